@@ -1,0 +1,65 @@
+# make help lists what this file does. Every goal makes .venv first, once, with the versions in constraints.txt.
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+DPC    := $(BIN)/dpc
+
+# The demo learns real actions when MSRACTION names a folder of MSRAction-3D, synthetic gestures otherwise.
+MSRACTION ?=
+ifneq ($(strip $(MSRACTION)),)
+DEMO       := demo/msraction3d
+DEMO_INPUT := msraction3d "$(MSRACTION)"
+else
+DEMO       := demo/gestures
+DEMO_INPUT := synthetic gestures
+endif
+DEMO_TRAIN ?= --preset tiny
+BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
+
+.DELETE_ON_ERROR:
+.DEFAULT_GOAL := help
+.PHONY: help venv demo test bench lint clean
+
+help:
+	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
+	@echo "make test                     the whole test suite"
+	@echo "make lint                     ruff over everything"
+	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
+	@echo "make clean                    remove .venv, demo/ and caches"
+	@echo "PYTHON=python3.12 make ...    uses another Python (3.10 to 3.13)"
+
+venv: $(READY)
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' \
+	    || { echo "make: $(PYTHON) is not Python 3.10 to 3.13; try PYTHON=python3.12 make $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null \
+	    || { echo "make: $(PYTHON) lacks the venv module; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	@touch $@
+
+demo: $(READY)
+	mkdir -p $(DEMO)
+	$(DPC) prepare $(DEMO_INPUT) -o $(DEMO)/clouds.h5
+	$(DPC) info $(DEMO)/clouds.h5 --picture $(DEMO)/clouds.png
+	$(DPC) classify train $(DEMO)/clouds.h5 -o $(DEMO)/model $(DEMO_TRAIN)
+	$(DPC) classify predict $(DEMO)/clouds.h5 --model $(DEMO)/model -o $(DEMO)/scores.h5
+	$(DPC) evaluate classification $(DEMO)/scores.h5 --split test --picture $(DEMO)/confusion.png
+	@echo "The pictures are $(DEMO)/clouds.png and $(DEMO)/confusion.png."
+
+test: $(READY)
+	$(BIN)/python -m pytest -q
+
+bench: $(READY)
+	$(BIN)/python -m tests.bench.bench_ops
+	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
+
+lint: $(READY)
+	$(BIN)/python -m ruff check .
+
+clean:
+	rm -rf $(VENV) demo build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,103 @@
+"""Every choice that shapes a Kinet, in one value that travels with the weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields, replace
+
+from dpcli.errors import DataError, UsageError
+
+VARIANTS = ("thesis", "release")
+
+
+@dataclass(frozen=True)
+class KinetConfig:
+    """Network and input of a Kinet. Defaults are the thesis's text; `release()` is the published code's choices.
+
+    Lengths are in the input's unit after normalisation, times in frames.
+    """
+
+    num_classes: int = 20
+    num_frames: int = 16
+    points_per_frame: int = 2048
+    normalize: str = "none"  # none | center (subtract the clip's mean) | unit (and divide by the largest radius) | image
+    variant: str = "thesis"
+    centroids: tuple[int, int] = (1024, 512)
+    neighbors: int = 64
+    radii: tuple[float, float] = (0.5, 1.0)  # at time distance 0
+    temporal_radius: int = 1  # frames
+    grouping: str = "balanced"  # which neighbours within the radius: first | nearest | balanced (equal shares of each frame)
+    widths: tuple[tuple[int, int], ...] = ((64, 128), (128, 256), (512, 1024))
+    # dynamic branch
+    group_size: int = 4  # d of eq. 3.5
+    reduction: float = 0.5  # c relative to the static width
+    xyz_group: bool = False  # one more group: the neighbour's relative coordinates
+    time_input: bool = False  # frame index beside the static feature, into the reduction
+    weighting: str = "deviation"  # deviation (eq. 3.8) | projection (release) | none (Table 3.1 vi)
+    normals: bool = True  # False: Table 3.1 v, the reduced features are pooled instead of fitted
+    merge: str = "residual"  # residual (thesis) | cross (release: both scales exchanged by 3-NN interpolation)
+    solver: str = "inverse"  # inverse (A.1.1) | ridge (ours: relative Tikhonov term, no guard needed)
+    guard: str = "signed"  # what a small determinant becomes: signed | release
+    fusion: str = "softmax"  # softmax | logits, averaged
+    dropout: float = 0.0  # before the last layer of each head
+
+    def __post_init__(self) -> None:
+        for name, legal in _LEGAL.items():
+            if getattr(self, name) not in legal:
+                raise UsageError(f"{name} = {getattr(self, name)!r}: expected one of {', '.join(map(str, legal))}")
+        if not 0 < self.reduction <= 1:
+            raise UsageError(f"reduction = {self.reduction}: expected a ratio in (0, 1]")
+        if self.num_frames < 1 or self.points_per_frame * self.num_frames < self.centroids[0]:
+            have = self.points_per_frame * self.num_frames
+            raise UsageError(f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {self.centroids[0]} centroids")
+
+    @classmethod
+    def release(cls, **changes: object) -> KinetConfig:
+        """The released code: groups of 3, a raw xyz group, absolute time, projection weights, cross-scale merge, logits."""
+        choices = {
+            "variant": "release", "group_size": 3, "xyz_group": True, "time_input": True, "weighting": "projection",
+            "merge": "cross", "guard": "release", "fusion": "logits", "grouping": "first",
+        }  # fmt: skip
+        return cls(**{**choices, **changes})
+
+    def changed(self, **changes: object) -> KinetConfig:
+        return replace(self, **changes)
+
+    def radius_table(self, stage: int) -> tuple[float, ...]:
+        """Radius per |dt| = 0..temporal_radius: r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (facts of the release)."""
+        growth = 0.2 * self.radii[stage] / max(self.num_frames - 1, 1)
+        return tuple(self.radii[stage] + growth * d for d in range(self.temporal_radius + 1))
+
+    def groups(self, width: int) -> int:
+        """Number of feature groups fitted at a layer of this width, the xyz group included."""
+        if self.xyz_group:
+            return int(width * self.reduction / self.group_size) + 1
+        return max(1, round(width * self.reduction / self.group_size))
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> KinetConfig:
+        """Back from `to_json`; DataError on unknown keys, so that a newer file isn't silently misread."""
+        values = json.loads(text)
+        known = {field.name for field in fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise DataError(f"the model's configuration has unknown keys {', '.join(unknown)}; a newer dpc wrote it")
+        for key in ("centroids", "radii"):
+            values[key] = tuple(values[key])
+        values["widths"] = tuple(tuple(pair) for pair in values["widths"])
+        return cls(**values)
+
+
+_LEGAL = {
+    "variant": VARIANTS,
+    "normalize": ("none", "center", "unit", "image"),
+    "grouping": ("first", "nearest", "balanced"),
+    "weighting": ("deviation", "projection", "none"),
+    "merge": ("residual", "cross"),
+    "solver": ("inverse", "ridge"),
+    "guard": ("signed", "release"),
+    "fusion": ("softmax", "logits"),
+}

@@ -1,0 +1,54 @@
+"""Kinet: a static stream, a dynamic stream on its frozen activations, and their fusion."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.config import KinetConfig
+from dpcli.classify.kinematic import Kinematics
+from dpcli.classify.pointnet2 import Grouping, PointNet2
+
+STREAMS = ("static", "dynamic")
+
+
+class Kinet(nn.Module):
+    """Both streams. `static_logits` trains the first, `dynamic_logits` the second, `forward` gives both in one pass."""
+
+    def __init__(self, config: KinetConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.static = PointNet2(config)
+        self.dynamic = Kinematics(config)
+
+    def group(self, points: Tensor) -> list[Grouping]:
+        """Neighbourhoods of a batch of clips: points (B,T,P,3), frame after frame."""
+        batch, frames, count = points.shape[:3]
+        times = torch.arange(frames, device=points.device, dtype=points.dtype).repeat_interleave(count)
+        return self.static.group(points.reshape(batch, frames * count, 3), times.expand(batch, -1).contiguous())
+
+    def static_logits(self, points: Tensor) -> Tensor:
+        return self.static(self.group(points))
+
+    def dynamic_logits(self, points: Tensor) -> Tensor:
+        """Gradients reach the dynamic branch only; the static network must be in eval mode."""
+        groups = self.group(points)
+        taps, _ = self.static.taps(groups)
+        return self.dynamic(groups, taps)
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
+        groups = self.group(points)
+        taps, static = self.static.taps(groups)
+        return static, self.dynamic(groups, taps)
+
+    def freeze_static(self) -> None:
+        """Stop the static stream's gradients and keep its batch norms at their running statistics."""
+        self.static.requires_grad_(False).eval()
+
+
+def fuse(static: Tensor, dynamic: Tensor, rule: str) -> Tensor:
+    """Class probabilities of both streams together: mean of softmax scores (thesis), or softmax of mean logits (release)."""
+    if rule == "logits":
+        return torch.softmax((static + dynamic) / 2, -1)
+    return (torch.softmax(static, -1) + torch.softmax(dynamic, -1)) / 2

@@ -1,0 +1,69 @@
+"""How the units' normals become one feature per stage-2 centroid: as the thesis says, or as the released code does."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.config import KinetConfig
+from dpcli.classify.pointnet2 import Grouping
+from dpcli.ops import three_nn_interpolate
+from dpcli.ops.grouped_mlp import gather_rows
+
+
+class ResidualMerge(nn.Module):
+    """h_l = relu(C_l n_l + R_l h_{l-1}) (thesis figure 3.4).
+
+    Where a unit's centroids are the next stage's neighbours, h is max-pooled over the neighbourhood first.
+    """
+
+    def __init__(self, channels: list[int], widths: list[int]) -> None:
+        super().__init__()
+        self.abstract = nn.ModuleList(nn.Linear(c, w) for c, w in zip(channels, widths))
+        self.align = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
+        self.channels = widths[-1]
+
+    def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
+        state = torch.relu(self.abstract[0](normals[0]))
+        per_stage = len(normals) // len(groups)
+        for level in range(1, len(normals)):
+            if level % per_stage == 0:
+                state = gather_rows(state, groups[level // per_stage].idx).amax(2)
+            state = torch.relu(self.abstract[level](normals[level]) + self.align[level - 1](state))
+        return state
+
+
+class CrossMerge(nn.Module):
+    """The released code: at each level both stages see their own and, by 3-NN interpolation, the other's features.
+
+    Every input carries its centroid's frame number as one more channel.
+    """
+
+    def __init__(self, channels: list[int]) -> None:
+        super().__init__()
+        first, second = channels[:2], channels[2:]
+        self.current = nn.ModuleList(nn.ModuleList(nn.Linear(c + 1, c) for c in pair) for pair in zip(first, second))
+        self.last = nn.ModuleList(nn.Linear(stage[0] + 1, stage[1]) for stage in (first, second))
+        self.cross = nn.ModuleList(nn.ModuleList(nn.Linear(sum(pair) + 2, c) for c in pair) for pair in zip(first, second))
+        self.channels = second[-1]
+
+    def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
+        times = [group.center_times[..., None] for group in groups]
+        states: list[Tensor] = []
+        for level in range(2):
+            raw = [torch.relu(self.current[level][s](torch.cat([normals[2 * s + level], times[s]], -1))) for s in range(2)]
+            if level:
+                raw = [raw[s] + torch.relu(self.last[s](torch.cat([states[s], times[s]], -1))) for s in range(2)]
+            timed = [torch.cat([raw[s], times[s]], -1) for s in range(2)]
+            states = []
+            for s in range(2):
+                other = three_nn_interpolate(groups[s].centers, groups[1 - s].centers, timed[1 - s])
+                states.append(raw[s] + torch.relu(self.cross[level][s](torch.cat([other, timed[s]], -1))))
+        return states[1]
+
+
+def build_merge(config: KinetConfig, channels: list[int]) -> ResidualMerge | CrossMerge:
+    """The merge that `config.merge` names, for units with these normal widths."""
+    if config.merge == "cross":
+        return CrossMerge(channels)
+    return ResidualMerge(channels, [*config.widths[0], *config.widths[1]])

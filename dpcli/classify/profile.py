@@ -1,0 +1,180 @@
+"""What a Kinet costs: parameters and multiply-adds as they are, the papers' ways of counting beside them, time and memory."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from torch import nn
+
+from dpcli.classify.kinet import Kinet, fuse
+from dpcli.runtime.memory import peak_memory
+
+
+def count_parameters(module: nn.Module) -> int:
+    """Every trainable number, batch norm's included."""
+    return sum(p.numel() for p in module.parameters())
+
+
+def paper_parameters(module: nn.Module) -> float:
+    """Millions as the thesis's table A.1 counts: weights, both Adam moments and batch norm's moving statistics, over 2^20."""
+    moving = sum(b.numel() for name, b in module.named_buffers() if "running" in name)
+    return (3 * count_parameters(module) + moving) / 2**20
+
+
+def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
+    """Multiply-adds of the matrix products of one clip (B=1), by stream, and of the fits (counted by hand).
+
+    Neighbour search, batch norm, activations and the small inverses are not in it; each is named in `uncounted`.
+    """
+    from torch.utils.flop_counter import FlopCounterMode
+
+    groups = model.group(points)
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        taps, _ = model.static.taps(groups)
+    static = counter.get_total_flops() // 2
+    # The count of the network as it is written in papers: each layer on every gathered neighbour.
+    dense = _dense_static_macs(model)
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        model.dynamic(groups, taps)
+    dynamic = counter.get_total_flops() // 2 + _fit_macs(model)
+    return {"static": static, "static_as_written": dense, "dynamic": dynamic, "total": static + dynamic}
+
+
+def _dense_static_macs(model: Kinet) -> int:
+    config, static = model.config, model.static
+    total = 0
+    for count, stage in zip(config.centroids, (static.stage1, static.stage2)):
+        total += count * config.neighbors * (stage.linear1.weight.numel() + stage.linear2.weight.numel())
+    head = static.head
+    return total + config.centroids[1] * (head.linear1.weight.numel() + head.linear2.weight.numel()) + head.classify.weight.numel()
+
+
+def _fit_macs(model: Kinet) -> int:
+    """Normal matrix, right side, solution and deviations of every fit: those kernels are invisible to torch's counter."""
+    config, size, total = model.config, model.config.group_size + 1, 0
+    for unit, count in zip(model.dynamic.units, (config.centroids[0],) * 2 + (config.centroids[1],) * 2):
+        per_neighbor = size * (size + 1) // 2 + size + (0 if config.weighting == "none" else size)
+        total += count * unit.groups * (config.neighbors * per_neighbor + size * size)
+    return total if config.normals else 0
+
+
+def latency(model: Kinet, points: torch.Tensor, device: torch.device, repeats: int = 5) -> dict[str, float]:
+    """Milliseconds of one clip (B=1): neighbour search, both streams, all; medians."""
+    rows = []
+    with torch.inference_mode():
+        for _ in range(repeats + 1):
+            marks = [_now(device)]
+            groups = model.group(points)
+            marks.append(_now(device))
+            taps, static = model.static.taps(groups)
+            marks.append(_now(device))
+            fuse(static, model.dynamic(groups, taps), model.config.fusion)
+            marks.append(_now(device))
+            rows.append([1000 * (b - a) for a, b in zip(marks, marks[1:])] + [1000 * (marks[-1] - marks[0])])
+    medians = torch.tensor(rows[1:]).median(0).values.tolist()
+    return dict(zip(("neighbours", "static", "dynamic", "total"), (round(value, 2) for value in medians)))
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def measure(model: Kinet, device: torch.device, steps: bool = False) -> dict[str, Any]:
+    """Everything `dpc classify profile` prints, as one object."""
+    config = model.config
+    torch.manual_seed(0)
+    points = body_like_clip(config.num_frames, config.points_per_frame).to(device)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    before = peak_memory()
+    counts = macs(model, points)
+    result = {
+        "variant": config.variant, "classes": config.num_classes, "clip": [config.num_frames, config.points_per_frame],
+        "parameters": {"total": count_parameters(model), "static": count_parameters(model.static),
+                       "dynamic": count_parameters(model.dynamic),
+                       **{f"static_{k}": count_parameters(getattr(model.static, k)) for k in ("stage1", "stage2", "head")},
+                       **{f"dynamic_{k}": count_parameters(getattr(model.dynamic, k)) for k in ("units", "merge", "head")}},
+        "paper_style_parameters": {"total": round(paper_parameters(model), 3), "static": round(paper_parameters(model.static), 3),
+                                   "rule": "weights + Adam moments + moving statistics, / 2^20 (thesis table A.1)"},
+        "macs_per_clip": counts,
+        "paper_style_gflops": {"static": round(2 * counts["static_as_written"] / 2**30, 2),
+                               "total": round(2 * (counts["static_as_written"] + counts["dynamic"]) / 2**30, 2),
+                               "rule": "2 x multiply-adds of the layers as written, / 2^30"},
+        "uncounted": "neighbour search, batch norm, activations, pooling, the small inverses",
+        "latency_ms": latency(model, points, device),
+        "peak_memory_mb": _peak(device, before),
+        "device": str(device), "threads": torch.get_num_threads(),
+    }  # fmt: skip
+    if steps:
+        result["static_step"] = static_step(model, device)
+    return result
+
+
+def _peak(device: torch.device, before: int) -> float:
+    if device.type == "cuda":
+        return round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
+    return round(max(peak_memory(), before) / 2**20, 1)
+
+
+def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
+    """A made-up clip (batch,T,P,3) of the size of a person in MSR-Action3D's units: an upright ellipsoid that sways."""
+    generator = torch.Generator().manual_seed(0)
+    shape = torch.randn(batch, frames, points, 3, generator=generator)
+    shape = torch.nn.functional.normalize(shape, dim=-1) * torch.tensor([0.2, 0.55, 0.15])
+    return shape + 0.1 * torch.sin(torch.arange(frames) / 3)[None, :, None, None]
+
+
+def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, Any]:
+    """Where a training step of the static stream spends its time: share of matrix products, the largest other parts."""
+    from torch.profiler import ProfilerActivity, profile
+
+    from dpcli.runtime.memory import keep_freed_memory
+
+    keep_freed_memory()
+    static = model.static.train().requires_grad_(True)
+    config = model.config
+    points = body_like_clip(config.num_frames, config.points_per_frame, batch).to(device)
+    labels = torch.arange(batch, device=device) % config.num_classes
+
+    def step() -> None:
+        loss = nn.functional.cross_entropy(static(model.group(points)), labels)
+        static.zero_grad(set_to_none=True)
+        loss.backward()
+
+    for _ in range(2):
+        step()
+    began = _now(device)
+    for _ in range(3):
+        step()
+    seconds = (_now(device) - began) / 3
+    with profile(activities=[ProfilerActivity.CPU]) as trace:
+        step()
+    products = [e for e in trace.key_averages() if e.key in ("aten::addmm", "aten::mm", "aten::bmm", "aten::addmm_")]
+    model.eval()
+    inside = sum(e.self_cpu_time_total for e in products) / 1e6
+    return {"batch": batch, "seconds": round(seconds, 4), "matrix_products_share": round(inside / seconds, 3)}
+
+
+def render(result: dict[str, Any]) -> str:
+    """The object of `measure` as lines for a person."""
+    lines = [f"Kinet, {result['variant']} variant, {result['classes']} classes, clip {result['clip'][0]} x {result['clip'][1]} points"]
+    parameters = result["parameters"]
+    lines.append(f"parameters    {parameters['total']:,} (static {parameters['static']:,}, dynamic {parameters['dynamic']:,})")
+    paper = result["paper_style_parameters"]
+    lines.append(f"  paper style {paper['total']} M, static {paper['static']} M: {paper['rule']}")
+    counts = result["macs_per_clip"]
+    lines.append(f"multiply-adds {counts['total'] / 1e9:.2f} G per clip (static {counts['static'] / 1e9:.2f}, dynamic {counts['dynamic'] / 1e9:.2f})")
+    gflops = result["paper_style_gflops"]
+    lines.append(f"  paper style {gflops['total']} GFLOPs, static {gflops['static']}: {gflops['rule']}")
+    lines.append(f"  not counted: {result['uncounted']}")
+    times = ", ".join(f"{key} {value}" for key, value in result["latency_ms"].items())
+    lines.append(f"latency       {times} ms on {result['device']} with {result['threads']} threads, one clip at a time")
+    lines.append(f"peak memory   {result['peak_memory_mb']} MB of the process")
+    if "static_step" in result:
+        step = result["static_step"]
+        lines.append(f"static step   {step['seconds']} s for {step['batch']} clips, {100 * step['matrix_products_share']:.0f} % in matrix products")
+    return "\n".join(lines)

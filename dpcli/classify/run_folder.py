@@ -1,0 +1,81 @@
+"""The folder a training run writes: checkpoints, logs, curves. Nothing here knows how a step is computed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from pathlib import Path
+
+import torch
+
+from dpcli.errors import DataError, UsageError
+
+COLUMNS = ("stage", "epoch", "loss", "train_accuracy", "validation_accuracy", "learning_rate", "seconds")
+
+
+class RunFolder:
+    """`config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`, `curves.png`."""
+
+    def __init__(self, path: str | Path, config: dict, force: bool = False) -> None:
+        self.path = Path(path)
+        self.path.mkdir(parents=True, exist_ok=True)
+        saved = self.path / "config.json"
+        if saved.exists() and not force:
+            before = json.loads(saved.read_text())
+            differing = sorted(k for k in before.keys() | config.keys() if before.get(k) != config.get(k))
+            if differing:
+                key = differing[0]
+                raise UsageError(
+                    f"{self.path}: holds a run with another configuration ({key}: {before.get(key)!r}, now {config.get(key)!r});"
+                    " use another -o, or --force to start over"
+                )
+        else:
+            for name in ("state.pt", "last.safetensors", "best.safetensors", "log.csv", "log.json", "curves.png"):
+                (self.path / name).unlink(missing_ok=True)
+            _replace(saved, json.dumps(config, indent=1, sort_keys=True))
+        self.rows: list[dict] = []
+
+    def file(self, name: str) -> Path:
+        return self.path / name
+
+    def load_state(self) -> dict | None:
+        """What an earlier, unfinished run saved; None for a fresh one."""
+        path = self.path / "state.pt"
+        if not path.exists():
+            return None
+        try:
+            state = torch.load(path, weights_only=True, map_location="cpu")
+        except Exception as error:
+            raise DataError(f"{path}: the saved state is damaged ({type(error).__name__}); --force starts over") from None
+        self.rows = state["rows"]
+        return state
+
+    def save_state(self, state: dict) -> None:
+        part = self.path / ".state.pt.part"
+        torch.save({**state, "rows": self.rows}, part)
+        os.replace(part, self.path / "state.pt")
+
+    def log(self, row: dict) -> None:
+        """Append one epoch and rewrite the small log files whole, so that a reader never sees half a line."""
+        self.rows.append({key: row.get(key) for key in COLUMNS})
+        _replace(self.path / "log.json", json.dumps(self.rows, indent=1))
+        part = self.path / ".log.csv.part"
+        with open(part, "w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(self.rows)
+        os.replace(part, self.path / "log.csv")
+
+    def draw_curves(self) -> None:
+        """Loss and accuracies over epochs, one panel a stage."""
+        from dpcli.classify.curves import draw_curves
+
+        if self.rows:
+            draw_curves(self.rows, self.path / "curves.png")
+
+
+def _replace(path: Path, text: str) -> None:
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text)
+    os.replace(part, path)

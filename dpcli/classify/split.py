@@ -1,0 +1,76 @@
+"""Which videos train and which choose: the validation part is carved from the training videos, never from the test ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime.seed import generator
+from dpcli.store import CloudsReader
+
+
+def labelled(reader: CloudsReader, split: str) -> list[int]:
+    """Sequences of this split that have a label. DataError when there are none."""
+    chosen = [i for i, name in enumerate(reader.splits) if name == split and reader.labels[i] >= 0]
+    if not chosen:
+        found = ", ".join(sorted({f"{name!r}" for name in reader.splits}))
+        raise DataError(f"{reader.path}: no labelled sample of split {split!r}; the file has {found}")
+    return chosen
+
+
+def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[int], list[int]]:
+    """(training, validation) sequences from the split `train`.
+
+    `rule`: `none`; `subject` (the training subject with the highest number, the default where there are several);
+    `subjects:3,5`; or a fraction such as `0.15`, drawn for each class.
+    """
+    chosen = labelled(reader, "train")
+    if rule == "none":
+        return chosen, []
+    if rule.startswith("subject"):
+        held = _held_out(reader, chosen, rule)
+        rest = [i for i in chosen if reader.subjects[i] not in held]
+        return rest, [i for i in chosen if reader.subjects[i] in held]
+    try:
+        share = float(rule)
+    except ValueError:
+        share = -1
+    if not 0 < share < 1:
+        raise UsageError(f"--validation {rule}: expected none, subject, subjects:3,5 or a fraction such as 0.15")
+    return _stratified(reader, chosen, share, seed)
+
+
+def _held_out(reader: CloudsReader, chosen: list[int], rule: str) -> set[int]:
+    subjects = {int(reader.subjects[i]) for i in chosen}
+    if rule == "subject":
+        held = {max(subjects)}
+    else:
+        try:
+            held = {int(word) for word in rule.split(":", 1)[1].split(",")}
+        except (IndexError, ValueError):
+            raise UsageError(f"--validation {rule}: expected subjects:3,5") from None
+    if not held < subjects:
+        raise UsageError(f"--validation {rule}: training subjects are {sorted(subjects)}; hold out some of them, not all")
+    return held
+
+
+def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int) -> tuple[list[int], list[int]]:
+    held: set[int] = set()
+    for label in sorted({int(reader.labels[i]) for i in chosen}):
+        members = [i for i in chosen if reader.labels[i] == label]
+        count = min(round(share * len(members)), len(members) - 1)
+        held.update(int(members[k]) for k in generator(seed, 3, label).permutation(len(members))[:count])
+    return [i for i in chosen if i not in held], sorted(held)
+
+
+def default_rule(reader: CloudsReader) -> str:
+    """`subject` when the training videos have several known subjects, else 15 % of each class."""
+    subjects = {int(reader.subjects[i]) for i in labelled(reader, "train")}
+    return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
+
+
+def class_table(reader: CloudsReader) -> list[str]:
+    """Class names; numbers where the file has labels but no names."""
+    if reader.class_names:
+        return reader.class_names
+    return [str(i) for i in range(int(np.max(reader.labels)) + 1)]

@@ -1,0 +1,54 @@
+"""The space-time surface: weighted least-squares fit of A f + b = t over a neighbourhood, its normal, and the deviations.
+
+Equations 3.4-3.7 of the thesis, for K groups of d features at once. Everything is differentiable, batched over leading
+dimensions, and free of parameters. n counts neighbours; times are in frames.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.ops import normal_equations, plane_deviations, small_inverse
+
+_RIDGE = 1e-3  # of the mean diagonal; large enough for float32 at rank-deficient neighbourhoods, small beside the data
+
+
+def fit_surface(
+    features: Tensor,  # (...,n,K,d)
+    times: Tensor,  # (...,n)
+    weights: Tensor | None = None,  # (...,n,K)
+    solver: str = "inverse",
+    guard: str = "signed",
+) -> Tensor:  # (...,K,d+1)
+    """Coefficients [A, b] minimising sum_j w_j (A f_j + b - t_j)^2 (eq. 3.5) for each group, in closed form (eq. 3.6).
+
+    `inverse` inverts the normal matrix by thesis A.1.1, where a small determinant is replaced as `guard` says;
+    `ridge` adds 1e-3 of the mean diagonal to it, which bounds the result where the neighbours don't span the space
+    (repeated points, dead features). `weights=None` means 1.
+    """
+    matrix, right = normal_equations(features, times, weights)
+    if solver == "ridge":
+        mean = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        matrix = matrix + (_RIDGE * mean + 1e-9) * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+        guard = "none"
+    return (small_inverse(matrix, guard=guard) * right[..., None, :]).sum(-1)
+
+
+def surface_normal(coefficients: Tensor) -> Tensor:
+    """Unit normal (A, -1) / ||(A, -1)|| of eq. 3.7: (...,d+1) coefficients -> (...,d+1)."""
+    slopes = coefficients[..., :-1]
+    return torch.nn.functional.normalize(torch.cat([slopes, -torch.ones_like(slopes[..., :1])], -1), dim=-1, eps=1e-6)
+
+
+def deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
+    """Fitting deviation A f_j + b - t_j of each neighbour: (...,K,d+1), (...,n,K,d), (...,n) -> (...,n,K)."""
+    return plane_deviations(features, times, coefficients)
+
+
+def projected_deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
+    """The deviation as a vector along the normal, (A,-1) e / ||(A,-1)||^2, as the released code uses it: (...,n,K,d+1)."""
+    slopes = coefficients[..., :-1]
+    direction = torch.cat([slopes, -torch.ones_like(slopes[..., :1])], -1)
+    scaled = direction / direction.square().sum(-1, keepdim=True)
+    return deviations(coefficients, features, times)[..., None] * scaled[..., None, :, :]

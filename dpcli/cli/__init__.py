@@ -1,0 +1,1 @@
+"""The command line: one module per subcommand, options in, one call down, result out."""

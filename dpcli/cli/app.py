@@ -1,0 +1,103 @@
+"""The `dpc` application: registers the subcommands and turns errors into messages and exit codes."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+
+import typer
+
+from dpcli import __version__
+from dpcli.cli import classify, evaluate, info, prepare
+from dpcli.errors import DpcError
+
+app = typer.Typer(
+    name="dpc",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    help="Dynamic point clouds: recognise actions and gestures in point cloud videos.",
+    epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
+)
+app.add_typer(prepare.app, name="prepare")
+app.add_typer(classify.app, name="classify")
+app.add_typer(evaluate.app, name="evaluate")
+app.command("info")(info.info)
+
+CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"dpc {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _root(version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version.")) -> None:
+    pass
+
+
+def _global_flags(argv: list[str]) -> list[str]:
+    """Take -q, -v and --debug out of the arguments, wherever they stand (before a bare `--`)."""
+    from dpcli.runtime.progress import log
+
+    end = argv.index("--") if "--" in argv else len(argv)
+    head, tail = argv[:end], argv[end:]
+    if {"-q", "--quiet"} & set(head):
+        log.level = 0
+    if {"-v", "--verbose"} & set(head):
+        log.level = 2
+    log.debug = "--debug" in head
+    return [word for word in head if word not in ("-q", "--quiet", "-v", "--verbose", "--debug")] + tail
+
+
+def _explain(error: BaseException) -> int:
+    """Print a message for a person and return the exit code."""
+    from dpcli.runtime.progress import log
+
+    if isinstance(error, BrokenPipeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes stdout once more at exit
+        return CLOSED_PIPE
+    if isinstance(error, KeyboardInterrupt) or type(error).__name__ == "Abort":
+        log.error("interrupted")
+        return INTERRUPTED
+    if hasattr(error, "show") and hasattr(error, "exit_code"):  # wrong use, found by the option parser
+        error.show(file=sys.stderr)
+        return error.exit_code
+    if isinstance(error, DpcError):
+        log.error(str(error))
+        return error.exit_code
+    if isinstance(error, FileNotFoundError) and error.filename is not None:
+        log.error(f"{error.filename}: no such file or folder")
+        return 2
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        log.error(f"no space left on the device while writing {error.filename or 'the output'}; free some and run again")
+        return 1
+    raise error
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Run `dpc`; exits with the code that design.md section 2 lists."""
+    arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
+    command = typer.main.get_command(app)
+    from dpcli.runtime.progress import log
+
+    try:
+        code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
+        sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        if log.debug and not isinstance(error, (BrokenPipeError, KeyboardInterrupt)):
+            import traceback
+
+            traceback.print_exc()
+        try:
+            code = _explain(error)
+        except Exception as unexpected:
+            if not log.debug:
+                log.error(f"{type(unexpected).__name__}: {unexpected} (a bug, or an unusual machine; --debug shows where)")
+            code = 1
+    sys.exit(code if isinstance(code, int) else 0)

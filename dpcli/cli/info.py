@@ -1,0 +1,116 @@
+"""`dpc info`: what is in a file."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from dpcli.cli.options import Json, Picture
+from dpcli.errors import UsageError
+
+_PIPE_WIDTH = 120
+_CLASSES_SHOWN, _COMMAND_SHOWN = 100, 300
+
+
+def info(
+    file: Annotated[str, typer.Argument(help="File of any kind, or - for a pipe.")],
+    as_object: Json = False,
+    picture: Picture = None,
+    samples: Annotated[int, typer.Option("--samples", min=1, max=100, help="Rows of the picture.")] = 8,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=60, help="Columns of the picture: moments.")] = 8,
+    view: Annotated[
+        str | None,
+        typer.Option("--view", help="Axes that point right, down and away in the picture, such as xyz or x-zy (z up)."),
+    ] = None,
+) -> None:
+    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames."""
+    from dpcli.store import input_file
+    from dpcli.store.info import summary
+
+    with input_file(file) as path:
+        found = {"file": file, **summary(path)}
+        if picture is not None:
+            _draw(path, found["kind"], picture, samples=samples, frames=frames, view=view)
+    if as_object:
+        typer.echo(json.dumps(found, allow_nan=False))
+    else:
+        _show(found)
+
+
+def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
+    from dpcli.evaluate.contact_sheet import contact_sheet
+    from dpcli.evaluate.pictures import check_picture
+    from dpcli.store import CloudsReader
+
+    if kind not in ("clouds", "parts"):
+        raise UsageError(
+            f"--picture draws point clouds, this file holds {kind!r}; for scores: dpc evaluate classification"
+        )
+    check_picture(picture)
+    with CloudsReader(path) as reader:
+        contact_sheet(reader, picture, **options)
+
+
+def _show(found: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    width = None if sys.stdout.isatty() else _PIPE_WIDTH
+    console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)
+    for name, value in _lines(found):
+        console.print(f"{name:<20} {value}", markup=False)
+    if found.get("classes"):
+        console.print()
+        console.print(_class_table(found))
+    for number, entry in enumerate(found["provenance"], 1):
+        command = str(entry.get("command", ""))
+        short = command if len(command) <= _COMMAND_SHOWN else command[:_COMMAND_SHOWN] + " ..."
+        console.print(f"{'provenance' if number == 1 else '':<20} {number}. {short}", markup=False)
+
+
+def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
+    kind = f"{found['kind']}, schema {found['schema']}, {found['bytes'] / 1e6:.3g} MB"
+    lines = [("file", found["file"]), ("kind", kind)]
+    if "counts" in found:
+        counts = (f"{count:,} {name.replace('_', ' ')}" for name, count in found["counts"].items())
+        lines.append(("counts", ", ".join(counts)))
+    for key, unit in (("frames_per_sequence", ""), ("points_per_frame", ""), ("frame_interval", " s")):
+        if found.get(key):
+            spread = " / ".join(f"{found[key][name]:.6g}" for name in ("min", "median", "max"))
+            lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
+    for axis, ends in found.get("range", {}).items():
+        unit = found["length_unit"] if axis in "xyz" else ""
+        text = f"{ends[0]:.5g} to {ends[1]:.5g} {unit}".rstrip() if ends else "no finite values"
+        lines.append((f"range {axis}", text))
+    for key in ("fields", "streams"):
+        if key in found:
+            lines.append((key, ", ".join(found[key]) or "none"))
+    for key in ("splits", "subjects", "cameras"):
+        if found.get(key):
+            lines.append((key, ", ".join(f"{name or 'none'} ({count})" for name, count in found[key].items())))
+    if found.get("unknown_labels"):
+        lines.append(("unknown labels", str(found["unknown_labels"])))
+    if found["kind"] not in ("clouds", "scores"):
+        lines += [(item["name"], f"{item['type']} {tuple(item['shape'])}") for item in found["datasets"]]
+    source = f" from {found['source']}" if found["source"] else ""
+    return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
+
+
+def _class_table(found: dict[str, Any]) -> Any:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    splits = list(found["splits"])
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
+    for name in ("label", "class", "samples", *(split or "no split" for split in splits)):
+        table.add_column(Text(name), justify="left" if name == "class" else "right", no_wrap=True)
+    rows = found["classes"]
+    for row in rows[:_CLASSES_SHOWN]:
+        counts = [str(row["splits"].get(split, 0)) for split in splits]
+        table.add_row(str(row["label"]), Text(row["name"]), str(row["samples"]), *counts)
+    if len(rows) > _CLASSES_SHOWN:
+        table.add_row("...", Text(f"and {len(rows) - _CLASSES_SHOWN} more classes; --json lists all"))
+    return table

@@ -1,0 +1,198 @@
+"""`dpc prepare`: raw data of many kinds into one kind of file."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dpcli.cli.options import Force, Jobs, OnError, Output, Seed
+from dpcli.errors import UsageError
+
+app = typer.Typer(no_args_is_help=True, help="Turn raw data into a file of point cloud sequences.")
+synthetic = typer.Typer(no_args_is_help=True, help="Make data out of nothing, with ground truth.")
+app.add_typer(synthetic, name="synthetic")
+
+
+def _common(
+    output: Output,
+    points: Annotated[
+        int, typer.Option("--points", min=0, help="At most this many points per frame; 0 keeps all.")
+    ] = 0,
+    sampling: Annotated[str, typer.Option("--sampling", help="How --points chooses: random, fps or voxel.")] = "random",
+    limit: Annotated[int | None, typer.Option("--limit", min=1, help="Only the first N samples, for a trial.")] = None,
+    compression: Annotated[str, typer.Option("--compression", help="Of the coordinates: none, lzf or gzip.")] = "none",
+    on_error: OnError = "skip",
+    jobs: Jobs = None,
+    seed: Seed = 0,
+    force: Force = False,
+) -> None:
+    """The options that every reader shares; only the signature matters."""
+
+
+def _reads(group: typer.Typer, name: str | None = None) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register a function that turns its own options into a Reader as a command that has the common options too."""
+
+    def register(make_reader: Callable[..., Any]) -> Callable[..., Any]:
+        own = inspect.signature(make_reader, eval_str=True)
+        shared = inspect.signature(_common, eval_str=True)
+
+        def run(**options: Any) -> None:
+            common = {key: options.pop(key) for key in shared.parameters}
+            if "seed" in own.parameters:
+                options["seed"] = common["seed"]
+            _convert(make_reader(**options), name or make_reader.__name__, **common)
+
+        parameters = {**own.parameters, **shared.parameters}
+        # a parameter without default may not follow one with: arguments first, then -o, then the rest
+        ordered = sorted(parameters.values(), key=lambda p: p.default is not inspect.Parameter.empty)
+        run.__signature__ = inspect.Signature([p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in ordered])  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in ordered}
+        run.__doc__ = make_reader.__doc__
+        group.command(name or make_reader.__name__)(run)
+        return make_reader
+
+    return register
+
+
+def _convert(reader: Any, name: str, *, output: str, jobs: int | None, **options: Any) -> None:
+    from dpcli.prepare.pipeline import convert
+    from dpcli.runtime.device import cpu_count
+    from dpcli.runtime.progress import log
+    from dpcli.store.pipes import output_file
+
+    with output_file(output) as path:
+        report = convert(reader, path, jobs=jobs or cpu_count(), task=f"prepare {name}", **options)
+    for line in report.lines():
+        log.warn(line)
+    if output != "-":
+        counts = (
+            f"{report.written} sequences, {report.frames} frames, {report.points} points, {len(report.skipped)} skipped"
+        )
+        typer.echo(f"{output}: {counts}")
+
+
+def _numbers(text: str, option: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in text.split(",") if word.strip())
+    except ValueError:
+        raise UsageError(f"{option} {text}: expected whole numbers with commas, such as 1,2,3") from None
+
+
+@_reads(app)
+def msraction3d(
+    raw: Annotated[Path, typer.Argument(help="Folder of aAA_sSS_eEE_sdepth.bin (official) or .mat files.")],
+    focal: Annotated[float, typer.Option("--focal", help="Focal length, pixels (as the published protocols).")] = 280.0,
+    scale: Annotated[float, typer.Option("--scale", help="Raw depth units per unit of length in the output.")] = 300.0,
+    train_subjects: Annotated[
+        str, typer.Option("--train-subjects", help="Their videos are split train.")
+    ] = "1,2,3,4,5",
+) -> Any:
+    """MSR-Action3D: 20 actions in Kinect depth, 567 videos of 10 subjects."""
+    from dpcli.prepare.msraction3d import MSRAction3D
+
+    return MSRAction3D(raw, focal, scale, _numbers(train_subjects, "--train-subjects"))
+
+
+@_reads(app)
+def nvgesture(
+    raw: Annotated[Path, typer.Argument(help="Folder of the official list files and Video_data/.")],
+    foreground: Annotated[str, typer.Option("--foreground", help="otsu (the hand, as the peers) or none.")] = "otsu",
+    erode: Annotated[int, typer.Option("--erode", min=0, help="Passes of 3x3 erosion, pixels off the rim.")] = 1,
+    coordinates: Annotated[
+        str,
+        typer.Option("--coordinates", help="image: row, column, grey level. camera: pinhole, depth 255 - grey level."),
+    ] = "image",
+) -> Any:
+    """NvGesture: 25 hand gestures in 8-bit depth, 1,532 clips of 20 subjects."""
+    from dpcli.prepare.nvgesture import NvGesture
+
+    return NvGesture(raw, foreground, erode, coordinates)
+
+
+@_reads(app)
+def depth(
+    inputs: Annotated[
+        list[Path], typer.Argument(help="Videos (.avi .mp4 .mkv .mov), .npy, folders of images, or folders of these.")
+    ],
+    intrinsics: Annotated[Path | None, typer.Option("--intrinsics", help="JSON with fx fy cx cy, pixels.")] = None,
+    fx: Annotated[float | None, typer.Option("--fx", help="Focal length, pixels; with --cx --cy.")] = None,
+    fy: Annotated[float | None, typer.Option("--fy", help="Focal length, pixels. Default: --fx.")] = None,
+    cx: Annotated[float | None, typer.Option("--cx", help="Principal point, pixels from the left.")] = None,
+    cy: Annotated[float | None, typer.Option("--cy", help="Principal point, pixels from the top.")] = None,
+    fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view, degrees. Default: 60.")] = None,
+    depth_scale: Annotated[
+        float | None,
+        typer.Option("--depth-scale", help="Raw units per metre. Default: 1000 (16-bit), 100 (8-bit), 1 (float)."),
+    ] = None,
+    invert: Annotated[bool, typer.Option("--invert", help="Larger values are nearer.")] = False,
+    near: Annotated[float, typer.Option("--near", help="Drop what is nearer, metres.")] = 0.0,
+    far: Annotated[float, typer.Option("--far", help="Drop what is farther, metres.")] = float("inf"),
+    background: Annotated[
+        str, typer.Option("--background", help="Remove what stays still: none, median or first (frame).")
+    ] = "none",
+    margin: Annotated[
+        float, typer.Option("--margin", help="Foreground is nearer than the background by this, metres.")
+    ] = 0.05,
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second. Default: the video's, else 30.")
+    ] = None,
+    stride: Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")] = 1,
+    labels: Annotated[Path | None, typer.Option("--labels", help="CSV: name,label[,subject][,split].")] = None,
+) -> Any:
+    """Any depth video, 8 or 16 bits, to points in metres."""
+    from dpcli.prepare.camera import Intrinsics
+    from dpcli.prepare.depth import DepthVideos
+
+    pixels = (fx, fx if fy is None else fy, cx, cy)
+    if intrinsics and any(v is not None for v in pixels):
+        raise UsageError("--intrinsics and --fx --fy --cx --cy were both given; use one")
+    camera = Intrinsics.from_json(intrinsics) if intrinsics else None
+    if any(v is not None for v in pixels):
+        if any(v is None for v in pixels):
+            raise UsageError("--fx, --cx and --cy belong together (--fy defaults to --fx); or use --fov")
+        camera = Intrinsics(*(float(v) for v in pixels if v is not None))
+    return DepthVideos(
+        tuple(inputs), camera, fov, depth_scale, invert, near, far, background, margin, fps, stride, labels
+    )  # fmt: skip
+
+
+@_reads(app)
+def clouds(
+    raw: Annotated[
+        Path, typer.Argument(help="Folder of .ply .pcd .npy .npz .bin .csv .las .xyz frames, or of such folders.")
+    ],
+    bin_columns: Annotated[
+        int, typer.Option("--bin-columns", help="float32 values per point of a .bin; KITTI has 4.")
+    ] = 4,
+    scale: Annotated[float, typer.Option("--scale", help="Input units per unit of length in the output.")] = 1.0,
+    unit: Annotated[str, typer.Option("--unit", help="Name of the output's unit of length.")] = "m",
+    fps: Annotated[
+        float | None, typer.Option("--fps", help="Frames per second; writes the time of every frame.")
+    ] = None,
+    stride: Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")] = 1,
+    label_from_folder: Annotated[bool, typer.Option("--label-from-folder", help="RAW/CLASS/SEQUENCE/frames.")] = False,
+    labels: Annotated[Path | None, typer.Option("--labels", help="CSV: name,label[,subject][,split].")] = None,
+) -> Any:
+    """Point cloud files: a folder is a sequence, its files are the frames."""
+    from dpcli.prepare.clouds import CloudFolders
+
+    return CloudFolders(raw, bin_columns, scale, unit, fps, stride, label_from_folder, labels)
+
+
+@_reads(synthetic)
+def gestures(
+    videos_per_class: Annotated[int, typer.Option("--videos-per-class", help="Videos of each of the 10 classes.")] = 20,
+    frames: Annotated[int, typer.Option("--frames", help="Frames per video.")] = 24,
+    subjects: Annotated[int, typer.Option("--subjects", help="People; the first 60 % are split train.")] = 10,
+    size: Annotated[int, typer.Option("--size", help="Image width, pixels; the height is 3/4 of it.")] = 160,
+    noise: Annotated[float, typer.Option("--noise", min=0.0, help="Sensor noise, 1 = like a Kinect.")] = 1.0,
+    seed: Seed = 0,
+) -> Any:
+    """Arm gestures whose pairs differ only in the direction of time, seen by a virtual depth camera."""
+    from dpcli.prepare.synthetic_gestures import SyntheticGestures
+
+    return SyntheticGestures(videos_per_class, frames, subjects, size, noise, seed)

@@ -1,0 +1,40 @@
+"""Geometry with more than one backend: sampling, neighbours, interpolation, small inverses.
+
+Every operation is one public function with a torch reference and a fast CPU kernel behind it (see `backend`).
+Names resolve on first use, so that `from dpcli.ops import fps_numpy` needs neither torch nor numba at import.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+_HOME = {
+    "fps": "sampling",
+    "fps_reference": "sampling",
+    "fps_numpy": "sampling_numpy",
+    "space_time_ball_query": "ball_query",
+    "space_time_ball_query_reference": "ball_query",
+    "knn": "nearest",
+    "knn_reference": "nearest",
+    "three_nn_interpolate": "interpolate",
+    "gather_points": "gather",
+    "small_inverse": "linalg",
+    "normal_equations": "plane_fit",
+    "plane_deviations": "plane_fit",
+    "chosen_backend": "backend",
+}
+
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

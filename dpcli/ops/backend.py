@@ -1,0 +1,124 @@
+"""Which implementation runs, on how many threads, in pieces of what size; and the checks that all operations share.
+
+Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorised, chunked), and
+`numba`, the fast kernels for CPU tensors. The environment variable DPC_BACKEND=torch|numba overrides the choice.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import torch
+
+from dpcli.errors import UsageError
+
+# Elements of one pairwise block: bounds the reference's memory, and on CPU keeps a block near the cache.
+_BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 26}
+
+
+@functools.cache
+def numba_available() -> bool:
+    """Whether numba imports; says so once on stderr if not."""
+    try:
+        import numba  # noqa: F401
+    except Exception as error:  # a broken llvmlite raises more than ImportError
+        print(f"dpc: numba does not import ({error}); the slower torch operations are used instead", file=sys.stderr)
+        return False
+    return True
+
+
+def chosen_backend(device: torch.device | str = "cpu") -> str:
+    """Backend for tensors on `device`: "numba" on CPU where it imports, else "torch". Reads DPC_BACKEND.
+
+    DPC_BACKEND=numba has no say over tensors on another device: their only path is torch.
+    Raises UsageError when DPC_BACKEND is something else than torch or numba.
+    """
+    wanted = os.environ.get("DPC_BACKEND", "")
+    if wanted not in ("", "torch", "numba"):
+        raise UsageError(f"DPC_BACKEND is {wanted!r}; expected torch or numba, or leave it unset")
+    if torch.device(device).type != "cpu" or wanted == "torch":
+        return "torch"
+    return "numba" if numba_available() else "torch"
+
+
+def run_in_threads(function: Callable[..., None], tasks: Sequence[tuple]) -> None:
+    """Call `function(*task)` for each task, on up to torch.get_num_threads() threads; for kernels that release the GIL.
+
+    The threads live only as long as the call, so a forked process inherits none; DataLoader workers have one torch
+    thread and therefore run serially.
+    """
+    workers = min(torch.get_num_threads(), len(tasks))
+    if workers <= 1:
+        for task in tasks:
+            function(*task)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        for future in [pool.submit(function, *task) for task in tasks]:
+            future.result()
+
+
+def thread_windows(batch: int, rows: int) -> list[tuple[int, int]]:
+    """Cut the rows of one item of a batch into (first, last) windows, so that all threads have work."""
+    pieces = -(-torch.get_num_threads() // max(batch, 1))
+    step = max(1, -(-rows // pieces))
+    return [(first, min(first + step, rows)) for first in range(0, rows, step)]
+
+
+def row_blocks(rows: int, elements_per_row: int, device: torch.device) -> list[slice]:
+    """Cut `rows` into slices whose pairwise blocks stay within the memory bound of `device`."""
+    bound = _BLOCK_ELEMENTS.get(device.type, _BLOCK_ELEMENTS["cpu"])
+    step = max(1, bound // max(1, elements_per_row))
+    return [slice(first, min(first + step, rows)) for first in range(0, rows, step)]
+
+
+def positions(name: str, tensor: torch.Tensor) -> torch.Tensor:
+    """Check a (B,N,3) tensor of positions and return it detached as float32. Raises ValueError."""
+    if tensor.ndim != 3 or tensor.shape[-1] != 3:
+        raise ValueError(f"{name} must have shape (B,N,3), but has {tuple(tensor.shape)}")
+    if not tensor.is_floating_point():
+        raise ValueError(f"{name} must be floating point, but is {tensor.dtype}")
+    tensor = tensor.detach().to(torch.float32)
+    if not bool(torch.isfinite(tensor.sum())) and not bool(torch.isfinite(tensor).all()):  # a sum is the cheaper look
+        raise ValueError(f"{name} holds NaN or infinite coordinates; remove those points first")
+    return tensor
+
+
+def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: torch.device) -> torch.Tensor | None:
+    """Check ragged `lengths` (B,) i64 in 1..most. Raises ValueError."""
+    if lengths is None:
+        return None
+    lengths = torch.as_tensor(lengths, device=device)
+    if lengths.shape != (batch,) or lengths.is_floating_point():
+        raise ValueError(f"lengths must be {batch} integers, but is {lengths.dtype} of shape {tuple(lengths.shape)}")
+    if batch and not (1 <= int(lengths.min()) and int(lengths.max()) <= most):
+        raise ValueError(f"lengths must lie in 1..{most}, but span {int(lengths.min())}..{int(lengths.max())}")
+    return lengths.to(torch.int64)
+
+
+def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Squared distances (B,M,N) of a (B,M,3) and b (B,N,3): (dx*dx + dy*dy) + dz*dz, the order every kernel keeps."""
+    dx, dy, dz = ((a[..., axis, None] - b[..., None, :, axis]) for axis in range(3))
+    return dx.mul_(dx).add_(dy.mul_(dy)).add_(dz.mul_(dz))
+
+
+def ordered_keys(distances: torch.Tensor) -> torch.Tensor:
+    """Unique int64 keys (..., N) that sort as (distance, index): non-negative float bits above, the index below.
+
+    torch.topk breaks ties as it likes; on these keys it cannot.
+    """
+    index = torch.arange(distances.shape[-1], device=distances.device)
+    return distances.contiguous().view(torch.int32).to(torch.int64).bitwise_left_shift_(32).bitwise_or_(index)
+
+
+def key_distances(keys: torch.Tensor) -> torch.Tensor:
+    """The float32 distances inside `ordered_keys`."""
+    return keys.bitwise_right_shift(32).to(torch.int32).view(torch.float32)
+
+
+def key_indices(keys: torch.Tensor) -> torch.Tensor:
+    """The indices inside `ordered_keys`."""
+    return keys.bitwise_and(0xFFFFFFFF)

@@ -1,0 +1,165 @@
+"""Space-time ball query: neighbours within a radius that depends on the distance in time (thesis 3.3, Kinet)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from dpcli.ops.backend import (
+    chosen_backend,
+    key_indices,
+    ordered_keys,
+    positions,
+    row_blocks,
+    run_in_threads,
+    squared_distances,
+    thread_windows,
+)
+
+def space_time_ball_query(
+    points: torch.Tensor,  # [B, N, 3]
+    times: torch.Tensor,  # [B, N]
+    centroids: torch.Tensor,  # [B, M, 3]
+    centroid_times: torch.Tensor,  # [B, M]
+    radii: torch.Tensor | Sequence[float],  # [R]
+    k: int,
+    *,
+    order: str = "first",
+) -> tuple[torch.Tensor, torch.Tensor]:  # [B, M, k], [B, M]
+    """Up to k neighbours of each centroid in space and time: indices (B,M,k) i64 and hit counts (B,M) i64 in 0..k.
+
+    Point j is a neighbour of centroid i when d = |t_i - t_j| < R and dist(i,j) < radii[d], both strict; compared squared,
+    in float32. times are whole frame indices (integers, or floats holding integers), in any order.
+    order "first": the k neighbours of lowest index, ascending; unused slots repeat the first. Frame-major points thus
+    favour the earlier frame, as the released Kinet does. order "nearest": the k nearest in space, ascending, ties to the
+    lowest index; unused slots repeat the nearest. A centroid without any neighbour has count 0 and index 0 in all slots.
+    Indices carry no gradient: gather with them. Backends: numba on CPU (frames found by bisection when the times are
+    sorted), torch elsewhere; same indices. Raises ValueError on wrong shapes, non-finite values, or fractional times.
+    """
+    points, times, centroids, centroid_times, limits = _checked(
+        points, times, centroids, centroid_times, radii, k, order
+    )
+    if chosen_backend(points.device) == "torch":
+        return _query_torch(points, times, centroids, centroid_times, limits, k, order)
+    return _query_numba(points, times, centroids, centroid_times, limits, k, order)
+
+
+def space_time_ball_query_reference(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    radii: torch.Tensor | Sequence[float],
+    k: int,
+    *,
+    order: str = "first",
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The torch twin of `space_time_ball_query`: all pairs, in blocks of bounded memory."""
+    return _query_torch(*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
+
+
+def _checked(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    radii: torch.Tensor | Sequence[float],
+    k: int,
+    order: str,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    points, centroids = positions("points", points), positions("centroids", centroids)
+    if points.shape[0] != centroids.shape[0] or points.shape[1] == 0:
+        raise ValueError(f"points {tuple(points.shape)} and centroids {tuple(centroids.shape)} need one batch, N >= 1")
+    if k < 1 or order not in ("first", "nearest"):
+        raise ValueError(f"k must be at least 1 and order first or nearest, but they are {k} and {order!r}")
+    return (
+        points,
+        _frame_indices("times", times, points),
+        centroids,
+        _frame_indices("centroid_times", centroid_times, centroids),
+        _squared_radii(radii, points.device),
+    )
+
+
+def _frame_indices(name: str, times: torch.Tensor, owner: torch.Tensor) -> torch.Tensor:
+    if times.shape != owner.shape[:2]:
+        raise ValueError(f"{name} must have shape {tuple(owner.shape[:2])}, but has {tuple(times.shape)}")
+    whole = times.detach().to(torch.int64)
+    if times.is_floating_point() and not bool((whole == times).all()):
+        raise ValueError(f"{name} must hold whole frame indices; divide seconds by the frame interval and round")
+    return whole.to(owner.device)
+
+
+def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device) -> torch.Tensor:
+    """(R,) squared radii without trailing zeros, which accept nothing but would widen the window in time."""
+    radii = torch.as_tensor(radii, dtype=torch.float32, device="cpu").detach()
+    if radii.ndim != 1 or not bool((torch.isfinite(radii) & (radii >= 0)).all()):
+        raise ValueError(f"radii must be a list of finite numbers >= 0, one per frame distance, but is {radii.tolist()}")
+    last = int(radii.nonzero().max()) + 1 if bool(radii.any()) else 0
+    return (radii[:last] * radii[:last]).to(device)
+
+
+def _query_numba(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    limits: torch.Tensor,
+    k: int,
+    order: str,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    from dpcli.ops.kernels_neighbours import ball_query_kernel
+
+    batch, rows = centroid_times.shape
+    index = torch.empty((batch, rows, k), dtype=torch.int64)
+    count = torch.empty((batch, rows), dtype=torch.int64)
+    arrays = (points.transpose(1, 2), times, centroids, centroid_times, index, count)
+    clips = zip(*(tensor.contiguous().numpy() for tensor in arrays), strict=True)
+    radii2, nearest = limits.numpy(), order == "nearest"
+    tasks = []
+    for xyz, frames, centres, centre_frames, out_index, out_count in clips:
+        for window in thread_windows(batch, rows):
+            tasks.append((xyz, frames, centres, centre_frames, radii2, nearest, *window, out_index, out_count))
+    run_in_threads(ball_query_kernel, tasks)
+    return index, count
+
+
+def _query_torch(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    limits: torch.Tensor,
+    k: int,
+    order: str,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    batch, rows = centroid_times.shape
+    total = points.shape[1]
+    bounds = torch.cat([limits, limits.new_full((1,), -1.0)])  # last: too far in time
+    pick = _first_hits if order == "first" else _nearest_hits
+    parts = []
+    for block in row_blocks(rows, batch * total, points.device):
+        gap = (centroid_times[:, block, None] - times[:, None, :]).abs_().clamp_(max=len(limits))
+        distance = squared_distances(centroids[:, block], points)
+        parts.append(pick(distance, distance < bounds[gap], min(k, total)))
+    if not parts:
+        return times.new_empty((batch, 0, k)), times.new_empty((batch, 0))
+    index, count = (torch.cat(part, 1) for part in zip(*parts, strict=True))
+    slot = torch.arange(k, device=points.device)
+    return index.gather(2, torch.where(slot < count[..., None], slot, 0)), count
+
+
+def _first_hits(distance: torch.Tensor, hit: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+    rank = hit.cumsum(-1, dtype=torch.int32)
+    index = rank.new_zeros((*hit.shape[:2], k), dtype=torch.int64)
+    b, m, j = (hit & (rank <= k)).nonzero(as_tuple=True)
+    index[b, m, rank[b, m, j].long() - 1] = j
+    return index, rank[..., -1].clamp(max=k).long()
+
+
+def _nearest_hits(distance: torch.Tensor, hit: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+    keys = ordered_keys(distance.masked_fill(~hit, float("inf")))
+    index = key_indices(keys.topk(k, dim=-1, largest=False, sorted=True).values)
+    count = hit.sum(-1).clamp(max=k)
+    return torch.where(count[..., None] > 0, index, 0), count

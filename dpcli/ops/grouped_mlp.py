@@ -1,0 +1,209 @@
+"""The core of a set-abstraction layer: gather neighbours, two shared linear layers with batch norm and ReLU, max pooling.
+
+`grouped_mlp` has a plain torch form (the reference, and the path on a GPU) and a CPU form whose forward and backward keep
+only the first layer's activations: the second layer is pooled as it is made, and the gradient of a max-pooled batch norm
+splits into a sparse part (one row per centroid and channel) and an affine one, so its dense part is a product with a
+C1 x C1 matrix instead of two with C1 x C2. Both give the same numbers; tests compare them in value and gradient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from dpcli.ops.backend import chosen_backend
+from dpcli.ops.parallel import parallel_kernels
+
+_BLOCKS = 32  # pieces of work per kernel: more than threads, for balance; fixed, so that sums repeat exactly
+
+
+@dataclass
+class Norm:
+    """Affine batch normalisation of C channels: weight and bias (C), and either given or returned statistics (C)."""
+
+    weight: Tensor
+    bias: Tensor
+    mean: Tensor | None  # None: use (and return) the batch's own
+    var: Tensor | None
+    eps: float = 1e-3
+
+
+def grouped_mlp(
+    points: Tensor,  # (B,N,3)
+    centers: Tensor,  # (B,M,3)
+    idx: Tensor,  # (B,M,K) i64
+    features: Tensor | None,  # (B,N,F)
+    linear1: tuple[Tensor, Tensor],  # weight (C1,3+F), bias (C1)
+    norm1: Norm,
+    linear2: tuple[Tensor, Tensor],  # weight (C2,C1), bias (C2)
+    norm2: Norm,
+) -> tuple[Tensor, list[Tensor]]:
+    """max over K of relu(bn2(W2 relu(bn1(W1 [x_j - x_i, f_j])))) (PointNet++'s set abstraction with two layers).
+
+    Returns (pooled (B,M,C2), [mean1, var1, mean2, var2]): the biased batch statistics, or the given ones.
+    Differentiable in features, weights, biases and norms; not in positions. float32 on the fast path.
+    """
+    fast = chosen_backend(points.device) == "numba" and norm1.mean is None and idx.shape[2] <= 256 and points.dtype == torch.float32
+    if fast:
+        return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
+    taps, statistics = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
+    return taps[1].amax(2), statistics
+
+
+def grouped_activations(
+    points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor], norm1: Norm,
+    linear2: tuple[Tensor, Tensor], norm2: Norm,
+) -> tuple[list[Tensor], list[Tensor]]:  # fmt: skip
+    """The two layers' activations before pooling, [(B,M,K,C1), (B,M,K,C2)], and the statistics. Arguments as `grouped_mlp`.
+
+    The first linear layer acts on points before they are gathered: W [x_j - x_i, f_j] = (W [x_j, f_j]) - W_x x_i.
+    Given statistics are folded into the weights.
+    """
+    if norm1.mean is not None and norm2.mean is not None:
+        linear1, linear2 = _folded(linear1, norm1), _folded(linear2, norm2)
+    table, offset = _project(points, centers, features, linear1)
+    hidden, statistics1 = _norm_relu(gather_rows(table, idx) - offset[:, :, None], norm1)
+    out, statistics2 = _norm_relu(torch.nn.functional.linear(hidden, *linear2), norm2)
+    return [hidden, out], [*statistics1, *statistics2]
+
+
+def _folded(linear: tuple[Tensor, Tensor], norm: Norm) -> tuple[Tensor, Tensor]:
+    """The linear layer with its batch norm's scale and shift in it."""
+    scale = norm.weight * torch.rsqrt(norm.var + norm.eps)
+    return linear[0] * scale[:, None], (linear[1] - norm.mean) * scale + norm.bias
+
+
+def gather_rows(table: Tensor, idx: Tensor) -> Tensor:
+    """table (B,N,C), idx (B,...) i64 -> (B,...,C)."""
+    batch, count, channels = table.shape
+    shift = torch.arange(batch, device=idx.device).view(-1, *[1] * (idx.dim() - 1)) * count
+    return table.reshape(batch * count, channels)[idx + shift]
+
+
+def _project(points: Tensor, centers: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    weight, bias = linear1
+    table = torch.nn.functional.linear(points, weight[:, :3], bias)
+    if features is not None:
+        table = table + torch.nn.functional.linear(features, weight[:, 3:])
+    return table, torch.nn.functional.linear(centers, weight[:, :3])
+
+
+def _norm_relu(values: Tensor, norm: Norm) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Batch norm by the batch's own statistics and ReLU; ReLU alone where given statistics are folded in already."""
+    if norm.mean is not None:
+        return (torch.relu(values) if values.requires_grad else values.relu_()), (norm.mean, norm.var)
+    var, mean = torch.var_mean(values, tuple(range(values.dim() - 1)), correction=0)
+    scale = norm.weight * torch.rsqrt(var + norm.eps)
+    return torch.relu(values * scale + (norm.bias - mean * scale)), (mean.detach(), var.detach())
+
+
+def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):  # noqa: ANN001, ANN202 - as grouped_mlp
+    norms = (norm1.weight, norm1.bias, norm2.weight, norm2.bias)
+    if features is None:
+        first = (points.contiguous(), centers.contiguous(), *linear1)
+    else:
+        first = (*_project(points, centers, features, linear1), None, None)
+    pooled, *statistics = _GroupedMLP.apply(idx.contiguous(), *first, *norms, *linear2, norm1.eps, norm2.eps)
+    return pooled, statistics
+
+
+def _statistics(sums: Tensor, rows: int) -> tuple[Tensor, Tensor]:
+    total = sums.sum(0) / rows
+    return total[0].float(), (total[1] - total[0] ** 2).clamp_min(0).float()
+
+
+class _GroupedMLP(torch.autograd.Function):
+    """The training path on a CPU. `table`/`offset` are points and centres when weight1 is given, else projected ones."""
+
+    @staticmethod
+    def forward(ctx, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):  # noqa: ANN001, ANN205
+        kernels = parallel_kernels("kernels_grouped")
+        batch, count, neighbors = idx.shape
+        rows, c1, c2 = idx.numel(), len(g1), len(g2)
+        hidden = torch.empty(batch, count, neighbors, c1)
+        sums = torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
+        if weight1 is not None:
+            kernels.project_xyz(table.numpy(), offset.numpy(), idx.numpy(), weight1.detach().t().contiguous().numpy(),
+                                bias1.detach().numpy(), hidden.numpy(), sums.numpy())  # fmt: skip
+        else:
+            table, offset = table.detach().contiguous(), offset.detach().contiguous()
+            kernels.gather_difference(table.numpy(), offset.numpy(), idx.numpy(), hidden.numpy(), sums.numpy())
+        mean1, var1 = _statistics(sums, rows)
+        inverse1 = torch.rsqrt(var1 + eps1)
+        scale1 = g1.detach() * inverse1
+        kernels.affine_relu(hidden.view(-1, c1).numpy(), scale1.numpy(), (b1.detach() - mean1 * scale1).numpy())
+        best, where, mean2, var2 = _pool_linear(hidden, weight2, bias2, g2)
+        inverse2 = torch.rsqrt(var2 + eps2)
+        normal = (best - mean2) * inverse2
+        out = torch.relu_(normal * g2 + b2)
+        ctx.save_for_backward(idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
+                              mean1, inverse1, mean2, inverse2)  # fmt: skip
+        ctx.mark_non_differentiable(mean1, var1, mean2, var2)
+        return out.view(batch, count, c2), mean1, var1, mean2, var2
+
+    @staticmethod
+    def backward(ctx, grad, *unused):  # noqa: ANN001, ANN205
+        kernels = parallel_kernels("kernels_grouped")
+        (idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
+         mean1, inverse1, mean2, inverse2) = ctx.saved_tensors  # fmt: skip
+        rows, c1, c2 = idx.numel(), len(g1), len(g2)
+        grad = grad.reshape(-1, c2) * (out > 0)
+        grad_b2, grad_g2 = grad.sum(0), (grad * normal).sum(0)
+        # d(linear output) = sparse - u - v * output, the last two from the batch statistics
+        scale2 = g2 * inverse2
+        v = scale2 * grad_g2 * inverse2 / rows
+        u = scale2 * grad_b2 / rows - v * mean2
+        sparse = (grad * scale2).contiguous()
+        flat = hidden.view(rows, c1)
+        lean = (v[:, None] * weight2).t()
+        constant = -((u + v * bias2) @ weight2)
+        dense = torch.addmm(constant, flat, lean @ weight2, beta=1, alpha=-1)
+        parts = torch.zeros(_BLOCKS, c2, c1)
+        kernels.scatter_pooled(sparse.numpy(), where.numpy(), weight2.detach().contiguous().numpy(),
+                               hidden.view(-1, idx.shape[2], c1).numpy(), dense.view(-1, idx.shape[2], c1).numpy(),
+                               parts.numpy())  # fmt: skip
+        gram = flat.t() @ flat
+        grad_w2 = parts.sum(0) - torch.outer(u + v * bias2, flat.sum(0)) - v[:, None] * (weight2 @ gram)
+        safe = torch.where(g1.abs() < 1e-12, torch.full_like(g1, 1e-12), g1)
+        sums = torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
+        kernels.relu_norm_sums(dense.numpy(), flat.numpy(), (1 / safe).numpy(), (-b1.detach() / safe.detach()).numpy(), sums.numpy())
+        grad_b1, grad_g1 = sums.sum(0).float()
+        first = _back_first(kernels, ctx.needs_input_grad, dense.view(*idx.shape, c1), idx, table, offset, weight1, bias1,
+                            mean1, inverse1, g1 * inverse1, grad_b1 / rows, grad_g1 / rows)  # fmt: skip
+        return None, *first, grad_g1, grad_b1, grad_g2, grad_b2, grad_w2, torch.zeros_like(bias2), None, None
+
+
+def _pool_linear(hidden: Tensor, weight: Tensor, bias: Tensor, sign: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Second linear layer and its pooling, a clip at a time so that the wide activations stay in one small buffer."""
+    kernels = parallel_kernels("kernels_grouped")
+    batch, count, neighbors, c1 = hidden.shape
+    c2 = len(bias)
+    best, where = torch.empty(batch * count, c2), torch.empty(batch * count, c2, dtype=torch.uint8)
+    sums = torch.zeros(_BLOCKS, 2, c2, dtype=torch.float64)
+    step = max(1, min(count, (1 << 16) // neighbors))  # centroids at a time
+    buffer = torch.empty(step * neighbors, c2)
+    weight, bias = weight.detach().t(), bias.detach()
+    signs = torch.where(sign < 0, -1.0, 1.0).numpy()
+    flat = hidden.view(batch * count, neighbors * c1)
+    for start in range(0, batch * count, step):
+        piece = flat[start : start + step]
+        rows = buffer[: len(piece) * neighbors]
+        torch.addmm(bias, piece.view(-1, c1), weight, out=rows)
+        stop = start + len(piece)
+        kernels.extreme(rows.view(-1, neighbors, c2).numpy(), signs, best[start:stop].numpy(), where[start:stop].numpy(), sums.numpy())
+    return best, where, *_statistics(sums, batch * count * neighbors)
+
+
+def _back_first(kernels, needs, grad, idx, table, offset, weight1, bias1, mean, inverse, scale, t0, t1):  # noqa: ANN001, ANN202
+    """Gradients of (table, offset, weight1, bias1) from the gradient after the first ReLU."""
+    statistics = (mean.numpy(), inverse.numpy(), scale.detach().numpy(), t0.numpy(), t1.numpy())
+    if weight1 is not None:
+        parts = torch.zeros(_BLOCKS, 3, len(bias1), dtype=torch.float64)
+        kernels.back_xyz(grad.numpy(), table.numpy(), offset.numpy(), idx.numpy(), weight1.detach().t().contiguous().numpy(),
+                         bias1.detach().numpy(), *statistics, parts.numpy())  # fmt: skip
+        return None, None, parts.sum(0).float().t().contiguous(), torch.zeros_like(bias1)
+    grad_table, grad_offset = torch.zeros_like(table), torch.zeros_like(offset)
+    kernels.back_gather(grad.numpy(), table.numpy(), offset.numpy(), idx.numpy(), *statistics, grad_table.numpy(), grad_offset.numpy())
+    return grad_table, grad_offset, None, None

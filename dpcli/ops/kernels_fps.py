@@ -1,0 +1,154 @@
+"""Farthest point sampling in numba: exact, bucketed; imports numpy and numba only (no torch).
+
+Points are sorted along a Morton curve and cut into buckets of 32 with bounding boxes. A new sample can only change a
+bucket whose box is nearer than the bucket's largest remaining distance, so most buckets are skipped; float32 rounding is
+monotone, so the box distance, computed in the same order as a point distance, never exceeds it and the skip is exact.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.ops.jit import kernel
+
+BUCKET = 32  # points per bucket: 16 and 64 measured slower or equal on 2 k - 32 k points
+_CELLS = 1023.0  # Morton cells per axis minus one: 10 bits each, three radix passes
+
+
+@kernel
+def _spread_bits(v):
+    """Put two zero bits between the ten low bits of `v`."""
+    v = (v | (v << 16)) & 0x030000FF
+    v = (v | (v << 8)) & 0x0300F00F
+    v = (v | (v << 4)) & 0x030C30C3
+    return (v | (v << 2)) & 0x09249249
+
+
+@kernel
+def _morton_keys(points, n):
+    low = np.empty(3, np.float64)
+    extent = 0.0
+    for axis in range(3):
+        least = points[0, axis]
+        most = least
+        for i in range(n):
+            least = min(least, points[i, axis])
+            most = max(most, points[i, axis])
+        low[axis] = least
+        extent = max(extent, np.float64(most) - np.float64(least))
+    scale = _CELLS / extent if extent > 0.0 else 0.0
+    keys = np.empty(n, np.int32)
+    for i in range(n):
+        keys[i] = (
+            _spread_bits(np.int32((points[i, 0] - low[0]) * scale))
+            | (_spread_bits(np.int32((points[i, 1] - low[1]) * scale)) << 1)
+            | (_spread_bits(np.int32((points[i, 2] - low[2]) * scale)) << 2)
+        )
+    return keys
+
+
+@kernel
+def _morton_order(points, n):
+    """Indices of the first `n` points along the Morton curve: a stable radix sort of 30-bit keys."""
+    keys = _morton_keys(points, n)
+    order = np.arange(n).astype(np.int32)
+    other = np.empty(n, np.int32)
+    start = np.empty(1025, np.int32)
+    for shift in (0, 10, 20):
+        start[:] = 0
+        for i in range(n):
+            start[((keys[i] >> shift) & 1023) + 1] += 1
+        for digit in range(1024):
+            start[digit + 1] += start[digit]
+        for i in range(n):
+            digit = (keys[order[i]] >> shift) & 1023
+            other[start[digit]] = order[i]
+            start[digit] += 1
+        order, other = other, order
+    return order
+
+
+@kernel
+def _fill_buckets(points, order, n, xyz, best, box):
+    """Copy the points to bucket order and bound each bucket: box rows are x min, x max, y min, y max, z min, z max."""
+    for b in range(box.shape[1]):
+        first = b * BUCKET
+        for axis in range(3):
+            box[2 * axis, b] = points[order[first], axis]
+            box[2 * axis + 1, b] = points[order[first], axis]
+        for i in range(first, min(first + BUCKET, n)):
+            best[i] = np.inf
+            for axis in range(3):
+                value = points[order[i], axis]
+                xyz[axis, i] = value
+                box[2 * axis, b] = min(box[2 * axis, b], value)
+                box[2 * axis + 1, b] = max(box[2 * axis + 1, b], value)
+
+
+@kernel
+def _box_distances(box, cx, cy, cz, out):
+    zero = np.float32(0)
+    for b in range(out.size):
+        gx = max(max(box[0, b] - cx, cx - box[1, b]), zero)
+        gy = max(max(box[2, b] - cy, cy - box[3, b]), zero)
+        gz = max(max(box[4, b] - cz, cz - box[5, b]), zero)
+        out[b] = gx * gx + gy * gy + gz * gz
+
+
+@kernel
+def _update_bucket(x, y, z, best, bucket, cx, cy, cz):
+    """Lower the distances of one bucket; returns its new maximum."""
+    first = np.uintp(bucket * BUCKET)  # unsigned: numba then drops the negative-index case and the loop vectorises
+    for i in range(np.uintp(BUCKET)):
+        dx = x[first + i] - cx
+        dy = y[first + i] - cy
+        dz = z[first + i] - cz
+        best[first + i] = min(best[first + i], dx * dx + dy * dy + dz * dz)
+    most = np.float32(0)
+    for i in range(np.uintp(BUCKET)):
+        most = max(most, best[first + i])
+    return most
+
+
+@kernel
+def _farthest(best, top, order, n):
+    """Lowest original index among the points at the largest distance, and that distance."""
+    most = np.float32(0)
+    for b in range(top.size):
+        most = max(most, top[b])
+    found = n
+    for b in range(top.size):
+        if top[b] == most:
+            for i in range(b * BUCKET, b * BUCKET + BUCKET):
+                if best[i] == most:
+                    found = min(found, order[i])
+    return found, most
+
+
+@kernel
+def fps_kernel(points, n, start, out):
+    """Fill `out` (S,) i64 with farthest points of points[:n] (N,3) f32, first `start`; ties to the lowest index."""
+    buckets = (n + BUCKET - 1) // BUCKET
+    order = _morton_order(points, n)
+    xyz = np.zeros((3, buckets * BUCKET), np.float32)
+    best = np.full(buckets * BUCKET, np.float32(-1))  # padding keeps -1: never a maximum
+    box = np.empty((6, buckets), np.float32)
+    _fill_buckets(points, order, n, xyz, best, box)
+    top = np.full(buckets, np.float32(np.inf))
+    lower = np.empty(buckets, np.float32)
+    x, y, z = xyz[0], xyz[1], xyz[2]  # views made once: each costs an atomic reference count
+    last = start
+    for s in range(min(out.size, n)):
+        out[s] = last
+        cx, cy, cz = points[last, 0], points[last, 1], points[last, 2]
+        _box_distances(box, cx, cy, cz, lower)
+        for b in range(buckets):
+            if lower[b] < top[b]:
+                top[b] = _update_bucket(x, y, z, best, b, cx, cy, cz)
+        last, most = _farthest(best, top, order, n)
+        if most == 0:  # every distinct position is taken: all further maxima tie at the lowest index
+            for rest in range(s + 1, min(out.size, n)):
+                out[rest] = 0
+            break
+    for s in range(n, out.size):
+        out[s] = out[s - n]

@@ -1,0 +1,148 @@
+"""Inverses of many small matrices at once (thesis A.1.1): closed form to 4x4, by blocks to 16x16, Cholesky beyond."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.ops.backend import chosen_backend, run_in_threads
+
+_GUARDS = ("signed", "release", "none")
+_CLOSED, _BLOCKS, _KERNEL = 4, 16, 8  # largest n of the closed form, of the block partition, and of the CPU kernel
+_ROWS_PER_TASK = 8192
+
+
+def small_inverse(matrices: Tensor, *, min_det: float = 1e-6, guard: str = "signed") -> Tensor:
+    """Inverses of matrices (...,n,n), differentiable; float32 or float64.
+
+    n <= 4: adjugate over determinant, element by element. n <= 16: 2x2 block partition with the Schur complement,
+    recursively down to the closed form; without pivoting, so it expects symmetric positive definite matrices, as normal
+    equations are. n > 16: Cholesky; reads the lower triangle only.
+    guard: what happens to a determinant (in a block partition: of a block) with |det| < min_det. "signed" moves it to
+    min_det with its own sign (0 counts as positive), "release" to +min_det, whatever its sign, as the released Kinet
+    does, "none" leaves it: a singular matrix then gives inf or nan. A moved determinant carries no gradient.
+    Cholesky knows no guard. Backends: to n = 8 a numba kernel on CPU, else torch; equal up to rounding.
+    Raises ValueError on a wrong shape, dtype or guard; torch.linalg.LinAlgError where Cholesky meets a matrix that is
+    not positive definite.
+    """
+    _check(matrices, guard)
+    n = matrices.shape[-1]
+    if n > _BLOCKS:
+        return torch.cholesky_inverse(torch.linalg.cholesky(matrices))
+    if n <= _KERNEL and matrices.numel() and chosen_backend(matrices.device) == "numba":
+        return _KernelInverse.apply(matrices, min_det, guard)
+    return _inverse(matrices, min_det, guard)
+
+
+def small_inverse_reference(matrices: Tensor, *, min_det: float = 1e-6, guard: str = "signed") -> Tensor:
+    """The torch twin of `small_inverse`: same arguments, same guard."""
+    _check(matrices, guard)
+    if matrices.shape[-1] > _BLOCKS:
+        return torch.cholesky_inverse(torch.linalg.cholesky(matrices))
+    return _inverse(matrices, min_det, guard)
+
+
+def _check(matrices: Tensor, guard: str) -> None:
+    if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or matrices.shape[-1] == 0:
+        raise ValueError(f"matrices must have shape (...,n,n) with n >= 1, but have {tuple(matrices.shape)}")
+    if matrices.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"matrices must be float32 or float64, but are {matrices.dtype}")
+    if guard not in _GUARDS:
+        raise ValueError(f"guard must be one of {', '.join(_GUARDS)}, but is {guard!r}")
+
+
+def _guarded(det: Tensor, min_det: float, guard: str) -> Tensor:
+    if guard == "none":
+        return det
+    floor = torch.full_like(det, min_det)
+    if guard == "signed":
+        floor = torch.where(det < 0, -floor, floor)
+    return torch.where(det.abs() < min_det, floor, det)
+
+
+def _inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
+    n = m.shape[-1]
+    if n <= _CLOSED:
+        rows = m.reshape(-1, n * n).t().contiguous().unbind(0)  # contiguous: strided entries cost twice the time
+        adjugate, det = (_adjugate1, _adjugate2, _adjugate3, _adjugate4)[n - 1](*rows)
+        return (torch.stack(adjugate) / _guarded(det, min_det, guard)).t().reshape(m.shape)
+    return _block_inverse(m, min_det, guard)
+
+
+def _block_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
+    """[[A,B],[C,D]]^-1 from A^-1 and the inverse of the Schur complement D - C A^-1 B."""
+    half = (m.shape[-1] + 1) // 2
+    b, c, d = m[..., :half, half:], m[..., half:, :half], m[..., half:, half:]
+    a_inverse = _inverse(m[..., :half, :half], min_det, guard)
+    left, right = c @ a_inverse, a_inverse @ b
+    corner = _inverse(d - left @ b, min_det, guard)
+    upper = -right @ corner
+    top = torch.cat([a_inverse - upper @ left, upper], -1)
+    return torch.cat([top, torch.cat([-corner @ left, corner], -1)], -2)
+
+
+def _adjugate1(a: Tensor) -> tuple[list[Tensor], Tensor]:
+    return [torch.ones_like(a)], a
+
+
+def _adjugate2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[list[Tensor], Tensor]:
+    return [d, -b, -c, a], a * d - b * c
+
+
+def _adjugate3(a, b, c, d, e, f, g, h, i) -> tuple[list[Tensor], Tensor]:  # noqa: ANN001 - nine tensors, row by row
+    first = [e * i - f * h, c * h - b * i, b * f - c * e]
+    second = [f * g - d * i, a * i - c * g, c * d - a * f]
+    third = [d * h - e * g, b * g - a * h, a * e - b * d]
+    return first + second + third, a * first[0] + b * second[0] + c * third[0]
+
+
+def _adjugate4(*m: Tensor) -> tuple[list[Tensor], Tensor]:
+    """By the 2x2 minors of the upper two rows (u) and the lower two (v): column pairs 01 02 03 12 13 23."""
+    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    u = [m[i] * m[4 + j] - m[j] * m[4 + i] for i, j in pairs]
+    v = [m[8 + i] * m[12 + j] - m[j + 8] * m[12 + i] for i, j in pairs]
+    det = u[0] * v[5] - u[1] * v[4] + u[2] * v[3] + u[3] * v[2] - u[4] * v[1] + u[5] * v[0]
+    adjugate: list[Tensor] = [det] * 16
+    # Row r of the adjugate leaves out column r: its minors pair the three columns that are left.
+    for r, (p, q, s) in enumerate(((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))):
+        qs, ps, pq = pairs.index((q, s)), pairs.index((p, s)), pairs.index((p, q))
+        for col, (row, w) in enumerate(((1, v), (0, v), (3, u), (2, u))):
+            minor = m[4 * row + p] * w[qs] - m[4 * row + q] * w[ps] + m[4 * row + s] * w[pq]
+            adjugate[4 * r + col] = minor if (r + col) % 2 == 0 else -minor
+    return adjugate, det
+
+
+class _KernelInverse(torch.autograd.Function):
+    """Forward and the gradient -X' G X' by the CPU kernel; where the guard moved a determinant, autograd's own gradient."""
+
+    @staticmethod
+    def forward(ctx, matrices: Tensor, min_det: float, guard: str) -> Tensor:  # noqa: ANN001
+        from dpcli.ops.kernels_linalg import inverse_kernel
+
+        flat = matrices.detach().reshape(-1, *matrices.shape[-2:]).contiguous()
+        inverse, moved = torch.empty_like(flat), torch.empty(len(flat), dtype=torch.bool)
+        arrays = (flat.numpy(), inverse.numpy(), moved.numpy())
+        run_in_threads(inverse_kernel, [(*arrays, min_det, _GUARDS.index(guard), *span) for span in _spans(len(flat))])
+        ctx.save_for_backward(flat, inverse, moved)
+        ctx.settings = (min_det, guard)
+        return inverse.view(matrices.shape)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN001
+        from dpcli.ops.kernels_linalg import inverse_gradient_kernel
+
+        flat, inverse, moved = ctx.saved_tensors
+        flat_grad, out = grad.reshape(flat.shape).contiguous(), torch.empty_like(flat)
+        arrays = (inverse.numpy(), flat_grad.numpy(), out.numpy())
+        run_in_threads(inverse_gradient_kernel, [(*arrays, *span) for span in _spans(len(flat))])
+        rows = moved.nonzero()[:, 0]
+        if len(rows):
+            with torch.enable_grad():
+                part = flat[rows].requires_grad_()
+                out[rows] = torch.autograd.grad(_inverse(part, *ctx.settings), part, flat_grad[rows])[0]
+        return out.view(grad.shape), None, None
+
+
+def _spans(rows: int) -> list[tuple[int, int]]:
+    return [(first, min(first + _ROWS_PER_TASK, rows)) for first in range(0, rows, _ROWS_PER_TASK)]

@@ -1,0 +1,18 @@
+"""Loading kernel modules that use numba's own threads.
+
+Never call such a kernel before a fork: libgomp then ends the child. Worker processes here come from a forkserver.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+
+
+def parallel_kernels(module: str) -> ModuleType:
+    """`dpcli.ops.<module>`, set to as many threads as torch uses."""
+    import numba
+    import torch
+
+    numba.set_num_threads(max(1, min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)))
+    return import_module(f"dpcli.ops.{module}")

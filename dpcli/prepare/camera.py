@@ -1,0 +1,85 @@
+"""Pinhole cameras: intrinsics, and depth images turned into points."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Focal lengths and principal point, in pixels; pixel (0, 0) is the centre of the top-left one."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(v) for v in (self.fx, self.fy, self.cx, self.cy)) or self.fx <= 0 or self.fy <= 0:
+            raise UsageError(f"intrinsics must be finite with positive focal lengths, found {self}")
+
+    @classmethod
+    def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
+        """Square pixels, centre in the middle; ``degrees`` is the HORIZONTAL field of view."""
+        if not 0 < degrees < 180:
+            raise UsageError(f"a field of view lies between 0 and 180 degrees, found {degrees:g}")
+        focal = width / 2 / math.tan(math.radians(degrees) / 2)
+        return cls(focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+    @classmethod
+    def from_json(cls, path: Path) -> Intrinsics:
+        """``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-major]}``."""
+        try:
+            data = json.loads(path.read_text())
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+        except ValueError as error:
+            raise DataError(f"{path}: is not JSON ({error})") from None
+        try:
+            if "intrinsic_matrix" in data:
+                m = [float(v) for v in data["intrinsic_matrix"]]
+                return cls(m[0], m[4], m[6], m[7])
+            return cls(*(float(data[key]) for key in ("fx", "fy", "cx", "cy")))
+        except (KeyError, IndexError, TypeError, ValueError):
+            raise DataError(f'{path}: expected {{"fx": .., "fy": .., "cx": .., "cy": ..}} in pixels') from None
+
+
+@lru_cache(maxsize=8)
+def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
+    """Rays through every pixel at unit depth, f32 (H*W, 3) in raster order; z is 1. Camera axes OpenCV."""
+    x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
+    y = (np.arange(height) - intrinsics.cy) / intrinsics.fy
+    rays = np.ones((height, width, 3), np.float32)
+    rays[..., 0] = x
+    rays[..., 1] = y[:, None]
+    rays.setflags(write=False)
+    return rays.reshape(-1, 3)
+
+
+def back_project(depth: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0.
+
+    depth: (T,H,W), any real dtype, 0 or less = nothing seen -> points f32 (P,3) in raster order within
+    each frame, frames one after the other, in depth's unit; counts i64 (T) of points per frame.
+    """
+    frames, height, width = depth.shape
+    rays = pixel_rays(height, width, intrinsics)
+    flat = depth.reshape(frames, height * width)
+    pixels = [np.flatnonzero(frame if frame.dtype.kind == "u" else frame > 0) for frame in flat]
+    counts = np.array([len(p) for p in pixels], np.int64)
+    points = np.empty((int(counts.sum()), 3), np.float32)
+    start = 0
+    for frame, index in zip(flat, pixels, strict=True):
+        block = points[start : start + len(index)]
+        # float64 z would double the traffic for nothing: raw depths are integers below 2**24 or metres
+        np.multiply(rays[index], frame[index].astype(np.float32)[:, None], out=block)
+        start += len(index)
+    return points, counts

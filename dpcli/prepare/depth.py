@@ -1,0 +1,159 @@
+"""Anybody's depth video: video files, folders of depth images, or arrays, to points in metres (camera axes OpenCV)."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.camera import Intrinsics, back_project
+from dpcli.prepare.depth_files import VIDEO_SUFFIXES, image_paths, read_depth_video
+from dpcli.prepare.labels import LabelTable, read_labels
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.store import CloudSequence
+
+DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
+DEFAULT_FPS = 30.0
+DEFAULT_DEPTH_SCALE = {"uint16": 1000.0, "uint8": 100.0}  # raw units per metre; floats are taken as metres
+BACKGROUNDS = ("none", "median", "first")
+_BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
+
+
+def background_depth(depth: np.ndarray, kind: str) -> np.ndarray:
+    """Depth of the still scene. depth (T,H,W), 0 = nothing seen -> (H,W), 0 = never seen there.
+
+    ``median``: per pixel, the lower median of the frames in which something was seen; ``first``: the first frame.
+    """
+    if kind == "first":
+        return depth[0]
+    some = depth[np.linspace(0, len(depth) - 1, min(len(depth), _BACKGROUND_FRAMES)).astype(int)]
+    seen = np.count_nonzero(some, axis=0)
+    ordered = np.sort(some, axis=0)  # the unseen zeros come first
+    middle = len(some) - seen + np.maximum(seen - 1, 0) // 2
+    return np.take_along_axis(ordered, np.minimum(middle, len(some) - 1)[None], axis=0)[0]
+
+
+@dataclass(frozen=True)
+class DepthVideos:
+    """Options of the reader. Lengths in metres, focal lengths and centres in pixels, the field of view in degrees."""
+
+    inputs: tuple[Path, ...]
+    intrinsics: Intrinsics | None = None
+    fov: float | None = None
+    depth_scale: float | None = None
+    invert: bool = False
+    near: float = 0.0
+    far: float = float("inf")
+    background: str = "none"
+    margin: float = 0.05
+    fps: float | None = None
+    stride: int = 1
+    labels: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.background not in BACKGROUNDS:
+            raise UsageError(f"--background {self.background}: expected one of {', '.join(BACKGROUNDS)}")
+        if not 0 <= self.near < self.far:
+            raise UsageError(f"--near {self.near:g} --far {self.far:g}: expected 0 <= near < far, in metres")
+        if self.depth_scale is not None and not self.depth_scale > 0:
+            raise UsageError(f"--depth-scale {self.depth_scale:g}: expected raw units per metre, more than 0")
+        if self.fps is not None and not self.fps > 0:
+            raise UsageError(f"--fps {self.fps:g}: expected more than 0")
+        if self.intrinsics and self.fov is not None:
+            raise UsageError("--fov and intrinsics were both given; use one")
+
+    @property
+    def class_names(self) -> list[str]:
+        return self._table.class_names if self._table else []
+
+    @property
+    def length_unit(self) -> str:
+        return "m"
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        return ("time",)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        values = {k: v for k, v in asdict(self).items() if k not in ("inputs", "labels", "far")}
+        return {**values, "far": self.far if np.isfinite(self.far) else None}
+
+    @cached_property
+    def _table(self) -> LabelTable | None:
+        return read_labels(self.labels) if self.labels else None
+
+    def items(self) -> list[Item]:
+        paths = [(found, given) for given in self.inputs for found in find_videos(given)]
+        items: dict[str, Item] = {}
+        for path, given in paths:
+            name = path.relative_to(given).as_posix() if path != given else path.name
+            if name in items:
+                raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
+            items[name] = Item(name, path)
+        found = list(items.values())
+        return self._table.apply(found) if self._table else found
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        video = read_depth_video(item.path, self.stride)
+        depth = self._metric(video.frames, item.path)
+        if self.background != "none":
+            still = background_depth(depth, self.background)
+            depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
+        depth[(depth < self.near) | (depth > self.far)] = 0
+        points, counts = back_project(depth, self._camera(*depth.shape[1:]))
+        kept, notes = drop_empty_frames(str(item.path), counts)
+        rate = (self.fps or video.fps or DEFAULT_FPS) / self.stride
+        return Sample(
+            CloudSequence(item.name, points, offsets(counts[kept]), time=kept / rate, **describe(item)), notes
+        )
+
+    def _metric(self, frames: np.ndarray, path: Path) -> np.ndarray:
+        """Raw frames -> depth f32 (T,H,W) in metres, 0 = nothing seen."""
+        kind = frames.dtype
+        if kind.kind == "f" and not np.isfinite(frames).all():
+            frames = np.nan_to_num(frames, nan=0, posinf=0, neginf=0)  # the usual marks for "no return"
+        scale = self.depth_scale or DEFAULT_DEPTH_SCALE.get(kind.name, 1.0)
+        if self.invert:
+            if kind.kind != "u":
+                raise DataError(
+                    f"{path}: depths of type {kind}; --invert needs unsigned integers, whose range is known"
+                )
+            frames = np.where(frames > 0, np.iinfo(kind).max - frames, 0)
+        return frames.astype(np.float32) * np.float32(1 / scale)
+
+    def _camera(self, height: int, width: int) -> Intrinsics:
+        if self.intrinsics:
+            return self.intrinsics
+        return Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
+
+    def summary(self, items: list[Item]) -> list[str]:
+        lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
+        if not self.intrinsics and self.fov is None:
+            lines.append(
+                f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
+            )
+        unlabelled = [item.name for item in items if item.label < 0]
+        if self._table and unlabelled:
+            lines.append(f"{len(unlabelled)} without a label in {self.labels}: {', '.join(unlabelled[:5])}")
+        return lines
+
+
+def find_videos(path: Path) -> list[Path]:
+    """The depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of images)."""
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder")
+    if path.is_file() or image_paths(path):
+        return [path]
+    below = sorted(path.rglob("*"), key=lambda p: natural_key(p.relative_to(path).as_posix()))
+    suffixes = (*VIDEO_SUFFIXES, ".npy")
+    found = [p for p in below if (p.is_dir() and image_paths(p)) or (p.is_file() and p.suffix.lower() in suffixes)]
+    if not found:
+        raise DataError(
+            f"{path}: no depth video in it; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)}"
+        )
+    return found

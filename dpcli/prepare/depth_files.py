@@ -1,0 +1,143 @@
+"""Decoding depth videos (8 or 16 bits), folders of images and NumPy arrays; frames come out as stored."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.reader import natural_key
+
+VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
+IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm")
+_GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
+
+
+@dataclass
+class DepthVideo:
+    """Raw frames (T,H,W) u8, u16, or float, and the frame rate its file declares (None = says nothing)."""
+
+    frames: np.ndarray
+    fps: float | None = None
+
+
+def load_cv2():  # -> module
+    """OpenCV without its own lines on stderr about damaged files: ours name the file and what to do."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    import cv2
+
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    cv2.setNumThreads(1)  # one process per core is the parallelism
+    return cv2
+
+
+def open_video(path: Path):  # -> cv2.VideoCapture
+    """An OpenCV capture that yields 16-bit gray frames unharmed and 8-bit ones expanded to the full range."""
+    if not path.is_file():
+        raise DataError(f"{path}: no such video")
+    cv2 = load_cv2()
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if capture.isOpened() and int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _GRAY16:
+        # the default conversion to 8-bit BGR would cut the lower byte off
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_CONVERT_RGB, 0])
+    if not capture.isOpened():
+        raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
+    return capture
+
+
+def video_frames(path: Path, start: int = 0, stop: int | None = None, stride: int = 1) -> Iterator[np.ndarray]:
+    """Frames start, start + stride, ... before ``stop``, each (H,W) u8 or u16; ends early where the file ends.
+
+    Decodes from the beginning: jumping to a frame of an inter-coded video isn't exact in every container.
+    """
+    capture = open_video(path)
+    try:
+        index = 0
+        while (stop is None or index < stop) and capture.grab():
+            if index >= start and (index - start) % stride == 0:
+                ok, frame = capture.retrieve()
+                if not ok:
+                    raise DataError(f"{path}: frame {index} cannot be decoded")
+                yield frame[..., 0] if frame.ndim == 3 else frame
+            index += 1
+    finally:
+        capture.release()
+
+
+def frame_rate(path: Path) -> float | None:
+    """Frames per second that a video file declares, or None."""
+    import cv2
+
+    capture = open_video(path)
+    rate = float(capture.get(cv2.CAP_PROP_FPS))
+    capture.release()
+    return rate if np.isfinite(rate) and 0 < rate < 10_000 else None
+
+
+def read_image(path: Path) -> np.ndarray:
+    """One gray depth image (H,W) u8, u16 or f32; DataError when unreadable or coloured."""
+    cv2 = load_cv2()
+    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    if image is None:
+        raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
+    if image.ndim == 3:
+        if image.shape[2] != 3 or (image != image[..., :1]).any():
+            raise DataError(f"{path}: a colour image of shape {image.shape}; expected one gray channel of depth")
+        image = image[..., 0]
+    return image
+
+
+def read_image_folder(folder: Path, stride: int = 1) -> np.ndarray:
+    """The images of a folder in natural order -> (T,H,W); DataError when sizes or types differ."""
+    paths = image_paths(folder)[::stride]
+    if not paths:
+        raise DataError(f"{folder}: no depth images ({', '.join(IMAGE_SUFFIXES)})")
+    frames = [read_image(path) for path in paths]
+    for path, frame in zip(paths, frames, strict=True):
+        if (frame.shape, frame.dtype) != (frames[0].shape, frames[0].dtype):
+            first = f"{frames[0].shape[1]}x{frames[0].shape[0]} {frames[0].dtype}"
+            raise DataError(f"{path}: {frame.shape[1]}x{frame.shape[0]} {frame.dtype}; the first image is {first}")
+    return np.stack(frames)
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """Image files directly in a folder, in natural order."""
+    return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
+
+
+def read_array(path: Path, stride: int = 1) -> np.ndarray:
+    """A ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise DataError(f"{path}: not a readable .npy array ({error})") from None
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or array.dtype.kind not in "uif":
+        raise DataError(
+            f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
+        )
+    return np.ascontiguousarray(array[::stride])
+
+
+def read_depth_video(path: Path, stride: int = 1) -> DepthVideo:
+    """Any depth video: a video file, an ``.npy``, or a folder of images. ``stride`` keeps every n-th frame."""
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        video = DepthVideo(read_image_folder(path, stride))
+    elif suffix == ".npy":
+        video = DepthVideo(read_array(path, stride))
+    elif suffix in VIDEO_SUFFIXES:
+        frames = list(video_frames(path, stride=stride))
+        if not frames:
+            raise DataError(f"{path}: an empty video: no frame can be decoded")
+        video = DepthVideo(np.stack(frames), frame_rate(path))
+    else:
+        raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
+    if video.frames.size == 0:
+        raise DataError(f"{path}: an empty video: shape {video.frames.shape}")
+    return video

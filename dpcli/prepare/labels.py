@@ -1,0 +1,94 @@
+"""A CSV table that says the label, and perhaps the subject and split, of samples that have no names to tell."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dpcli.errors import DataError
+from dpcli.prepare.reader import Item
+
+_COLUMNS = ("name", "label", "subject", "split")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What one line says about one sample; ``label`` indexes the table's class names."""
+
+    label: int
+    subject: int
+    split: str
+
+
+@dataclass(frozen=True)
+class LabelTable:
+    """Rows by sample name, and the class names that their labels index."""
+
+    path: Path
+    rows: dict[str, Row]
+    class_names: list[str]
+
+    def apply(self, items: list[Item]) -> list[Item]:
+        """Items with the table's fields; an item it doesn't name keeps label -1. DataError when it names a stranger."""
+        strangers = sorted(self.rows.keys() - {item.name for item in items})
+        if strangers:
+            known = ", ".join(item.name for item in items[:3])
+            raise DataError(f"{self.path}: names {strangers[0]!r}, which is not among the samples ({known}, ...)")
+        rows = ((item, self.rows.get(item.name)) for item in items)
+        return [replace(i, label=r.label, subject=r.subject, split=r.split) if r else i for i, r in rows]
+
+
+def read_labels(path: Path) -> LabelTable:
+    """Columns ``name,label[,subject][,split]`` with a header line, or the first two without one.
+
+    Labels are whole numbers from 0, or words; words are numbered in alphabetical order. DataError names file and line.
+    """
+    try:
+        lines = [
+            [cell.strip() for cell in row] for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
+        ]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
+    numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
+    header = list(_COLUMNS[:2])
+    if numbered and "name" in numbered[0][1]:
+        header = numbered.pop(0)[1]
+        if "label" not in header or set(header) - set(_COLUMNS):
+            raise DataError(f"{path}:1: columns {','.join(header)}; expected name,label and perhaps subject, split")
+    records: dict[str, dict[str, str]] = {}
+    for number, row in numbered:
+        record = dict(zip(header, row, strict=False))
+        if len(row) != len(header) or not record["name"] or not record["label"]:
+            raise DataError(f"{path}:{number}: {','.join(row)!r}; expected {','.join(header)}")
+        if record["name"] in records:
+            raise DataError(f"{path}:{number}: {record['name']!r} appears twice")
+        records[record["name"]] = record | {"line": str(number)}
+    if not records:
+        raise DataError(f"{path}: no rows; expected {','.join(header)}")
+    return _number_labels(path, records)
+
+
+def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:
+    words = [record["label"] for record in records.values()]
+    if all(_is_number(word) for word in words):
+        class_names = [str(k) for k in range(max(map(int, words)) + 1)]
+    elif any(_is_number(word) for word in words):
+        raise DataError(f"{path}: some labels are numbers and some are words; use one kind")
+    else:
+        class_names = sorted(set(words))
+    rows = {}
+    for name, record in records.items():
+        where = f"{path}:{record['line']}"
+        label = int(record["label"]) if _is_number(record["label"]) else class_names.index(record["label"])
+        if label < 0:
+            raise DataError(f"{where}: label {label} is out of range; labels count from 0")
+        subject = record.get("subject", "") or "-1"
+        if not _is_number(subject):
+            raise DataError(f"{where}: subject {subject!r}; expected a whole number")
+        rows[name] = Row(label, int(subject), record.get("split", ""))
+    return LabelTable(path, rows, class_names)
+
+
+def _is_number(word: str) -> bool:
+    return word.isascii() and word.removeprefix("-").isdigit()

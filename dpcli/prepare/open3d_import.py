@@ -1,0 +1,32 @@
+"""Importing Open3D on machines without the system's libusb-1.0."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from types import ModuleType
+
+from dpcli.errors import DpcError
+
+
+@lru_cache(maxsize=1)
+def load_open3d() -> ModuleType:
+    """The ``open3d`` module; DpcError when it can't be imported.
+
+    Its wheel links against libusb-1.0. The PyPI package ``libusb-package`` carries that library; loaded first and
+    globally, it satisfies the link without root rights.
+    """
+    try:
+        import libusb_package
+
+        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError, TypeError):
+        pass  # the system may have its own
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise DpcError(
+            f"Open3D cannot be imported ({error}); it reads .ply and .pcd: pip install open3d libusb-package"
+        ) from None
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d

@@ -1,0 +1,215 @@
+"""From a reader to a file: items are read in worker processes and written in order by the one writer."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import signal
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.prepare.reader import Item, Reader, Sample
+from dpcli.prepare.thin import Thinning
+from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.provenance import record
+from dpcli.runtime.seed import generator
+from dpcli.runtime.signals import StopRequest, stop_requested
+from dpcli.store import CloudsReader, CloudsWriter
+
+_LISTED = 20  # skipped samples and notes named one by one on the terminal; the file's record has all
+
+
+@dataclass
+class Report:
+    """What a conversion did. ``skipped`` holds (name, reason); ``notes`` counts what readers left out."""
+
+    written: int = 0
+    frames: int = 0
+    points: int = 0
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    notes: Counter = field(default_factory=Counter)
+    was_complete: bool = False
+
+    def lines(self) -> list[str]:
+        """The report in words; nothing that was left out goes unmentioned."""
+        lines = [f"{what}: {count}" for what, count in sorted(self.notes.items())]
+        if self.skipped:
+            lines.append(f"{len(self.skipped)} skipped:")
+            lines += [f"  {name}: {reason}" for name, reason in self.skipped[:_LISTED]]
+            if len(self.skipped) > _LISTED:
+                lines.append(f"  ... and {len(self.skipped) - _LISTED} more; dpc info --json names all")
+        return lines
+
+
+def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:
+    """Read and thin one item; its randomness depends on the seed and its index alone. Runs in a worker process."""
+    index, item = indexed
+    if item.problem:
+        raise DataError(item.problem)
+    rng = generator(seed, index)
+    try:
+        sample = reader.read(item, rng)
+    except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
+        raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
+    sample.sequence = thinning.apply(sample.sequence, rng)
+    return sample
+
+
+def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
+    """Everything that decides the file's content, except the seed: equal configurations may continue each other."""
+    digest = hashlib.sha256()
+    for item in items:
+        digest.update(f"{item.name}\n{item.split}\n{item.label}\n".encode())
+    thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
+    reader_config = {"reader": type(reader).__name__, **reader.config}
+    index = {"items": len(items), "items_digest": digest.hexdigest()[:16]}
+    # through JSON, because it is compared with what a file's attribute gives back: tuples become lists
+    return json.loads(json.dumps({**reader_config, **thin, "compression": compression, **index}))
+
+
+def convert(
+    reader: Reader,
+    output: Path,
+    *,
+    jobs: int = 1,
+    points: int = 0,
+    sampling: str = "random",
+    seed: int = 0,
+    on_error: str = "skip",
+    compression: str = "none",
+    force: bool = False,
+    limit: int | None = None,
+    task: str = "prepare",
+) -> Report:
+    """Convert every item of a reader into one clouds file; running again continues where a stopped run ended.
+
+    points, sampling: see Thinning. limit: only the first items. on_error: ``skip`` bad samples or ``stop`` at one.
+    The file's bytes don't depend on jobs. UsageError when ``output`` was made another way and ``force`` is off;
+    DataError when no sample is good; Stopped after a stop signal, with what is done kept beside ``output``.
+    """
+    if on_error not in ("skip", "stop"):
+        raise UsageError(f"--on-error {on_error}: expected skip or stop")
+    thinning = Thinning(points, sampling)
+    items = reader.items()
+    for line in reader.summary(items):
+        log.info(line)
+    items = items[:limit]
+    provenance = record(configuration(reader, thinning, items, compression), seed)
+    report = Report()
+    if not force and already_complete(output, provenance):
+        log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
+        report.was_complete = True
+        return _count(report, output)
+    work = partial(convert_item, reader, thinning, seed)
+    try:
+        with CloudsWriter(
+            output, class_names=reader.class_names, length_unit=reader.length_unit, source=type(reader).__name__,
+            seed=seed, fields=reader.fields, compression=compression, provenance=provenance, force=force, resume=True,
+        ) as writer:  # fmt: skip
+            with stop_requested() as stop:
+                _stream(work, items, writer, report, stop, jobs=jobs, on_error=on_error, task=task)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        raise DpcError(f"{output}: no space left on the device; nothing was left under this name") from None
+    return _count(report, output)
+
+
+def _stream(
+    work: Any, items: list[Item], writer: CloudsWriter, report: Report, stop: StopRequest, *,
+    jobs: int, on_error: str, task: str,
+) -> None:  # fmt: skip
+    done = set(writer.written_names)
+    if done:
+        log.info(f"continuing: {len(done)} of {len(items)} were converted before")
+    last = max((i for i, item in enumerate(items) if item.name in done), default=-1)
+    todo = [(i, item) for i, item in enumerate(items) if item.name not in done]
+    with Progress(task, total=len(items), unit="video") as bar:
+        bar.skip(len(done))
+        try:
+            for (index, item), result in ordered_map(work, todo, jobs):
+                if isinstance(result, Sample) and index > last:
+                    _write(writer, item, result, report, bar)
+                else:
+                    _skip(item, result, report, bar, on_error)
+                stop.check(f"{len(writer)} of {len(items)} samples are kept")
+        except DpcError:
+            # a signal to the whole process group takes the workers down as well: that is a stop, not a failure
+            stop.check(f"{len(writer)} of {len(items)} samples are kept")
+            raise
+    if not len(writer):
+        reason = report.skipped[0][1] if report.skipped else "the index is empty"
+        raise DataError(f"none of the {len(items)} samples is good; the first: {reason}")
+
+
+def _write(writer: CloudsWriter, item: Item, sample: Sample, report: Report, bar: Progress) -> None:
+    with _whole():
+        writer.write(sample.sequence)
+    report.notes.update(sample.notes)
+    for what, count in sample.notes.items():
+        log.detail(f"{item.name}: {what}: {count}")
+    bar.advance(1, frames=sample.sequence.num_frames)
+
+
+@contextmanager
+def _whole() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block: a half-appended sample would make the part file useless."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pending: list[int] = []
+    previous = signal.signal(signal.SIGINT, lambda number, frame: pending.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if pending:
+        raise KeyboardInterrupt
+
+
+def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str) -> None:
+    if isinstance(result, Sample):
+        # a stopped run had passed it over as bad; putting it in now would break the order of the file
+        result = DataError("is readable now but was skipped before the stop; --force starts over and includes it")
+    if not isinstance(result, DataError):
+        log.error(f"{item.name}: reading it failed in an unforeseen way")
+        raise result
+    if on_error == "stop":
+        raise DataError(f"{item.name}: {result} (--on-error skip passes bad samples over)")
+    report.skipped.append((item.name, str(result)))
+    log.detail(f"skipped {item.name}: {result}")
+    bar.advance(1)
+
+
+def already_complete(output: Path, provenance: dict[str, Any]) -> bool:
+    """Whether ``output`` exists and was made by this configuration and seed; UsageError when made by another."""
+    if not output.exists():
+        return False
+    try:
+        with CloudsReader(output) as reader:
+            before = reader.provenance[-1] if reader.provenance else {}
+    except DataError as error:
+        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
+    old, new = (({**entry.get("config", {}), "seed": entry.get("seed")}) for entry in (before, provenance))
+    if old == new:
+        return True
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    different = ", ".join(f"{key} {old.get(key)} (now {new.get(key)})" for key in keys[:4])
+    raise UsageError(f"{output}: exists, made with {different}; write to another file, or --force to replace it")
+
+
+def _count(report: Report, output: Path) -> Report:
+    """What the finished file holds, whether this run wrote all of it or continued another."""
+    with CloudsReader(output) as reader:
+        report.written = len(reader)
+        report.frames, report.points = int(reader.frame_counts.sum()), int(reader.point_counts.sum())
+    return report

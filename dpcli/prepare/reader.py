@@ -1,0 +1,109 @@
+"""What every raw-format reader offers: a cheap index of items, and one item read into a sample."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.store import CloudSequence
+
+
+@dataclass(frozen=True)
+class Item:
+    """One sample of the index: what is known about it before its data are opened.
+
+    A non-empty ``problem`` marks an entry that can't be read at all (a list line naming a missing file,
+    a label out of range); the pipeline reports it like a failed read and never calls the reader.
+    """
+
+    name: str
+    path: Path
+    split: str = ""
+    label: int = -1
+    subject: int = -1
+    camera: int = -1
+    extra: dict[str, Any] = field(default_factory=dict)
+    problem: str = ""
+
+
+@dataclass
+class Sample:
+    """One sequence, and counts of what its reader left out, such as ``{"frames without depth dropped": 2}``."""
+
+    sequence: CloudSequence
+    notes: dict[str, int] = field(default_factory=dict)
+
+
+class Reader(Protocol):
+    """A raw format. Implementations are frozen dataclasses of their options, so they pickle into worker processes."""
+
+    @property
+    def class_names(self) -> list[str]: ...
+    @property
+    def length_unit(self) -> str: ...
+    @property
+    def fields(self) -> tuple[str, ...]: ...
+    @property
+    def config(self) -> dict[str, Any]: ...
+
+    def items(self) -> list[Item]:
+        """The index in its final order; DataError when the folder is not what it should be."""
+        ...
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """One sample, in a worker process; DataError on a bad one. ``rng`` belongs to this item alone."""
+        ...
+
+    def summary(self, items: list[Item]) -> list[str]:
+        """Lines for the log about what the index holds and lacks."""
+        ...
+
+
+def describe(item: Item) -> dict[str, Any]:
+    """The fields of a CloudSequence that the index already knows."""
+    return {
+        "split": item.split,
+        "label": item.label,
+        "subject": item.subject,
+        "camera": item.camera,
+    }
+
+
+def natural_key(path: Path | str) -> list[tuple[int, int, str]]:
+    """Sort key under which ``frame2`` comes before ``frame10``; equal numbers fall back to the spelling."""
+    text = path.name if isinstance(path, Path) else path
+    parts = re.split(r"(\d+)", text)
+    return [(0, int(p), p) if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts if p]
+
+
+def require_folder(path: Path, expected: str) -> Path:
+    """``path`` when it is a folder; else DataError that says what was looked for in it."""
+    if path.is_dir():
+        return path
+    found = "is a file" if path.exists() else "does not exist"
+    raise DataError(f"{path}: {found}; expected a folder with {expected}")
+
+
+def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[str, int]]:
+    """Which frames to keep. ``counts`` i64 (T) points per frame -> kept i64 (T'), notes.
+
+    A frame without a single valid point carries no geometry and would break samplers later, so it is
+    dropped and counted; a sequence of nothing but such frames is a bad sample (DataError).
+    """
+    kept = np.flatnonzero(counts)
+    if len(counts) == 0:
+        raise DataError(f"{name}: holds no frames; expected at least 1")
+    if len(kept) == 0:
+        raise DataError(f"{name}: none of its {len(counts)} frames has a valid depth pixel or point")
+    dropped = len(counts) - len(kept)
+    return kept, {"frames without points dropped": dropped} if dropped else {}
+
+
+def offsets(counts: np.ndarray) -> np.ndarray:
+    """Counts i64 (T) -> offsets i64 (T+1) that start with 0."""
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)

@@ -1,0 +1,90 @@
+"""Fewer points per frame: random, farthest point or voxel sampling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.errors import UsageError
+from dpcli.prepare.reader import offsets
+from dpcli.store import CloudSequence
+
+METHODS = ("random", "fps", "voxel")
+_SEARCH_STEPS = 20
+_CLOSE_ENOUGH = 1.05  # this many times more cubes than points: the rest is drawn at random
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """At most ``points`` points per frame, chosen by ``sampling``; smaller frames are kept whole. 0 = keep all."""
+
+    points: int = 0
+    sampling: str = "random"
+
+    def __post_init__(self) -> None:
+        if self.points < 0:
+            raise UsageError(f"--points {self.points}: expected 0 (keep all) or more")
+        if self.sampling not in METHODS:
+            raise UsageError(f"--sampling {self.sampling}: expected one of {', '.join(METHODS)}")
+
+    def choose(self, cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Indices i64 (min(N, points)) into one frame f32 (N,3).
+
+        ``random`` and ``voxel`` keep the frame's own order. ``fps`` starts at point 0 and keeps the order of
+        choice, so that every prefix of the frame is a farthest point sample too.
+        """
+        if self.sampling == "fps":
+            from dpcli.ops import fps_numpy
+
+            return np.asarray(fps_numpy(cloud, self.points))
+        candidates = voxel_representatives(cloud, self.points) if self.sampling == "voxel" else np.arange(len(cloud))
+        return candidates[np.sort(rng.choice(len(candidates), self.points, replace=False))]
+
+    def apply(self, sequence: CloudSequence, rng: np.random.Generator) -> CloudSequence:
+        """The sequence with each frame thinned; per-point fields follow their points."""
+        counts = np.diff(sequence.frame_offsets)
+        if self.points == 0 or counts.max(initial=0) <= self.points:
+            return sequence
+        chosen = []
+        for start, count in zip(sequence.frame_offsets[:-1], counts, strict=True):
+            frame = sequence.points[start : start + count]
+            index = self.choose(frame, rng) if count > self.points else np.arange(count)
+            chosen.append(index + start)
+        sequence.frame_offsets = offsets(np.array([len(c) for c in chosen], np.int64))
+        index = np.concatenate(chosen)
+        for name in ("points", "color", "part", "track"):
+            values = getattr(sequence, name)
+            if values is not None:
+                setattr(sequence, name, values[index])
+        return sequence
+
+
+def voxel_representatives(cloud: np.ndarray, points: int) -> np.ndarray:
+    """One point per occupied cube of the coarsest grid found that still has at least ``points`` occupied cubes.
+
+    cloud: f32 (N,3), N >= points -> sorted indices i64 (M), points <= M <= N; the first point of a cube stands for it.
+    """
+    shifted = cloud - cloud.min(0)
+    extent = float(shifted.max())
+    best = np.arange(len(cloud))
+    fine, coarse, edge = 0.0, extent, extent / np.sqrt(points)
+    for _ in range(_SEARCH_STEPS if extent > 0 else 0):
+        first = _first_in_voxel(shifted, edge)
+        if len(first) < points:
+            coarse = edge
+        else:
+            fine, best = edge, first
+            if len(first) <= points * _CLOSE_ENOUGH:
+                break
+        # a depth camera sees surfaces: the number of occupied cubes goes like 1 / edge^2
+        guess = edge * np.sqrt(len(first) / (points * (1 + _CLOSE_ENOUGH) / 2))
+        edge = guess if fine < guess < coarse else (fine + coarse) / 2
+    return best
+
+
+def _first_in_voxel(shifted: np.ndarray, edge: float) -> np.ndarray:
+    cell = (shifted / np.float32(edge)).astype(np.int64)
+    size = cell.max(0) + 1
+    key = (cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2]
+    return np.sort(np.unique(key, return_index=True)[1])

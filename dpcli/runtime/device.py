@@ -1,0 +1,32 @@
+"""Choosing the device and the number of threads."""
+
+from __future__ import annotations
+
+import os
+
+from dpcli.errors import UsageError
+
+
+def cpu_count() -> int:
+    """CPUs this process may use: the affinity mask, narrowed by SLURM_CPUS_PER_TASK when a batch system sets it."""
+    try:
+        cpus = len(os.sched_getaffinity(0))
+    except AttributeError:  # not Linux
+        cpus = os.cpu_count() or 1
+    granted = os.environ.get("SLURM_CPUS_PER_TASK", "")
+    return min(cpus, int(granted)) if granted.isdigit() and int(granted) > 0 else cpus
+
+
+def choose_device(name: str = "auto"):
+    """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError when a CUDA device is asked for and absent."""
+    import torch
+
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise UsageError(f"--device {name}: unknown device; use auto, cpu, cuda or cuda:N") from None
+    if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
+        raise UsageError(f"--device {name}: {torch.cuda.device_count()} CUDA devices are visible; use --device cpu")
+    return device

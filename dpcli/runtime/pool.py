@@ -1,0 +1,65 @@
+"""Spreading independent items over processes, results in input order, with a bounded number in flight."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+from dpcli.errors import DpcError
+
+# One process per core is the parallelism: libraries inside a worker must not start threads of their own.
+_SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def _start_worker() -> None:
+    """The parent decides when to stop: Ctrl-C and SIGTERM reach the whole process group, workers ignore them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    os.environ.update({name: "1" for name in _SINGLE_THREAD})
+
+
+def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
+    try:
+        return function(item)
+    except Exception as error:  # an item's failure is a result, so that the caller can skip it
+        return error
+
+
+def ordered_map(
+    function: Callable[[Any], Any], items: Iterable[Any], jobs: int, executor: Executor | None = None
+) -> Iterator[tuple[Any, Any]]:
+    """Yield `(item, function(item) or the exception it raised)` in input order.
+
+    At most `2 * jobs` results exist at a time, so memory doesn't grow with the number of items. `jobs <= 1` without an
+    executor runs in this process; else `executor`, or `jobs` processes started by `forkserver` (safe beside threads).
+    A worker that dies (out of memory, killed) ends the iteration with a DpcError.
+    """
+    if executor is None and jobs <= 1:
+        for item in items:
+            yield item, _guarded(function, item)
+        return
+    own = executor is None
+    pool = executor or ProcessPoolExecutor(jobs, multiprocessing.get_context("forkserver"), initializer=_start_worker)
+    waiting: deque = deque()
+    try:
+        for item in items:
+            waiting.append((item, pool.submit(_guarded, function, item)))
+            if len(waiting) >= 2 * max(jobs, 1):
+                done, future = waiting.popleft()
+                yield done, future.result()
+        while waiting:
+            done, future = waiting.popleft()
+            yield done, future.result()
+    except BrokenProcessPool:
+        raise DpcError("a worker process died (killed, or out of memory); run again, perhaps with a smaller --jobs") from None
+    finally:
+        for _, future in waiting:
+            future.cancel()
+        if own:
+            pool.shutdown(wait=True, cancel_futures=True)

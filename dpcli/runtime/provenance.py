@@ -1,0 +1,44 @@
+"""What a command records about itself in the file it writes."""
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+import sys
+from pathlib import Path
+
+from dpcli import __version__
+
+# Options that change how the work runs but not its result: left out, so that equal work gives equal bytes.
+_VALUED = {"-o", "--output", "--jobs", "--picture", "--device", "--log", "--report"}
+_FLAGS = {"-q", "--quiet", "-v", "--verbose", "--debug", "--force", "--json"}
+
+
+def command_line(argv: list[str] | None = None) -> str:
+    """The command as typed, without the options that don't change the result (`-o`, `--jobs`, `-q`, ...)."""
+    kept, skip = ["dpc"], False
+    for word in sys.argv[1:] if argv is None else argv:
+        if skip:
+            skip = False
+        elif word in _VALUED:
+            skip = True
+        elif word not in _FLAGS and word.split("=")[0] not in _VALUED:
+            kept.append(word)
+    return shlex.join(kept)
+
+
+def file_digest(path: str | Path) -> str:
+    """SHA-256 of a file's bytes, in hexadecimal."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def record(config: dict, seed: int, inputs: dict[str, str | Path] | None = None) -> dict:
+    """One provenance entry: command, resolved options, seed, version, and the digest of every input file."""
+    entry = {"command": command_line(), "config": config, "seed": int(seed), "version": __version__}
+    if inputs:
+        entry["inputs"] = {role: file_digest(path) for role, path in inputs.items()}
+    return entry

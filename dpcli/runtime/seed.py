@@ -1,0 +1,13 @@
+"""Random generators derived from one seed and an item's index, so results don't depend on order, workers or shards."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def generator(seed: int, *keys: int) -> np.random.Generator:
+    """A NumPy generator for `(seed, *keys)`; the same arguments always give the same stream.
+
+    `keys` are non-negative integers such as an item's index or an epoch. 0 is a valid seed.
+    """
+    return np.random.default_rng(np.random.SeedSequence([int(seed), *map(int, keys)]))

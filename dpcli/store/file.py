@@ -1,0 +1,187 @@
+"""What every file of the contract has in common: the root attributes, safe opening, writing whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+import h5py
+import numpy as np
+
+from dpcli import __version__
+from dpcli.errors import DataError, DpcError
+
+SCHEMA = 1
+KINDS = ("clouds", "views", "scores", "parts", "gaussians")
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+STRING = h5py.string_dtype("utf-8")
+
+
+def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
+    """Open a file of the contract for reading.
+
+    Raises DataError when it isn't HDF5, is truncated, is not ours, is of another schema or kind, or refers to data
+    outside itself (external links, virtual data sets, external storage) or to Python objects.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise DataError(f"{path}: a folder, expected an HDF5 file; `dpc prepare` turns raw folders into one")
+    with open(path, "rb") as raw:
+        magic = raw.read(8)
+    if not magic:
+        raise DataError(f"{path}: the file is empty, expected HDF5; did the command that writes it fail?")
+    if magic != _MAGIC:
+        raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); `dpc prepare` makes them from raw data")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise DataError(_opening_problem(path, error)) from None
+    try:
+        _check_root(file, path, kinds)
+        _refuse_outside(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def _opening_problem(path: Path, error: OSError) -> str:
+    text = str(error)
+    if "truncated" in text or "end of file" in text:
+        return f"{path}: the HDF5 file is truncated ({path.stat().st_size} bytes are left); make or copy it again"
+    if "lock" in text:
+        return f"{path}: locked by a writer, or on a file system without locks (then set HDF5_USE_FILE_LOCKING=FALSE)"
+    return f"{path}: the HDF5 file is damaged ({text.splitlines()[0]}); make or copy it again"
+
+
+def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:
+    kind, schema = file.attrs.get("dpc_kind"), file.attrs.get("dpc_schema")
+    if kind is None or schema is None:
+        raise DataError(f"{path}: an HDF5 file, but not one of dpc's (no dpc_kind attribute); see `dpc prepare --help`")
+    if int(schema) != SCHEMA:
+        raise DataError(f"{path}: schema {schema}, this dpc {__version__} reads schema {SCHEMA}")
+    if kind not in kinds:
+        raise DataError(f"{path}: holds {kind!r}, expected {' or '.join(repr(k) for k in kinds)}; `dpc info {path}` shows more")
+
+
+def _refuse_outside(file: h5py.File, path: Path) -> None:
+    """Hostile or broken files could name other files, or pickles; a file of the contract is self-contained."""
+
+    def visit(group: h5py.Group) -> None:
+        for name in group:
+            link = group.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                raise DataError(f"{path}: {group.name}/{name} is a link to elsewhere; a dpc file must be self-contained")
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                visit(item)
+            elif item.is_virtual or item.external:
+                raise DataError(f"{path}: {item.name} keeps its data in another file; a dpc file must be self-contained")
+            elif item.dtype.kind not in "fiub" and h5py.check_string_dtype(item.dtype) is None:
+                raise DataError(f"{path}: {item.name} has type {item.dtype}, expected numbers or strings")
+
+    visit(file)
+
+
+def file_kind(path: str | Path) -> str:
+    """The kind of a file of the contract, such as `clouds`; DataError as `open_store`."""
+    with open_store(path) as file:
+        return str(file.attrs["dpc_kind"])
+
+
+def root_attributes(file: h5py.File) -> dict:
+    """Root attributes as plain Python values, without the long ones (`class_names`, `provenance` are data sets)."""
+    return {key: value.item() if isinstance(value, np.generic) else value for key, value in file.attrs.items()}
+
+
+def read_provenance(file: h5py.File) -> list[dict]:
+    """The commands that led to this file, oldest first."""
+    if "provenance" not in file:
+        return []
+    try:
+        return [json.loads(entry) for entry in file["provenance"].asstr()[:]]
+    except ValueError:
+        raise DataError(f"{file.filename}: provenance is not JSON; the file was changed by another program") from None
+
+
+def read_strings(file: h5py.File, name: str) -> list[str]:
+    """A string data set as a list; DataError when it is absent."""
+    if name not in file:
+        raise DataError(f"{file.filename}: data set {name!r} is missing; the file is incomplete, make it again")
+    return list(file[name].asstr()[:])
+
+
+class AtomicFile:
+    """An HDF5 file written beside its target (`.NAME.part`) and renamed when whole.
+
+    A file under the final name is therefore always complete. `commit` closes, syncs and renames; `discard` removes;
+    `suspend` closes and keeps the part for a later run. Write errors become DpcError with the reason in words.
+    """
+
+    def __init__(self, target: str | Path, mode: str = "w") -> None:
+        self.target = Path(target)
+        self.part = self.target.with_name(f".{self.target.name}.part")
+        if not self.target.parent.is_dir():
+            raise DataError(f"{self.target}: the folder {self.target.parent} does not exist; create it first")
+        if self.target.is_dir():
+            raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
+        try:
+            self.file = h5py.File(self.part, mode)
+        except OSError as error:
+            busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
+            why = "another dpc is writing it" if busy else str(error).splitlines()[0]
+            raise DpcError(f"{self.target}: cannot write ({why})") from None
+
+    def problem(self, error: BaseException) -> DpcError | None:
+        """A DpcError for a failed write, or None when `error` is something else."""
+        text = str(error).lower()
+        for number, words in ((errno.ENOSPC, "no space left on the device"), (errno.EFBIG, "the file size limit is reached"),
+                              (errno.EDQUOT, "the disk quota is used up")):  # fmt: skip
+            if getattr(error, "errno", None) == number or f"errno = {number}," in text:
+                return DpcError(f"{self.target}: {words}; nothing was left under that name. Free space, then run again")
+        return None
+
+    def commit(self) -> None:
+        """Close, flush to the disk, rename."""
+        try:
+            self.file.close()
+            with open(self.part, "rb") as whole:
+                os.fsync(whole.fileno())
+            os.replace(self.part, self.target)
+        except (OSError, RuntimeError) as error:
+            self.discard()
+            raise self.problem(error) or DpcError(f"{self.target}: could not be finished ({error})") from None
+
+    def suspend(self) -> None:
+        self.file.close()
+
+    def discard(self) -> None:
+        try:
+            self.file.close()
+        except (OSError, RuntimeError):  # closing flushes, which fails again on a full disk
+            pass
+        self.part.unlink(missing_ok=True)
+
+    def failed(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Discard after an exception; re-raise a failed write in words."""
+        self.discard()
+        worded = self.problem(error) if error is not None else None
+        if worded is not None:
+            raise worded from None
+
+
+def write_root(file: h5py.File, kind: str, *, length_unit: str, source: str, seed: int, class_names: Sequence[str],
+               provenance: Sequence[dict]) -> None:  # fmt: skip
+    """Root attributes, class names and provenance, as design.md section 3 lists them. No clock time, so bytes repeat."""
+    last = provenance[-1] if provenance else {}
+    file.attrs.update({
+        "dpc_kind": kind, "dpc_schema": SCHEMA, "dpc_version": __version__, "command": str(last.get("command", "")),
+        "seed": int(seed), "source": source, "length_unit": length_unit,
+    })  # fmt: skip
+    file.create_dataset("class_names", data=np.array(list(class_names), dtype=object), dtype=STRING)
+    entries = [json.dumps(entry, sort_keys=True) for entry in provenance]
+    file.create_dataset("provenance", data=np.array(entries, dtype=object), dtype=STRING)

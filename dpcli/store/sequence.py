@@ -1,0 +1,83 @@
+"""One sample: a sequence of frames, each a set of points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+
+POINT_FIELDS = {"color": (np.uint8, (3,)), "part": (np.int16, ()), "track": (np.int64, ())}  # name -> dtype, shape of one point
+
+
+@dataclass
+class CloudSequence:
+    """A point cloud video. Per-point arrays are flat, frame after frame; `frame_offsets` cuts them.
+
+    points f32 (P,3) in the file's length unit; frame_offsets i64 (T+1), from 0 to P; label counts from 0, -1 = unknown;
+    time f64 (T) seconds; color u8 (P,3); part i16 (P) rigid part; track i64 (P) identity of a point over frames;
+    pose f64 (T,parts,4,4) part-to-world.
+    """
+
+    name: str
+    points: np.ndarray
+    frame_offsets: np.ndarray
+    split: str = ""
+    label: int = -1
+    subject: int = -1
+    camera: int = -1
+    time: np.ndarray | None = None
+    color: np.ndarray | None = None
+    part: np.ndarray | None = None
+    track: np.ndarray | None = None
+    pose: np.ndarray | None = None
+
+    @classmethod
+    def from_frames(cls, name: str, frames: list[np.ndarray], **fields: Any) -> CloudSequence:
+        """From a list of (N_t,3) arrays; per-point fields are given as lists of per-frame arrays, too."""
+        offsets = np.concatenate([[0], np.cumsum([len(frame) for frame in frames])]).astype(np.int64)
+        points = np.concatenate(frames).astype(np.float32, copy=False) if frames else np.zeros((0, 3), np.float32)
+        for key in POINT_FIELDS.keys() & fields.keys():
+            if fields[key] is not None:
+                fields[key] = np.concatenate(fields[key]).astype(POINT_FIELDS[key][0], copy=False)
+        return cls(name, points, offsets, **fields)
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.frame_offsets) - 1
+
+    def frame(self, t: int) -> np.ndarray:
+        """Points of frame t, f32 (N_t,3), a view."""
+        return self.points[self.frame_offsets[t] : self.frame_offsets[t + 1]]
+
+    def validate(self, num_classes: int = 0) -> None:
+        """Raise DataError unless shapes, offsets, label and values are as the class says."""
+        where = f"sample {self.name!r}"
+        if not self.name:
+            raise DataError("a sample has no name; every sample needs a unique one")
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise DataError(f"{where}: points have shape {self.points.shape}, expected (points, 3)")
+        offsets = self.frame_offsets
+        if len(offsets) < 2 or len(self.points) == 0:
+            raise DataError(f"{where}: no frames or no points; a sample needs at least one point")
+        if offsets[0] != 0 or offsets[-1] != len(self.points) or np.any(np.diff(offsets) < 0):
+            raise DataError(f"{where}: frame_offsets must rise from 0 to {len(self.points)}, found {offsets[:4]}...{offsets[-1]}")
+        if not np.isfinite(self.points).all():
+            bad = int((~np.isfinite(self.points)).any(1).sum())
+            raise DataError(f"{where}: {bad} of {len(self.points)} points are NaN or infinite; drop them before writing")
+        if self.label < -1 or (num_classes and self.label >= num_classes):
+            raise DataError(f"{where}: label {self.label} is out of range; expected -1 (unknown) or 0..{num_classes - 1}")
+        self._validate_fields(where)
+
+    def _validate_fields(self, where: str) -> None:
+        for key, (dtype, shape) in POINT_FIELDS.items():
+            value = getattr(self, key)
+            if value is not None and (value.shape != (len(self.points), *shape) or value.dtype != dtype):
+                expected = (len(self.points), *shape)
+                raise DataError(f"{where}: {key} is {value.dtype} {value.shape}, expected {np.dtype(dtype)} {expected}")
+        if self.time is not None and self.time.shape != (self.num_frames,):
+            raise DataError(f"{where}: time has shape {self.time.shape}, expected ({self.num_frames},)")
+        if self.pose is not None and (self.pose.ndim != 4 or self.pose.shape[::3] != (self.num_frames, 4)):
+            raise DataError(f"{where}: pose has shape {self.pose.shape}, expected ({self.num_frames}, parts, 4, 4)")
