@@ -37,15 +37,18 @@ def clip_frames(length: int, frames: int, start: int) -> tuple[int, ...]:
     return tuple(min(start + t, length - 1) for t in range(frames))
 
 
-def uniform_frames(length: int, frames: int) -> tuple[int, ...]:
-    """`frames` frames over the whole video, int(j * length / frames), as the gesture benchmarks take them."""
-    return tuple(j * length // frames for j in range(frames))
+def uniform_frames(length: int, frames: int, phase: float | np.ndarray = 0.0) -> tuple[int, ...]:
+    """`frames` frames over the whole video: int((j + phase) * length / frames), phase in [0, 1).
+
+    Phase 0 is what the gesture benchmarks take; a random phase for each j is the training draw.
+    """
+    return tuple(int(t) for t in np.minimum((np.arange(frames) + phase) * length // frames, length - 1))
 
 
 class ClipSource:
     """Clips of some sequences of a `clouds` file as arrays a network takes. Picklable, for DataLoader workers.
 
-    `timing` is `clips` (consecutive frames) or `uniform` (frames spread over the video: one clip each).
+    `timing` is `clips` (consecutive frames, as MSR-Action3D's peers) or `uniform` (frames spread over the whole video).
     `dropped` lists the videos left out because they are shorter than a clip (only with `drop_short`).
     """
 
@@ -70,20 +73,22 @@ class ClipSource:
     def _video_clips(self, sequence: int, count: int | None) -> list[Clip]:
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
         if self.timing == "uniform":
-            return [Clip(sequence, uniform_frames(length, frames))]
+            return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]
         return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
 
     def epoch(self, number: int, per_video: int | None) -> list[Clip]:
         """The clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
         rng = generator(self.seed, 1, number)
-        if per_video is None or self.timing == "uniform":
+        if per_video is None and self.timing == "clips":
             clips = self.clips(None)
         else:
-            clips = [self._random_clip(s, rng) for s in self.sequences for _ in range(per_video)]
+            clips = [self._random_clip(s, rng) for s in self.sequences for _ in range(per_video or 1)]
         return [clips[i] for i in rng.permutation(len(clips))]
 
     def _random_clip(self, sequence: int, rng: np.random.Generator) -> Clip:
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
+        if self.timing == "uniform":
+            return Clip(sequence, uniform_frames(length, frames, rng.random(frames)))
         return Clip(sequence, clip_frames(length, frames, int(rng.integers(max(length - frames, 0) + 1))))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:

@@ -36,7 +36,8 @@ class ResidualMerge(nn.Module):
 class CrossMerge(nn.Module):
     """The released code: at each level both stages see their own and, by 3-NN interpolation, the other's features.
 
-    Every input carries its centroid's frame number as one more channel.
+    Every input carries its centroid's frame number as one more channel. Only stage 2's last output is used, so the weights
+    `cross.1.0` never act; they stay because the released model has (and counts) them.
     """
 
     def __init__(self, channels: list[int]) -> None:
@@ -55,10 +56,10 @@ class CrossMerge(nn.Module):
             if level:
                 raw = [raw[s] + torch.relu(self.last[s](torch.cat([states[s], times[s]], -1))) for s in range(2)]
             timed = [torch.cat([raw[s], times[s]], -1) for s in range(2)]
-            states = []
-            for s in range(2):
+            states = [raw[0]]
+            for s in range(2) if level == 0 else (1,):
                 other = three_nn_interpolate(groups[s].centers, groups[1 - s].centers, timed[1 - s])
-                states.append(raw[s] + torch.relu(self.cross[level][s](torch.cat([other, timed[s]], -1))))
+                states[s:] = [raw[s] + torch.relu(self.cross[level][s](torch.cat([other, timed[s]], -1)))]
         return states[1]
 
 

@@ -20,6 +20,7 @@ _HOME = {
     "three_nn_interpolate": "interpolate",
     "gather_points": "gather",
     "small_inverse": "linalg",
+    "small_inverse_reference": "linalg",
     "normal_equations": "plane_fit",
     "plane_deviations": "plane_fit",
     "chosen_backend": "backend",

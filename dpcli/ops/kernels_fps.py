@@ -69,20 +69,28 @@ def _morton_order(points, n):
 
 
 @kernel
-def _fill_buckets(points, order, n, xyz, best, box):
-    """Copy the points to bucket order and bound each bucket: box rows are x min, x max, y min, y max, z min, z max."""
-    for b in range(box.shape[1]):
+def bucket_points(points, n):
+    """Points[:n] (N,3) f32 in buckets: (order (n,) i32, xyz (3, buckets*BUCKET) f32, box (6, buckets) f32).
+
+    Bucket b holds the points order[b*BUCKET:(b+1)*BUCKET]; zeros pad the last. The rows of box are x min, x max, y min,
+    y max, z min, z max.
+    """
+    order = _morton_order(points, n)
+    buckets = (n + BUCKET - 1) // BUCKET
+    xyz = np.zeros((3, buckets * BUCKET), np.float32)
+    box = np.empty((6, buckets), np.float32)
+    for b in range(buckets):
         first = b * BUCKET
         for axis in range(3):
             box[2 * axis, b] = points[order[first], axis]
             box[2 * axis + 1, b] = points[order[first], axis]
         for i in range(first, min(first + BUCKET, n)):
-            best[i] = np.inf
             for axis in range(3):
                 value = points[order[i], axis]
                 xyz[axis, i] = value
                 box[2 * axis, b] = min(box[2 * axis, b], value)
                 box[2 * axis + 1, b] = max(box[2 * axis + 1, b], value)
+    return order, xyz, box
 
 
 @kernel
@@ -128,12 +136,10 @@ def _farthest(best, top, order, n):
 @kernel
 def fps_kernel(points, n, start, out):
     """Fill `out` (S,) i64 with farthest points of points[:n] (N,3) f32, first `start`; ties to the lowest index."""
-    buckets = (n + BUCKET - 1) // BUCKET
-    order = _morton_order(points, n)
-    xyz = np.zeros((3, buckets * BUCKET), np.float32)
+    order, xyz, box = bucket_points(points, n)
+    buckets = box.shape[1]
     best = np.full(buckets * BUCKET, np.float32(-1))  # padding keeps -1: never a maximum
-    box = np.empty((6, buckets), np.float32)
-    _fill_buckets(points, order, n, xyz, best, box)
+    best[:n] = np.inf
     top = np.full(buckets, np.float32(np.inf))
     lower = np.empty(buckets, np.float32)
     x, y, z = xyz[0], xyz[1], xyz[2]  # views made once: each costs an atomic reference count

@@ -24,131 +24,140 @@ def _guard_row(det, moved, min_det, guard):
 
 
 @kernel
-def _closed1(m, out, det):
+def _closed1(m, out, at, det):
     for w in range(TILE):
-        det[w] = m[0, 0, w]
-        out[0, 0, w] = 1
+        det[w] = m[at, at, w]
+        out[at, at, w] = 1
 
 
 @kernel
-def _closed2(m, out, det):
+def _closed2(m, out, at, det):
     for w in range(TILE):
-        a, b, c, d = m[0, 0, w], m[0, 1, w], m[1, 0, w], m[1, 1, w]
+        a, b, c, d = m[at, at, w], m[at, at + 1, w], m[at + 1, at, w], m[at + 1, at + 1, w]
         det[w] = a * d - b * c
-        out[0, 0, w], out[0, 1, w], out[1, 0, w], out[1, 1, w] = d, -b, -c, a
+        out[at, at, w], out[at, at + 1, w], out[at + 1, at, w], out[at + 1, at + 1, w] = d, -b, -c, a
 
 
 @kernel
-def _closed3(m, out, det):
+def _closed3(m, out, at, det):
     for w in range(TILE):
-        a, b, c = m[0, 0, w], m[0, 1, w], m[0, 2, w]
-        d, e, f = m[1, 0, w], m[1, 1, w], m[1, 2, w]
-        g, h, i = m[2, 0, w], m[2, 1, w], m[2, 2, w]
+        a, b, c = m[at, at, w], m[at, at + 1, w], m[at, at + 2, w]
+        d, e, f = m[at + 1, at, w], m[at + 1, at + 1, w], m[at + 1, at + 2, w]
+        g, h, i = m[at + 2, at, w], m[at + 2, at + 1, w], m[at + 2, at + 2, w]
         x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
         det[w] = a * x + b * y + c * z
-        out[0, 0, w], out[0, 1, w], out[0, 2, w] = x, c * h - b * i, b * f - c * e
-        out[1, 0, w], out[1, 1, w], out[1, 2, w] = y, a * i - c * g, c * d - a * f
-        out[2, 0, w], out[2, 1, w], out[2, 2, w] = z, b * g - a * h, a * e - b * d
+        out[at, at, w], out[at, at + 1, w], out[at, at + 2, w] = x, c * h - b * i, b * f - c * e
+        out[at + 1, at, w], out[at + 1, at + 1, w], out[at + 1, at + 2, w] = y, a * i - c * g, c * d - a * f
+        out[at + 2, at, w], out[at + 2, at + 1, w], out[at + 2, at + 2, w] = z, b * g - a * h, a * e - b * d
 
 
 @kernel
-def _closed4(m, out, det):
+def _closed4(m, out, at, det):
     for w in range(TILE):
-        a, b, c, d = m[0, 0, w], m[0, 1, w], m[0, 2, w], m[0, 3, w]
-        e, f, g, h = m[1, 0, w], m[1, 1, w], m[1, 2, w], m[1, 3, w]
-        i, j, k, l = m[2, 0, w], m[2, 1, w], m[2, 2, w], m[2, 3, w]  # noqa: E741 - the sixteen entries, a to p
-        n, o, p, q = m[3, 0, w], m[3, 1, w], m[3, 2, w], m[3, 3, w]
+        a, b, c, d = m[at, at, w], m[at, at + 1, w], m[at, at + 2, w], m[at, at + 3, w]
+        e, f, g, h = m[at + 1, at, w], m[at + 1, at + 1, w], m[at + 1, at + 2, w], m[at + 1, at + 3, w]
+        i, j, k, l = m[at + 2, at, w], m[at + 2, at + 1, w], m[at + 2, at + 2, w], m[at + 2, at + 3, w]  # noqa: E741 - the sixteen entries, a to p
+        n, o, p, q = m[at + 3, at, w], m[at + 3, at + 1, w], m[at + 3, at + 2, w], m[at + 3, at + 3, w]
         u01, u02, u03 = a * f - b * e, a * g - c * e, a * h - d * e
         u12, u13, u23 = b * g - c * f, b * h - d * f, c * h - d * g
         v01, v02, v03 = i * o - j * n, i * p - k * n, i * q - l * n
         v12, v13, v23 = j * p - k * o, j * q - l * o, k * q - l * p
         det[w] = u01 * v23 - u02 * v13 + u03 * v12 + u12 * v03 - u13 * v02 + u23 * v01
-        out[0, 0, w] = f * v23 - g * v13 + h * v12
-        out[0, 1, w] = -(b * v23 - c * v13 + d * v12)
-        out[0, 2, w] = o * u23 - p * u13 + q * u12
-        out[0, 3, w] = -(j * u23 - k * u13 + l * u12)
-        out[1, 0, w] = -(e * v23 - g * v03 + h * v02)
-        out[1, 1, w] = a * v23 - c * v03 + d * v02
-        out[1, 2, w] = -(n * u23 - p * u03 + q * u02)
-        out[1, 3, w] = i * u23 - k * u03 + l * u02
-        out[2, 0, w] = e * v13 - f * v03 + h * v01
-        out[2, 1, w] = -(a * v13 - b * v03 + d * v01)
-        out[2, 2, w] = n * u13 - o * u03 + q * u01
-        out[2, 3, w] = -(i * u13 - j * u03 + l * u01)
-        out[3, 0, w] = -(e * v12 - f * v02 + g * v01)
-        out[3, 1, w] = a * v12 - b * v02 + c * v01
-        out[3, 2, w] = -(n * u12 - o * u02 + p * u01)
-        out[3, 3, w] = i * u12 - j * u02 + k * u01
+        out[at, at, w] = f * v23 - g * v13 + h * v12
+        out[at, at + 1, w] = -(b * v23 - c * v13 + d * v12)
+        out[at, at + 2, w] = o * u23 - p * u13 + q * u12
+        out[at, at + 3, w] = -(j * u23 - k * u13 + l * u12)
+        out[at + 1, at, w] = -(e * v23 - g * v03 + h * v02)
+        out[at + 1, at + 1, w] = a * v23 - c * v03 + d * v02
+        out[at + 1, at + 2, w] = -(n * u23 - p * u03 + q * u02)
+        out[at + 1, at + 3, w] = i * u23 - k * u03 + l * u02
+        out[at + 2, at, w] = e * v13 - f * v03 + h * v01
+        out[at + 2, at + 1, w] = -(a * v13 - b * v03 + d * v01)
+        out[at + 2, at + 2, w] = n * u13 - o * u03 + q * u01
+        out[at + 2, at + 3, w] = -(i * u13 - j * u03 + l * u01)
+        out[at + 3, at, w] = -(e * v12 - f * v02 + g * v01)
+        out[at + 3, at + 1, w] = a * v12 - b * v02 + c * v01
+        out[at + 3, at + 2, w] = -(n * u12 - o * u02 + p * u01)
+        out[at + 3, at + 3, w] = i * u12 - j * u02 + k * u01
 
 
 @kernel
-def _closed(m, out, det, moved, min_det, guard):
-    """Closed-form inverses of a tile (n,n,W), n <= 4."""
-    n = m.shape[0]
+def _closed(m, out, at, n, det, moved, min_det, guard):
+    """Closed-form inverses of the diagonal n x n blocks, n <= 4, that start at row and column `at`."""
     if n == 1:
-        _closed1(m, out, det)
+        _closed1(m, out, at, det)
     elif n == 2:
-        _closed2(m, out, det)
+        _closed2(m, out, at, det)
     elif n == 3:
-        _closed3(m, out, det)
+        _closed3(m, out, at, det)
     else:
-        _closed4(m, out, det)
+        _closed4(m, out, at, det)
     _guard_row(det, moved, min_det, guard)
-    for i in range(n):
-        for j in range(n):
+    for i in range(at, at + n):
+        for j in range(at, at + n):
             for w in range(TILE):
                 out[i, j, w] *= det[w]
 
 
 @kernel
-def _add_product(a, b, sign, out):
-    """out += sign * a b for tiles (p,r,W), (r,q,W), (p,q,W)."""
-    for i in range(a.shape[0]):
-        for j in range(b.shape[1]):
-            for k in range(b.shape[0]):
+def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
+    """Add sign * a b to `out`, for blocks that start at the entries given: shape (p,r,q) for p x r times r x q.
+
+    Offsets, not slices: a sliced tile has an unknown stride, and its loops no longer vectorise.
+    """
+    for i in range(shape[0]):
+        for j in range(shape[2]):
+            for k in range(shape[1]):
+                ai, ak, bk, bj = a_at[0] + i, a_at[1] + k, b_at[0] + k, b_at[1] + j
+                oi, oj = out_at[0] + i, out_at[1] + j
                 for w in range(TILE):
-                    out[i, j, w] += sign * a[i, k, w] * b[k, j, w]
+                    out[oi, oj, w] += sign * a[ai, ak, w] * b[bk, bj, w]
 
 
 @kernel
-def _blocks(m, out, det, moved, left, right, min_det, guard):
+def _blocks(m, out, left, right, det, moved, min_det, guard):
     """Block-partitioned inverses of a tile (n,n,W), 4 < n <= 8; left (q,p,W) and right (p,q,W) are scratch."""
-    half = (m.shape[0] + 1) // 2
-    one = m.dtype.type(1)
-    a, b, c, d = m[:half, :half], m[:half, half:], m[half:, :half], m[half:, half:]
-    inverse, upper, lower, corner = out[:half, :half], out[:half, half:], out[half:, :half], out[half:, half:]
-    _closed(a, inverse, det, moved, min_det, guard)
+    p = (m.shape[0] + 1) // 2
+    q = m.shape[0] - p
+    plus, minus = m.dtype.type(1), m.dtype.type(-1)
+    a, b, c, d = (0, 0), (0, p), (p, 0), (p, p)
     left[:] = 0
     right[:] = 0
-    _add_product(c, inverse, one, left)
-    _add_product(inverse, b, one, right)
-    _add_product(left, b, -one, d)  # m is a copy: d becomes the Schur complement
-    _closed(d, corner, det, moved, min_det, guard)
-    upper[:] = 0
-    lower[:] = 0
-    _add_product(right, corner, -one, upper)
-    _add_product(corner, left, -one, lower)
-    _add_product(upper, left, -one, inverse)
+    out[:] = 0
+    _closed(m, out, 0, p, det, moved, min_det, guard)
+    _add_product(m, c, out, a, plus, left, a, (q, p, p))
+    _add_product(out, a, m, b, plus, right, a, (p, p, q))
+    _add_product(left, a, m, b, minus, m, d, (q, p, q))  # m is a copy: its corner becomes the Schur complement
+    _closed(m, out, p, q, det, moved, min_det, guard)
+    _add_product(right, a, out, d, minus, out, b, (p, q, q))
+    _add_product(out, d, left, a, minus, out, c, (q, q, p))
+    _add_product(out, b, left, a, minus, out, a, (p, q, p))
 
 
 @kernel
-def _load(matrices, first, size, tile):
-    """Matrices first..first+size-1 as a tile (n,n,W); the identity behind them."""
+def _load(matrices, first, size, tile, transposed):
+    """Matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
     n = tile.shape[0]
-    for i in range(n):
-        for j in range(n):
-            for w in range(size):
-                tile[i, j, w] = matrices[first + w, i, j]
-            tile[i, j, size:] = 1 if i == j else 0
+    low = np.uintp(first)
+    for i in range(np.uintp(n)):
+        for j in range(np.uintp(n)):
+            if transposed:
+                for w in range(np.uintp(size)):
+                    tile[i, j, w] = matrices[low + w, j, i]
+            else:
+                for w in range(np.uintp(size)):
+                    tile[i, j, w] = matrices[low + w, i, j]
+            if size < TILE:
+                tile[i, j, size:] = 1 if i == j else 0
 
 
 @kernel
 def _store(tile, matrices, first, size):
-    n = tile.shape[0]
-    for w in range(size):
-        for i in range(n):
-            for j in range(n):
-                matrices[first + w, i, j] = tile[i, j, w]
+    low = np.uintp(first)
+    for w in range(np.uintp(size)):
+        for i in range(np.uintp(tile.shape[0])):
+            for j in range(np.uintp(tile.shape[0])):
+                matrices[low + w, i, j] = tile[i, j, w]
 
 
 @kernel
@@ -165,12 +174,12 @@ def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
     acted = np.empty(TILE, np.bool_)
     for low in range(first, last, TILE):
         size = min(TILE, last - low)
-        _load(matrices, low, size, tile)
+        _load(matrices, low, size, tile, False)
         acted[:] = False
         if n <= 4:
-            _closed(tile, out, det, acted, floor, guard)
+            _closed(tile, out, 0, n, det, acted, floor, guard)
         else:
-            _blocks(tile, out, det, acted, left, right, floor, guard)
+            _blocks(tile, out, left, right, det, acted, floor, guard)
         _store(out, inverse, low, size)
         moved[low : low + size] = acted[:size]
 
@@ -179,18 +188,18 @@ def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
 def inverse_gradient_kernel(inverse, grad, out, first, last):
     """out = -X' G X' for rows first..last-1 of X = inverse (R,n,n) and G = grad: the gradient of an exact inverse."""
     n = inverse.shape[1]
-    x = np.empty((n, n, TILE), inverse.dtype)
+    x = np.empty((n, n, TILE), inverse.dtype)  # X'
     g = np.empty_like(x)
     inner = np.empty_like(x)
     outer = np.empty_like(x)
-    one = inverse.dtype.type(1)
+    plus, minus = inverse.dtype.type(1), inverse.dtype.type(-1)
+    origin = (0, 0)
     for low in range(first, last, TILE):
         size = min(TILE, last - low)
-        _load(inverse, low, size, x)
-        _load(grad, low, size, g)
-        transposed = x.transpose(1, 0, 2)
+        _load(inverse, low, size, x, True)
+        _load(grad, low, size, g, False)
         inner[:] = 0
         outer[:] = 0
-        _add_product(g, transposed, one, inner)
-        _add_product(transposed, inner, -one, outer)
+        _add_product(g, origin, x, origin, plus, inner, origin, (n, n, n))
+        _add_product(x, origin, inner, origin, minus, outer, origin, (n, n, n))
         _store(outer, out, low, size)

@@ -177,3 +177,86 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, fi
             filled = _first_hits(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, block, row)
         row[filled:] = row[0] if filled else 0
         count[m] = filled
+
+
+@kernel
+def _box_bounds(box, cx, cy, cz, lower, upper):
+    """Squared distances to the near and the far side of every box; returns the box with the closest far side.
+
+    The near side is never further than a point inside: rounding is monotone, the order of operations the same.
+    """
+    zero = np.float32(0)
+    for b in range(lower.size):
+        gx = max(max(box[0, b] - cx, cx - box[1, b]), zero)
+        gy = max(max(box[2, b] - cy, cy - box[3, b]), zero)
+        gz = max(max(box[4, b] - cz, cz - box[5, b]), zero)
+        lower[b] = gx * gx + gy * gy + gz * gz
+    for b in range(lower.size):
+        fx = max(box[1, b] - cx, cx - box[0, b])
+        fy = max(box[3, b] - cy, cy - box[2, b])
+        fz = max(box[5, b] - cz, cz - box[4, b])
+        upper[b] = fx * fx + fy * fy + fz * fz
+    least = np.float32(np.inf)
+    for b in range(upper.size):
+        least = min(least, upper[b])
+    for b in range(upper.size):
+        if upper[b] == least:
+            return b
+    return 0
+
+
+@kernel
+def _scan_bucket(x, y, z, order, first, size, cx, cy, cz, block, bits, heap, filled):
+    worst = _worst(heap, filled, block, bits)
+    if _measure(x, y, z, first, size, cx, cy, cz, block) > worst:
+        return filled
+    for i in range(size):
+        if block[i] <= worst:
+            key = (np.int64(bits[i]) << 32) | np.int64(order[first + i])
+            if filled < heap.size or key < heap[0]:
+                filled = _keep(heap, filled, key)
+                worst = _worst(heap, filled, block, bits)
+    return filled
+
+
+@kernel
+def _search(x, y, z, order, box, bucket, cx, cy, cz, lower, upper, block, bits, heap):
+    """Keep the nearest of all bucketed points: first some close buckets, then all that may hold a nearer point."""
+    n = order.size
+    start = _box_bounds(box, cx, cy, cz, lower, upper)
+    reach = (heap.size - 1) // (2 * bucket)  # neighbours on the curve, enough for k points, are close in space
+    filled = 0
+    for b in range(max(0, start - reach), min(start + reach + 1, lower.size)):
+        size = min(bucket, n - b * bucket)
+        filled = _scan_bucket(x, y, z, order, b * bucket, size, cx, cy, cz, block, bits, heap, filled)
+        lower[b] = np.inf
+    worst = _worst(heap, filled, block, bits)
+    for b in range(lower.size):
+        if lower[b] <= worst and lower[b] != np.inf:
+            size = min(bucket, n - b * bucket)
+            filled = _scan_bucket(x, y, z, order, b * bucket, size, cx, cy, cz, block, bits, heap, filled)
+            worst = _worst(heap, filled, block, bits)
+    return filled
+
+
+@kernel
+def knn_kernel(order, xyz, box, bucket, queries, first, last, squared, index):
+    """Fill rows first..last-1 of squared (M,k) f32 and index (M,k) i64 for queries (M,3); see `nearest.knn`.
+
+    order, xyz, box: `kernels_fps.bucket_points`, with `bucket` points in each.
+    """
+    x, y, z = xyz[0], xyz[1], xyz[2]
+    block = np.empty(_BLOCK + 1, np.float32)
+    bits = block.view(np.int32)
+    heap = np.empty(index.shape[1], np.int64)
+    lower = np.empty(box.shape[1], np.float32)
+    upper = np.empty(box.shape[1], np.float32)
+    for m in range(first, last):
+        cx, cy, cz = queries[m, 0], queries[m, 1], queries[m, 2]
+        filled = _search(x, y, z, order, box, bucket, cx, cy, cz, lower, upper, block, bits, heap)
+        heap[:filled].sort()
+        for slot in range(heap.size):
+            key = heap[slot if slot < filled else 0]
+            index[m, slot] = key & _INDEX_BITS
+            bits[_BLOCK] = key >> 32
+            squared[m, slot] = block[_BLOCK]

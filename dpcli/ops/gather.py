@@ -1,0 +1,53 @@
+"""Rows of features by index, with a backward that keeps up with the forward."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.ops.backend import chosen_backend, run_in_threads
+
+
+def gather_points(features: Tensor, idx: Tensor) -> Tensor:
+    """features (B,N,C), idx (B,...) i64 in 0..N-1 -> (B,...,C), differentiable in features.
+
+    Backward adds each row's gradient to its source: by a kernel per cloud on CPU (threads never share a cloud, so sums
+    repeat exactly), by index_add_ elsewhere. Raises ValueError on wrong shapes and, on CPU, on indices out of range (on
+    a GPU that look would stall the stream, and an index past a cloud's end reads its neighbour in the batch).
+    """
+    if features.ndim != 3 or idx.ndim < 1 or idx.shape[0] != features.shape[0]:
+        raise ValueError(f"features (B,N,C) and idx (B,...) do not fit: {tuple(features.shape)}, {tuple(idx.shape)}")
+    batch, count, channels = features.shape
+    if idx.device.type == "cpu" and idx.numel() and not (0 <= int(idx.min()) and int(idx.max()) < count):
+        raise ValueError(f"idx must lie in 0..{count - 1}, but spans {int(idx.min())}..{int(idx.max())}")
+    shift = torch.arange(batch, device=idx.device).mul_(count).view(-1, *[1] * (idx.ndim - 1))
+    rows = (idx + shift).view(-1)
+    flat = features.reshape(batch * count, channels)
+    if features.dtype in (torch.float32, torch.float64) and chosen_backend(features.device) == "numba":
+        gathered = _GatherRows.apply(flat, rows, batch)
+    else:
+        gathered = flat.index_select(0, rows)
+    return gathered.view(*idx.shape, channels)
+
+
+class _GatherRows(torch.autograd.Function):
+    """index_select of rows whose indices come cloud after cloud, equally many for each."""
+
+    @staticmethod
+    def forward(ctx, flat: Tensor, rows: Tensor, batch: int) -> Tensor:  # noqa: ANN001
+        ctx.save_for_backward(rows)
+        ctx.sizes = (flat.shape, batch)
+        return flat.index_select(0, rows)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN001
+        from dpcli.ops.kernels_gather import scatter_add_kernel
+
+        (rows,) = ctx.saved_tensors
+        shape, batch = ctx.sizes
+        out = torch.zeros(shape, dtype=grad.dtype)
+        arrays = (grad.contiguous().numpy(), rows.numpy(), out.numpy())
+        step = len(rows) // max(batch, 1)
+        run_in_threads(scatter_add_kernel, [(*arrays, b * step, (b + 1) * step) for b in range(batch)])
+        return out, None, None

@@ -1,0 +1,50 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.store import CloudSequence
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Real data sets beside the project; tests that need them are skipped where they are absent."""
+    path = Path(os.environ.get("DPC_TEST_DATA", ROOT.parent / "shared" / "data"))
+    if not path.is_dir():
+        pytest.skip(f"no real data at {path}; DPC_TEST_DATA names another folder")
+    return path
+
+
+@pytest.fixture(scope="session")
+def dpc() -> Callable[..., subprocess.CompletedProcess]:
+    """Run `dpc` as a process of its own; stdout and stderr come back as bytes."""
+
+    def run(*words: object, stdin: bytes | None = None, cwd: Path | None = None, timeout: float = 300, **env: str):
+        command = [sys.executable, "-m", "dpcli", *map(str, words)]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), **env}
+        given = {"input": stdin} if stdin is not None else {"stdin": subprocess.DEVNULL}
+        return subprocess.run(command, capture_output=True, cwd=cwd, env=environment, timeout=timeout, **given)
+
+    return run
+
+
+@pytest.fixture
+def make_sequence() -> Callable[..., CloudSequence]:
+    """A random sequence; frames have different sizes, so that offsets matter."""
+
+    def make(name: str, seed: int = 0, frames: int = 5, **fields: object) -> CloudSequence:
+        rng = np.random.default_rng(seed)
+        clouds = [rng.normal(size=(20 + seed + 3 * t, 3)).astype(np.float32) for t in range(frames)]
+        return CloudSequence.from_frames(name, clouds, **fields)
+
+    return make

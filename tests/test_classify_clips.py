@@ -1,0 +1,136 @@
+"""Which frames and points a network sees: published clip counts, fairness of the draw, coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.classify.augment import NONE, PEERS, Augmentation
+from dpcli.classify.clips import ClipSource, clip_frames, clip_starts, normalize, sample_points, uniform_frames
+from dpcli.classify.config import KinetConfig
+from dpcli.classify.split import carve_validation, default_rule
+from dpcli.errors import DataError, UsageError
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+
+CONFIG = KinetConfig(num_classes=2, num_frames=4, points_per_frame=16, centroids=(8, 4), neighbors=4, widths=((8, 8), (8, 8), (8, 8)))
+
+
+@pytest.fixture
+def reader(tmp_path) -> CloudsReader:
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a", "b"]) as writer:
+        for i, length in enumerate((2, 4, 7, 10, 9, 8)):
+            # frame t holds the value t in its first coordinate: a clip tells which frames it has
+            frames = [np.full((5 + 7 * t, 3), [t, i, 0], np.float32) for t in range(length)]
+            writer.write(CloudSequence.from_frames(f"v{i}", frames, label=i % 2, split="train" if i < 5 else "test", subject=i))
+    return CloudsReader(tmp_path / "c.h5")
+
+
+def test_every_start_and_spread_clips():
+    assert clip_starts(7, 4, None) == [0, 1, 2, 3] and clip_starts(4, 4, None) == [0] and clip_starts(2, 4, None) == [0]
+    assert clip_starts(24, 4, 3) == [0, 10, 20] and clip_starts(24, 4, 1) == [10] and clip_starts(5, 4, 9) == [0, 1]
+    assert clip_frames(3, 5, 0) == (0, 1, 2, 2, 2)
+    assert uniform_frames(80, 8) == tuple(int(j * 80 / 8) for j in range(8)) and uniform_frames(3, 6) == (0, 0, 1, 1, 2, 2)
+
+
+
+
+def test_published_clip_counts(shared_data):
+    """Facts 4.1 for the videos at hand: every start with stride 1, counted from the real files' lengths."""
+    import re
+
+    from scipy.io import whosmat
+
+    lengths = {}
+    for path in sorted((shared_data / "msraction3d").glob("*.mat")):
+        subject = int(re.search(r"_s(\d+)_", path.name).group(1))
+        lengths[path.name] = (whosmat(path)[0][1][2], subject <= 5)
+    missing = 270 - sum(train for _, train in lengths.values())
+    for frames, clips, dropped in ((4, 9825, 0), (8, 8745, 0), (12, 7665, 0), (16, 6587, 2), (24, 4478, 13)):
+        ours = sum(n - frames + 1 for n, train in lengths.values() if train and n >= frames)
+        short = sum(train and n < frames for n, train in lengths.values())
+        assert short <= dropped <= short + missing
+        assert 0 <= clips - ours <= missing * 60  # the four absent videos: at most 60 frames each
+
+
+def test_short_videos_are_padded_or_dropped_and_named(reader):
+    padded = ClipSource(reader, [0, 1, 2], CONFIG)
+    assert padded.padded == ["v0"] and padded.dropped == [] and len(padded.clips(None)) == 1 + 1 + 4
+    dropped = ClipSource(reader, [0, 1, 2], CONFIG, drop_short=True)
+    assert dropped.dropped == ["v0"] and dropped.sequences == [1, 2]
+    with pytest.raises(DataError, match="no video has 4 frames"):
+        ClipSource(reader, [0], CONFIG, drop_short=True)
+
+
+def test_a_clip_holds_its_frames_in_order(reader):
+    source = ClipSource(reader, [2], CONFIG)
+    points = source.load(source.clips(None)[2], 0)
+    assert points.shape == (4, 16, 3) and points[..., 0].tolist() == [[t] * 16 for t in (2, 3, 4, 5)]
+
+
+def test_the_draw_depends_on_the_key_alone(reader):
+    source = ClipSource(reader, [2, 3], CONFIG, augmentation=Augmentation(), seed=5)
+    clip = source.epoch(3, 1)[0]
+    assert source.epoch(3, 1) == ClipSource(reader, [2, 3], CONFIG, seed=5).epoch(3, 1)
+    assert np.array_equal(source.load(clip, 3, 0), source.load(clip, 3, 0))
+    assert not np.array_equal(source.load(clip, 3, 0), source.load(clip, 3, 1))
+    assert len({tuple(c.frames) for n in range(60) for c in source.epoch(n, 1) if c.sequence == 3}) == 7  # every start occurs
+
+
+def test_points_are_drawn_without_replacement_or_in_whole_copies():
+    rng = np.random.default_rng(0)
+    frame = np.arange(30, dtype=np.float32).reshape(10, 3)
+    few = sample_points(frame, 6, rng)
+    assert len(np.unique(few, axis=0)) == 6
+    many = sample_points(frame, 25, rng)
+    counts = np.unique(many[:, 0], return_counts=True)[1]
+    assert len(counts) == 10 and sorted(set(counts)) == [2, 3]
+    assert sample_points(frame[:0], 4, rng).tolist() == [[0, 0, 0]] * 4
+
+
+def test_normalisations():
+    points = np.random.default_rng(0).normal(3, 2, (4, 50, 3)).astype(np.float32)
+    assert np.allclose(normalize(points, "center").mean((0, 1)), 0, atol=1e-5)
+    unit = normalize(points, "unit")
+    assert np.isclose(np.linalg.norm(unit, axis=-1).max(), 1)
+    image = normalize(points, "image")
+    assert np.allclose(image[..., 0], (points[..., 0] - points[..., 0].mean()) / 120, atol=1e-5)
+    assert np.isclose(image[..., 2].std(), 1, atol=1e-4) and normalize(points, "none") is points
+    flat = points.copy()
+    flat[..., 2] = 5
+    assert np.isfinite(normalize(flat, "image")).all()
+
+
+def test_augmentation_is_one_rigid_draw_a_clip():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3, 40, 3)).astype(np.float32)
+    turned = Augmentation(0, False, 0.5, 0.1, 0, 0, 0)(points, rng)
+    before, after = (np.linalg.norm(p.reshape(-1, 3)[:, None] - p.reshape(-1, 3)[None], axis=-1) for p in (points, turned))
+    assert np.allclose(before, after, atol=1e-4) and not np.allclose(points, turned, atol=1e-2)
+    scaled = PEERS(points, rng)
+    ratio = (scaled - scaled.mean((0, 1))) / (points - points.mean((0, 1)))
+    assert np.allclose(ratio, ratio[0, 0], rtol=1e-2) and len(np.unique(ratio[0, 0].round(4))) == 3
+    assert np.all((ratio[0, 0] > 0.89) & (ratio[0, 0] < 1.11))
+    thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9)(points, np.random.default_rng(3))
+    assert len(np.unique(thinned[0], axis=0)) < 40 and np.isin(thinned[..., 0].round(4), points[..., 0].round(4)).all()
+    assert NONE == Augmentation(0, False, 0, 0, 0, 0, 0)
+
+
+def test_validation_comes_from_training_subjects_only(reader):
+    assert default_rule(reader) == "subject"
+    train, held = carve_validation(reader, "subject", 0)
+    assert held == [4] and train == [0, 1, 2, 3]
+    train, held = carve_validation(reader, "subjects:1,2", 0)
+    assert held == [1, 2]
+    train, held = carve_validation(reader, "0.4", 0)
+    assert sorted(train + held) == [0, 1, 2, 3, 4] and 5 not in train + held and len(held) == 2
+    assert carve_validation(reader, "none", 0) == ([0, 1, 2, 3, 4], [])
+    for bad in ("subjects:9", "subjects:0,1,2,3,4", "1.5", "some", "subjects:x"):
+        with pytest.raises(UsageError):
+            carve_validation(reader, bad, 0)
+
+
+def test_without_a_training_split_the_splits_are_named(tmp_path, make_sequence):
+    with CloudsWriter(tmp_path / "x.h5") as writer:
+        writer.write(make_sequence("a", split="valid", label=0))
+    with pytest.raises(DataError, match="'valid'"):
+        carve_validation(CloudsReader(tmp_path / "x.h5"), "none", 0)

@@ -1,0 +1,140 @@
+"""Kinet's shape: published counts, symmetries, the frozen static stream, the switches."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dpcli.classify.config import KinetConfig
+from dpcli.classify.kinet import Kinet, fuse
+from dpcli.classify.profile import body_like_clip, count_parameters, macs, paper_parameters
+from dpcli.errors import DataError, UsageError
+
+TINY = {"num_classes": 5, "num_frames": 4, "points_per_frame": 64, "centroids": (32, 16), "neighbors": 8,
+        "widths": ((16, 16), (16, 32), (32, 64))}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("classes", "static", "total"), [(20, 741_652, 1_586_906), (25, 746_777, 1_597_156), (28, 749_852, 1_603_306), (60, 782_652, 1_668_906)]
+)
+def test_release_parameter_counts_are_exact(classes, static, total):
+    model = Kinet(KinetConfig.release(num_classes=classes))
+    assert (count_parameters(model.static), count_parameters(model)) == (static, total)
+
+
+def test_release_parts_and_the_paper_s_way_of_counting():
+    model = Kinet(KinetConfig.release(num_classes=28))
+    assert [count_parameters(getattr(model.static, part)) for part in ("stage1", "stage2")] == [8_960, 50_688]
+    assert count_parameters(model.dynamic.merge) == 153_520
+    assert [unit.groups for unit in model.dynamic.units] == [11, 22, 22, 43]
+    assert [unit.channels for unit in model.dynamic.units] == [44, 88, 88, 172]
+    assert [count_parameters(u.reduce) for u in model.dynamic.units] == [1_980, 8_190, 8_190, 32_508]
+    assert [count_parameters(u.weigh) for u in list(model.dynamic.units)[1:]] == [301, 543, 1_026]
+    assert round(paper_parameters(Kinet(KinetConfig.release(num_classes=20)).static), 3) == 2.126  # table A.1: 2.13
+
+
+def test_macs_of_the_static_stream_as_written():
+    """5.018e9 operations of facts section 2: 2 x multiply-adds, counted layer by layer by hand."""
+    model = Kinet(KinetConfig.release(num_classes=28, num_frames=16, points_per_frame=256)).eval()
+    counts = macs(model, body_like_clip(16, 256))
+    by_hand = 1024 * 64 * (3 * 64 + 64 * 128) + 512 * 64 * (131 * 128 + 128 * 256) + 512 * (259 * 512 + 512 * 1024) + 1024 * 28
+    assert counts["static_as_written"] == by_hand and round(2 * by_hand / 1e9, 3) == 5.018
+    assert counts["static"] < by_hand  # gathering after the first layer saves the difference
+    assert 5.3e9 < 2 * counts["dynamic"] < 6.1e9  # facts: 5.73e9
+
+
+CONFIGS = [
+    KinetConfig(**TINY),
+    KinetConfig.release(**TINY),
+    KinetConfig(**TINY, solver="ridge", grouping="nearest"),
+    KinetConfig(**TINY, normals=False, weighting="none"),
+    KinetConfig(**TINY, weighting="none"),
+    KinetConfig(**TINY, temporal_radius=0, grouping="balanced"),
+    KinetConfig(**TINY, group_size=8, temporal_radius=2),
+]
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}")
+def test_every_switch_trains_the_dynamic_branch_alone(config):
+    torch.manual_seed(0)
+    model = Kinet(config)
+    model.freeze_static()
+    model.dynamic.train()
+    before = {key: value.clone() for key, value in model.static.state_dict().items()}
+    loss = torch.nn.functional.cross_entropy(model.dynamic_logits(body_like_clip(4, 64, 3)), torch.arange(3))
+    loss.backward()
+    for name, parameter in model.dynamic.named_parameters():
+        if name.startswith("merge.cross.1.0"):
+            continue  # dead in the release, too: only stage 2's last output is used
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
+    assert all(p.grad is None for p in model.static.parameters())
+    assert all(torch.equal(before[key], value) for key, value in model.static.state_dict().items())
+
+
+@pytest.mark.parametrize("config", CONFIGS[:2], ids=["thesis", "release"])
+def test_a_shift_of_the_body_only_reaches_the_absolute_inputs(config):
+    """Groups, normals and weights are relative: with the heads' absolute xyz taken out, nothing may change."""
+    torch.manual_seed(0)
+    model = Kinet(config).eval()
+    clip = body_like_clip(4, 64)
+    shift = torch.tensor([0.25, -0.5, 1.0])  # exact in float32 sums of this size
+    features = []
+    for points in (clip, clip + shift):
+        groups = model.group(points)
+        taps, _ = model.static.taps(groups)
+        features.append((taps[1][1], model.dynamic.features(groups, taps)))
+    assert torch.allclose(features[0][0], features[1][0], atol=1e-4)
+
+
+def test_order_of_points_within_a_frame_doesn_t_matter_with_nearest_neighbours():
+    """FPS starts at point 0, so that one stays first; all others may be shuffled."""
+    torch.manual_seed(0)
+    model = Kinet(KinetConfig(**TINY, grouping="nearest", solver="ridge")).eval()
+    clip = body_like_clip(4, 64)
+    order = torch.cat([torch.zeros(1, dtype=torch.long), torch.randperm(63) + 1])
+    with torch.no_grad():
+        static, dynamic = model(clip)
+        static2, dynamic2 = model(clip[:, :, order])
+    torch.testing.assert_close(static, static2, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(dynamic, dynamic2, atol=1e-3, rtol=1e-3)
+
+
+def test_reversed_time_is_another_input_to_the_dynamic_stream_only_in_its_normals():
+    """The static stream is blind to the direction of time up to its choice of centroids; the dynamic one must not be."""
+    torch.manual_seed(0)
+    config = KinetConfig(**TINY, solver="ridge", grouping="nearest")
+    model = Kinet(config).eval()
+    clip = body_like_clip(4, 64)
+    with torch.no_grad():
+        _, forward = model(clip)
+        _, backward = model(clip.flip(1))
+    assert (forward - backward).abs().max() > 1e-3
+
+
+def test_balanced_grouping_shares_the_slots_between_frames():
+    config = KinetConfig(**{**TINY, "points_per_frame": 256, "neighbors": 9}, grouping="balanced")
+    group = Kinet(config).group(body_like_clip(4, 256))[0]
+    offsets = group.neighbor_times() - group.center_times[..., None]
+    inner = (group.center_times > 0) & (group.center_times < 3)
+    counts = torch.stack([(offsets[inner] == d).sum(-1) for d in (-1, 0, 1)], -1)
+    assert (counts == 3).all() and (offsets.abs() <= 1).all()
+    assert (group.relative().norm(dim=-1) < config.radius_table(0)[1]).all()
+    first = Kinet(config.changed(grouping="first")).group(body_like_clip(4, 256))[0]
+    early = (first.neighbor_times() - first.center_times[..., None])[first.center_times > 0]
+    assert (early == -1).float().mean() > 0.9  # why the release's rule can't fit a surface in time on dense frames
+
+
+def test_fusion_rules():
+    static, dynamic = torch.tensor([[2.0, 0.0]]), torch.tensor([[0.0, 4.0]])
+    torch.testing.assert_close(fuse(static, dynamic, "softmax"), (static.softmax(-1) + dynamic.softmax(-1)) / 2)
+    torch.testing.assert_close(fuse(static, dynamic, "logits"), torch.tensor([[1.0, 2.0]]).softmax(-1))
+
+
+def test_config_survives_json_and_refuses_nonsense():
+    config = KinetConfig.release(num_classes=7, radii=(0.2, 0.4))
+    assert KinetConfig.from_json(config.to_json()) == config
+    with pytest.raises(DataError, match="unknown keys"):
+        KinetConfig.from_json('{"nonsense": 1}')
+    for bad in ({"grouping": "random"}, {"reduction": 0.0}, {"num_frames": 1, "points_per_frame": 10}):
+        with pytest.raises(UsageError):
+            KinetConfig(**bad)

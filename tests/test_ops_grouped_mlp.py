@@ -1,0 +1,117 @@
+"""The fused set-abstraction layer and plane fit give the reference's values and gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dpcli.ops import grouped_mlp as module
+from dpcli.ops.grouped_mlp import Norm, grouped_activations, grouped_mlp
+from dpcli.ops.plane_fit import (
+    normal_equations,
+    normal_equations_reference,
+    plane_deviations,
+    plane_deviations_reference,
+)
+
+
+def layer(features: int, dtype=torch.float32, seed: int = 0, repeat: bool = False):
+    """Inputs and weights of a layer with 8 and 12 channels; norms with scales of both signs."""
+    g = torch.Generator().manual_seed(seed)
+    rand = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)  # noqa: E731
+    points, idx = rand(2, 50, 3), torch.randint(0, 50, (2, 20, 9), generator=g)
+    if repeat:
+        idx[:] = idx[..., :1]  # a centroid with one neighbour, nine times: every maximum is a tie
+    inputs = {"features": rand(2, 50, features) if features else None, "w1": rand(8, 3 + features) * 0.3, "b1": rand(8),
+              "g1": rand(8), "s1": rand(8), "w2": rand(12, 8) * 0.3, "b2": rand(12), "g2": rand(12), "s2": rand(12)}  # fmt: skip
+    learned = {key: value.requires_grad_() for key, value in inputs.items() if value is not None}
+    return points, points[:, :20].clone(), idx, inputs, learned
+
+
+def run(case, fast: bool, grad):
+    points, centers, idx, v, learned = case
+    arguments = (points, centers, idx, v["features"], (v["w1"], v["b1"]), Norm(v["g1"], v["s1"], None, None),
+                 (v["w2"], v["b2"]), Norm(v["g2"], v["s2"], None, None))  # fmt: skip
+    if fast:
+        pooled, statistics = grouped_mlp(*arguments)
+    else:
+        taps, statistics = grouped_activations(*arguments)
+        pooled = taps[1].amax(2)
+    return pooled, statistics, dict(zip(learned, torch.autograd.grad(pooled, list(learned.values()), grad)))
+
+
+def compare(features: int, repeat: bool = False) -> None:
+    grad = torch.randn(2, 20, 12, generator=torch.Generator().manual_seed(1))
+    pooled, statistics, grads = run(layer(features, repeat=repeat), True, grad)
+    expected, expected_statistics, expected_grads = run(layer(features, torch.float64, repeat=repeat), False, grad.double())
+    torch.testing.assert_close(pooled.double(), expected, rtol=0, atol=2e-5)  # measured 3e-6
+    for ours, theirs in zip(statistics, expected_statistics):
+        torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-6)
+    for key, value in expected_grads.items():
+        if key in ("b1", "b2"):  # a bias before batch norm has no effect: float64 leaves 1e-13 here
+            assert value.abs().max() < 1e-10 and grads[key].abs().max() < 1e-3
+            continue
+        assert value.abs().max() > 1e-3, f"{key}: a zero gradient would pass any tolerance"
+        error = (grads[key].double() - value).abs().max() / value.abs().max()
+        assert error < 5e-5, f"{key}: {error}"  # measured 6e-6
+
+
+@pytest.mark.parametrize("features", [0, 7])
+def test_values_statistics_and_gradients_match_float64_autograd(features):
+    compare(features)
+
+
+def test_checker_rejects_a_kernel_that_drops_the_batch_statistics(monkeypatch):
+    """The affine part of the batch-norm gradient is easy to forget; the comparison must notice."""
+    original = module._GroupedMLP.backward
+
+    def broken(ctx, grad, *rest):
+        out = list(original(ctx, grad, *rest))
+        out[9] = out[9] + 0.01 * out[9].abs().max()
+        return tuple(out)
+
+    monkeypatch.setattr(module._GroupedMLP, "backward", staticmethod(broken))
+    with pytest.raises(AssertionError, match="w2"):
+        compare(0)
+
+
+def test_given_statistics_are_folded_exactly():
+    points, centers, idx, v, _ = layer(7, torch.float64)
+    norms = [Norm(v[g], v[s], torch.rand(len(v[g])).double(), torch.rand(len(v[g])).double() + 0.5) for g, s in (("g1", "s1"), ("g2", "s2"))]
+    taps, _ = grouped_activations(points, centers, idx, v["features"], (v["w1"], v["b1"]), norms[0], (v["w2"], v["b2"]), norms[1])
+    x = torch.stack([torch.cat([points[b][idx[b]] - centers[b][:, None], v["features"][b][idx[b]]], -1) for b in range(2)])
+    for (w, bias), norm, tap in zip(((v["w1"], v["b1"]), (v["w2"], v["b2"])), norms, taps):
+        y = x @ w.T + bias
+        x = torch.relu((y - norm.mean) / (norm.var + norm.eps).sqrt() * norm.weight + norm.bias)
+        torch.testing.assert_close(tap, x)
+
+
+def test_torch_backend_is_used_when_asked_for(monkeypatch):
+    monkeypatch.setenv("DPC_BACKEND", "torch")
+    monkeypatch.setattr(module, "_fast", lambda *a: pytest.fail("the numba path ran"))
+    run(layer(0), True, torch.ones(2, 20, 12))
+
+
+@pytest.mark.parametrize("size", [2, 3, 4])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_plane_fit_kernels_match_float64(size, weighted):
+    g = torch.Generator().manual_seed(0)
+    features, times = torch.randn(3, 5, 9, 6, size, generator=g), torch.randn(3, 5, 9, generator=g)
+    weights = torch.rand(3, 5, 9, 6, generator=g) if weighted else None
+    planes = torch.randn(3, 5, 6, size + 1, generator=g)
+
+    def outputs(dtype, equations, deviations):
+        f, p = features.to(dtype).requires_grad_(), planes.to(dtype).requires_grad_()
+        w = None if weights is None else weights.to(dtype).requires_grad_()
+        matrix, right = equations(f, times.to(dtype), w)
+        out = (matrix * torch.arange(matrix.numel()).view_as(matrix).cos()).sum() + (right * right).sum()
+        out = out + deviations(f, times.to(dtype), p).square().sum()
+        return matrix, right, *torch.autograd.grad(out, [value for value in (f, w, p) if value is not None])
+
+    ours = outputs(torch.float32, normal_equations, plane_deviations)
+    exact = outputs(torch.float64, normal_equations_reference, plane_deviations_reference)
+    for a, b in zip(ours, exact):
+        torch.testing.assert_close(a.double(), b, rtol=2e-5, atol=2e-4)
+    design = torch.cat([features, torch.ones_like(features[..., :1])], -1)[1, 2, :, 3].double()
+    diagonal = torch.ones(9).double() if weights is None else weights[1, 2, :, 3].double()
+    torch.testing.assert_close(exact[0][1, 2, 3], design.T @ diagonal.diag() @ design)
