@@ -46,7 +46,7 @@ demo: $(READY)
 	$(DPC) prepare $(DEMO_INPUT) -o $(DEMO)/clouds.h5
 	$(DPC) info $(DEMO)/clouds.h5 --picture $(DEMO)/clouds.png
 	$(DPC) classify train $(DEMO)/clouds.h5 -o $(DEMO)/model $(DEMO_TRAIN)
-	$(DPC) classify predict $(DEMO)/clouds.h5 --model $(DEMO)/model -o $(DEMO)/scores.h5
+	$(DPC) classify predict $(DEMO)/clouds.h5 --model $(DEMO)/model -o $(DEMO)/scores.h5 --force
 	$(DPC) evaluate classification $(DEMO)/scores.h5 --split test --picture $(DEMO)/confusion.png
 	@echo "The pictures are $(DEMO)/clouds.png and $(DEMO)/confusion.png."
 

@@ -55,6 +55,7 @@ def assert_agrees_with_sklearn(metrics: ClassificationMetrics, scores: np.ndarra
         assert metrics.top_accuracy == pytest.approx(top, abs=1e-12)
 
 
+@pytest.mark.filterwarnings("ignore:A single label")  # scikit-learn of the smallest case
 @pytest.mark.parametrize(("samples", "classes"), [(1, 2), (7, 3), (40, 6), (227, 20), (500, 60), (12, 40)])
 def test_metrics_equal_sklearn(samples: int, classes: int) -> None:
     scores, labels = random_case(samples, samples, classes)

@@ -103,7 +103,7 @@ class Trainer:
         if self.optimizer is None:
             self.optimizer = self._new_optimizer(branch)
         epochs = self.schedule.epochs[self.stage]
-        clips = len(self.training.epoch(0, self.schedule.clips_per_video))
+        clips = self._per_epoch(self.training.epoch(0, self.schedule.clips_per_video)) * self.schedule.batch
         name = f"train {STREAMS[self.stage]}"
         with Progress(name, epochs * clips, "clip") as bar:
             bar.skip(self.epoch * clips + self.step * self.schedule.batch)
@@ -123,7 +123,8 @@ class Trainer:
         branch.train()
         started = time.monotonic()
         clips = self.training.epoch(self.stage * 100_000 + self.epoch, self.schedule.clips_per_video)
-        per_epoch = max(len(clips) // self.schedule.batch, 1)
+        per_epoch = self._per_epoch(clips)
+        rate = 0.0  # a run stopped after an epoch's last step has none left to do
         for points, labels in self._batches(clips[: per_epoch * self.schedule.batch]):
             rate = self.schedule.rate(self.epoch * per_epoch + self.step, epochs * per_epoch)
             self._optimise(points.to(self.device), labels.to(self.device), rate)
@@ -134,8 +135,11 @@ class Trainer:
                 self.spent += time.monotonic() - started
                 self._save()
                 self.stop.check(f"{STREAMS[self.stage]} stage saved at epoch {self.epoch + 1}, step {self.step}")
-        bar.skip(len(clips) - per_epoch * self.schedule.batch)
         self._end_epoch(rate, started)
+
+    def _per_epoch(self, clips: list[Clip]) -> int:
+        """Whole batches in an epoch; the few clips left over come in another epoch's order."""
+        return max(len(clips) // self.schedule.batch, 1)
 
     def _batches(self, clips: list[Clip]) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         """The epoch's batches from `self.step` on; each clip's position in the epoch, not the process, seeds it."""

@@ -34,14 +34,14 @@ class _GatherRows(torch.autograd.Function):
     """index_select of rows whose indices come cloud after cloud, equally many for each."""
 
     @staticmethod
-    def forward(ctx, flat: Tensor, rows: Tensor, batch: int) -> Tensor:  # noqa: ANN001
+    def forward(ctx, flat: Tensor, rows: Tensor, batch: int) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.sizes = (flat.shape, batch)
         return flat.index_select(0, rows)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN001
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
         from dpcli.ops.kernels_gather import scatter_add_kernel
 
         (rows,) = ctx.saved_tensors

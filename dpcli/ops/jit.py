@@ -22,3 +22,15 @@ def kernel(function: Callable) -> Callable:
         return numba.njit(nogil=True, fastmath=_FLAGS, cache=True)(function)
     except RuntimeError:
         return numba.njit(nogil=True, fastmath=_FLAGS)(function)
+
+
+def parallel_kernel(function: Callable) -> Callable:
+    """For floating-point work on numba's own threads: contraction and reordering allowed, results to rounding only.
+
+    Must not run in a process that forks afterwards; `parallel.parallel_kernels` loads modules that use it.
+    """
+    options = {"parallel": True, "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "error_model": "numpy"}
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:
+        return numba.njit(**options)(function)

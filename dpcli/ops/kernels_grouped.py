@@ -7,12 +7,11 @@ into accumulators of its own; sums are float64. All arrays are C-contiguous floa
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-_OPTIONS = {"cache": True, "parallel": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
+from dpcli.ops.jit import parallel_kernel
 
-
-@njit(**_OPTIONS)
+@parallel_kernel
 def project_xyz(points, centers, idx, weight, bias, out, sums):
     """out[r] = weight @ (points[idx[r]] - centers[i]) + bias; sums (blocks,2,C) f64 collect sum and sum of squares.
 
@@ -39,7 +38,7 @@ def project_xyz(points, centers, idx, weight, bias, out, sums):
                 sums[block, 1, c] += squares[c]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def gather_difference(table, offset, idx, out, sums):
     """out[r] = table[idx[r]] - offset[i], with sums as in `project_xyz`. table (B,N,C), offset (B,M,C), idx (B,M,K)."""
     batch, count, neighbors = idx.shape
@@ -60,7 +59,7 @@ def gather_difference(table, offset, idx, out, sums):
                 sums[block, 1, c] += squares[c]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def affine_relu(rows, scale, shift):
     """rows = max(rows * scale + shift, 0), in place. rows (R,C)."""
     for r in prange(rows.shape[0]):
@@ -68,7 +67,7 @@ def affine_relu(rows, scale, shift):
             rows[r, c] = max(rows[r, c] * scale[c] + shift[c], np.float32(0))
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def extreme(rows, sign, best, where, sums):
     """Per centroid and channel the largest (sign > 0) or smallest value over its K rows, which row, and sums as above.
 
@@ -102,7 +101,7 @@ def extreme(rows, sign, best, where, sums):
                 sums[block, 1, c] += squares[c]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def scatter_pooled(grad, where, weight, hidden, dense, grad_weight):
     """Add the gradient that came through the pooling: it reaches one row per centroid and channel.
 
@@ -122,7 +121,7 @@ def scatter_pooled(grad, where, weight, hidden, dense, grad_weight):
                         grad_weight[block, o, c] += g * hidden[i, k, c]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def relu_norm_sums(grad, hidden, scale, shift, sums):
     """Zero `grad` where hidden is 0 (ReLU) and collect, per channel, sum(grad) and sum(grad * normalised).
 
@@ -146,7 +145,7 @@ def relu_norm_sums(grad, hidden, scale, shift, sums):
                 sums[block, 1, c] += products[c]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def back_xyz(grad, points, centers, idx, weight, bias, mean, inverse, scale, t0, t1, grad_weight):
     """Through batch norm and the first linear layer of `project_xyz`, straight into its weight: (blocks,3,C) f64."""
     batch, count, neighbors = idx.shape
@@ -171,7 +170,7 @@ def back_xyz(grad, points, centers, idx, weight, bias, mean, inverse, scale, t0,
                     grad_weight[block, a, c] += sums[a, c]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def back_gather(grad, table, offset, idx, mean, inverse, scale, t0, t1, grad_table, grad_offset):
     """Through batch norm and `gather_difference`; one thread per clip, since clips don't share points."""
     batch, count, neighbors = idx.shape

@@ -229,10 +229,10 @@ def _search(x, y, z, order, box, bucket, cx, cy, cz, lower, upper, block, bits, 
     for b in range(max(0, start - reach), min(start + reach + 1, lower.size)):
         size = min(bucket, n - b * bucket)
         filled = _scan_bucket(x, y, z, order, b * bucket, size, cx, cy, cz, block, bits, heap, filled)
-        lower[b] = np.inf
+        lower[b] = -1  # done
     worst = _worst(heap, filled, block, bits)
     for b in range(lower.size):
-        if lower[b] <= worst and lower[b] != np.inf:
+        if 0 <= lower[b] <= worst:
             size = min(bucket, n - b * bucket)
             filled = _scan_bucket(x, y, z, order, b * bucket, size, cx, cy, cz, block, bits, heap, filled)
             worst = _worst(heap, filled, block, bits)

@@ -7,12 +7,11 @@ C-contiguous float32. One pass over the features each; a thread owns whole centr
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-_OPTIONS = {"cache": True, "parallel": True, "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "error_model": "numpy"}
+from dpcli.ops.jit import parallel_kernel
 
-
-@njit(**_OPTIONS)
+@parallel_kernel
 def normal_forward(features, times, weights, matrix, right):
     """matrix (M,K,d+1,d+1) = sum_n w x x', right (M,K,d+1) = sum_n w x t, x = [f, 1]; weights of size 0 mean 1."""
     count, neighbors, groups, size = features.shape
@@ -40,7 +39,7 @@ def normal_forward(features, times, weights, matrix, right):
                     matrix[m, k, b, a] = total[k, a, b]
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def normal_backward(features, times, weights, grad_matrix, grad_right, grad_features, grad_weights):
     """Gradients from those of matrix (made symmetric by the caller: G + G') and right. grad_features is added to."""
     count, neighbors, groups, size = features.shape
@@ -64,7 +63,7 @@ def normal_backward(features, times, weights, grad_matrix, grad_right, grad_feat
                     grad_weights[m, j, k] = np.float32(0.5) * last + linear
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def deviation_forward(features, times, coefficients, out):
     """out (M,n,K) = A f + b - t for coefficients (M,K,d+1) = [A, b]."""
     count, neighbors, groups, size = features.shape
@@ -77,7 +76,7 @@ def deviation_forward(features, times, coefficients, out):
                 out[m, j, k] = value
 
 
-@njit(**_OPTIONS)
+@parallel_kernel
 def deviation_backward(features, coefficients, grad, grad_features, grad_coefficients):
     """Gradients of `deviation_forward`; grad_coefficients must start at zero."""
     count, neighbors, groups, size = features.shape

@@ -89,7 +89,7 @@ def _adjugate2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[list[Tensor]
     return [d, -b, -c, a], a * d - b * c
 
 
-def _adjugate3(a, b, c, d, e, f, g, h, i) -> tuple[list[Tensor], Tensor]:  # noqa: ANN001 - nine tensors, row by row
+def _adjugate3(a, b, c, d, e, f, g, h, i) -> tuple[list[Tensor], Tensor]:  # nine tensors, row by row
     first = [e * i - f * h, c * h - b * i, b * f - c * e]
     second = [f * g - d * i, a * i - c * g, c * d - a * f]
     third = [d * h - e * g, b * g - a * h, a * e - b * d]
@@ -116,7 +116,7 @@ class _KernelInverse(torch.autograd.Function):
     """Forward and the gradient -X' G X' by the CPU kernel; where the guard moved a determinant, autograd's own gradient."""
 
     @staticmethod
-    def forward(ctx, matrices: Tensor, min_det: float, guard: str) -> Tensor:  # noqa: ANN001
+    def forward(ctx, matrices: Tensor, min_det: float, guard: str) -> Tensor:
         from dpcli.ops.kernels_linalg import inverse_kernel
 
         flat = matrices.detach().reshape(-1, *matrices.shape[-2:]).contiguous()
@@ -129,7 +129,7 @@ class _KernelInverse(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:  # noqa: ANN001
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
         from dpcli.ops.kernels_linalg import inverse_gradient_kernel
 
         flat, inverse, moved = ctx.saved_tensors

@@ -31,7 +31,7 @@ def fps_numpy(points: np.ndarray, num_samples: int, *, start: int = 0) -> np.nda
 
 
 @functools.cache
-def _kernel():  # noqa: ANN202 - a numba dispatcher or None
+def _kernel():  # a numba dispatcher or None
     try:
         from dpcli.ops.kernels_fps import fps_kernel
     except Exception:  # a broken llvmlite raises more than ImportError

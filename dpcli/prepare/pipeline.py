@@ -25,7 +25,7 @@ from dpcli.runtime.seed import generator
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
 
-_LISTED = 20  # skipped samples and notes named one by one on the terminal; the file's record has all
+_LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Report:
             lines.append(f"{len(self.skipped)} skipped:")
             lines += [f"  {name}: {reason}" for name, reason in self.skipped[:_LISTED]]
             if len(self.skipped) > _LISTED:
-                lines.append(f"  ... and {len(self.skipped) - _LISTED} more; dpc info --json names all")
+                lines.append(f"  ... and {len(self.skipped) - _LISTED} more; -v names every one")
         return lines
 
 
@@ -142,6 +142,9 @@ def _stream(
                 else:
                     _skip(item, result, report, bar, on_error)
                 stop.check(f"{len(writer)} of {len(items)} samples are kept")
+        except KeyboardInterrupt:
+            log.warn(f"interrupted; {len(writer)} of {len(items)} samples are kept; run again to continue")
+            raise
         except DpcError:
             # a signal to the whole process group takes the workers down as well: that is a stop, not a failure
             stop.check(f"{len(writer)} of {len(items)} samples are kept")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import forkserver
 from typing import Any
 
 from dpcli.errors import DpcError
@@ -17,11 +19,27 @@ from dpcli.errors import DpcError
 _SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
+_STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]
+
+
 def _start_worker() -> None:
-    """The parent decides when to stop: Ctrl-C and SIGTERM reach the whole process group, workers ignore them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    """The parent decides when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
+    for number in (signal.SIGINT, *_STOPPING):
+        signal.signal(number, signal.SIG_IGN)
     os.environ.update({name: "1" for name in _SINGLE_THREAD})
+
+
+def _new_pool(jobs: int) -> ProcessPoolExecutor:
+    """Processes from a forkserver that ignores stop signals: if one killed it, its workers would be left behind for ever."""
+    context = multiprocessing.get_context("forkserver")
+    if threading.current_thread() is threading.main_thread():
+        previous = [signal.signal(number, signal.SIG_IGN) for number in _STOPPING]  # inherited by the server it starts
+        try:
+            forkserver.ensure_running()
+        finally:
+            for number, handler in zip(_STOPPING, previous):
+                signal.signal(number, handler)
+    return ProcessPoolExecutor(jobs, context, initializer=_start_worker)
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
@@ -45,7 +63,7 @@ def ordered_map(
             yield item, _guarded(function, item)
         return
     own = executor is None
-    pool = executor or ProcessPoolExecutor(jobs, multiprocessing.get_context("forkserver"), initializer=_start_worker)
+    pool = executor or _new_pool(jobs)
     waiting: deque = deque()
     try:
         for item in items:

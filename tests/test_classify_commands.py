@@ -1,0 +1,175 @@
+"""`dpc classify` as people use it: real processes, pipes, signals, kills, wrong input."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
+
+ROOT = Path(__file__).resolve().parents[1]
+TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "0.34")
+
+
+def gestures(path: Path, videos: int = 12, frames: int = 6) -> Path:
+    """Two classes that differ only in the direction of a blob's motion, two splits."""
+    rng = np.random.default_rng(0)
+    with CloudsWriter(path, class_names=["left", "right"]) as writer:
+        for i in range(videos):
+            sign = 1 if i % 2 else -1
+            body = rng.normal(size=(frames, 90, 3)) * [0.2, 0.5, 0.1]
+            body[:, :45, 0] += sign * np.linspace(-0.5, 0.5, frames)[:, None]
+            writer.write(CloudSequence.from_frames(f"v{i}", list(body.astype(np.float32)), label=i % 2, split="test" if i % 3 == 2 else "train"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return gestures(tmp_path_factory.mktemp("data") / "clouds.h5")
+
+
+@pytest.fixture(scope="module")
+def run_folder(data, dpc) -> Path:
+    folder = data.parent / "run"
+    done = dpc("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2)
+    assert done.returncode == 0, done.stderr.decode()
+    return folder
+
+
+def test_training_leaves_weights_logs_and_a_picture(run_folder):
+    log = json.loads((run_folder / "log.json").read_text())
+    assert [(row["stage"], row["epoch"]) for row in log] == [("static", 1), ("static", 2), ("dynamic", 1), ("dynamic", 2)]
+    assert all(np.isfinite(row["loss"]) and 0 <= row["validation_accuracy"] <= 1 for row in log)
+    assert (run_folder / "log.csv").read_text().count("\n") == 5
+    assert (run_folder / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert (run_folder / "best.safetensors").stat().st_size > 100_000
+
+
+def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, dpc, tmp_path):
+    by_file = dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
+    assert by_file.returncode == 0, by_file.stderr.decode()
+    piped = dpc("classify", "predict", "-", "--model", run_folder, "-o", "-", stdin=data.read_bytes())
+    assert piped.returncode == 0 and piped.stdout[1:4] == b"HDF"
+    (tmp_path / "p.h5").write_bytes(piped.stdout)
+    a, b = ScoresReader(tmp_path / "s.h5"), ScoresReader(tmp_path / "p.h5")
+    assert np.array_equal(a.scores, b.scores) and a.names == b.names == [f"v{i}" for i in range(12) if i % 3 == 2]
+    np.testing.assert_allclose(a.scores, (a.streams["static"] + a.streams["dynamic"]) / 2, atol=1e-6)
+    np.testing.assert_allclose(a.scores.sum(1), 1, atol=1e-5)
+    report = dpc("evaluate", "classification", "-", "--json", stdin=piped.stdout)
+    assert report.returncode == 0, report.stderr.decode()
+    answer = json.loads(report.stdout)
+    assert answer["units"]["accuracy"] == "fraction"
+    value = answer["metrics"]["accuracy"]
+    assert value == pytest.approx((a.scores.argmax(1) == a.labels).mean())
+
+
+def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc, tmp_path):
+    for size in (1, 7):
+        dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / f"{size}.h5", "--batch", size)
+    a, b = (ScoresReader(tmp_path / f"{size}.h5").scores for size in (1, 7))
+    np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+def last_weights(folder: Path) -> dict:
+    from safetensors.torch import load_file
+
+    return load_file(folder / "best.safetensors")
+
+
+def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folder, dpc, tmp_path):
+    """SIGTERM in the middle of an epoch saves the step and exits 75; kill -9 loses at most the epoch in hand."""
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "dpcli", "classify", "train", str(data), "-o", str(folder), *TRAIN, "--epochs", "2", "--epochs-dynamic", "2"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    first = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment)
+    wait_for(folder / "state.pt", first)
+    first.send_signal(signal.SIGTERM)
+    message = first.communicate(timeout=120)[1].decode()
+    if first.returncode != 0:  # 0: it was done before the signal came
+        assert first.returncode == 75 and "run the same command again" in message
+    second = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
+    time.sleep(4)
+    second.kill()
+    second.wait()
+    third = subprocess.run(command, capture_output=True, env=environment)
+    assert third.returncode == 0, third.stderr.decode()
+    ours, whole = last_weights(folder), last_weights(run_folder)
+    assert all((ours[key] - whole[key]).abs().max() < 1e-5 for key in whole if whole[key].is_floating_point())
+
+
+def wait_for(path: Path, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 240
+    while not path.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+
+
+def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc):
+    other = dpc("classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5)
+    assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
+
+
+def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc, tmp_path, make_sequence):
+    with CloudsWriter(tmp_path / "other.h5", class_names=["up", "down"]) as writer:
+        writer.write(make_sequence("x", label=0, frames=6))
+    wrong = dpc("classify", "predict", tmp_path / "other.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
+    assert wrong.returncode == 3 and b"'up'" in wrong.stderr and b"'left'" in wrong.stderr
+    dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "scores.h5")
+    kind = dpc("classify", "predict", tmp_path / "scores.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
+    assert kind.returncode == 3 and b"holds 'scores'" in kind.stderr and not (tmp_path / "s.h5").exists()
+    none = dpc("classify", "predict", data, "--model", "nowhere", "-o", tmp_path / "s.h5")
+    assert none.returncode == 2 and b"nowhere" in none.stderr
+
+
+def test_truncated_and_foreign_weights_are_refused(data, run_folder, dpc, tmp_path):
+    weights = (run_folder / "best.safetensors").read_bytes()
+    (tmp_path / "half.safetensors").write_bytes(weights[: len(weights) // 2])
+    (tmp_path / "pickle.safetensors").write_bytes(b"\x80\x04K\x01.")
+    for name in ("half", "pickle"):
+        run = dpc("classify", "predict", data, "--model", tmp_path / f"{name}.safetensors", "-o", tmp_path / "s.h5")
+        assert run.returncode == 3 and b"safetensors" in run.stderr, name
+
+
+def test_profile_prints_true_and_paper_counts(dpc):
+    run = dpc("classify", "profile", "--variant", "release", "--classes", 20, "--frames", 4, "--points", 256, "--json")
+    assert run.returncode == 0, run.stderr.decode()
+    report = json.loads(run.stdout)
+    assert report["parameters"]["static"] == 741_652 and report["parameters"]["total"] == 1_586_906
+    assert report["paper_style_parameters"]["static"] == 2.126 and report["macs_per_clip"]["total"] > 1e9
+
+
+def test_static_weights_of_another_run_are_a_start(data, run_folder, dpc, tmp_path):
+    run = dpc("classify", "train", data, "-o", tmp_path / "r", *TRAIN, "--epochs", 0, "--epochs-dynamic", 1, "--static-from", run_folder)
+    assert run.returncode == 0, run.stderr.decode()
+    ours, theirs = last_weights(tmp_path / "r"), last_weights(run_folder)
+    assert all(bool((ours[key] == theirs[key]).all()) for key in ours if key.startswith("static."))
+
+
+def test_help_is_quick_and_imports_nothing_heavy():
+    code = "import sys; from dpcli.cli import app; print([m for m in ('torch', 'open3d', 'cv2', 'numba', 'scipy', 'matplotlib', 'h5py') if m in sys.modules])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert run.stdout.strip() == "[]", run.stdout + run.stderr
+
+
+def test_every_start_is_scored(data, run_folder, dpc, tmp_path):
+    """6 frames, clips of 4: three clips a video; their mean is the video's score."""
+    from dpcli.classify.clips import ClipSource
+    from dpcli.classify.model_file import load_model
+    from dpcli.classify.predict import batches, predict_videos
+    import torch
+
+    model, info = load_model(str(run_folder))
+    reader = CloudsReader(data)
+    source = ClipSource(reader, [2], info.config)
+    video = next(predict_videos(model, source, None, 8, torch.device("cpu")))
+    assert video.clips == 3
+    with torch.inference_mode():
+        rows = [model(points)[0].softmax(-1) for _, points in batches(source, source.clips(None), 1)]
+    np.testing.assert_allclose(video.static, torch.cat(rows).mean(0), atol=1e-5)
