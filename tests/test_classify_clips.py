@@ -103,16 +103,16 @@ def test_normalisations():
 def test_augmentation_is_one_rigid_draw_a_clip():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3, 40, 3)).astype(np.float32)
-    turned = Augmentation(0, False, 0.5, 0.1, 0, 0, 0)(points, rng)
+    turned = Augmentation(0, False, 0.5, 0.1, 0, 0, 0, 0)(points, rng)
     before, after = (np.linalg.norm(p.reshape(-1, 3)[:, None] - p.reshape(-1, 3)[None], axis=-1) for p in (points, turned))
     assert np.allclose(before, after, atol=1e-4) and not np.allclose(points, turned, atol=1e-2)
     scaled = PEERS(points, rng)
     ratio = (scaled - scaled.mean((0, 1))) / (points - points.mean((0, 1)))
     assert np.allclose(ratio, ratio[0, 0], rtol=1e-2) and len(np.unique(ratio[0, 0].round(4))) == 3
     assert np.all((ratio[0, 0] > 0.89) & (ratio[0, 0] < 1.11))
-    thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9)(points, np.random.default_rng(3))
+    thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9, 0)(points, np.random.default_rng(3))
     assert len(np.unique(thinned[0], axis=0)) < 40 and np.isin(thinned[..., 0].round(4), points[..., 0].round(4)).all()
-    assert NONE == Augmentation(0, False, 0, 0, 0, 0, 0)
+    assert NONE == Augmentation(0, False, 0, 0, 0, 0, 0, 0)
 
 
 def test_validation_comes_from_training_subjects_only(reader):
@@ -134,3 +134,11 @@ def test_without_a_training_split_the_splits_are_named(tmp_path, make_sequence):
         writer.write(make_sequence("a", split="valid", label=0))
     with pytest.raises(DataError, match="'valid'"):
         carve_validation(CloudsReader(tmp_path / "x.h5"), "none", 0)
+
+
+def test_a_uniform_training_clip_spans_most_of_the_video_in_order(reader):
+    source = ClipSource(reader, [3], CONFIG, timing="uniform", augmentation=Augmentation(crop=0.5))
+    seen = [source.epoch(n, 1)[0].frames for n in range(200)]
+    assert all(list(f) == sorted(f) and 0 <= f[0] and f[-1] < 10 for f in seen)
+    assert min(f[-1] - f[0] for f in seen) >= 2 and {f[0] for f in seen} >= {0, 1, 2} and len(set(seen)) > 100
+    assert source.clips(None)[0].frames == uniform_frames(10, 4) and len(source.clips(3)) == 3

@@ -72,7 +72,7 @@ def test_gather_equals_indexing(name: str, shape: tuple[int, ...], dtype: torch.
         if want.numel():
             upstream = torch.randn(want.shape, generator=generator).to(dtype)
             ours, theirs = (torch.autograd.grad(out, features, upstream)[0] for out in (got, want))
-            torch.testing.assert_close(ours, theirs)
+            torch.testing.assert_close(ours, theirs, **({"rtol": 0, "atol": 0.02} if dtype == torch.float16 else {}))
 
 
 @pytest.mark.parametrize("name", BACKENDS)

@@ -9,18 +9,19 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays rigid.
+    """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays as it is.
 
-    The defaults are ours; `PEERS` scales the axes only, `RELEASE` is what the published Kinet does (facts section 3).
+    The defaults are ours (chosen on a validation subject: docs/experiments.md); `PEERS` scales the axes only, `RELEASE` is what the published Kinet does (facts section 3).
     """
 
-    scale: float = 0.1  # factor U(1-s, 1+s)
+    scale: float = 0.2  # factor U(1-s, 1+s)
     per_axis: bool = True  # a factor for each axis
-    turn: float = 0.25  # rad, U(-t, t) about the camera's vertical axis y
-    tilt: float = 0.06  # rad, standard deviation of small rotations about all axes, clipped at 3 of them
-    shift: float = 0.05  # length units, U(-s, s) for each axis
-    jitter: float = 0.005  # length units, standard deviation for each point
+    turn: float = 0.4  # rad, U(-t, t) about the camera's vertical axis y
+    tilt: float = 0.1  # rad, standard deviation of small rotations about all axes, clipped at 3 of them
+    shift: float = 0.1  # length units, U(-s, s) for each axis
+    jitter: float = 0.01  # length units, standard deviation for each point
     dropout: float = 0.2  # largest share of points replaced by their predecessor
+    crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
 
     def __call__(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """points f32 (T,P,3) -> the same shape, a new array."""
@@ -43,9 +44,9 @@ class Augmentation:
         return np.take_along_axis(points, source[..., None], 1)
 
 
-NONE = Augmentation(0, False, 0, 0, 0, 0, 0)
-PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0)
-RELEASE = Augmentation(0.1, False, 0, 0.06, 0, 0, 0.2)
+NONE = Augmentation(0, False, 0, 0, 0, 0, 0, 0)
+PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0, 0)
+RELEASE = Augmentation(0.1, False, 0, 0.06, 0, 0, 0.2, 0)
 PRESETS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
 
 

@@ -88,7 +88,9 @@ class ClipSource:
     def _random_clip(self, sequence: int, rng: np.random.Generator) -> Clip:
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
         if self.timing == "uniform":
-            return Clip(sequence, uniform_frames(length, frames, rng.random(frames)))
+            lost = int(rng.uniform(0, self.augmentation.crop) * length)
+            start = int(rng.integers(lost + 1))
+            return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random(frames))))
         return Clip(sequence, clip_frames(length, frames, int(rng.integers(max(length - frames, 0) + 1))))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:

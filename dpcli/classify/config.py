@@ -36,6 +36,7 @@ class KinetConfig:
     weighting: str = "deviation"  # deviation (eq. 3.8) | projection (release) | none (Table 3.1 vi)
     normals: bool = True  # False: Table 3.1 v, the reduced features are pooled instead of fitted
     merge: str = "residual"  # residual (thesis) | cross (release: both scales exchanged by 3-NN interpolation)
+    merge_norm: bool = False  # batch norm in the residual merge (ours: trains in a fraction of the epochs)
     solver: str = "inverse"  # inverse (A.1.1) | ridge (ours: relative Tikhonov term, no guard needed)
     guard: str = "signed"  # what a small determinant becomes: signed | release
     fusion: str = "softmax"  # softmax | logits, averaged

@@ -14,23 +14,28 @@ from dpcli.ops.grouped_mlp import gather_rows
 class ResidualMerge(nn.Module):
     """h_l = relu(C_l n_l + R_l h_{l-1}) (thesis figure 3.4).
 
-    Where a unit's centroids are the next stage's neighbours, h is max-pooled over the neighbourhood first.
+    Where a unit's centroids are the next stage's neighbours, h is max-pooled over the neighbourhood first. With `norm`
+    the sum is batch-normalised before the ReLU.
     """
 
-    def __init__(self, channels: list[int], widths: list[int]) -> None:
+    def __init__(self, channels: list[int], widths: list[int], norm: bool) -> None:
         super().__init__()
+        self.norms = nn.ModuleList(nn.BatchNorm1d(width, eps=1e-3) if norm else nn.Identity() for width in widths)
         self.abstract = nn.ModuleList(nn.Linear(c, w) for c, w in zip(channels, widths))
         self.align = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
         self.channels = widths[-1]
 
     def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
-        state = torch.relu(self.abstract[0](normals[0]))
+        state = self._activate(0, self.abstract[0](normals[0]))
         per_stage = len(normals) // len(groups)
         for level in range(1, len(normals)):
             if level % per_stage == 0:
                 state = gather_rows(state, groups[level // per_stage].idx).amax(2)
-            state = torch.relu(self.abstract[level](normals[level]) + self.align[level - 1](state))
+            state = self._activate(level, self.abstract[level](normals[level]) + self.align[level - 1](state))
         return state
+
+    def _activate(self, level: int, values: Tensor) -> Tensor:
+        return torch.relu(self.norms[level](values.flatten(0, 1)).view_as(values))
 
 
 class CrossMerge(nn.Module):
@@ -67,4 +72,4 @@ def build_merge(config: KinetConfig, channels: list[int]) -> ResidualMerge | Cro
     """The merge that `config.merge` names, for units with these normal widths."""
     if config.merge == "cross":
         return CrossMerge(channels)
-    return ResidualMerge(channels, [*config.widths[0], *config.widths[1]])
+    return ResidualMerge(channels, [*config.widths[0], *config.widths[1]], config.merge_norm)

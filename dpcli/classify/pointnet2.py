@@ -158,3 +158,6 @@ def he_init(module: nn.Module) -> None:
         if isinstance(layer, nn.Linear):
             nn.init.trunc_normal_(layer.weight, std=(2 / layer.in_features) ** 0.5)
             nn.init.zeros_(layer.bias)
+    for layer in module.modules():
+        if isinstance(layer, GlobalHead):  # logits near zero, so that the first steps don't unlearn large random ones
+            nn.init.trunc_normal_(layer.classify.weight, std=0.01)

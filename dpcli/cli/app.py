@@ -89,6 +89,10 @@ def main(argv: list[str] | None = None) -> None:
     try:
         code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
         sys.stdout.flush()
+    except SystemExit as ended:  # typer turns Ctrl-C into this, silently
+        code = ended.code
+        if code == INTERRUPTED:
+            log.error("interrupted")
     except (Exception, KeyboardInterrupt) as error:
         if log.debug and not isinstance(error, (BrokenPipeError, KeyboardInterrupt)):
             import traceback

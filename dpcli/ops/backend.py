@@ -17,7 +17,7 @@ import torch
 from dpcli.errors import UsageError
 
 # Elements of one pairwise block: bounds the reference's memory, and on CPU keeps a block near the cache.
-_BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 26}
+_BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 24}
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""One decorator for every CPU kernel: numba, cached on disk, releasing the GIL."""
+"""The decorators of the CPU kernels: numba, cached on disk."""
 
 from __future__ import annotations
 
@@ -6,22 +6,30 @@ from collections.abc import Callable
 
 import numba
 
-
 # No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorise. Nothing that changes a
 # value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
 _FLAGS = {"nnan", "nsz"}
 
 
 def kernel(function: Callable) -> Callable:
-    """Compile `function` on first call.
+    """For searches, whose indices and distances must equal the reference's; compiled on first call.
 
     Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
     mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process.
     """
+    return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
+
+
+def arithmetic_kernel(function: Callable) -> Callable:
+    """As `kernel`, but infinities and NaN pass through as IEEE 754 has them: for work on values nobody has checked."""
+    return _compiled(function, nogil=True, error_model="numpy")
+
+
+def _compiled(function: Callable, **options: object) -> Callable:
     try:
-        return numba.njit(nogil=True, fastmath=_FLAGS, cache=True)(function)
+        return numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        return numba.njit(nogil=True, fastmath=_FLAGS)(function)
+        return numba.njit(**options)(function)
 
 
 def parallel_kernel(function: Callable) -> Callable:
@@ -30,7 +38,4 @@ def parallel_kernel(function: Callable) -> Callable:
     Must not run in a process that forks afterwards; `parallel.parallel_kernels` loads modules that use it.
     """
     options = {"parallel": True, "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "error_model": "numpy"}
-    try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:
-        return numba.njit(**options)(function)
+    return _compiled(function, **options)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.ops.jit import kernel
+from dpcli.ops.jit import arithmetic_kernel
 
 
-@kernel
+@arithmetic_kernel
 def scatter_add_kernel(grad, rows, out, first, last):
     """Add rows first..last-1 of grad (R,C) to the rows of `out` (N,C) that `rows` (R,) names, in order."""
     for i in range(first, last):

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.ops.jit import kernel
+from dpcli.ops.jit import arithmetic_kernel
 
 TILE = 64  # matrices per tile: an 8x8 tile of float32 is 16 kB
 _SIGNED, _NONE = 0, 2  # positions in linalg._GUARDS
 
 
-@kernel
+@arithmetic_kernel
 def _guard_row(det, moved, min_det, guard):
     """Move small determinants (W,) away from zero and note which; then invert them in place."""
     for w in range(det.size):
@@ -23,14 +23,14 @@ def _guard_row(det, moved, min_det, guard):
         det[w] = 1 / det[w]
 
 
-@kernel
+@arithmetic_kernel
 def _closed1(m, out, at, det):
     for w in range(TILE):
         det[w] = m[at, at, w]
         out[at, at, w] = 1
 
 
-@kernel
+@arithmetic_kernel
 def _closed2(m, out, at, det):
     for w in range(TILE):
         a, b, c, d = m[at, at, w], m[at, at + 1, w], m[at + 1, at, w], m[at + 1, at + 1, w]
@@ -38,7 +38,7 @@ def _closed2(m, out, at, det):
         out[at, at, w], out[at, at + 1, w], out[at + 1, at, w], out[at + 1, at + 1, w] = d, -b, -c, a
 
 
-@kernel
+@arithmetic_kernel
 def _closed3(m, out, at, det):
     for w in range(TILE):
         a, b, c = m[at, at, w], m[at, at + 1, w], m[at, at + 2, w]
@@ -51,7 +51,7 @@ def _closed3(m, out, at, det):
         out[at + 2, at, w], out[at + 2, at + 1, w], out[at + 2, at + 2, w] = z, b * g - a * h, a * e - b * d
 
 
-@kernel
+@arithmetic_kernel
 def _closed4(m, out, at, det):
     for w in range(TILE):
         a, b, c, d = m[at, at, w], m[at, at + 1, w], m[at, at + 2, w], m[at, at + 3, w]
@@ -81,7 +81,7 @@ def _closed4(m, out, at, det):
         out[at + 3, at + 3, w] = i * u12 - j * u02 + k * u01
 
 
-@kernel
+@arithmetic_kernel
 def _closed(m, out, at, n, det, moved, min_det, guard):
     """Closed-form inverses of the diagonal n x n blocks, n <= 4, that start at row and column `at`."""
     if n == 1:
@@ -99,7 +99,7 @@ def _closed(m, out, at, n, det, moved, min_det, guard):
                 out[i, j, w] *= det[w]
 
 
-@kernel
+@arithmetic_kernel
 def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
     """Add sign * a b to `out`, for blocks that start at the entries given: shape (p,r,q) for p x r times r x q.
 
@@ -114,27 +114,34 @@ def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
                     out[oi, oj, w] += sign * a[ai, ak, w] * b[bk, bj, w]
 
 
-@kernel
-def _blocks(m, out, left, right, det, moved, min_det, guard):
-    """Block-partitioned inverses of a tile (n,n,W), 4 < n <= 8; left (q,p,W) and right (p,q,W) are scratch."""
-    p = (m.shape[0] + 1) // 2
-    q = m.shape[0] - p
+@arithmetic_kernel
+def _invert(m, out, left, right, det, moved, min_det, guard):
+    """Inverses of a tile (n,n,W), n <= 8, which is overwritten; left (q,p,W) and right (p,q,W) are scratch.
+
+    The leading p x p block A in closed form; where q = n - p rows are left, the others by its Schur complement.
+    """
+    p, q = right.shape[0], left.shape[0]
     plus, minus = m.dtype.type(1), m.dtype.type(-1)
-    a, b, c, d = (0, 0), (0, p), (p, 0), (p, p)
-    left[:] = 0
-    right[:] = 0
+    zero = p - p  # a literal 0 would compile every callee once more
+    a, b, c, d = (zero, zero), (zero, p), (p, zero), (p, p)
     out[:] = 0
-    _closed(m, out, 0, p, det, moved, min_det, guard)
-    _add_product(m, c, out, a, plus, left, a, (q, p, p))
-    _add_product(out, a, m, b, plus, right, a, (p, p, q))
-    _add_product(left, a, m, b, minus, m, d, (q, p, q))  # m is a copy: its corner becomes the Schur complement
-    _closed(m, out, p, q, det, moved, min_det, guard)
-    _add_product(right, a, out, d, minus, out, b, (p, q, q))
-    _add_product(out, d, left, a, minus, out, c, (q, q, p))
-    _add_product(out, b, left, a, minus, out, a, (p, q, p))
+    for at, size in ((zero, p), (p, q)):
+        if size == 0:
+            break
+        _closed(m, out, at, size, det, moved, min_det, guard)
+        if at == 0 and q > 0:
+            left[:] = 0
+            right[:] = 0
+            _add_product(m, c, out, a, plus, left, a, (q, p, p))
+            _add_product(out, a, m, b, plus, right, a, (p, p, q))
+            _add_product(left, a, m, b, minus, m, d, (q, p, q))
+    if q > 0:
+        _add_product(right, a, out, d, minus, out, b, (p, q, q))
+        _add_product(out, d, left, a, minus, out, c, (q, q, p))
+        _add_product(out, b, left, a, minus, out, a, (p, q, p))
 
 
-@kernel
+@arithmetic_kernel
 def _load(matrices, first, size, tile, transposed):
     """Matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
     n = tile.shape[0]
@@ -151,7 +158,7 @@ def _load(matrices, first, size, tile, transposed):
                 tile[i, j, size:] = 1 if i == j else 0
 
 
-@kernel
+@arithmetic_kernel
 def _store(tile, matrices, first, size):
     low = np.uintp(first)
     for w in range(np.uintp(size)):
@@ -160,13 +167,13 @@ def _store(tile, matrices, first, size):
                 matrices[low + w, i, j] = tile[i, j, w]
 
 
-@kernel
+@arithmetic_kernel
 def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
     """Invert matrices first..last-1 of (R,n,n), n <= 8, into `inverse`; moved (R,) bool: where the guard acted."""
     n = matrices.shape[1]
-    half = (n + 1) // 2
+    half = n if n <= 4 else (n + 1) // 2
     tile = np.empty((n, n, TILE), matrices.dtype)
-    out = np.empty_like(tile)
+    out = np.empty((n, n, TILE), matrices.dtype)
     left = np.empty((n - half, half, TILE), matrices.dtype)
     right = np.empty((half, n - half, TILE), matrices.dtype)
     det = np.empty(TILE, matrices.dtype)
@@ -176,24 +183,20 @@ def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
         size = min(TILE, last - low)
         _load(matrices, low, size, tile, False)
         acted[:] = False
-        if n <= 4:
-            _closed(tile, out, 0, n, det, acted, floor, guard)
-        else:
-            _blocks(tile, out, left, right, det, acted, floor, guard)
+        _invert(tile, out, left, right, det, acted, floor, guard)
         _store(out, inverse, low, size)
-        moved[low : low + size] = acted[:size]
+        for w in range(size):  # a slice assignment would compile an error message for 2 s
+            moved[low + w] = acted[w]
 
 
-@kernel
+@arithmetic_kernel
 def inverse_gradient_kernel(inverse, grad, out, first, last):
     """out = -X' G X' for rows first..last-1 of X = inverse (R,n,n) and G = grad: the gradient of an exact inverse."""
     n = inverse.shape[1]
     x = np.empty((n, n, TILE), inverse.dtype)  # X'
-    g = np.empty_like(x)
-    inner = np.empty_like(x)
-    outer = np.empty_like(x)
+    g, inner, outer = np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype)
     plus, minus = inverse.dtype.type(1), inverse.dtype.type(-1)
-    origin = (0, 0)
+    origin = (n - n, n - n)
     for low in range(first, last, TILE):
         size = min(TILE, last - low)
         _load(inverse, low, size, x, True)

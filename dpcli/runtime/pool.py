@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import forkserver
+from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DpcError
@@ -27,6 +28,15 @@ def _start_worker() -> None:
     for number in (signal.SIGINT, *_STOPPING):
         signal.signal(number, signal.SIG_IGN)
     os.environ.update({name: "1" for name in _SINGLE_THREAD})
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A killed parent can't tell its workers to end, and they would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
@@ -63,6 +73,7 @@ def ordered_map(
             yield item, _guarded(function, item)
         return
     own = executor is None
+    strangers = set(multiprocessing.active_children())
     pool = executor or _new_pool(jobs)
     waiting: deque = deque()
     try:
@@ -75,6 +86,9 @@ def ordered_map(
             done, future = waiting.popleft()
             yield done, future.result()
     except BrokenProcessPool:
+        # the executor ends the other workers by SIGTERM, which they ignore, and would wait for them for ever
+        for child in set(multiprocessing.active_children()) - strangers if own else ():
+            child.kill()
         raise DpcError("a worker process died (killed, or out of memory); run again, perhaps with a smaller --jobs") from None
     finally:
         for _, future in waiting:

@@ -10,4 +10,5 @@ def generator(seed: int, *keys: int) -> np.random.Generator:
 
     `keys` are non-negative integers such as an item's index or an epoch. 0 is a valid seed.
     """
-    return np.random.default_rng(np.random.SeedSequence([int(seed), *map(int, keys)]))
+    # SeedSequence ignores zeros at the end: the number of keys tells (seed, 1) from (seed, 1, 0)
+    return np.random.default_rng(np.random.SeedSequence([int(seed), len(keys), *map(int, keys)]))
