@@ -27,7 +27,7 @@ def backend(name: str) -> Iterator[None]:
 
 
 def cloud(rng: np.random.Generator, *shape: int, kind: str) -> np.ndarray:
-    """Points (*shape,3) f32: `random`; on a `grid` of 5 steps (ties and duplicates); `same`; or `far` from the origin."""
+    """Points (*shape,3) f32: `random`, on a `grid` of 5 steps (ties, duplicates), all the `same`, `far` from zero."""
     if kind == "grid":
         return rng.integers(-2, 3, (*shape, 3)).astype(np.float32) / 4
     if kind == "same":

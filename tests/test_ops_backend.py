@@ -12,7 +12,7 @@ import torch
 import dpcli.ops
 from dpcli.errors import UsageError
 from dpcli.ops import chosen_backend, fps, fps_reference, space_time_ball_query
-from dpcli.ops.backend import key_distances, key_indices, ordered_keys, row_blocks, run_in_threads, thread_windows
+from dpcli.ops.backend import key_distances, key_indices, ordered_keys, row_blocks, run_in_threads
 from tests.ops_helpers import backend
 
 
@@ -69,7 +69,7 @@ def test_kernels_survive_a_fork_after_use() -> None:
     """Plain threads, made per call: numba's own parallel mode would kill the child here."""
     code = (
         "import multiprocessing as mp, torch; from dpcli.ops import fps\n"
-        "torch.set_num_threads(2)\n"
+        "import dpcli.ops.backend as b; b._THREAD_NS = 1.0; torch.set_num_threads(2)\n"
         "p = torch.randn(8, 500, 3, generator=torch.Generator().manual_seed(0))\n"
         "fps(p, 50)\n"
         "def child(q): torch.set_num_threads(1); q.put(fps(p, 50).sum().item())\n"
@@ -80,7 +80,8 @@ def test_kernels_survive_a_fork_after_use() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_thread_count_changes_nothing(threads: int) -> None:
+def test_thread_count_changes_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("dpcli.ops.backend._THREAD_NS", 1.0)
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(3, 700, 3, generator=generator)
     times = torch.arange(7).repeat_interleave(100).expand(3, -1)
@@ -96,17 +97,34 @@ def test_thread_count_changes_nothing(threads: int) -> None:
 
 
 def test_an_error_in_a_thread_reaches_the_caller() -> None:
-    def fail(number: int) -> None:
-        raise RuntimeError(f"task {number}")
+    def fail_late(first: int, last: int) -> None:
+        if last == 10:
+            raise RuntimeError(f"window {first}")
 
-    with pytest.raises(RuntimeError, match="task"):
-        run_in_threads(fail, [(0,), (1,), (2,)])
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        with pytest.raises(RuntimeError, match="window 6"):
+            run_in_threads(fail_late, (), 10, 1e9)
+    finally:
+        torch.set_num_threads(before)
 
 
-@pytest.mark.parametrize(("batch", "rows"), [(1, 0), (1, 1), (1, 5), (7, 10), (0, 3)])
-def test_windows_cover_all_rows_once(batch: int, rows: int) -> None:
-    covered = [row for first, last in thread_windows(batch, rows) for row in range(first, last)]
-    assert covered == list(range(rows))
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize(
+    ("total", "milliseconds", "most"), [(0, 9, 1), (1, 9, 1), (4, 9, 4), (11, 9, 11), (11, 1, 2), (11, 0.1, 1)]
+)
+def test_windows_cover_all_items_once(threads: int, total: int, milliseconds: float, most: int) -> None:
+    """At most `most` windows: one per item, and none of less than 4 ms."""
+    windows = []
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        run_in_threads(lambda name, *window: windows.append(window), ("x",), total, milliseconds * 1e6)
+    finally:
+        torch.set_num_threads(before)
+    assert sorted(item for first, last in windows for item in range(first, last)) == list(range(total))
+    assert len(windows) == min(threads, most)
 
 
 def test_reference_memory_is_bounded() -> None:

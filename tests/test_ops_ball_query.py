@@ -101,7 +101,9 @@ def test_by_hand(name: str) -> None:
 def test_batch_items_and_float_times_do_not_mix(name: str, order: str) -> None:
     points, times, centroids, centroid_times = (torch.from_numpy(a) for a in clip(9, "random", 3, 200, 20, 5, True))
     with backend(name):
-        whole = space_time_ball_query(points, times.float(), centroids, centroid_times.double(), [0.8, 0.6], 8, order=order)
+        whole = space_time_ball_query(
+            points, times.float(), centroids, centroid_times.double(), [0.8, 0.6], 8, order=order
+        )
         for b in range(3):
             part = (a[b : b + 1] for a in (points, times, centroids, centroid_times))
             alone = space_time_ball_query(*part, torch.tensor([0.8, 0.6]), 8, order=order)
@@ -142,4 +144,6 @@ def test_rejects(name: str, position: int, value: object, message: str) -> None:
 
 def test_rejects_an_unknown_order() -> None:
     with pytest.raises(ValueError, match="order"):
-        space_time_ball_query(torch.zeros(1, 5, 3), torch.zeros(1, 5), torch.zeros(1, 2, 3), torch.zeros(1, 2), [1.0], 3, order="any")
+        space_time_ball_query(
+            torch.zeros(1, 5, 3), torch.zeros(1, 5), torch.zeros(1, 2, 3), torch.zeros(1, 2), [1.0], 3, order="any"
+        )

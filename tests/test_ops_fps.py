@@ -20,7 +20,9 @@ def test_matches_the_definition(name: str, seed: int, kind: str, count: int, sam
     points = cloud(np.random.default_rng(seed), count, kind=kind)
     with backend(name):
         assert_fps(fps, points, samples, start % count)
-    assert fps_numpy(points, samples, start=start % count).tolist() == _fps_plain(points, samples, start % count).tolist()
+    assert (
+        fps_numpy(points, samples, start=start % count).tolist() == _fps_plain(points, samples, start % count).tolist()
+    )
 
 
 def test_checker_rejects_broken_twins() -> None:
@@ -88,7 +90,9 @@ def test_duplicates_only_repeat_index_zero(name: str) -> None:
 def test_accepts_views_doubles_and_gradients(name: str) -> None:
     base = torch.randn(2, 3, 60, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
     with backend(name):
-        assert torch.equal(fps(base.transpose(1, 2), 9), fps_reference(base.detach().float().transpose(1, 2).contiguous(), 9))
+        assert torch.equal(
+            fps(base.transpose(1, 2), 9), fps_reference(base.detach().float().transpose(1, 2).contiguous(), 9)
+        )
         assert fps(torch.zeros(0, 5, 3), 2).shape == (0, 2)
 
 
@@ -116,8 +120,14 @@ def test_rejects(name: str, change: dict, message: str) -> None:
 
 @pytest.mark.parametrize(
     ("points", "samples", "start"),
-    [(np.zeros((0, 3)), 1, 0), (np.zeros((4, 2)), 1, 0), (np.full((4, 3), np.nan), 1, 0), (np.zeros((4, 3)), 0, 0), (np.zeros((4, 3)), 1, 4)],
-)  # fmt: skip
+    [
+        (np.zeros((0, 3)), 1, 0),
+        (np.zeros((4, 2)), 1, 0),
+        (np.full((4, 3), np.nan), 1, 0),
+        (np.zeros((4, 3)), 0, 0),
+        (np.zeros((4, 3)), 1, 4),
+    ],
+)
 def test_numpy_entry_rejects(points: np.ndarray, samples: int, start: int) -> None:
     with pytest.raises(ValueError):
         fps_numpy(points, samples, start=start)

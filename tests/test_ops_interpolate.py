@@ -81,7 +81,9 @@ def test_gather_gradients_repeat_exactly(name: str) -> None:
     features = torch.randn(3, 4, 8, requires_grad=True)
     idx = torch.randint(0, 4, (3, 5000))
     with backend(name):
-        grads = [torch.autograd.grad(gather_points(features, idx), features, torch.ones(3, 5000, 8))[0] for _ in range(2)]
+        grads = [
+            torch.autograd.grad(gather_points(features, idx), features, torch.ones(3, 5000, 8))[0] for _ in range(2)
+        ]
     assert torch.equal(*grads)
     counts = torch.stack([torch.bincount(row, minlength=4) for row in idx]).float()
     assert torch.equal(grads[0], counts[..., None].expand(-1, -1, 8))

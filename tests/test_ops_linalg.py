@@ -24,7 +24,9 @@ def spd(seed: int, *shape: int, n: int) -> torch.Tensor:
 def test_matches_numpy(name: str, seed: int, n: int, shape: tuple[int, ...]) -> None:
     matrices = spd(seed, *shape, n=n)
     with backend(name):
-        np.testing.assert_allclose(small_inverse(matrices).numpy(), np.linalg.inv(matrices.numpy()), rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(
+            small_inverse(matrices).numpy(), np.linalg.inv(matrices.numpy()), rtol=1e-7, atol=1e-9
+        )
         single = small_inverse(matrices.float())
     assert single.dtype == torch.float32
     np.testing.assert_allclose(single.numpy(), np.linalg.inv(matrices.numpy()), rtol=5e-3, atol=2e-3)

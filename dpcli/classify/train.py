@@ -31,6 +31,7 @@ class Schedule:
     epochs: tuple[int, int] = (150, 150)  # static, dynamic
     batch: int = 16
     learning_rate: float = 1e-3
+    learning_rate_dynamic: float | None = None  # None: the same
     decay: str = "cosine"  # cosine (after a short warm-up, to zero) | staircase | constant
     weight_decay: float = 0.0
     label_smoothing: float = 0.0
@@ -39,16 +40,17 @@ class Schedule:
     validation_clips: int = 4  # per video
     workers: int = 0  # processes that load clips; 0: this one
 
-    def rate(self, step: int, steps: int) -> float:
-        """Learning rate at an optimiser step of a stage with `steps` in all."""
+    def rate(self, stage: int, step: int, steps: int) -> float:
+        """Learning rate at an optimiser step of a stage (0 static, 1 dynamic) with `steps` in all."""
+        top = self.learning_rate if stage == 0 or self.learning_rate_dynamic is None else self.learning_rate_dynamic
         if self.decay == "constant":
-            return self.learning_rate
+            return top
         if self.decay == "staircase":
-            return max(self.learning_rate * 0.7 ** (step * self.batch // 200_000), 1e-5)
+            return max(top * 0.7 ** (step * self.batch // 200_000), 1e-5)
         warm = max(1, min(100, steps // 10))
         if step < warm:
-            return self.learning_rate * (step + 1) / warm
-        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(steps - warm, 1)))
+            return top * (step + 1) / warm
+        return top * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(steps - warm, 1)))
 
 
 class _Loader(torch.utils.data.Dataset):
@@ -114,9 +116,15 @@ class Trainer:
         return self.model.static if self.stage == 0 else self.model.dynamic
 
     def _new_optimizer(self, branch: nn.Module) -> torch.optim.Optimizer:
-        decayed = [p for p in branch.parameters() if p.dim() > 1]
-        rest = [p for p in branch.parameters() if p.dim() <= 1]
-        groups = [{"params": decayed, "weight_decay": self.schedule.weight_decay}, {"params": rest, "weight_decay": 0.0}]
+        # The last layer sums a thousand pooled maxima, all positive: at the others' rate its first steps overshoot.
+        named = dict(branch.named_parameters())
+        last = [p for name, p in named.items() if name.startswith("head.classify")]
+        rest = [p for name, p in named.items() if not name.startswith("head.classify")]
+        groups = [
+            {"params": last, "weight_decay": self.schedule.weight_decay, "share": 0.1},
+            {"params": [p for p in rest if p.dim() > 1], "weight_decay": self.schedule.weight_decay, "share": 1.0},
+            {"params": [p for p in rest if p.dim() <= 1], "weight_decay": 0.0, "share": 1.0},
+        ]
         return torch.optim.AdamW(groups, lr=self.schedule.learning_rate)
 
     def _run_epoch(self, branch: nn.Module, epochs: int, bar: Progress) -> None:
@@ -126,7 +134,7 @@ class Trainer:
         per_epoch = self._per_epoch(clips)
         rate = 0.0  # a run stopped after an epoch's last step has none left to do
         for points, labels in self._batches(clips[: per_epoch * self.schedule.batch]):
-            rate = self.schedule.rate(self.epoch * per_epoch + self.step, epochs * per_epoch)
+            rate = self.schedule.rate(self.stage, self.epoch * per_epoch + self.step, epochs * per_epoch)
             self._optimise(points.to(self.device), labels.to(self.device), rate)
             self.step += 1
             bar.note(epoch=f"{self.epoch + 1}/{epochs}", loss=self.sums[0] / self.sums[2], accuracy=self.sums[1] / self.sums[2])
@@ -151,7 +159,7 @@ class Trainer:
     def _optimise(self, points: torch.Tensor, labels: torch.Tensor, rate: float) -> None:
         assert self.optimizer is not None
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["share"]
         logits = self.model.static_logits(points) if self.stage == 0 else self.model.dynamic_logits(points)
         loss = nn.functional.cross_entropy(logits, labels, label_smoothing=self.schedule.label_smoothing)
         self.optimizer.zero_grad(set_to_none=True)

@@ -28,6 +28,7 @@ def train(
     validation: Annotated[Optional[str], typer.Option(help="Carved from the training videos: subject, subjects:3,5, a fraction, or none. Default: subject, or 0.15 without subjects.")] = None,
     batch: Annotated[Optional[int], typer.Option(help="Clips per step. Default: the preset's.")] = None,
     lr: Annotated[Optional[float], typer.Option(help="Adam's learning rate. Default: the preset's.")] = None,
+    lr_dynamic: Annotated[Optional[float], typer.Option(help="The same for the dynamic stage. Default: the preset's.")] = None,
     decay: Annotated[Optional[str], typer.Option(help="cosine, staircase (x0.7 every 200,000 clips) or constant.")] = None,
     augment: Annotated[Optional[str], typer.Option(help="ours, peers (axis scales), release or none. Default: the preset's.")] = None,
     variant: Annotated[Optional[str], typer.Option(help="thesis or release: where text and published code disagree.")] = None,
@@ -54,7 +55,7 @@ def train(
         "weighting": "none" if no_weights or no_normals else None,
     }  # fmt: skip
     schedule = {
-        "batch": batch, "learning_rate": lr, "decay": decay, "workers": workers,
+        "batch": batch, "learning_rate": lr, "learning_rate_dynamic": lr_dynamic, "decay": decay, "workers": workers,
         "clips_per_video": clips_per_video, "epochs": (epochs, epochs_dynamic),
     }  # fmt: skip
     from dpcli.classify.commands import run_training

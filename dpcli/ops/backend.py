@@ -1,7 +1,7 @@
 """Which implementation runs, on how many threads, in pieces of what size; and the checks that all operations share.
 
-Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorised, chunked), and
-`numba`, the fast kernels for CPU tensors. The environment variable DPC_BACKEND=torch|numba overrides the choice.
+Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorised, chunked),
+and `numba`, the fast kernels for CPU tensors. The environment variable DPC_BACKEND=torch|numba overrides the choice.
 """
 
 from __future__ import annotations
@@ -9,15 +9,17 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import torch
 
 from dpcli.errors import UsageError
 
 # Elements of one pairwise block: bounds the reference's memory, and on CPU keeps a block near the cache.
 _BLOCK_ELEMENTS = {"cpu": 1 << 20, "cuda": 1 << 24}
+_THREAD_NS = 4e6
 
 
 @functools.cache
@@ -45,27 +47,24 @@ def chosen_backend(device: torch.device | str = "cpu") -> str:
     return "numba" if numba_available() else "torch"
 
 
-def run_in_threads(function: Callable[..., None], tasks: Sequence[tuple]) -> None:
-    """Call `function(*task)` for each task, on up to torch.get_num_threads() threads; for kernels that release the GIL.
+def run_in_threads(kernel: Callable[..., None], arguments: tuple, total: int, item_ns: float) -> None:
+    """Call kernel(*arguments, first, last) on windows that cover 0..total-1, one per thread.
 
-    The threads live only as long as the call, so a forked process inherits none; DataLoader workers have one torch
-    thread and therefore run serially.
+    For kernels that release the GIL: one call each, since a thread that has to come back for the GIL may find its
+    holder preempted. As many threads as torch has, but none for less than 4 ms of work by the estimate item_ns: torch's
+    OpenMP threads spin for about as long after each operation and hold the core that a new thread would need. Threads
+    live only as long as the call, so a forked process inherits none; DataLoader workers have one torch thread and run
+    serially.
     """
-    workers = min(torch.get_num_threads(), len(tasks))
-    if workers <= 1:
-        for task in tasks:
-            function(*task)
-        return
-    with ThreadPoolExecutor(workers) as pool:
-        for future in [pool.submit(function, *task) for task in tasks]:
-            future.result()
-
-
-def thread_windows(batch: int, rows: int) -> list[tuple[int, int]]:
-    """Cut the rows of one item of a batch into (first, last) windows, so that all threads have work."""
-    pieces = -(-torch.get_num_threads() // max(batch, 1))
-    step = max(1, -(-rows // pieces))
-    return [(first, min(first + step, rows)) for first in range(0, rows, step)]
+    workers = max(1, min(torch.get_num_threads(), total, int(total * item_ns / _THREAD_NS)))
+    bounds = [total * worker // workers for worker in range(workers + 1)]
+    if workers == 1:
+        return kernel(*arguments, 0, total)
+    with ThreadPoolExecutor(workers - 1) as pool:  # the caller works too
+        others = [pool.submit(kernel, *arguments, *window) for window in zip(bounds[1:], bounds[2:], strict=False)]
+        kernel(*arguments, *bounds[:2])
+        for other in others:
+            other.result()
 
 
 def row_blocks(rows: int, elements_per_row: int, device: torch.device) -> list[slice]:
@@ -82,9 +81,18 @@ def positions(name: str, tensor: torch.Tensor) -> torch.Tensor:
     if not tensor.is_floating_point():
         raise ValueError(f"{name} must be floating point, but is {tensor.dtype}")
     tensor = tensor.detach().to(torch.float32)
-    if not bool(torch.isfinite(tensor.sum())) and not bool(torch.isfinite(tensor).all()):  # a sum is the cheaper look
+    if not _is_finite(tensor):
         raise ValueError(f"{name} holds NaN or infinite coordinates; remove those points first")
     return tensor
+
+
+def _is_finite(tensor: torch.Tensor) -> bool:
+    """Whether all values are finite; their sum is the cheaper first look, numpy's wakes no OpenMP threads."""
+    if tensor.device.type == "cpu":
+        with np.errstate(all="ignore"):
+            array = tensor.numpy()
+            return bool(np.isfinite(array.sum()) or np.isfinite(array).all())
+    return bool(torch.isfinite(tensor.sum())) or bool(torch.isfinite(tensor).all())
 
 
 def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: torch.device) -> torch.Tensor | None:

@@ -14,8 +14,10 @@ from dpcli.ops.backend import (
     row_blocks,
     run_in_threads,
     squared_distances,
-    thread_windows,
 )
+
+_ROW_NS = {"first": 1e3, "nearest": 1.5e4}  # measured on a 16 x 2048 clip
+
 
 def space_time_ball_query(
     points: torch.Tensor,  # [B, N, 3]
@@ -29,11 +31,12 @@ def space_time_ball_query(
 ) -> tuple[torch.Tensor, torch.Tensor]:  # [B, M, k], [B, M]
     """Up to k neighbours of each centroid in space and time: indices (B,M,k) i64 and hit counts (B,M) i64 in 0..k.
 
-    Point j is a neighbour of centroid i when d = |t_i - t_j| < R and dist(i,j) < radii[d], both strict; compared squared,
-    in float32. times are whole frame indices (integers, or floats holding integers), in any order.
+    Point j is a neighbour of centroid i when d = |t_i - t_j| < R and dist(i,j) < radii[d], both strict; distances are
+    compared squared, in float32. times are whole frame indices (integers, or floats holding integers), in any order.
     order "first": the k neighbours of lowest index, ascending; unused slots repeat the first. Frame-major points thus
-    favour the earlier frame, as the released Kinet does. order "nearest": the k nearest in space, ascending, ties to the
-    lowest index; unused slots repeat the nearest. A centroid without any neighbour has count 0 and index 0 in all slots.
+    favour the earlier frame, as the released Kinet does. order "nearest": the k nearest in space, ascending, ties to
+    the lowest index; unused slots repeat the nearest. A centroid without any neighbour has count 0 and index 0 in all
+    slots.
     Indices carry no gradient: gather with them. Backends: numba on CPU (frames found by bisection when the times are
     sorted), torch elsewhere; same indices. Raises ValueError on wrong shapes, non-finite values, or fractional times.
     """
@@ -95,7 +98,9 @@ def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device) 
     """(R,) squared radii without trailing zeros, which accept nothing but would widen the window in time."""
     radii = torch.as_tensor(radii, dtype=torch.float32, device="cpu").detach()
     if radii.ndim != 1 or not bool((torch.isfinite(radii) & (radii >= 0)).all()):
-        raise ValueError(f"radii must be a list of finite numbers >= 0, one per frame distance, but is {radii.tolist()}")
+        raise ValueError(
+            f"radii must be a list of finite numbers >= 0, one per frame distance, but is {radii.tolist()}"
+        )
     last = int(radii.nonzero().max()) + 1 if bool(radii.any()) else 0
     return (radii[:last] * radii[:last]).to(device)
 
@@ -114,14 +119,10 @@ def _query_numba(
     batch, rows = centroid_times.shape
     index = torch.empty((batch, rows, k), dtype=torch.int64)
     count = torch.empty((batch, rows), dtype=torch.int64)
-    arrays = (points.transpose(1, 2), times, centroids, centroid_times, index, count)
-    clips = zip(*(tensor.contiguous().numpy() for tensor in arrays), strict=True)
-    radii2, nearest = limits.numpy(), order == "nearest"
-    tasks = []
-    for xyz, frames, centres, centre_frames, out_index, out_count in clips:
-        for window in thread_windows(batch, rows):
-            tasks.append((xyz, frames, centres, centre_frames, radii2, nearest, *window, out_index, out_count))
-    run_in_threads(ball_query_kernel, tasks)
+    tensors = (points.transpose(1, 2), times, centroids, centroid_times, limits)
+    arrays = (tensor.contiguous().numpy() for tensor in tensors)
+    arguments = (*arrays, order == "nearest", index.numpy(), count.numpy())
+    run_in_threads(ball_query_kernel, arguments, batch * rows, _ROW_NS[order])
     return index, count
 
 

@@ -48,6 +48,6 @@ class _GatherRows(torch.autograd.Function):
         shape, batch = ctx.sizes
         out = torch.zeros(shape, dtype=grad.dtype)
         arrays = (grad.contiguous().numpy(), rows.numpy(), out.numpy())
-        step = len(rows) // max(batch, 1)
-        run_in_threads(scatter_add_kernel, [(*arrays, b * step, (b + 1) * step) for b in range(batch)])
+        per_cloud = len(rows) // max(batch, 1)
+        run_in_threads(scatter_add_kernel, (*arrays, per_cloud), batch, per_cloud * shape[1] * 0.4)
         return out, None, None

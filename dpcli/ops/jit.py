@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numba
 
-# No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorise. Nothing that changes a
-# value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
+# No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorise. Nothing that changes
+# a value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
 _FLAGS = {"nnan", "nsz"}
 
 
@@ -15,7 +15,8 @@ def kernel(function: Callable) -> Callable:
     """For searches, whose indices and distances must equal the reference's; compiled on first call.
 
     Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
-    mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process.
+    mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process. Helpers belong
+    in the file of the kernel that calls them: numba's cache looks for changes in that file only.
     """
     return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
 

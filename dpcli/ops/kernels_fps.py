@@ -1,8 +1,9 @@
 """Farthest point sampling in numba: exact, bucketed; imports numpy and numba only (no torch).
 
 Points are sorted along a Morton curve and cut into buckets of 32 with bounding boxes. A new sample can only change a
-bucket whose box is nearer than the bucket's largest remaining distance, so most buckets are skipped; float32 rounding is
-monotone, so the box distance, computed in the same order as a point distance, never exceeds it and the skip is exact.
+bucket whose box is nearer than the bucket's largest remaining distance, so most buckets are skipped. The skip is exact:
+float32 rounding is monotone, so the distance to a box, computed in the order of a point distance, never exceeds that of
+a point inside.
 """
 
 from __future__ import annotations
@@ -69,17 +70,10 @@ def _morton_order(points, n):
 
 
 @kernel
-def bucket_points(points, n):
-    """Points[:n] (N,3) f32 in buckets: (order (n,) i32, xyz (3, buckets*BUCKET) f32, box (6, buckets) f32).
-
-    Bucket b holds the points order[b*BUCKET:(b+1)*BUCKET]; zeros pad the last. The rows of box are x min, x max, y min,
-    y max, z min, z max.
-    """
-    order = _morton_order(points, n)
-    buckets = (n + BUCKET - 1) // BUCKET
-    xyz = np.zeros((3, buckets * BUCKET), np.float32)
-    box = np.empty((6, buckets), np.float32)
-    for b in range(buckets):
+def _fill_buckets(points, n, order, xyz, box):
+    """Bucket points[:n] into order (n,), xyz (3, buckets*BUCKET) and box (6, buckets); see `bucket_kernel`."""
+    order[:n] = _morton_order(points, n)
+    for b in range((n + BUCKET - 1) // BUCKET):
         first = b * BUCKET
         for axis in range(3):
             box[2 * axis, b] = points[order[first], axis]
@@ -90,7 +84,17 @@ def bucket_points(points, n):
                 xyz[axis, i] = value
                 box[2 * axis, b] = min(box[2 * axis, b], value)
                 box[2 * axis + 1, b] = max(box[2 * axis + 1, b], value)
-    return order, xyz, box
+
+
+@kernel
+def bucket_kernel(points, lengths, order, xyz, box, first, last):
+    """Bucket clouds first..last-1 of points (B,N,3) f32, the first lengths[b] points of each.
+
+    Bucket j holds the points order[b, j*BUCKET:(j+1)*BUCKET]; order is (B,N) i32, xyz (B,3,buckets*BUCKET) their
+    coordinates, box (B,6,buckets) the rows x min, x max, y min, y max, z min, z max.
+    """
+    for b in range(first, last):
+        _fill_buckets(points[b], lengths[b], order[b], xyz[b], box[b])
 
 
 @kernel
@@ -134,10 +138,12 @@ def _farthest(best, top, order, n):
 
 
 @kernel
-def fps_kernel(points, n, start, out):
-    """Fill `out` (S,) i64 with farthest points of points[:n] (N,3) f32, first `start`; ties to the lowest index."""
-    order, xyz, box = bucket_points(points, n)
-    buckets = box.shape[1]
+def _sample(points, n, start, out):
+    buckets = (n + BUCKET - 1) // BUCKET
+    order = np.empty(n, np.int32)
+    xyz = np.zeros((3, buckets * BUCKET), np.float32)
+    box = np.empty((6, buckets), np.float32)
+    _fill_buckets(points, n, order, xyz, box)
     best = np.full(buckets * BUCKET, np.float32(-1))  # padding keeps -1: never a maximum
     best[:n] = np.inf
     top = np.full(buckets, np.float32(np.inf))
@@ -158,3 +164,13 @@ def fps_kernel(points, n, start, out):
             break
     for s in range(n, out.size):
         out[s] = out[s - n]
+
+
+@kernel
+def fps_kernel(points, lengths, start, out, first, last):
+    """Farthest points of clouds first..last-1 into out (B,S) i64: of points (B,N,3) f32, the first lengths[b] of each.
+
+    The first sample is `start`, ties go to the lowest index, and samples beyond lengths[b] repeat the sequence.
+    """
+    for b in range(first, last):
+        _sample(points[b], lengths[b], start, out[b])

@@ -148,12 +148,8 @@ def _nearest_row(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, guess
 
 
 @kernel
-def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, first, last, index, count):
-    """Fill rows first..last-1 of index (M,k) i64 and count (M,) i64; see `space_time_ball_query`.
-
-    xyz (3,N) f32, times (N,) i64, centroids (M,3) f32, centroid_times (M,) i64, limits (R,) f32 squared radii. Where
-    the times are sorted, only the frames within reach are looked at.
-    """
+def _query_clip(xyz, times, centroids, centroid_times, limits, nearest, low_row, high_row, index, count):
+    """Rows low_row..high_row-1 of one clip; where its times are sorted, only the frames within reach are looked at."""
     x, y, z = xyz[0], xyz[1], xyz[2]  # views made once: each costs an atomic reference count
     block = np.empty(_BLOCK + 1, np.float32)
     bits = block.view(np.int32)
@@ -164,7 +160,7 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, fi
     for limit in limits:
         widest = max(widest, limit)
     low, high = 0, times.size
-    for m in range(first, last):
+    for m in range(low_row, high_row):
         row = index[m]
         cx, cy, cz, t = centroids[m, 0], centroids[m, 1], centroids[m, 2], centroid_times[m]
         if in_order:
@@ -177,6 +173,21 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, fi
             filled = _first_hits(x, y, z, times, low, high, cx, cy, cz, t, limits, widest, block, row)
         row[filled:] = row[0] if filled else 0
         count[m] = filled
+
+
+@kernel
+def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, index, count, first, last):
+    """Fill rows first..last-1, counted through all clips, of index (B,M,k) i64 and count (B,M) i64.
+
+    xyz (B,3,N) f32, times (B,N) i64, centroids (B,M,3) f32, centroid_times (B,M) i64, limits (R,) f32 squared radii;
+    see `ball_query.space_time_ball_query`.
+    """
+    rows = centroids.shape[1]
+    while first < last:
+        b = first // rows
+        low, high = first - b * rows, min(last - b * rows, rows)
+        _query_clip(xyz[b], times[b], centroids[b], centroid_times[b], limits, nearest, low, high, index[b], count[b])
+        first += high - low
 
 
 @kernel
@@ -220,9 +231,8 @@ def _scan_bucket(x, y, z, order, first, size, cx, cy, cz, block, bits, heap, fil
 
 
 @kernel
-def _search(x, y, z, order, box, bucket, cx, cy, cz, lower, upper, block, bits, heap):
-    """Keep the nearest of all bucketed points: first some close buckets, then all that may hold a nearer point."""
-    n = order.size
+def _search(x, y, z, order, n, box, bucket, cx, cy, cz, lower, upper, block, bits, heap):
+    """Keep the nearest of all n bucketed points: first some close buckets, then all that may hold a nearer point."""
     start = _box_bounds(box, cx, cy, cz, lower, upper)
     reach = (heap.size - 1) // (2 * bucket)  # neighbours on the curve, enough for k points, are close in space
     filled = 0
@@ -240,23 +250,35 @@ def _search(x, y, z, order, box, bucket, cx, cy, cz, lower, upper, block, bits, 
 
 
 @kernel
-def knn_kernel(order, xyz, box, bucket, queries, first, last, squared, index):
-    """Fill rows first..last-1 of squared (M,k) f32 and index (M,k) i64 for queries (M,3); see `nearest.knn`.
-
-    order, xyz, box: `kernels_fps.bucket_points`, with `bucket` points in each.
-    """
+def _knn_cloud(order, n, xyz, box, bucket, queries, low, high, squared, index):
+    """Rows low..high-1 of one cloud."""
     x, y, z = xyz[0], xyz[1], xyz[2]
     block = np.empty(_BLOCK + 1, np.float32)
     bits = block.view(np.int32)
     heap = np.empty(index.shape[1], np.int64)
-    lower = np.empty(box.shape[1], np.float32)
-    upper = np.empty(box.shape[1], np.float32)
-    for m in range(first, last):
+    buckets = (n + bucket - 1) // bucket
+    lower, upper = np.empty(buckets, np.float32), np.empty(buckets, np.float32)
+    for m in range(low, high):
         cx, cy, cz = queries[m, 0], queries[m, 1], queries[m, 2]
-        filled = _search(x, y, z, order, box, bucket, cx, cy, cz, lower, upper, block, bits, heap)
+        filled = _search(x, y, z, order, n, box, bucket, cx, cy, cz, lower, upper, block, bits, heap)
         heap[:filled].sort()
         for slot in range(heap.size):
             key = heap[slot if slot < filled else 0]
             index[m, slot] = key & _INDEX_BITS
             bits[_BLOCK] = key >> 32
             squared[m, slot] = block[_BLOCK]
+
+
+@kernel
+def knn_kernel(order, lengths, xyz, box, bucket, queries, squared, index, first, last):
+    """Fill rows first..last-1, counted through all clouds, of squared (B,M,k) f32 and index (B,M,k) i64.
+
+    order, lengths, xyz, box: of `kernels_fps.bucket_kernel`, with `bucket` points in each; queries (B,M,3) f32; see
+    `nearest.knn`.
+    """
+    rows = queries.shape[1]
+    while first < last:
+        b = first // rows
+        low, high = first - b * rows, min(last - b * rows, rows)
+        _knn_cloud(order[b], lengths[b], xyz[b], box[b], bucket, queries[b], low, high, squared[b], index[b])
+        first += high - low

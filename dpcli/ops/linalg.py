@@ -9,7 +9,7 @@ from dpcli.ops.backend import chosen_backend, run_in_threads
 
 _GUARDS = ("signed", "release", "none")
 _CLOSED, _BLOCKS, _KERNEL = 4, 16, 8  # largest n of the closed form, of the block partition, and of the CPU kernel
-_ROWS_PER_TASK = 8192
+_ENTRY_NS = 2.5  # measured, per matrix entry
 
 
 def small_inverse(matrices: Tensor, *, min_det: float = 1e-6, guard: str = "signed") -> Tensor:
@@ -113,7 +113,7 @@ def _adjugate4(*m: Tensor) -> tuple[list[Tensor], Tensor]:
 
 
 class _KernelInverse(torch.autograd.Function):
-    """Forward and the gradient -X' G X' by the CPU kernel; where the guard moved a determinant, autograd's own gradient."""
+    """Forward and the gradient -X' G X' by the CPU kernel; autograd's own where the guard moved a determinant."""
 
     @staticmethod
     def forward(ctx, matrices: Tensor, min_det: float, guard: str) -> Tensor:
@@ -122,7 +122,7 @@ class _KernelInverse(torch.autograd.Function):
         flat = matrices.detach().reshape(-1, *matrices.shape[-2:]).contiguous()
         inverse, moved = torch.empty_like(flat), torch.empty(len(flat), dtype=torch.bool)
         arrays = (flat.numpy(), inverse.numpy(), moved.numpy())
-        run_in_threads(inverse_kernel, [(*arrays, min_det, _GUARDS.index(guard), *span) for span in _spans(len(flat))])
+        run_in_threads(inverse_kernel, (*arrays, min_det, _GUARDS.index(guard)), len(flat), flat[0].numel() * _ENTRY_NS)
         ctx.save_for_backward(flat, inverse, moved)
         ctx.settings = (min_det, guard)
         return inverse.view(matrices.shape)
@@ -135,14 +135,10 @@ class _KernelInverse(torch.autograd.Function):
         flat, inverse, moved = ctx.saved_tensors
         flat_grad, out = grad.reshape(flat.shape).contiguous(), torch.empty_like(flat)
         arrays = (inverse.numpy(), flat_grad.numpy(), out.numpy())
-        run_in_threads(inverse_gradient_kernel, [(*arrays, *span) for span in _spans(len(flat))])
+        run_in_threads(inverse_gradient_kernel, arrays, len(flat), flat[0].numel() * _ENTRY_NS)
         rows = moved.nonzero()[:, 0]
         if len(rows):
             with torch.enable_grad():
                 part = flat[rows].requires_grad_()
                 out[rows] = torch.autograd.grad(_inverse(part, *ctx.settings), part, flat_grad[rows])[0]
         return out.view(grad.shape), None, None
-
-
-def _spans(rows: int) -> list[tuple[int, int]]:
-    return [(first, min(first + _ROWS_PER_TASK, rows)) for first in range(0, rows, _ROWS_PER_TASK)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 from dpcli.ops.backend import (
@@ -14,8 +15,9 @@ from dpcli.ops.backend import (
     row_lengths,
     run_in_threads,
     squared_distances,
-    thread_windows,
 )
+
+_BUCKET_NS, _ROW_NS = 60, 6e3  # measured: per point, and per query with k = 16..32
 
 
 def knn(
@@ -25,8 +27,9 @@ def knn(
     *,
     lengths: torch.Tensor | None = None,  # [B]
 ) -> tuple[torch.Tensor, torch.Tensor]:  # [B, M, k], [B, M, k]
-    """Squared distances (B,M,k) f32 and indices (B,M,k) i64 of the k nearest points, ascending; ties to the lowest index.
+    """Squared distances (B,M,k) f32 and indices (B,M,k) i64 of the k nearest points, ascending.
 
+    Ties go to the lowest index.
     lengths: valid points per cloud; padding behind them is never found (but must be finite). Slots beyond a cloud's
     number of points repeat the nearest. Distances are float32 and carry no gradient: recompute them from the indices.
     Backends: numba on CPU (buckets with bounding boxes; exact, ties included), torch elsewhere (all pairs, in blocks of
@@ -61,20 +64,20 @@ def _checked(
 def _knn_numba(
     query: torch.Tensor, points: torch.Tensor, k: int, lengths: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    from dpcli.ops.kernels_fps import BUCKET, bucket_points
+    from dpcli.ops.kernels_fps import BUCKET, bucket_kernel
     from dpcli.ops.kernels_neighbours import knn_kernel
 
     batch, rows, _ = query.shape
-    valid = [points.shape[1]] * batch if lengths is None else lengths.tolist()
+    total = points.shape[1]
+    buckets = -(-total // BUCKET)
+    valid = (torch.full((batch,), total) if lengths is None else lengths).numpy()
+    order = np.empty((batch, total), np.int32)
+    xyz, box = np.empty((batch, 3, buckets * BUCKET), np.float32), np.empty((batch, 6, buckets), np.float32)
+    run_in_threads(bucket_kernel, (points.contiguous().numpy(), valid, order, xyz, box), batch, total * _BUCKET_NS)
     squared = torch.empty((batch, rows, k), dtype=torch.float32)
     index = torch.empty((batch, rows, k), dtype=torch.int64)
-    clouds = zip(*(t.contiguous().numpy() for t in (points, query, squared, index)), valid, strict=True)
-    tasks = []
-    for cloud, centres, out_squared, out_index, count in clouds:
-        buckets = bucket_points(cloud, count)
-        for window in thread_windows(batch, rows):
-            tasks.append((*buckets, BUCKET, centres, *window, out_squared, out_index))
-    run_in_threads(knn_kernel, tasks)
+    found = (order, valid, xyz, box, BUCKET, query.contiguous().numpy(), squared.numpy(), index.numpy())
+    run_in_threads(knn_kernel, found, batch * rows, _ROW_NS)
     return squared, index
 
 

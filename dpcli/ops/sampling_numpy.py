@@ -25,9 +25,9 @@ def fps_numpy(points: np.ndarray, num_samples: int, *, start: int = 0) -> np.nda
     kernel = _kernel() if os.environ.get("DPC_BACKEND") != "torch" else None
     if kernel is None:
         return _fps_plain(points, num_samples, start)
-    out = np.empty(num_samples, np.int64)
-    kernel(points, len(points), start, out)
-    return out
+    out = np.empty((1, num_samples), np.int64)
+    kernel(points[None], np.array([len(points)]), start, out, 0, 1)
+    return out[0]
 
 
 @functools.cache

@@ -1,0 +1,201 @@
+"""Speed of the operations: ours against the torch reference, and against what a user would take instead.
+
+    python -m tests.bench.bench_ops [--repeat 5]
+
+Every row times the three in turn (median of several, first call not counted) and compares their results in the same
+run: ours and the reference must give identical indices (inverses: equal to rounding), or the bench fails. The shapes
+are a 16 x 2048 clip of a moving body about 1.1 tall, as Kinet sees it, and frames as `dpc prepare` thins them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+
+from dpcli import ops
+from dpcli.errors import DpcError
+from dpcli.prepare.open3d_import import load_open3d
+from tests.ops_helpers import backend
+
+
+def median_ms(function: Callable[[], object], repeat: int) -> float:
+    function()
+    times = []
+    for _ in range(repeat):
+        start = time.perf_counter()
+        function()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times)
+
+
+def body(frames: int, count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """A turning ellipsoid shell with 1 cm of noise: points (1,frames*count,3) and their frame numbers."""
+    rng = np.random.default_rng(seed)
+    shell = rng.normal(size=(frames, count, 3))
+    shell /= np.linalg.norm(shell, axis=-1, keepdims=True)
+    points = shell * [0.25, 0.55, 0.15] + rng.normal(scale=0.01, size=shell.shape)
+    points[..., 0] += np.linspace(0, 0.3, frames)[:, None]
+    times = np.repeat(np.arange(frames), count)[None]
+    return torch.from_numpy(points.reshape(1, -1, 3).astype(np.float32)), torch.from_numpy(times)
+
+
+def open3d_fps(points: torch.Tensor, samples: int) -> Callable[[], object] | None:
+    try:
+        open3d = load_open3d()
+    except DpcError:
+        return None
+    clouds = [open3d.geometry.PointCloud(open3d.utility.Vector3dVector(p.double().numpy())) for p in points]
+    return lambda: [cloud.farthest_point_down_sample(samples) for cloud in clouds]
+
+
+def scipy_ball(
+    points: torch.Tensor, times: torch.Tensor, centers: torch.Tensor, center_times: torch.Tensor, radius: float
+):
+    """A tree per frame, asked for all neighbours: what fills the slots is left to the user."""
+    from scipy.spatial import cKDTree
+
+    frames = [points[0][times[0] == t].numpy() for t in range(int(times.max()) + 1)]
+
+    def run() -> None:
+        trees = [cKDTree(frame) for frame in frames]
+        for t in range(len(frames)):
+            asked = centers[0][center_times[0] == t].numpy()
+            for near in range(max(0, t - 1), min(len(frames), t + 2)):
+                trees[near].query_ball_point(asked, radius, workers=-1)
+
+    return run
+
+
+def scipy_knn(query: torch.Tensor, points: torch.Tensor, k: int) -> Callable[[], object]:
+    from scipy.spatial import cKDTree
+
+    return lambda: [cKDTree(p.numpy()).query(q.numpy(), k, workers=-1) for q, p in zip(query, points, strict=True)]
+
+
+def fps_rows() -> Iterator[tuple]:
+    for batch, count, samples in ((1, 32768, 1024), (16, 2048, 512), (1, 7000, 2048)):
+        points = body(1, batch * count)[0].view(batch, count, 3)
+        yield (
+            f"fps {batch} x {count} -> {samples}",
+            lambda p=points, s=samples: ops.fps(p, s),
+            lambda p=points, s=samples: ops.fps_reference(p, s),
+            ("open3d", open3d_fps(points, samples)),
+        )
+
+
+def ball_rows() -> Iterator[tuple]:
+    points, times = body(16, 2048)
+    chosen = ops.fps(points, 1024)[0]
+    centers, center_times = points[:, chosen], times[:, chosen]
+    clip = (points, times, centers, center_times)
+    for order, radii in (("first", [0.5, 0.507]), ("nearest", [0.5, 0.507]), ("first", [0.05, 0.05])):
+        yield (
+            f"ball query 16 x 2048, r {radii[0]}, {order} 64 of 1024",
+            lambda r=radii, o=order: ops.space_time_ball_query(*clip, r, 64, order=o),
+            lambda r=radii, o=order: ops.space_time_ball_query_reference(*clip, r, 64, order=o),
+            ("scipy", scipy_ball(*clip, radii[0])),
+        )
+    second = ops.fps(centers, 512)[0]
+    stage = (centers, center_times, centers[:, second], center_times[:, second])
+    yield (
+        "ball query 1024 unsorted, r 1.0, first 64 of 512",
+        lambda: ops.space_time_ball_query(*stage, [1.0, 1.01], 64),
+        lambda: ops.space_time_ball_query_reference(*stage, [1.0, 1.01], 64),
+        ("scipy", scipy_ball(*stage, 1.0)),
+    )
+
+
+def knn_rows() -> Iterator[tuple]:
+    generator = torch.Generator().manual_seed(0)
+    for batch, rows, count, k in ((16, 512, 2048, 32), (1, 20000, 20000, 16), (16, 1024, 512, 3)):
+        query, points = (torch.randn(batch, n, 3, generator=generator) for n in (rows, count))
+        yield (
+            f"knn {batch} x {rows} in {count}, k {k}",
+            lambda q=query, p=points, k=k: ops.knn(q, p, k),
+            lambda q=query, p=points, k=k: ops.knn_reference(q, p, k),
+            ("scipy", scipy_knn(query, points, k)),
+        )
+
+
+def with_gradient(function: Callable, leaf: torch.Tensor) -> Callable[[], torch.Tensor]:
+    def run() -> torch.Tensor:
+        out = function(leaf)
+        return torch.autograd.grad(out, leaf, torch.ones_like(out))[0]
+
+    return run
+
+
+def under(name: str, function: Callable) -> Callable:
+    def run(*args: object) -> object:
+        with backend(name):
+            return function(*args)
+
+    return run
+
+
+def value_rows() -> Iterator[tuple]:
+    """Forward and backward of what carries gradients."""
+    generator = torch.Generator().manual_seed(0)
+    for n in (4, 5):
+        factor = torch.randn(60000, 3 * n, n, generator=generator)
+        leaf = (factor.mT @ factor / n).requires_grad_()
+        yield (
+            f"inverse 60000 x {n} x {n}, with gradient",
+            with_gradient(ops.small_inverse, leaf),
+            with_gradient(ops.small_inverse_reference, leaf),
+            ("torch.linalg.inv", with_gradient(torch.linalg.inv, leaf)),
+        )
+    features = torch.randn(4, 1024, 128, generator=generator).requires_grad_()
+    idx = torch.randint(0, 1024, (4, 512, 64), generator=generator)
+    flat = idx.view(4, -1, 1).expand(-1, -1, 128)
+    yield (
+        "gather 4 x 512 x 64 of 1024 x 128, with gradient",
+        with_gradient(lambda f: ops.gather_points(f, idx), features),
+        with_gradient(under("torch", lambda f: ops.gather_points(f, idx)), features),
+        ("torch.gather", with_gradient(lambda f: f.gather(1, flat).view(*idx.shape, -1), features)),
+    )
+    query, points = (torch.randn(16, n, 3, generator=generator) for n in (1024, 512))
+    values = torch.randn(16, 512, 88, generator=generator).requires_grad_()
+    yield (
+        "3-NN interpolation 16 x 512 -> 1024 x 88, with gradient",
+        with_gradient(lambda f: ops.three_nn_interpolate(query, points, f), values),
+        with_gradient(under("torch", lambda f: ops.three_nn_interpolate(query, points, f)), values),
+        ("-", None),
+    )
+
+
+def agree(ours: object, reference: object) -> str:
+    """Identical indices, or values equal to rounding; anything else ends the bench."""
+    pairs = [(ours, reference)] if isinstance(ours, torch.Tensor) else list(zip(ours, reference, strict=True))
+    if all(torch.equal(a, b) for a, b in pairs):
+        return "identical"
+    if any(not a.is_floating_point() for a, b in pairs):
+        sys.exit("indices differ from the reference")
+    worst = max(float((a - b).abs().max() / b.abs().max()) for a, b in pairs)
+    if worst > 1e-3:
+        sys.exit(f"values differ from the reference by {worst:.1e} of the largest")
+    return f"{worst:.0e}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--repeat", type=int, default=5)
+    repeat = parser.parse_args().repeat
+    print(f"{torch.get_num_threads()} torch threads; median of {repeat} after one call; ms")
+    print(f"{'operation':58} {'ours':>8} {'torch':>8} {'ratio':>6} {'results':>9}  instead")
+    for rows in (fps_rows, ball_rows, knn_rows, value_rows):
+        for title, ours, reference, (other, theirs) in rows():
+            results = agree(ours(), reference())
+            fast, slow = median_ms(ours, repeat), median_ms(reference, repeat)
+            instead = f"{other} {median_ms(theirs, repeat):.1f}" if theirs else "-"
+            print(f"{title:58} {fast:8.2f} {slow:8.1f} {slow / fast:5.1f}x {results:>9}  {instead}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
