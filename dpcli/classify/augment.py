@@ -19,7 +19,7 @@ class Augmentation:
     turn: float = 0.4  # rad, U(-t, t) about the camera's vertical axis y
     tilt: float = 0.1  # rad, standard deviation of small rotations about all axes, clipped at 3 of them
     shift: float = 0.1  # length units, U(-s, s) for each axis
-    jitter: float = 0.01  # length units, standard deviation for each point
+    jitter: float = 0.002  # length units, standard deviation for each point
     dropout: float = 0.2  # largest share of points replaced by their predecessor
     crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
 

@@ -37,10 +37,11 @@ def clip_frames(length: int, frames: int, start: int) -> tuple[int, ...]:
     return tuple(min(start + t, length - 1) for t in range(frames))
 
 
-def uniform_frames(length: int, frames: int, phase: float | np.ndarray = 0.0) -> tuple[int, ...]:
+def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, ...]:
     """`frames` frames over the whole video: int((j + phase) * length / frames), phase in [0, 1).
 
-    Phase 0 is what the gesture benchmarks take; a random phase for each j is the training draw.
+    Phase 0 is what the gesture benchmarks take. Training draws one phase a clip: one for each j would shake the
+    time between frames, and with it every speed.
     """
     return tuple(int(t) for t in np.minimum((np.arange(frames) + phase) * length // frames, length - 1))
 
@@ -90,7 +91,7 @@ class ClipSource:
         if self.timing == "uniform":
             lost = int(rng.uniform(0, self.augmentation.crop) * length)
             start = int(rng.integers(lost + 1))
-            return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random(frames))))
+            return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random())))
         return Clip(sequence, clip_frames(length, frames, int(rng.integers(max(length - frames, 0) + 1))))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:

@@ -14,8 +14,8 @@ from dpcli.ops.grouped_mlp import gather_rows
 class ResidualMerge(nn.Module):
     """h_l = relu(C_l n_l + R_l h_{l-1}) (thesis figure 3.4).
 
-    Where a unit's centroids are the next stage's neighbours, h is max-pooled over the neighbourhood first. With `norm`
-    the sum is batch-normalised before the ReLU.
+    Where a unit's centroids are the next stage's neighbours, h is averaged over the neighbourhood first: a single normal
+    is noisy, and a maximum would pick the noise. With `norm` the sum is batch-normalised before the ReLU.
     """
 
     def __init__(self, channels: list[int], widths: list[int], norm: bool) -> None:
@@ -30,7 +30,7 @@ class ResidualMerge(nn.Module):
         per_stage = len(normals) // len(groups)
         for level in range(1, len(normals)):
             if level % per_stage == 0:
-                state = gather_rows(state, groups[level // per_stage].idx).amax(2)
+                state = gather_rows(state, groups[level // per_stage].idx).mean(2)
             state = self._activate(level, self.abstract[level](normals[level]) + self.align[level - 1](state))
         return state
 

@@ -20,8 +20,8 @@ class Preset:
     augmentation: Augmentation
 
 
-_SMALL = {"centroids": (256, 128), "neighbors": 32, "points_per_frame": 256, "radii": (0.3, 0.6), "normalize": "center",
-          "solver": "ridge", "merge_norm": True, "dropout": 0.3}  # fmt: skip
+_SMALL = {"centroids": (256, 128), "neighbors": 32, "points_per_frame": 256, "radii": (0.15, 0.5), "normalize": "center",
+          "solver": "ridge", "merge_norm": True, "xyz_group": True, "group_size": 3, "dropout": 0.2}  # fmt: skip
 _TINY = {**_SMALL, "centroids": (128, 64), "neighbors": 16, "points_per_frame": 128, "dropout": 0.0,
          "widths": ((32, 64), (64, 128), (128, 256))}  # fmt: skip
 
@@ -32,7 +32,7 @@ PRESETS = {
         Schedule((250, 250), batch=8, decay="staircase", validate_every=5), AUGMENTATIONS["release"],
     ),
     "quick": Preset(
-        KinetConfig(**_SMALL), Schedule((160, 60), batch=8, weight_decay=0.01, label_smoothing=0.1), AUGMENTATIONS["ours"]
+        KinetConfig(**_SMALL), Schedule((80, 60), batch=8, weight_decay=0.01, label_smoothing=0.1), AUGMENTATIONS["ours"]
     ),
     "tiny": Preset(
         KinetConfig(**_TINY), Schedule((20, 20), batch=8, learning_rate=2e-3, weight_decay=0.01), AUGMENTATIONS["ours"]

@@ -23,4 +23,4 @@ def three_nn_interpolate(query: Tensor, points: Tensor, features: Tensor) -> Ten
     distance = (query[..., None, :] - gather_points(points, idx)).square().sum(-1)
     weight = distance.clamp(min=_LEAST).reciprocal()
     weight = weight / weight.sum(-1, keepdim=True)
-    return (weight[..., None, :] @ gather_points(features, idx))[..., 0, :]
+    return (weight[..., None] * gather_points(features, idx)).sum(-2)  # a batched product took three times as long
