@@ -78,6 +78,16 @@ def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc, tmp_path):
     np.testing.assert_allclose(a, b, atol=2e-5)
 
 
+def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_folder, dpc, tmp_path):
+    words = ("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
+    assert dpc(*words).returncode == 0
+    before = (tmp_path / "s.h5").read_bytes()
+    again = dpc(*words)
+    assert again.returncode == 0 and b"already complete" in again.stderr
+    other = dpc(*words, "--split", "all")
+    assert other.returncode == 2 and b"--force" in other.stderr and (tmp_path / "s.h5").read_bytes() == before
+
+
 def last_weights(folder: Path) -> dict:
     from safetensors.torch import load_file
 

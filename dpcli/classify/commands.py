@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from dpcli.classify.augment import PRESETS as AUGMENTATIONS
 from dpcli.classify.clips import ClipSource
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinet import Kinet
-from dpcli.classify.model_file import ModelInfo, load_model
+from dpcli.classify.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.predict import predict_videos
 from dpcli.classify.presets import find_preset
 from dpcli.classify.run_folder import RunFolder
@@ -25,7 +26,7 @@ from dpcli.runtime.device import choose_device
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
-from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
+from dpcli.store import CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
 
 _RELEASE = {key: getattr(KinetConfig.release(), key) for key in
             ("variant", "group_size", "xyz_group", "time_input", "weighting", "merge", "guard", "fusion", "grouping")}  # fmt: skip
@@ -139,14 +140,31 @@ def run_prediction(
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=seed)
         _report_short(source, info.config.num_frames)
         config = {"split": split, "clips_per_video": clips_per_video, "drop_short": drop_short, "dropped": source.dropped,
-                  "model": info.notes, "fusion": info.config.fusion}  # fmt: skip
+                  "model": info.notes, "weights": provenance.file_digest(find_model(model_name)), "fusion": info.config.fusion}  # fmt: skip
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
+        if not force and _already_scored(target, history[-1]):
+            return
         keep_freed_memory()
         with ScoresWriter(target, class_names=info.class_names, seed=seed, source=reader.path.name if data != "-" else "stdin",
                           provenance=history, streams=("static", "dynamic"), force=force) as writer:  # fmt: skip
             _score(model.to(chosen), source, writer, clips_per_video, batch, chosen)
     if output != "-":
         print(f"{output}: scores of {len(writer)} videos in {len(info.class_names)} classes")
+
+
+def _already_scored(target: Path, entry: dict) -> bool:
+    """Whether `target` holds the scores of this very work; UsageError when it holds something else."""
+    if not target.exists():
+        return False
+    try:
+        before = ScoresReader(target).provenance[-1:]
+    except DataError as error:
+        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
+    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
+        raise UsageError(f"{target}: holds scores of another model, data or choice; use another -o, or --force to replace it")
+    log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
+    print(f"{target}: complete")
+    return True
 
 
 def _select(reader: CloudsReader, split: str) -> list[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 
 from dpcli.ops.backend import (
@@ -119,9 +120,9 @@ def _query_numba(
     batch, rows = centroid_times.shape
     index = torch.empty((batch, rows, k), dtype=torch.int64)
     count = torch.empty((batch, rows), dtype=torch.int64)
-    tensors = (points.transpose(1, 2), times, centroids, centroid_times, limits)
-    arrays = (tensor.contiguous().numpy() for tensor in tensors)
-    arguments = (*arrays, order == "nearest", index.numpy(), count.numpy())
+    xyz = np.ascontiguousarray(points.numpy().transpose(0, 2, 1))  # by numpy: torch's copy would wake OpenMP threads
+    rest = (tensor.contiguous().numpy() for tensor in (times, centroids, centroid_times, limits))
+    arguments = (xyz, *rest, order == "nearest", index.numpy(), count.numpy())
     run_in_threads(ball_query_kernel, arguments, batch * rows, _ROW_NS[order])
     return index, count
 
