@@ -12,7 +12,9 @@ from dpcli.classify.split import carve_validation, default_rule
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
-CONFIG = KinetConfig(num_classes=2, num_frames=4, points_per_frame=16, centroids=(8, 4), neighbors=4, widths=((8, 8), (8, 8), (8, 8)))
+CONFIG = KinetConfig(
+    num_classes=2, num_frames=4, points_per_frame=16, centroids=(8, 4), neighbors=4, widths=((8, 8), (8, 8), (8, 8))
+)
 
 
 @pytest.fixture
@@ -21,7 +23,9 @@ def reader(tmp_path) -> CloudsReader:
         for i, length in enumerate((2, 4, 7, 10, 9, 8)):
             # frame t holds the value t in its first coordinate: a clip tells which frames it has
             frames = [np.full((5 + 7 * t, 3), [t, i, 0], np.float32) for t in range(length)]
-            writer.write(CloudSequence.from_frames(f"v{i}", frames, label=i % 2, split="train" if i < 5 else "test", subject=i))
+            writer.write(
+                CloudSequence.from_frames(f"v{i}", frames, label=i % 2, split="train" if i < 5 else "test", subject=i)
+            )
     return CloudsReader(tmp_path / "c.h5")
 
 
@@ -29,9 +33,14 @@ def test_every_start_and_spread_clips():
     assert clip_starts(7, 4, None) == [0, 1, 2, 3] and clip_starts(4, 4, None) == [0] and clip_starts(2, 4, None) == [0]
     assert clip_starts(24, 4, 3) == [0, 10, 20] and clip_starts(24, 4, 1) == [10] and clip_starts(5, 4, 9) == [0, 1]
     assert clip_frames(3, 5, 0) == (0, 1, 2, 2, 2)
-    assert uniform_frames(80, 8) == tuple(int(j * 80 / 8) for j in range(8)) and uniform_frames(3, 6) == (0, 0, 1, 1, 2, 2)
-
-
+    assert uniform_frames(80, 8) == tuple(int(j * 80 / 8) for j in range(8)) and uniform_frames(3, 6) == (
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    )
 
 
 def test_published_clip_counts(shared_data):
@@ -73,7 +82,9 @@ def test_the_draw_depends_on_the_key_alone(reader):
     assert source.epoch(3, 1) == ClipSource(reader, [2, 3], CONFIG, seed=5).epoch(3, 1)
     assert np.array_equal(source.load(clip, 3, 0), source.load(clip, 3, 0))
     assert not np.array_equal(source.load(clip, 3, 0), source.load(clip, 3, 1))
-    assert len({tuple(c.frames) for n in range(60) for c in source.epoch(n, 1) if c.sequence == 3}) == 7  # every start occurs
+    assert (
+        len({tuple(c.frames) for n in range(60) for c in source.epoch(n, 1) if c.sequence == 3}) == 7
+    )  # every start occurs
 
 
 def test_points_are_drawn_without_replacement_or_in_whole_copies():
@@ -104,7 +115,9 @@ def test_augmentation_is_one_rigid_draw_a_clip():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3, 40, 3)).astype(np.float32)
     turned = Augmentation(0, False, 0.5, 0.1, 0, 0, 0, 0)(points, rng)
-    before, after = (np.linalg.norm(p.reshape(-1, 3)[:, None] - p.reshape(-1, 3)[None], axis=-1) for p in (points, turned))
+    before, after = (
+        np.linalg.norm(p.reshape(-1, 3)[:, None] - p.reshape(-1, 3)[None], axis=-1) for p in (points, turned)
+    )
     assert np.allclose(before, after, atol=1e-4) and not np.allclose(points, turned, atol=1e-2)
     scaled = PEERS(points, rng)
     ratio = (scaled - scaled.mean((0, 1))) / (points - points.mean((0, 1)))

@@ -27,7 +27,11 @@ def gestures(path: Path, videos: int = 12, frames: int = 6) -> Path:
             sign = 1 if i % 2 else -1
             body = rng.normal(size=(frames, 90, 3)) * [0.2, 0.5, 0.1]
             body[:, :45, 0] += sign * np.linspace(-0.5, 0.5, frames)[:, None]
-            writer.write(CloudSequence.from_frames(f"v{i}", list(body.astype(np.float32)), label=i % 2, split="test" if i % 3 == 2 else "train"))
+            writer.write(
+                CloudSequence.from_frames(
+                    f"v{i}", list(body.astype(np.float32)), label=i % 2, split="test" if i % 3 == 2 else "train"
+                )
+            )
     return path
 
 
@@ -46,7 +50,12 @@ def run_folder(data, dpc) -> Path:
 
 def test_training_leaves_weights_logs_and_a_picture(run_folder):
     log = json.loads((run_folder / "log.json").read_text())
-    assert [(row["stage"], row["epoch"]) for row in log] == [("static", 1), ("static", 2), ("dynamic", 1), ("dynamic", 2)]
+    assert [(row["stage"], row["epoch"]) for row in log] == [
+        ("static", 1),
+        ("static", 2),
+        ("dynamic", 1),
+        ("dynamic", 2),
+    ]
     assert all(np.isfinite(row["loss"]) and 0 <= row["validation_accuracy"] <= 1 for row in log)
     assert (run_folder / "log.csv").read_text().count("\n") == 5
     assert (run_folder / "curves.png").read_bytes().startswith(b"\x89PNG")
@@ -97,7 +106,21 @@ def last_weights(folder: Path) -> dict:
 def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folder, dpc, tmp_path):
     """SIGTERM in the middle of an epoch saves the step and exits 75; kill -9 loses at most the epoch in hand."""
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "dpcli", "classify", "train", str(data), "-o", str(folder), *TRAIN, "--epochs", "2", "--epochs-dynamic", "2"]
+    command = [
+        sys.executable,
+        "-m",
+        "dpcli",
+        "classify",
+        "train",
+        str(data),
+        "-o",
+        str(folder),
+        *TRAIN,
+        "--epochs",
+        "2",
+        "--epochs-dynamic",
+        "2",
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     first = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment)
     wait_for(folder / "state.pt", first)
@@ -156,24 +179,39 @@ def test_profile_prints_true_and_paper_counts(dpc):
 
 
 def test_static_weights_of_another_run_are_a_start(data, run_folder, dpc, tmp_path):
-    run = dpc("classify", "train", data, "-o", tmp_path / "r", *TRAIN, "--epochs", 0, "--epochs-dynamic", 1, "--static-from", run_folder)
+    run = dpc(
+        "classify",
+        "train",
+        data,
+        "-o",
+        tmp_path / "r",
+        *TRAIN,
+        "--epochs",
+        0,
+        "--epochs-dynamic",
+        1,
+        "--static-from",
+        run_folder,
+    )
     assert run.returncode == 0, run.stderr.decode()
     ours, theirs = last_weights(tmp_path / "r"), last_weights(run_folder)
     assert all(bool((ours[key] == theirs[key]).all()) for key in ours if key.startswith("static."))
 
 
 def test_help_is_quick_and_imports_nothing_heavy():
-    code = "import sys; from dpcli.cli import app; print([m for m in ('torch', 'open3d', 'cv2', 'numba', 'scipy', 'matplotlib', 'h5py') if m in sys.modules])"
+    heavy = ("torch", "open3d", "cv2", "numba", "scipy", "matplotlib", "h5py")
+    code = f"import sys; from dpcli.cli import app\nprint([m for m in {heavy} if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert run.stdout.strip() == "[]", run.stdout + run.stderr
 
 
 def test_every_start_is_scored(data, run_folder, dpc, tmp_path):
     """6 frames, clips of 4: three clips a video; their mean is the video's score."""
+    import torch
+
     from dpcli.classify.clips import ClipSource
     from dpcli.classify.model_file import load_model
     from dpcli.classify.predict import batches, predict_videos
-    import torch
 
     model, info = load_model(str(run_folder))
     reader = CloudsReader(data)

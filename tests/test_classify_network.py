@@ -15,7 +15,8 @@ TINY = {"num_classes": 5, "num_frames": 4, "points_per_frame": 64, "centroids": 
 
 
 @pytest.mark.parametrize(
-    ("classes", "static", "total"), [(20, 741_652, 1_586_906), (25, 746_777, 1_597_156), (28, 749_852, 1_603_306), (60, 782_652, 1_668_906)]
+    ("classes", "static", "total"),
+    [(20, 741_652, 1_586_906), (25, 746_777, 1_597_156), (28, 749_852, 1_603_306), (60, 782_652, 1_668_906)],
 )
 def test_release_parameter_counts_are_exact(classes, static, total):
     model = Kinet(KinetConfig.release(num_classes=classes))
@@ -37,7 +38,12 @@ def test_macs_of_the_static_stream_as_written():
     """5.018e9 operations of facts section 2: 2 x multiply-adds, counted layer by layer by hand."""
     model = Kinet(KinetConfig.release(num_classes=28, num_frames=16, points_per_frame=256)).eval()
     counts = macs(model, body_like_clip(16, 256))
-    by_hand = 1024 * 64 * (3 * 64 + 64 * 128) + 512 * 64 * (131 * 128 + 128 * 256) + 512 * (259 * 512 + 512 * 1024) + 1024 * 28
+    by_hand = (
+        1024 * 64 * (3 * 64 + 64 * 128)
+        + 512 * 64 * (131 * 128 + 128 * 256)
+        + 512 * (259 * 512 + 512 * 1024)
+        + 1024 * 28
+    )
     assert counts["static_as_written"] == by_hand and round(2 * by_hand / 1e9, 3) == 5.018
     assert counts["static"] < by_hand  # gathering after the first layer saves the difference
     assert 5.3e9 < 2 * counts["dynamic"] < 6.1e9  # facts: 5.73e9
@@ -54,7 +60,9 @@ CONFIGS = [
 ]
 
 
-@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}")
+@pytest.mark.parametrize(
+    "config", CONFIGS, ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}"
+)
 def test_every_switch_trains_the_dynamic_branch_alone(config):
     torch.manual_seed(0)
     model = Kinet(config)

@@ -16,7 +16,11 @@ def moving_plane(normal, velocity, count=60, seed=0, dtype=torch.float64):
     basis = np.linalg.svd(normal[None])[2][1:]
     times = rng.integers(-1, 2, count).astype(float)
     points = rng.normal(size=(count, 2)) @ basis + times[:, None] * np.asarray(velocity)
-    return torch.tensor(points, dtype=dtype)[:, None], torch.tensor(times, dtype=dtype), torch.tensor(normal, dtype=dtype)
+    return (
+        torch.tensor(points, dtype=dtype)[:, None],
+        torch.tensor(times, dtype=dtype),
+        torch.tensor(normal, dtype=dtype),
+    )
 
 
 def test_normal_is_orthogonal_to_the_flow_and_gives_the_normal_speed():
@@ -45,7 +49,10 @@ def test_weights_leave_outliers_out():
 def test_fit_equals_a_least_squares_solver(size):
     g = torch.Generator().manual_seed(size)
     features = torch.randn(5, 64, 3, size, generator=g, dtype=torch.float64)
-    times, weights = torch.randn(5, 64, generator=g, dtype=torch.float64), torch.rand(5, 64, 3, generator=g, dtype=torch.float64)
+    times, weights = (
+        torch.randn(5, 64, generator=g, dtype=torch.float64),
+        torch.rand(5, 64, 3, generator=g, dtype=torch.float64),
+    )
     ours = fit_surface(features, times, weights, guard="none")
     for b in range(5):
         for k in range(3):
@@ -60,7 +67,9 @@ def test_ridge_and_guard_are_finite_where_neighbours_repeat():
     times = torch.zeros(7, 64)
     for options in ({"solver": "ridge"}, {"guard": "signed"}, {"guard": "release"}):
         normal = surface_normal(fit_surface(features, times, **options))
-        assert torch.isfinite(normal).all() and torch.isfinite(torch.autograd.grad(normal.sum(), features)[0]).all(), options
+        assert torch.isfinite(normal).all() and torch.isfinite(torch.autograd.grad(normal.sum(), features)[0]).all(), (
+            options
+        )
 
 
 def test_deviations_vanish_on_the_plane_and_project_onto_the_normal():
@@ -86,4 +95,6 @@ def test_gradients_against_finite_differences():
 
 def test_measuring_time_from_the_centroid_changes_no_normal():
     points, times, _ = moving_plane([1, 2, 0], [0.2, 0, 0])
-    torch.testing.assert_close(surface_normal(fit_surface(points, times)), surface_normal(fit_surface(points, times + 7)), rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(
+        surface_normal(fit_surface(points, times)), surface_normal(fit_surface(points, times + 7)), rtol=1e-7, atol=1e-7
+    )

@@ -43,7 +43,9 @@ def run(case, fast: bool, grad):
 def compare(features: int, repeat: bool = False) -> None:
     grad = torch.randn(2, 20, 12, generator=torch.Generator().manual_seed(1))
     pooled, statistics, grads = run(layer(features, repeat=repeat), True, grad)
-    expected, expected_statistics, expected_grads = run(layer(features, torch.float64, repeat=repeat), False, grad.double())
+    expected, expected_statistics, expected_grads = run(
+        layer(features, torch.float64, repeat=repeat), False, grad.double()
+    )
     torch.testing.assert_close(pooled.double(), expected, rtol=0, atol=2e-5)  # measured 3e-6
     for ours, theirs in zip(statistics, expected_statistics):
         torch.testing.assert_close(ours.double(), theirs, rtol=1e-5, atol=1e-6)
@@ -77,9 +79,16 @@ def test_checker_rejects_a_kernel_that_drops_the_batch_statistics(monkeypatch):
 
 def test_given_statistics_are_folded_exactly():
     points, centers, idx, v, _ = layer(7, torch.float64)
-    norms = [Norm(v[g], v[s], torch.rand(len(v[g])).double(), torch.rand(len(v[g])).double() + 0.5) for g, s in (("g1", "s1"), ("g2", "s2"))]
-    taps, _ = grouped_activations(points, centers, idx, v["features"], (v["w1"], v["b1"]), norms[0], (v["w2"], v["b2"]), norms[1])
-    x = torch.stack([torch.cat([points[b][idx[b]] - centers[b][:, None], v["features"][b][idx[b]]], -1) for b in range(2)])
+    norms = [
+        Norm(v[g], v[s], torch.rand(len(v[g])).double(), torch.rand(len(v[g])).double() + 0.5)
+        for g, s in (("g1", "s1"), ("g2", "s2"))
+    ]
+    taps, _ = grouped_activations(
+        points, centers, idx, v["features"], (v["w1"], v["b1"]), norms[0], (v["w2"], v["b2"]), norms[1]
+    )
+    x = torch.stack(
+        [torch.cat([points[b][idx[b]] - centers[b][:, None], v["features"][b][idx[b]]], -1) for b in range(2)]
+    )
     for (w, bias), norm, tap in zip(((v["w1"], v["b1"]), (v["w2"], v["b2"])), norms, taps):
         y = x @ w.T + bias
         x = torch.relu((y - norm.mean) / (norm.var + norm.eps).sqrt() * norm.weight + norm.bias)

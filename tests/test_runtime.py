@@ -96,7 +96,9 @@ def test_a_batch_log_gets_plain_lines(monkeypatch):
         bar.advance(1, frames=10)
     lines = stream.getvalue().splitlines()
     assert lines[0].startswith("dpc: prepare x 3/4 75% ") and "eta" in lines[0] and "frames/s" in lines[0]
-    assert lines[-1].startswith("dpc: prepare x 4/4 100% ") and "eta" not in lines[-1] and "\x1b" not in stream.getvalue()
+    assert (
+        lines[-1].startswith("dpc: prepare x 4/4 100% ") and "eta" not in lines[-1] and "\x1b" not in stream.getvalue()
+    )
 
 
 def test_durations():
@@ -135,7 +137,9 @@ if __name__ == "__main__":
     script = tmp_path / "spread.py"
     script.write_text(code)
     environment = {**os.environ, "PYTHONPATH": os.getcwd()}
-    process = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment)
+    process = subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment
+    )
     process.stdout.readline()
     process.kill()
     process.communicate(timeout=20)  # returns when the last process holding the pipes is gone

@@ -49,7 +49,10 @@ def test_round_trip_of_every_field(tmp_path, make_sequence):
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(sizes=st.lists(st.lists(st.integers(0, 6), min_size=1, max_size=5).filter(any), min_size=1, max_size=4), data=st.data())
+@given(
+    sizes=st.lists(st.lists(st.integers(0, 6), min_size=1, max_size=5).filter(any), min_size=1, max_size=4),
+    data=st.data(),
+)
 def test_any_frames_of_any_ragged_file(tmp_path, sizes, data):
     rng = np.random.default_rng(1)
     clouds = [[rng.normal(size=(n, 3)).astype(np.float32) for n in frames] for frames in sizes]
@@ -69,7 +72,9 @@ def test_reads_only_the_frames_asked_for(tmp_path, three, monkeypatch):
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     touched = []
     original = h5py.Dataset.__getitem__
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda self, key, **k: touched.append((self.name, key)) or original(self, key, **k))
+    monkeypatch.setattr(
+        h5py.Dataset, "__getitem__", lambda self, key, **k: touched.append((self.name, key)) or original(self, key, **k)
+    )
     reader.read(1, slice(1, 3))
     spans = [key for name, key in touched if name == "/points"]
     first = int(reader._frame_offsets[reader._sequence_offsets[1] + 1])
@@ -160,7 +165,9 @@ def test_several_loader_workers_read_what_one_reads(tmp_path, three):
     torch = pytest.importorskip("torch")
     reader = CloudsReader(write(tmp_path / "a.h5", three))
     reader.read(0)  # an open handle in the parent must not leak into the workers
-    loader = torch.utils.data.DataLoader(_Sums(reader), batch_size=None, num_workers=2, multiprocessing_context="forkserver")
+    loader = torch.utils.data.DataLoader(
+        _Sums(reader), batch_size=None, num_workers=2, multiprocessing_context="forkserver"
+    )
     assert [float(v) for v in loader] == [float(s.points.sum()) for s in three]
 
 
@@ -283,7 +290,9 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
     peaks = []
     for count in (10, 160):  # 4.8 MB and 77 MB of points
-        run = subprocess.run([sys.executable, "-c", code, str(tmp_path / f"{count}.h5"), str(count)], capture_output=True, text=True)
+        run = subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path / f"{count}.h5"), str(count)], capture_output=True, text=True
+        )
         peaks.append(int(run.stdout) / 1024)
     assert peaks[1] - peaks[0] < 12, peaks
 

@@ -31,11 +31,17 @@ def test_round_trip(tmp_path):
 
 
 def test_bad_rows_are_refused(tmp_path):
-    with pytest.raises(DataError, match="2 finite numbers"), ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer:
+    with (
+        pytest.raises(DataError, match="2 finite numbers"),
+        ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer,
+    ):
         writer.write("v", np.array([0.5, np.nan]))
     with pytest.raises(DataError, match="not one sample"), ScoresWriter(tmp_path / "s.h5", class_names=["a"]):
         pass
-    with pytest.raises(DataError, match="streams"), ScoresWriter(tmp_path / "s.h5", class_names=["a"], streams=("x",)) as writer:
+    with (
+        pytest.raises(DataError, match="streams"),
+        ScoresWriter(tmp_path / "s.h5", class_names=["a"], streams=("x",)) as writer,
+    ):
         writer.write("v", np.array([1.0]))
     assert list(tmp_path.iterdir()) == []
 

@@ -11,7 +11,8 @@ import numpy as np
 class Augmentation:
     """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays as it is.
 
-    The defaults are ours (chosen on a validation subject: docs/experiments.md); `PEERS` scales the axes only, `RELEASE` is what the published Kinet does (facts section 3).
+    The defaults are ours (chosen on a validation subject: docs/experiments.md). `PEERS` scales the axes only,
+    `RELEASE` is what the published Kinet does (facts section 3).
     """
 
     scale: float = 0.2  # factor U(1-s, 1+s)
@@ -32,7 +33,9 @@ class Augmentation:
         moved = (points - center) @ (linear @ _rotation(angles).T).astype(np.float32)
         moved += center + rng.uniform(-self.shift, self.shift, 3).astype(np.float32)
         if self.jitter:
-            moved += (rng.standard_normal(moved.shape, np.float32) * self.jitter).clip(-3 * self.jitter, 3 * self.jitter)
+            moved += (rng.standard_normal(moved.shape, np.float32) * self.jitter).clip(
+                -3 * self.jitter, 3 * self.jitter
+            )
         return self._drop(moved, rng)
 
     def _drop(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:

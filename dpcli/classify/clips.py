@@ -65,7 +65,9 @@ class ClipSource:
         self.padded = [] if drop_short else [reader.names[s] for s in short]
         self.sequences = [s for s in sequences if not drop_short or lengths[s] >= config.num_frames]
         if not self.sequences:
-            raise DataError(f"{reader.path}: no video has {config.num_frames} frames; use fewer --frames or pad short videos")
+            raise DataError(
+                f"{reader.path}: no video has {config.num_frames} frames; use fewer --frames or pad short videos"
+            )
 
     def clips(self, count: int | None) -> list[Clip]:
         """The clips of every video, for prediction: every start, or `count` a video."""
@@ -98,7 +100,9 @@ class ClipSource:
         """The clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
         rng = generator(self.seed, 2, *key)
         sequence = self.reader.read(clip.sequence, clip.frames, fields=())
-        points = np.stack([sample_points(sequence.frame(t), self.config.points_per_frame, rng) for t in range(len(clip.frames))])
+        points = np.stack(
+            [sample_points(sequence.frame(t), self.config.points_per_frame, rng) for t in range(len(clip.frames))]
+        )
         points = normalize(points, self.config.normalize)
         return points if self.augmentation == NONE else self.augmentation(points, rng)
 

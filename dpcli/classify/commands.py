@@ -73,8 +73,12 @@ def run_training(
                   "timing": timing, "validation": rule, "drop_short": drop_short, "seed": seed, "static_from": static_from,
                   "data": provenance.file_digest(path)}  # fmt: skip
         folder = RunFolder(output, json.loads(json.dumps(record)), force)
-        training = ClipSource(reader, train_part, config, timing=timing, augmentation=augmentation, drop_short=drop_short, seed=seed)
-        held = ClipSource(reader, val_part, config, timing=timing, drop_short=drop_short, seed=seed) if val_part else None
+        training = ClipSource(
+            reader, train_part, config, timing=timing, augmentation=augmentation, drop_short=drop_short, seed=seed
+        )
+        held = (
+            ClipSource(reader, val_part, config, timing=timing, drop_short=drop_short, seed=seed) if val_part else None
+        )
         _report_short(training, config.num_frames)
         torch.manual_seed(seed)
         model = Kinet(config)
@@ -109,14 +113,20 @@ def _start_from(model: Kinet, name: str) -> None:
 
 
 def _announce(device: torch.device, training: int, validation: int, rule: str, plan: Schedule) -> None:
-    where = f"{device} ({torch.get_num_threads()} threads)" if device.type == "cpu" else torch.cuda.get_device_name(device)
-    log.info(f"training on {where}: {training} videos, {validation} for validation ({rule}); epochs {plan.epochs[0]} + {plan.epochs[1]}")
+    where = (
+        f"{device} ({torch.get_num_threads()} threads)" if device.type == "cpu" else torch.cuda.get_device_name(device)
+    )
+    log.info(
+        f"training on {where}: {training} videos, {validation} for validation ({rule}); epochs {plan.epochs[0]} + {plan.epochs[1]}"
+    )
 
 
 def _report_short(source: ClipSource, frames: int) -> None:
     for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
         if names:
-            log.info(f"{len(names)} videos shorter than {frames} frames are {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}")
+            log.info(
+                f"{len(names)} videos shorter than {frames} frames are {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
+            )
 
 
 def _print_outcome(folder: RunFolder, summary: dict[str, float], videos: int) -> None:
@@ -161,7 +171,9 @@ def _already_scored(target: Path, entry: dict) -> bool:
     except DataError as error:
         raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
     if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(f"{target}: holds scores of another model, data or choice; use another -o, or --force to replace it")
+        raise UsageError(
+            f"{target}: holds scores of another model, data or choice; use another -o, or --force to replace it"
+        )
     log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
     print(f"{target}: complete")
     return True
@@ -183,16 +195,22 @@ def _check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> No
     if reader.class_names and reader.class_names != info.class_names:
         pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
         index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
-        raise DataError(f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; the model was trained for other classes")
+        raise DataError(
+            f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; the model was trained for other classes"
+        )
 
 
-def _score(model: Kinet, source: ClipSource, writer: ScoresWriter, count: int | None, batch: int, device: torch.device) -> None:
+def _score(
+    model: Kinet, source: ClipSource, writer: ScoresWriter, count: int | None, batch: int, device: torch.device
+) -> None:
     reader = source.reader
     with stop_requested() as stop, Progress("classify predict", len(source.sequences), "video") as bar:
         for video in predict_videos(model, source, count, batch, device):
             i = video.sequence
             streams = {"static": video.static, "dynamic": video.dynamic}
-            writer.write(reader.names[i], video.fused, label=int(reader.labels[i]), split=reader.splits[i], streams=streams)
+            writer.write(
+                reader.names[i], video.fused, label=int(reader.labels[i]), split=reader.splits[i], streams=streams
+            )
             bar.advance(1, clips=video.clips)
             stop.check(f"{len(writer)} videos were scored, none kept")
 
@@ -208,6 +226,8 @@ def run_profile(
     if model_name:
         model = load_model(model_name)[0]
     else:
-        model = Kinet(network_config(preset, variant, {"num_frames": frames, "points_per_frame": points}, classes)).eval()
+        model = Kinet(
+            network_config(preset, variant, {"num_frames": frames, "points_per_frame": points}, classes)
+        ).eval()
     result = profile.measure(model.to(chosen), chosen, steps)
     print(json.dumps(result) if json_output else profile.render(result), file=sys.stdout)

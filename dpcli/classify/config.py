@@ -20,13 +20,17 @@ class KinetConfig:
     num_classes: int = 20
     num_frames: int = 16
     points_per_frame: int = 2048
-    normalize: str = "none"  # none | center (subtract the clip's mean) | unit (and divide by the largest radius) | image
+    normalize: str = (
+        "none"  # none | center (subtract the clip's mean) | unit (and divide by the largest radius) | image
+    )
     variant: str = "thesis"
     centroids: tuple[int, int] = (1024, 512)
     neighbors: int = 64
     radii: tuple[float, float] = (0.5, 1.0)  # at time distance 0
     temporal_radius: int = 1  # frames
-    grouping: str = "balanced"  # which neighbours within the radius: first | nearest | balanced (equal shares of each frame)
+    grouping: str = (
+        "balanced"  # which neighbours within the radius: first | nearest | balanced (equal shares of each frame)
+    )
     widths: tuple[tuple[int, int], ...] = ((64, 128), (128, 256), (512, 1024))
     # dynamic branch
     group_size: int = 4  # d of eq. 3.5
@@ -50,7 +54,9 @@ class KinetConfig:
             raise UsageError(f"reduction = {self.reduction}: expected a ratio in (0, 1]")
         if self.num_frames < 1 or self.points_per_frame * self.num_frames < self.centroids[0]:
             have = self.points_per_frame * self.num_frames
-            raise UsageError(f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {self.centroids[0]} centroids")
+            raise UsageError(
+                f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {self.centroids[0]} centroids"
+            )
 
     @classmethod
     def release(cls, **changes: object) -> KinetConfig:

@@ -19,7 +19,11 @@ def draw_curves(rows: list[dict], path: Path) -> None:
         axes.set(title=f"{stage} stream", xlabel="epoch", ylabel="cross-entropy", yscale="log")
         right = axes.twinx()
         right.plot(epochs, [100 * row["train_accuracy"] for row in mine], color="tab:blue", label="training")
-        known = [(e, 100 * row["validation_accuracy"]) for e, row in zip(epochs, mine) if row["validation_accuracy"] is not None]
+        known = [
+            (e, 100 * row["validation_accuracy"])
+            for e, row in zip(epochs, mine)
+            if row["validation_accuracy"] is not None
+        ]
         if known:
             right.plot(*zip(*known), color="tab:orange", marker=".", label="validation")
         right.set(ylabel="accuracy (%)", ylim=(0, 102))

@@ -73,7 +73,9 @@ class KinematicUnit(nn.Module):
         """Width of `Surface.normals`."""
         return self.groups * (self.config.group_size + 1)
 
-    def forward(self, activation: Tensor, relative: Tensor, times: Tensor, center_times: Tensor, previous: Tensor | None) -> Surface:
+    def forward(
+        self, activation: Tensor, relative: Tensor, times: Tensor, center_times: Tensor, previous: Tensor | None
+    ) -> Surface:
         """activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous deviations."""
         features = self._reduced(activation, relative, times)
         if not self.config.normals:
@@ -141,8 +143,12 @@ class Kinematics(nn.Module):
         if self.config.variant == "release":
             own = deviations[:, :, 0]
         else:
-            distance = before.relative().square().sum(-1) + (before.neighbor_times() - before.center_times[..., None]).square()
+            distance = (
+                before.relative().square().sum(-1) + (before.neighbor_times() - before.center_times[..., None]).square()
+            )
             slot = distance.argmin(-1)
-            own = deviations.flatten(3).gather(2, slot[..., None, None].expand(-1, -1, 1, deviations.flatten(3).shape[-1]))[:, :, 0]
+            own = deviations.flatten(3).gather(
+                2, slot[..., None, None].expand(-1, -1, 1, deviations.flatten(3).shape[-1])
+            )[:, :, 0]
             own = own.view(*deviations.shape[:2], *deviations.shape[3:])
         return gather_rows(own.flatten(2), group.idx).view(*group.idx.shape, *own.shape[2:])

@@ -50,14 +50,18 @@ class CrossMerge(nn.Module):
         first, second = channels[:2], channels[2:]
         self.current = nn.ModuleList(nn.ModuleList(nn.Linear(c + 1, c) for c in pair) for pair in zip(first, second))
         self.last = nn.ModuleList(nn.Linear(stage[0] + 1, stage[1]) for stage in (first, second))
-        self.cross = nn.ModuleList(nn.ModuleList(nn.Linear(sum(pair) + 2, c) for c in pair) for pair in zip(first, second))
+        self.cross = nn.ModuleList(
+            nn.ModuleList(nn.Linear(sum(pair) + 2, c) for c in pair) for pair in zip(first, second)
+        )
         self.channels = second[-1]
 
     def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
         times = [group.center_times[..., None] for group in groups]
         states: list[Tensor] = []
         for level in range(2):
-            raw = [torch.relu(self.current[level][s](torch.cat([normals[2 * s + level], times[s]], -1))) for s in range(2)]
+            raw = [
+                torch.relu(self.current[level][s](torch.cat([normals[2 * s + level], times[s]], -1))) for s in range(2)
+            ]
             if level:
                 raw = [raw[s] + torch.relu(self.last[s](torch.cat([states[s], times[s]], -1))) for s in range(2)]
             timed = [torch.cat([raw[s], times[s]], -1) for s in range(2)]

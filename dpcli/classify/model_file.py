@@ -46,7 +46,9 @@ def find_model(name: str) -> Path:
     if path.is_dir():
         path = path / "best.safetensors"
     if not path.is_file():
-        raise UsageError(f"--model {name}: no such file; give a .safetensors file or a folder made by `dpc classify train`")
+        raise UsageError(
+            f"--model {name}: no such file; give a .safetensors file or a folder made by `dpc classify train`"
+        )
     return path
 
 

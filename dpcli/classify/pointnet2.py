@@ -45,7 +45,9 @@ def group_clip(points: Tensor, times: Tensor, config: KinetConfig) -> list[Group
     return stages
 
 
-def _neighbors(points: Tensor, times: Tensor, centers: Tensor, center_times: Tensor, config: KinetConfig, stage: int) -> Tensor:
+def _neighbors(
+    points: Tensor, times: Tensor, centers: Tensor, center_times: Tensor, config: KinetConfig, stage: int
+) -> Tensor:
     radii = config.radius_table(stage)
     query = (points, times, centers)
     if config.grouping != "balanced" or config.temporal_radius == 0:
@@ -54,7 +56,9 @@ def _neighbors(points: Tensor, times: Tensor, centers: Tensor, center_times: Ten
     # `first` fills all slots from the earliest frame when frames are dense, and then no surface in time can be fitted:
     # so every frame gets an equal share. Points come in random order, hence the first hits of a frame are a random draw.
     offsets = range(-config.temporal_radius, config.temporal_radius + 1)
-    shares = [config.neighbors * (i + 1) // len(offsets) - config.neighbors * i // len(offsets) for i in range(len(offsets))]
+    shares = [
+        config.neighbors * (i + 1) // len(offsets) - config.neighbors * i // len(offsets) for i in range(len(offsets))
+    ]
     found = {}
     for offset, share in zip(offsets, shares):
         exact = radii[abs(offset) : abs(offset) + 1]  # one radius: only the frame at this offset

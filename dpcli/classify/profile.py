@@ -48,7 +48,11 @@ def _dense_static_macs(model: Kinet) -> int:
     for count, stage in zip(config.centroids, (static.stage1, static.stage2)):
         total += count * config.neighbors * (stage.linear1.weight.numel() + stage.linear2.weight.numel())
     head = static.head
-    return total + config.centroids[1] * (head.linear1.weight.numel() + head.linear2.weight.numel()) + head.classify.weight.numel()
+    return (
+        total
+        + config.centroids[1] * (head.linear1.weight.numel() + head.linear2.weight.numel())
+        + head.classify.weight.numel()
+    )
 
 
 def _fit_macs(model: Kinet) -> int:
@@ -161,13 +165,19 @@ def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str,
 
 def render(result: dict[str, Any]) -> str:
     """The object of `measure` as lines for a person."""
-    lines = [f"Kinet, {result['variant']} variant, {result['classes']} classes, clip {result['clip'][0]} x {result['clip'][1]} points"]
+    lines = [
+        f"Kinet, {result['variant']} variant, {result['classes']} classes, clip {result['clip'][0]} x {result['clip'][1]} points"
+    ]
     parameters = result["parameters"]
-    lines.append(f"parameters    {parameters['total']:,} (static {parameters['static']:,}, dynamic {parameters['dynamic']:,})")
+    lines.append(
+        f"parameters    {parameters['total']:,} (static {parameters['static']:,}, dynamic {parameters['dynamic']:,})"
+    )
     paper = result["paper_style_parameters"]
     lines.append(f"  paper style {paper['total']} M, static {paper['static']} M: {paper['rule']}")
     counts = result["macs_per_clip"]
-    lines.append(f"multiply-adds {counts['total'] / 1e9:.2f} G per clip (static {counts['static'] / 1e9:.2f}, dynamic {counts['dynamic'] / 1e9:.2f})")
+    lines.append(
+        f"multiply-adds {counts['total'] / 1e9:.2f} G per clip (static {counts['static'] / 1e9:.2f}, dynamic {counts['dynamic'] / 1e9:.2f})"
+    )
     gflops = result["paper_style_gflops"]
     lines.append(f"  paper style {gflops['total']} GFLOPs, static {gflops['static']}: {gflops['rule']}")
     lines.append(f"  not counted: {result['uncounted']}")
@@ -176,5 +186,7 @@ def render(result: dict[str, Any]) -> str:
     lines.append(f"peak memory   {result['peak_memory_mb']} MB of the process")
     if "static_step" in result:
         step = result["static_step"]
-        lines.append(f"static step   {step['seconds']} s for {step['batch']} clips, {100 * step['matrix_products_share']:.0f} % in matrix products")
+        lines.append(
+            f"static step   {step['seconds']} s for {step['batch']} clips, {100 * step['matrix_products_share']:.0f} % in matrix products"
+        )
     return "\n".join(lines)

@@ -47,7 +47,9 @@ class RunFolder:
         try:
             state = torch.load(path, weights_only=True, map_location="cpu")
         except Exception as error:
-            raise DataError(f"{path}: the saved state is damaged ({type(error).__name__}); --force starts over") from None
+            raise DataError(
+                f"{path}: the saved state is damaged ({type(error).__name__}); --force starts over"
+            ) from None
         self.rows = state["rows"]
         return state
 

@@ -50,7 +50,9 @@ def _held_out(reader: CloudsReader, chosen: list[int], rule: str) -> set[int]:
         except (IndexError, ValueError):
             raise UsageError(f"--validation {rule}: expected subjects:3,5") from None
     if not held < subjects:
-        raise UsageError(f"--validation {rule}: training subjects are {sorted(subjects)}; hold out some of them, not all")
+        raise UsageError(
+            f"--validation {rule}: training subjects are {sorted(subjects)}; hold out some of them, not all"
+        )
     return held
 
 

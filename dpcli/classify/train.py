@@ -137,7 +137,11 @@ class Trainer:
             rate = self.schedule.rate(self.stage, self.epoch * per_epoch + self.step, epochs * per_epoch)
             self._optimise(points.to(self.device), labels.to(self.device), rate)
             self.step += 1
-            bar.note(epoch=f"{self.epoch + 1}/{epochs}", loss=self.sums[0] / self.sums[2], accuracy=self.sums[1] / self.sums[2])
+            bar.note(
+                epoch=f"{self.epoch + 1}/{epochs}",
+                loss=self.sums[0] / self.sums[2],
+                accuracy=self.sums[1] / self.sums[2],
+            )
             bar.advance(len(points))
             if self.stop.requested:
                 self.spent += time.monotonic() - started
@@ -153,7 +157,11 @@ class Trainer:
         """The epoch's batches from `self.step` on; each clip's position in the epoch, not the process, seeds it."""
         data = _Loader(self.training, clips, self.stage * 100_000 + self.epoch)
         rest = torch.utils.data.Subset(data, range(self.step * self.schedule.batch, len(clips)))
-        workers = {"num_workers": self.schedule.workers, "multiprocessing_context": "forkserver"} if self.schedule.workers else {}
+        workers = (
+            {"num_workers": self.schedule.workers, "multiprocessing_context": "forkserver"}
+            if self.schedule.workers
+            else {}
+        )
         yield from torch.utils.data.DataLoader(rest, self.schedule.batch, **workers)
 
     def _optimise(self, points: torch.Tensor, labels: torch.Tensor, rate: float) -> None:
@@ -165,7 +173,9 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self._branch().parameters(), 5.0)
-        if torch.isfinite(norm):  # a nearly singular fit can overflow: such a step is left out rather than poisoning the weights
+        if torch.isfinite(
+            norm
+        ):  # a nearly singular fit can overflow: such a step is left out rather than poisoning the weights
             self.optimizer.step()
         self.sums[0] += float(loss.detach()) * len(labels)
         self.sums[1] += int((logits.argmax(-1) == labels).sum())
@@ -205,13 +215,18 @@ class Trainer:
         assert self.validation is not None
         self.model.eval()
         totals: dict[str, dict[int, torch.Tensor]] = {}
-        for clips, points in batches(self.validation, self.validation.clips(self.schedule.validation_clips), self.schedule.batch):
+        for clips, points in batches(
+            self.validation, self.validation.clips(self.schedule.validation_clips), self.schedule.batch
+        ):
             for key, scores in self._scores(points.to(self.device)).items():
                 sums = totals.setdefault(key, {})
                 for clip, row in zip(clips, scores.cpu()):
                     sums[clip.sequence] = sums.get(clip.sequence, 0) + row
         labels = self.validation.reader.labels
-        return {key: sum(int(row.argmax()) == int(labels[s]) for s, row in sums.items()) / len(sums) for key, sums in totals.items()}
+        return {
+            key: sum(int(row.argmax()) == int(labels[s]) for s, row in sums.items()) / len(sums)
+            for key, sums in totals.items()
+        }
 
     def _scores(self, points: torch.Tensor) -> dict[str, torch.Tensor]:
         """Class probabilities of a batch by stream."""

@@ -37,7 +37,9 @@ def _version(wanted: bool) -> None:
 
 
 @app.callback()
-def _root(version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version.")) -> None:
+def _root(
+    version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
+) -> None:
     pass
 
 
@@ -60,7 +62,9 @@ def _explain(error: BaseException) -> int:
     from dpcli.runtime.progress import log
 
     if isinstance(error, BrokenPipeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes stdout once more at exit
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # the interpreter flushes stdout once more at exit
         return CLOSED_PIPE
     if isinstance(error, KeyboardInterrupt) or type(error).__name__ == "Abort":
         log.error("interrupted")
@@ -75,13 +79,17 @@ def _explain(error: BaseException) -> int:
         log.error(f"{error.filename}: no such file or folder")
         return 2
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        log.error(f"no space left on the device while writing {error.filename or 'the output'}; free some and run again")
+        log.error(
+            f"no space left on the device while writing {error.filename or 'the output'}; free some and run again"
+        )
         return 1
     raise error
 
 
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
+    # torch's and numba's threads take turns: spinning while they wait, each pool would hold the cores the other needs
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = typer.main.get_command(app)
     from dpcli.runtime.progress import log
@@ -102,6 +110,8 @@ def main(argv: list[str] | None = None) -> None:
             code = _explain(error)
         except Exception as unexpected:
             if not log.debug:
-                log.error(f"{type(unexpected).__name__}: {unexpected} (a bug, or an unusual machine; --debug shows where)")
+                log.error(
+                    f"{type(unexpected).__name__}: {unexpected} (a bug, or an unusual machine; --debug shows where)"
+                )
             code = 1
     sys.exit(code if isinstance(code, int) else 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -12,37 +12,70 @@ from dpcli.errors import UsageError
 app = typer.Typer(no_args_is_help=True, help="Recognise actions and gestures (Kinet).")
 
 
-
 @app.command()
 def train(
     data: Annotated[str, typer.Argument(help="A clouds file with labels and a split 'train', or - for a pipe.")],
     output: Annotated[str, typer.Option("-o", "--output", help="Folder for checkpoints, logs and curves.")],
-    preset: Annotated[str, typer.Option(help="thesis, release, quick (half the centroids and neighbours, fits a CPU) or tiny (demo).")] = "quick",
-    frames: Annotated[Optional[int], typer.Option(help="Frames per clip. Default: the preset's (16; release 32).")] = None,
-    points: Annotated[Optional[int], typer.Option(help="Points drawn per frame. Default: the preset's.")] = None,
-    timing: Annotated[str, typer.Option(help="clips (consecutive frames) or uniform (frames spread over the video).")] = "clips",
-    epochs: Annotated[Optional[int], typer.Option(help="Epochs of the static stage. Default: the preset's.")] = None,
-    epochs_dynamic: Annotated[Optional[int], typer.Option(help="Epochs of the dynamic stage. Default: the preset's.")] = None,
+    preset: Annotated[
+        str, typer.Option(help="thesis, release, quick (half the centroids and neighbours, fits a CPU) or tiny (demo).")
+    ] = "quick",
+    frames: Annotated[int | None, typer.Option(help="Frames per clip. Default: the preset's (16; release 32).")] = None,
+    points: Annotated[int | None, typer.Option(help="Points drawn per frame. Default: the preset's.")] = None,
+    timing: Annotated[
+        str, typer.Option(help="clips (consecutive frames) or uniform (frames spread over the video).")
+    ] = "clips",
+    epochs: Annotated[int | None, typer.Option(help="Epochs of the static stage. Default: the preset's.")] = None,
+    epochs_dynamic: Annotated[
+        int | None, typer.Option(help="Epochs of the dynamic stage. Default: the preset's.")
+    ] = None,
     clips_per_video: Annotated[int, typer.Option(help="Random clips per video and epoch; 0 takes every start.")] = 1,
-    drop_short: Annotated[bool, typer.Option("--drop-short", help="Leave out videos shorter than a clip, as peers do, instead of padding.")] = False,
-    validation: Annotated[Optional[str], typer.Option(help="Carved from the training videos: subject, subjects:3,5, a fraction, or none. Default: subject, or 0.15 without subjects.")] = None,
-    batch: Annotated[Optional[int], typer.Option(help="Clips per step. Default: the preset's.")] = None,
-    lr: Annotated[Optional[float], typer.Option(help="Adam's learning rate. Default: the preset's.")] = None,
-    lr_dynamic: Annotated[Optional[float], typer.Option(help="The same for the dynamic stage. Default: the preset's.")] = None,
-    decay: Annotated[Optional[str], typer.Option(help="cosine, staircase (x0.7 every 200,000 clips) or constant.")] = None,
-    augment: Annotated[Optional[str], typer.Option(help="ours, peers (axis scales), release or none. Default: the preset's.")] = None,
-    variant: Annotated[Optional[str], typer.Option(help="thesis or release: where text and published code disagree.")] = None,
-    normalize: Annotated[Optional[str], typer.Option(help="Coordinates of a clip: none, center, unit or image. Default: the preset's.")] = None,
-    grouping: Annotated[Optional[str], typer.Option(help="Neighbours in the radius: first, nearest or balanced over frames.")] = None,
-    solver: Annotated[Optional[str], typer.Option(help="Surface fit: inverse (thesis A.1.1) or ridge.")] = None,
-    group_size: Annotated[Optional[int], typer.Option(help="Features per fitted surface (d).")] = None,
-    temporal_radius: Annotated[Optional[int], typer.Option(help="Frames before and after that count as neighbours.")] = None,
-    radius: Annotated[Optional[float], typer.Option(help="Spatial radius of stage 1, in the input's unit; stage 2 doubles it.")] = None,
-    dropout: Annotated[Optional[float], typer.Option(help="Dropout before each head's last layer.")] = None,
-    no_normals: Annotated[bool, typer.Option("--no-normals", help="Ablation v: pool reduced features instead of fitting surfaces.")] = False,
+    drop_short: Annotated[
+        bool,
+        typer.Option("--drop-short", help="Leave out videos shorter than a clip, as peers do, instead of padding."),
+    ] = False,
+    validation: Annotated[
+        str | None,
+        typer.Option(
+            help="Carved from the training videos: subject, subjects:3,5, a fraction, or none. Default: subject, or 0.15 without subjects."
+        ),
+    ] = None,
+    batch: Annotated[int | None, typer.Option(help="Clips per step. Default: the preset's.")] = None,
+    lr: Annotated[float | None, typer.Option(help="Adam's learning rate. Default: the preset's.")] = None,
+    lr_dynamic: Annotated[
+        float | None, typer.Option(help="The same for the dynamic stage. Default: the preset's.")
+    ] = None,
+    decay: Annotated[str | None, typer.Option(help="cosine, staircase (x0.7 every 200,000 clips) or constant.")] = None,
+    augment: Annotated[
+        str | None, typer.Option(help="ours, peers (axis scales), release or none. Default: the preset's.")
+    ] = None,
+    variant: Annotated[
+        str | None, typer.Option(help="thesis or release: where text and published code disagree.")
+    ] = None,
+    normalize: Annotated[
+        str | None, typer.Option(help="Coordinates of a clip: none, center, unit or image. Default: the preset's.")
+    ] = None,
+    grouping: Annotated[
+        str | None, typer.Option(help="Neighbours in the radius: first, nearest or balanced over frames.")
+    ] = None,
+    solver: Annotated[str | None, typer.Option(help="Surface fit: inverse (thesis A.1.1) or ridge.")] = None,
+    group_size: Annotated[int | None, typer.Option(help="Features per fitted surface (d).")] = None,
+    temporal_radius: Annotated[
+        int | None, typer.Option(help="Frames before and after that count as neighbours.")
+    ] = None,
+    radius: Annotated[
+        float | None, typer.Option(help="Spatial radius of stage 1, in the input's unit; stage 2 doubles it.")
+    ] = None,
+    dropout: Annotated[float | None, typer.Option(help="Dropout before each head's last layer.")] = None,
+    no_normals: Annotated[
+        bool, typer.Option("--no-normals", help="Ablation v: pool reduced features instead of fitting surfaces.")
+    ] = False,
     no_weights: Annotated[bool, typer.Option("--no-weights", help="Ablation vi: every neighbour weighs 1.")] = False,
-    static_from: Annotated[Optional[str], typer.Option(help="A trained model whose static stream to start from (ablations ii, iv).")] = None,
-    workers: Annotated[Optional[int], typer.Option(help="Processes that load clips. Default: 0 on a CPU, 4 on a GPU.")] = None,
+    static_from: Annotated[
+        str | None, typer.Option(help="A trained model whose static stream to start from (ablations ii, iv).")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU, 4 on a GPU.")
+    ] = None,
     seed: Seed = 0,
     device: Device = "auto",
     force: Force = False,
@@ -69,9 +102,13 @@ def predict(
     data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
     model: Annotated[str, typer.Option("--model", help="A .safetensors file, or a folder made by train.")],
     output: Output,
-    split: Annotated[str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")] = "auto",
+    split: Annotated[
+        str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")
+    ] = "auto",
     clips_per_video: Annotated[int, typer.Option(help="Clips spread evenly over a video; 0 takes every start.")] = 0,
-    drop_short: Annotated[bool, typer.Option("--drop-short", help="Leave out videos shorter than a clip instead of padding.")] = False,
+    drop_short: Annotated[
+        bool, typer.Option("--drop-short", help="Leave out videos shorter than a clip instead of padding.")
+    ] = False,
     batch: Annotated[int, typer.Option(help="Clips at a time.")] = 8,
     seed: Seed = 0,
     device: Device = "auto",
@@ -88,12 +125,14 @@ def predict(
 
 @app.command()
 def profile(
-    model: Annotated[Optional[str], typer.Option("--model", help="A trained model; else an untrained one of --preset.")] = None,
+    model: Annotated[
+        str | None, typer.Option("--model", help="A trained model; else an untrained one of --preset.")
+    ] = None,
     preset: Annotated[str, typer.Option(help="thesis, release, quick or tiny.")] = "thesis",
-    variant: Annotated[Optional[str], typer.Option(help="thesis or release.")] = None,
+    variant: Annotated[str | None, typer.Option(help="thesis or release.")] = None,
     classes: Annotated[int, typer.Option("--classes", help="Number of classes.")] = 20,
-    frames: Annotated[Optional[int], typer.Option(help="Frames per clip. Default: the preset's.")] = None,
-    points: Annotated[Optional[int], typer.Option(help="Points per frame. Default: the preset's.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Frames per clip. Default: the preset's.")] = None,
+    points: Annotated[int | None, typer.Option(help="Points per frame. Default: the preset's.")] = None,
     steps: Annotated[bool, typer.Option("--steps", help="Also where a static training step spends its time.")] = False,
     device: Device = "auto",
     json_output: Json = False,
@@ -103,5 +142,3 @@ def profile(
 
     run_profile(model, preset=preset, variant=variant, classes=classes, frames=frames, points=points, steps=steps, device=device,
                 json_output=json_output)  # fmt: skip
-
-

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
-Jobs = Annotated[Optional[int], typer.Option("--jobs", min=1, help="Processes. Default: the CPUs this process may use.")]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. Default: the CPUs this process may use.")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 OnError = Annotated[str, typer.Option("--on-error", help="A bad sample: skip (list it at the end) or stop.")]
 Force = Annotated[bool, typer.Option("--force", help="Start over, even if the output or a part of it exists.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
-Picture = Annotated[Optional[Path], typer.Option("--picture", help="Write a picture (.png) to this file.")]
+Picture = Annotated[Path | None, typer.Option("--picture", help="Write a picture (.png) to this file.")]

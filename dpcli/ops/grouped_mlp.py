@@ -45,7 +45,12 @@ def grouped_mlp(
     Returns (pooled (B,M,C2), [mean1, var1, mean2, var2]): the biased batch statistics, or the given ones.
     Differentiable in features, weights, biases and norms; not in positions. float32 on the fast path.
     """
-    fast = chosen_backend(points.device) == "numba" and norm1.mean is None and idx.shape[2] <= 256 and points.dtype == torch.float32
+    fast = (
+        chosen_backend(points.device) == "numba"
+        and norm1.mean is None
+        and idx.shape[2] <= 256
+        and points.dtype == torch.float32
+    )
     if fast:
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
     taps, statistics = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
@@ -82,7 +87,9 @@ def gather_rows(table: Tensor, idx: Tensor) -> Tensor:
     return table.reshape(batch * count, channels)[idx + shift]
 
 
-def _project(points: Tensor, centers: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _project(
+    points: Tensor, centers: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor]
+) -> tuple[Tensor, Tensor]:
     weight, bias = linear1
     table = torch.nn.functional.linear(points, weight[:, :3], bias)
     if features is not None:
@@ -99,7 +106,7 @@ def _norm_relu(values: Tensor, norm: Norm) -> tuple[Tensor, tuple[Tensor, Tensor
     return torch.relu(values * scale + (norm.bias - mean * scale)), (mean.detach(), var.detach())
 
 
-def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):  # noqa: ANN001, ANN202 - as grouped_mlp
+def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):
     norms = (norm1.weight, norm1.bias, norm2.weight, norm2.bias)
     if features is None:
         first = (points.contiguous(), centers.contiguous(), *linear1)
@@ -118,7 +125,7 @@ class _GroupedMLP(torch.autograd.Function):
     """The training path on a CPU. `table`/`offset` are points and centres when weight1 is given, else projected ones."""
 
     @staticmethod
-    def forward(ctx, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):  # noqa: ANN001, ANN205
+    def forward(ctx, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):
         kernels = parallel_kernels("kernels_grouped")
         batch, count, neighbors = idx.shape
         rows, c1, c2 = idx.numel(), len(g1), len(g2)
@@ -144,7 +151,7 @@ class _GroupedMLP(torch.autograd.Function):
         return out.view(batch, count, c2), mean1, var1, mean2, var2
 
     @staticmethod
-    def backward(ctx, grad, *unused):  # noqa: ANN001, ANN205
+    def backward(ctx, grad, *unused):
         kernels = parallel_kernels("kernels_grouped")
         (idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
          mean1, inverse1, mean2, inverse2) = ctx.saved_tensors  # fmt: skip
@@ -168,7 +175,9 @@ class _GroupedMLP(torch.autograd.Function):
         grad_w2 = parts.sum(0) - torch.outer(u + v * bias2, flat.sum(0)) - v[:, None] * (weight2 @ gram)
         safe = torch.where(g1.abs() < 1e-12, torch.full_like(g1, 1e-12), g1)
         sums = torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
-        kernels.relu_norm_sums(dense.numpy(), flat.numpy(), (1 / safe).numpy(), (-b1.detach() / safe.detach()).numpy(), sums.numpy())
+        kernels.relu_norm_sums(
+            dense.numpy(), flat.numpy(), (1 / safe).numpy(), (-b1.detach() / safe.detach()).numpy(), sums.numpy()
+        )
         grad_b1, grad_g1 = sums.sum(0).float()
         first = _back_first(kernels, ctx.needs_input_grad, dense.view(*idx.shape, c1), idx, table, offset, weight1, bias1,
                             mean1, inverse1, g1 * inverse1, grad_b1 / rows, grad_g1 / rows)  # fmt: skip
@@ -192,11 +201,17 @@ def _pool_linear(hidden: Tensor, weight: Tensor, bias: Tensor, sign: Tensor) -> 
         rows = buffer[: len(piece) * neighbors]
         torch.addmm(bias, piece.view(-1, c1), weight, out=rows)
         stop = start + len(piece)
-        kernels.extreme(rows.view(-1, neighbors, c2).numpy(), signs, best[start:stop].numpy(), where[start:stop].numpy(), sums.numpy())
+        kernels.extreme(
+            rows.view(-1, neighbors, c2).numpy(),
+            signs,
+            best[start:stop].numpy(),
+            where[start:stop].numpy(),
+            sums.numpy(),
+        )
     return best, where, *_statistics(sums, batch * count * neighbors)
 
 
-def _back_first(kernels, needs, grad, idx, table, offset, weight1, bias1, mean, inverse, scale, t0, t1):  # noqa: ANN001, ANN202
+def _back_first(kernels, needs, grad, idx, table, offset, weight1, bias1, mean, inverse, scale, t0, t1):
     """Gradients of (table, offset, weight1, bias1) from the gradient after the first ReLU."""
     statistics = (mean.numpy(), inverse.numpy(), scale.detach().numpy(), t0.numpy(), t1.numpy())
     if weight1 is not None:
@@ -205,5 +220,7 @@ def _back_first(kernels, needs, grad, idx, table, offset, weight1, bias1, mean, 
                          bias1.detach().numpy(), *statistics, parts.numpy())  # fmt: skip
         return None, None, parts.sum(0).float().t().contiguous(), torch.zeros_like(bias1)
     grad_table, grad_offset = torch.zeros_like(table), torch.zeros_like(offset)
-    kernels.back_gather(grad.numpy(), table.numpy(), offset.numpy(), idx.numpy(), *statistics, grad_table.numpy(), grad_offset.numpy())
+    kernels.back_gather(
+        grad.numpy(), table.numpy(), offset.numpy(), idx.numpy(), *statistics, grad_table.numpy(), grad_offset.numpy()
+    )
     return grad_table, grad_offset, None, None

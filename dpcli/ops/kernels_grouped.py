@@ -11,6 +11,7 @@ from numba import prange
 
 from dpcli.ops.jit import parallel_kernel
 
+
 @parallel_kernel
 def project_xyz(points, centers, idx, weight, bias, out, sums):
     """out[r] = weight @ (points[idx[r]] - centers[i]) + bias; sums (blocks,2,C) f64 collect sum and sum of squares.

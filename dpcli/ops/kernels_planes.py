@@ -11,6 +11,7 @@ from numba import prange
 
 from dpcli.ops.jit import parallel_kernel
 
+
 @parallel_kernel
 def normal_forward(features, times, weights, matrix, right):
     """matrix (M,K,d+1,d+1) = sum_n w x x', right (M,K,d+1) = sum_n w x t, x = [f, 1]; weights of size 0 mean 1."""

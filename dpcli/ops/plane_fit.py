@@ -56,7 +56,7 @@ def _fast(features: Tensor) -> bool:
 
 class _NormalEquations(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features, times, weights):  # noqa: ANN001, ANN205
+    def forward(ctx, features, times, weights):
         kernels = parallel_kernels("kernels_planes")
         features, times, weights = (value.detach().contiguous() for value in (features, times, weights))
         count, _, groups, size = features.shape
@@ -66,7 +66,7 @@ class _NormalEquations(torch.autograd.Function):
         return matrix, right
 
     @staticmethod
-    def backward(ctx, grad_matrix, grad_right):  # noqa: ANN001, ANN205
+    def backward(ctx, grad_matrix, grad_right):
         kernels = parallel_kernels("kernels_planes")
         features, times, weights = ctx.saved_tensors
         both = (grad_matrix + grad_matrix.transpose(-1, -2)).contiguous()
@@ -78,7 +78,7 @@ class _NormalEquations(torch.autograd.Function):
 
 class _Deviations(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, features, times, coefficients):  # noqa: ANN001, ANN205
+    def forward(ctx, features, times, coefficients):
         kernels = parallel_kernels("kernels_planes")
         features, times, coefficients = (value.detach().contiguous() for value in (features, times, coefficients))
         out = torch.empty(features.shape[:3])
@@ -87,9 +87,15 @@ class _Deviations(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx, grad):  # noqa: ANN001, ANN205
+    def backward(ctx, grad):
         kernels = parallel_kernels("kernels_planes")
         features, coefficients = ctx.saved_tensors
         grad_features, grad_coefficients = torch.empty_like(features), torch.zeros_like(coefficients)
-        kernels.deviation_backward(features.numpy(), coefficients.numpy(), grad.contiguous().numpy(), grad_features.numpy(), grad_coefficients.numpy())
+        kernels.deviation_backward(
+            features.numpy(),
+            coefficients.numpy(),
+            grad.contiguous().numpy(),
+            grad_features.numpy(),
+            grad_coefficients.numpy(),
+        )
         return grad_features, None, grad_coefficients

@@ -89,7 +89,9 @@ def ordered_map(
         # the executor ends the other workers by SIGTERM, which they ignore, and would wait for them for ever
         for child in set(multiprocessing.active_children()) - strangers if own else ():
             child.kill()
-        raise DpcError("a worker process died (killed, or out of memory); run again, perhaps with a smaller --jobs") from None
+        raise DpcError(
+            "a worker process died (killed, or out of memory); run again, perhaps with a smaller --jobs"
+        ) from None
     finally:
         for _, future in waiting:
             future.cancel()

@@ -65,7 +65,9 @@ def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:
     if int(schema) != SCHEMA:
         raise DataError(f"{path}: schema {schema}, this dpc {__version__} reads schema {SCHEMA}")
     if kind not in kinds:
-        raise DataError(f"{path}: holds {kind!r}, expected {' or '.join(repr(k) for k in kinds)}; `dpc info {path}` shows more")
+        raise DataError(
+            f"{path}: holds {kind!r}, expected {' or '.join(repr(k) for k in kinds)}; `dpc info {path}` shows more"
+        )
 
 
 def _refuse_outside(file: h5py.File, path: Path) -> None:
@@ -75,12 +77,16 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
         for name in group:
             link = group.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
-                raise DataError(f"{path}: {group.name}/{name} is a link to elsewhere; a dpc file must be self-contained")
+                raise DataError(
+                    f"{path}: {group.name}/{name} is a link to elsewhere; a dpc file must be self-contained"
+                )
             item = group[name]
             if isinstance(item, h5py.Group):
                 visit(item)
             elif item.is_virtual or item.external:
-                raise DataError(f"{path}: {item.name} keeps its data in another file; a dpc file must be self-contained")
+                raise DataError(
+                    f"{path}: {item.name} keeps its data in another file; a dpc file must be self-contained"
+                )
             elif item.dtype.kind not in "fiub" and h5py.check_string_dtype(item.dtype) is None:
                 raise DataError(f"{path}: {item.name} has type {item.dtype}, expected numbers or strings")
 
@@ -166,7 +172,9 @@ class AtomicFile:
             pass
         self.part.unlink(missing_ok=True)
 
-    def failed(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def failed(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Discard after an exception; re-raise a failed write in words."""
         self.discard()
         worded = self.problem(error) if error is not None else None

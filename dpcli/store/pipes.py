@@ -31,7 +31,9 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
         return
     stream = stdin or sys.stdin.buffer
     if stream.isatty():
-        raise UsageError("- reads from a pipe, but stdin is a terminal; pipe a dpc command into this one or name a file")
+        raise UsageError(
+            "- reads from a pipe, but stdin is a terminal; pipe a dpc command into this one or name a file"
+        )
     direct = _regular_file(stream)
     if direct is not None:
         yield direct

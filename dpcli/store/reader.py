@@ -41,12 +41,16 @@ class CloudsReader:
         frames = int(self._sequence_offsets[-1])
         self._frame_offsets = self._offsets(file, "frame_offsets", self.num_points)
         if frames != len(self._frame_offsets) - 1:
-            raise DataError(f"{self.path}: sequence_offsets end at {frames}, but there are {len(self._frame_offsets) - 1} frames")
+            raise DataError(
+                f"{self.path}: sequence_offsets end at {frames}, but there are {len(self._frame_offsets) - 1} frames"
+            )
         if not len(self.names) == len(self.splits) == len(self._sequence_offsets) - 1:
             raise DataError(f"{self.path}: {len(self.names)} names for {len(self._sequence_offsets) - 1} sequences")
         if self.class_names and len(self.labels) and self.labels.max() >= len(self.class_names):
             worst = int(self.labels.argmax())
-            raise DataError(f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {len(self.class_names)} classes")
+            raise DataError(
+                f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {len(self.class_names)} classes"
+            )
         self.fields = tuple(key for key in OPTIONAL if key in file)
         for key in self.fields:
             rows = self.num_points if key in POINT_FIELDS else frames
@@ -57,7 +61,9 @@ class CloudsReader:
         if name not in file:
             raise DataError(f"{self.path}: data set {name!r} is missing; the file is incomplete, make it again")
         if file[name].shape[1:] != tail:
-            raise DataError(f"{self.path}: {name} has shape {file[name].shape}, expected (n{''.join(f', {d}' for d in tail)})")
+            raise DataError(
+                f"{self.path}: {name} has shape {file[name].shape}, expected (n{''.join(f', {d}' for d in tail)})"
+            )
         return file[name]
 
     def _column(self, file: h5py.File, name: str) -> np.ndarray:
@@ -109,7 +115,11 @@ class CloudsReader:
         """
         first = int(self._sequence_offsets[index])
         count = int(self._sequence_offsets[index + 1]) - first
-        wanted = np.arange(count)[frames if frames is not None else slice(None)] if not isinstance(frames, Sequence) else np.asarray(frames)
+        wanted = (
+            np.arange(count)[frames if frames is not None else slice(None)]
+            if not isinstance(frames, Sequence)
+            else np.asarray(frames)
+        )
         if len(wanted) == 0 or wanted.min() < 0 or wanted.max() >= count:
             raise DataError(f"{self.path}: frames {frames} of {self.names[index]!r}, which has {count} frames")
         low, high = int(wanted.min()), int(wanted.max()) + 1
@@ -124,7 +134,9 @@ class CloudsReader:
             else:
                 values[key] = _pick(self.file[key][span], offsets - offsets[0], picks)
         if not np.isfinite(values["points"]).all():
-            raise DataError(f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again")
+            raise DataError(
+                f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
+            )
         return CloudSequence(
             self.names[index], values.pop("points"), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
             self.splits[index], int(self.labels[index]), int(self.subjects[index]), int(self.cameras[index]), **values,

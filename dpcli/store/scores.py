@@ -34,13 +34,21 @@ class ScoresWriter:
         self._atomic = AtomicFile(path)
 
     def write(
-        self, name: str, scores: np.ndarray, *, label: int = -1, split: str = "", streams: dict[str, np.ndarray] | None = None
+        self,
+        name: str,
+        scores: np.ndarray,
+        *,
+        label: int = -1,
+        split: str = "",
+        streams: dict[str, np.ndarray] | None = None,
     ) -> None:
         """One sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
         rows = {"scores": scores, **(streams or {})}
         for key, row in rows.items():
             if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():
-                raise DataError(f"sample {name!r}: {key} {np.shape(row)} must be {len(self.class_names)} finite numbers")
+                raise DataError(
+                    f"sample {name!r}: {key} {np.shape(row)} must be {len(self.class_names)} finite numbers"
+                )
         if set(self.streams) != set(streams or {}):
             raise DataError(f"sample {name!r}: streams {sorted(streams or {})}, expected {sorted(self.streams)}")
         self._rows.append((name, split, int(label), {key: np.asarray(row, np.float32) for key, row in rows.items()}))
@@ -111,4 +119,6 @@ class ScoresReader:
             raise DataError(f"{self.path}: sample names repeat; names identify samples")
         if len(self.labels) and (self.labels.min() < -1 or self.labels.max() >= shape[1]):
             row = int(np.argmax((self.labels < -1) | (self.labels >= shape[1])))
-            raise DataError(f"{self.path}: label {self.labels[row]} of {self.names[row]!r}; expected -1..{shape[1] - 1}")
+            raise DataError(
+                f"{self.path}: label {self.labels[row]} of {self.names[row]!r}; expected -1..{shape[1] - 1}"
+            )

@@ -9,7 +9,11 @@ import numpy as np
 
 from dpcli.errors import DataError
 
-POINT_FIELDS = {"color": (np.uint8, (3,)), "part": (np.int16, ()), "track": (np.int64, ())}  # name -> dtype, shape of one point
+POINT_FIELDS = {
+    "color": (np.uint8, (3,)),
+    "part": (np.int16, ()),
+    "track": (np.int64, ()),
+}  # name -> dtype, shape of one point
 
 
 @dataclass
@@ -63,12 +67,18 @@ class CloudSequence:
         if len(offsets) < 2 or len(self.points) == 0:
             raise DataError(f"{where}: no frames or no points; a sample needs at least one point")
         if offsets[0] != 0 or offsets[-1] != len(self.points) or np.any(np.diff(offsets) < 0):
-            raise DataError(f"{where}: frame_offsets must rise from 0 to {len(self.points)}, found {offsets[:4]}...{offsets[-1]}")
+            raise DataError(
+                f"{where}: frame_offsets must rise from 0 to {len(self.points)}, found {offsets[:4]}...{offsets[-1]}"
+            )
         if not np.isfinite(self.points).all():
             bad = int((~np.isfinite(self.points)).any(1).sum())
-            raise DataError(f"{where}: {bad} of {len(self.points)} points are NaN or infinite; drop them before writing")
+            raise DataError(
+                f"{where}: {bad} of {len(self.points)} points are NaN or infinite; drop them before writing"
+            )
         if self.label < -1 or (num_classes and self.label >= num_classes):
-            raise DataError(f"{where}: label {self.label} is out of range; expected -1 (unknown) or 0..{num_classes - 1}")
+            raise DataError(
+                f"{where}: label {self.label} is out of range; expected -1 (unknown) or 0..{num_classes - 1}"
+            )
         self._validate_fields(where)
 
     def _validate_fields(self, where: str) -> None:

@@ -78,7 +78,9 @@ class CloudsWriter:
         for name in ("frame_offsets", "sequence_offsets"):
             file.create_dataset(name, data=np.zeros(1, np.int64), maxshape=(None,), chunks=(4096,), **_PACKED)
         for name, dtype in _PER_SAMPLE.items():
-            file.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(1024,), **({} if dtype is STRING else _PACKED))
+            file.create_dataset(
+                name, (0,), dtype, maxshape=(None,), chunks=(1024,), **({} if dtype is STRING else _PACKED)
+            )
         for name in self.fields:
             self._create_field(file, name)
 
@@ -114,10 +116,14 @@ class CloudsWriter:
     def _append(self, name: str, values: np.ndarray | list) -> None:
         if name == "pose" and name not in self._file:
             shape = values.shape[1:]
-            self._file.create_dataset(name, (0, *shape), np.float64, maxshape=(None, *shape), chunks=(64, *shape), **_PACKED)
+            self._file.create_dataset(
+                name, (0, *shape), np.float64, maxshape=(None, *shape), chunks=(64, *shape), **_PACKED
+            )
         data = self._file[name]
         if name == "pose" and values.shape[1:] != data.shape[1:]:
-            raise DataError(f"pose has {values.shape[1]} parts, earlier samples have {data.shape[1]}; pad to the largest")
+            raise DataError(
+                f"pose has {values.shape[1]} parts, earlier samples have {data.shape[1]}; pad to the largest"
+            )
         start = len(data)
         data.resize(start + len(values), axis=0)
         data[start:] = values
@@ -142,7 +148,9 @@ class CloudsWriter:
         if not len(self):
             self._atomic.discard()
             raise DataError(f"{self.path}: not one good sample to write; nothing was written")
-        if self.resumed:  # a file that was closed and reopened has another layout: copy, so that equal work gives equal bytes
+        if (
+            self.resumed
+        ):  # a file that was closed and reopened has another layout: copy, so that equal work gives equal bytes
             self._repack()
         self._atomic.commit()
 
