@@ -16,7 +16,7 @@ from dpcli.classify.config import KinetConfig
 from dpcli.classify.merge import build_merge
 from dpcli.classify.pointnet2 import GlobalHead, Grouping, he_init
 from dpcli.classify.st_surface import deviations, fit_surface, projected_deviations, surface_normal
-from dpcli.ops.grouped_mlp import gather_rows
+from dpcli.ops import gather_points
 
 
 class DeviationWeights(nn.Module):
@@ -151,4 +151,4 @@ class Kinematics(nn.Module):
                 2, slot[..., None, None].expand(-1, -1, 1, deviations.flatten(3).shape[-1])
             )[:, :, 0]
             own = own.view(*deviations.shape[:2], *deviations.shape[3:])
-        return gather_rows(own.flatten(2), group.idx).view(*group.idx.shape, *own.shape[2:])
+        return gather_points(own.flatten(2), group.idx).view(*group.idx.shape, *own.shape[2:])

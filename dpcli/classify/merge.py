@@ -7,8 +7,7 @@ from torch import Tensor, nn
 
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.pointnet2 import Grouping
-from dpcli.ops import three_nn_interpolate
-from dpcli.ops.grouped_mlp import gather_rows
+from dpcli.ops import gather_points, three_nn_interpolate
 
 
 class ResidualMerge(nn.Module):
@@ -30,7 +29,7 @@ class ResidualMerge(nn.Module):
         per_stage = len(normals) // len(groups)
         for level in range(1, len(normals)):
             if level % per_stage == 0:
-                state = gather_rows(state, groups[level // per_stage].idx).mean(2)
+                state = gather_points(state, groups[level // per_stage].idx).mean(2)
             state = self._activate(level, self.abstract[level](normals[level]) + self.align[level - 1](state))
         return state
 

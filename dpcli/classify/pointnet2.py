@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from dpcli.classify.config import KinetConfig
-from dpcli.ops import fps, space_time_ball_query
-from dpcli.ops.grouped_mlp import Norm, gather_rows, grouped_activations, grouped_mlp
+from dpcli.ops import fps, gather_points, space_time_ball_query
+from dpcli.ops.grouped_mlp import Norm, grouped_activations, grouped_mlp
 
 
 @dataclass
@@ -24,11 +24,11 @@ class Grouping:
 
     def neighbor_times(self) -> Tensor:
         """Frame number of each neighbour, (B,M,K)."""
-        return gather_rows(self.times[..., None], self.idx)[..., 0]
+        return gather_points(self.times[..., None], self.idx)[..., 0]
 
     def relative(self) -> Tensor:
         """Neighbour minus centroid, (B,M,K,3)."""
-        return gather_rows(self.points, self.idx) - self.centers[:, :, None]
+        return gather_points(self.points, self.idx) - self.centers[:, :, None]
 
 
 @torch.no_grad()
@@ -37,8 +37,8 @@ def group_clip(points: Tensor, times: Tensor, config: KinetConfig) -> list[Group
     stages = []
     for stage, count in enumerate(config.centroids):
         chosen = fps(points, count)
-        centers = gather_rows(points, chosen)
-        center_times = gather_rows(times[..., None], chosen)[..., 0]
+        centers = gather_points(points, chosen)
+        center_times = gather_points(times[..., None], chosen)[..., 0]
         idx = _neighbors(points, times, centers, center_times, config, stage)
         stages.append(Grouping(points, times, centers, center_times, idx))
         points, times = centers, center_times

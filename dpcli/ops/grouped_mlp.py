@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops.backend import chosen_backend
+from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 
 _BLOCKS = 32  # pieces of work per kernel: more than threads, for balance; fixed, so that sums repeat exactly
@@ -69,7 +70,7 @@ def grouped_activations(
     if norm1.mean is not None and norm2.mean is not None:
         linear1, linear2 = _folded(linear1, norm1), _folded(linear2, norm2)
     table, offset = _project(points, centers, features, linear1)
-    hidden, statistics1 = _norm_relu(gather_rows(table, idx) - offset[:, :, None], norm1)
+    hidden, statistics1 = _norm_relu(gather_points(table, idx) - offset[:, :, None], norm1)
     out, statistics2 = _norm_relu(torch.nn.functional.linear(hidden, *linear2), norm2)
     return [hidden, out], [*statistics1, *statistics2]
 
@@ -78,13 +79,6 @@ def _folded(linear: tuple[Tensor, Tensor], norm: Norm) -> tuple[Tensor, Tensor]:
     """The linear layer with its batch norm's scale and shift in it."""
     scale = norm.weight * torch.rsqrt(norm.var + norm.eps)
     return linear[0] * scale[:, None], (linear[1] - norm.mean) * scale + norm.bias
-
-
-def gather_rows(table: Tensor, idx: Tensor) -> Tensor:
-    """table (B,N,C), idx (B,...) i64 -> (B,...,C)."""
-    batch, count, channels = table.shape
-    shift = torch.arange(batch, device=idx.device).view(-1, *[1] * (idx.dim() - 1)) * count
-    return table.reshape(batch * count, channels)[idx + shift]
 
 
 def _project(
