@@ -15,7 +15,7 @@ else
 DEMO       := demo/gestures
 DEMO_INPUT := synthetic gestures
 endif
-DEMO_TRAIN ?= --preset tiny
+DEMO_TRAIN ?= --preset tiny --timing uniform
 BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
@@ -46,7 +46,7 @@ demo: $(READY)
 	$(DPC) prepare $(DEMO_INPUT) -o $(DEMO)/clouds.h5
 	$(DPC) info $(DEMO)/clouds.h5 --picture $(DEMO)/clouds.png
 	$(DPC) classify train $(DEMO)/clouds.h5 -o $(DEMO)/model $(DEMO_TRAIN)
-	$(DPC) classify predict $(DEMO)/clouds.h5 --model $(DEMO)/model -o $(DEMO)/scores.h5 --force
+	$(DPC) classify predict $(DEMO)/clouds.h5 --model $(DEMO)/model -o $(DEMO)/scores.h5 --clips-per-video 3 --force
 	$(DPC) evaluate classification $(DEMO)/scores.h5 --split test --picture $(DEMO)/confusion.png
 	@echo "The pictures are $(DEMO)/clouds.png and $(DEMO)/confusion.png."
 
@@ -55,6 +55,7 @@ test: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m tests.bench.bench_ops
+	$(DPC) classify profile --preset thesis --steps
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
 
 lint: $(READY)

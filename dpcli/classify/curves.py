@@ -8,6 +8,7 @@ from pathlib import Path
 def draw_curves(rows: list[dict], path: Path) -> None:
     """Loss (left axis, log) and accuracies in % (right axis) of every stage, over epochs, as a PNG."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     stages = list(dict.fromkeys(row["stage"] for row in rows))
     figure = Figure(figsize=(5.6 * len(stages), 3.8), layout="constrained")
@@ -16,7 +17,9 @@ def draw_curves(rows: list[dict], path: Path) -> None:
         epochs = [row["epoch"] for row in mine]
         axes = figure.add_subplot(1, len(stages), panel + 1)
         axes.plot(epochs, [row["loss"] for row in mine], color="0.6", label="loss")
-        axes.set(title=f"{stage} stream", xlabel="epoch", ylabel="cross-entropy", yscale="log")
+        axes.set(title=f"{stage} stream", xlabel="epoch", ylabel="cross-entropy")
+        axes.set_ylim(bottom=0)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         right = axes.twinx()
         right.plot(epochs, [100 * row["train_accuracy"] for row in mine], color="tab:blue", label="training")
         known = [
@@ -28,5 +31,5 @@ def draw_curves(rows: list[dict], path: Path) -> None:
             right.plot(*zip(*known), color="tab:orange", marker=".", label="validation")
         right.set(ylabel="accuracy (%)", ylim=(0, 102))
         lines = axes.get_lines() + right.get_lines()
-        right.legend(lines, [line.get_label() for line in lines], loc="center right", frameon=False)
+    figure.legend(lines, [line.get_label() for line in lines], loc="outside lower center", ncols=len(lines), frameon=False)
     figure.savefig(path, dpi=120)

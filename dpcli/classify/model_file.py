@@ -40,14 +40,25 @@ def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
     os.replace(part, path)
 
 
+SHIPPED = Path(__file__).with_name("weights")
+
+
+def shipped_models() -> list[str]:
+    """Names of the models that come with the package; each has a card `NAME.md` beside it."""
+    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+
+
 def find_model(name: str) -> Path:
-    """A model's file: the path itself, or `best.safetensors` of a training folder. UsageError when there is none."""
+    """A model's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
     path = Path(name)
     if path.is_dir():
         path = path / "best.safetensors"
+    if not path.is_file() and name in shipped_models():
+        return SHIPPED / f"{name}.safetensors"
     if not path.is_file():
         raise UsageError(
-            f"--model {name}: no such file; give a .safetensors file or a folder made by `dpc classify train`"
+            f"--model {name}: no such file; give a .safetensors file, a folder made by `dpc classify train`"
+            f" or a shipped model ({', '.join(shipped_models()) or 'none in this installation'})"
         )
     return path
 

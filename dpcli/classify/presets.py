@@ -35,7 +35,7 @@ PRESETS = {
         KinetConfig(**_SMALL), Schedule((80, 60), batch=8, weight_decay=0.01, label_smoothing=0.1), AUGMENTATIONS["ours"]
     ),
     "tiny": Preset(
-        KinetConfig(**_TINY), Schedule((20, 20), batch=8, learning_rate=2e-3, weight_decay=0.01), AUGMENTATIONS["ours"]
+        KinetConfig(**_TINY), Schedule((20, 40), batch=8, learning_rate=2e-3, weight_decay=0.01), AUGMENTATIONS["ours"]
     ),
 }  # fmt: skip
 
