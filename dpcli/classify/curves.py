@@ -31,5 +31,7 @@ def draw_curves(rows: list[dict], path: Path) -> None:
             right.plot(*zip(*known), color="tab:orange", marker=".", label="validation")
         right.set(ylabel="accuracy (%)", ylim=(0, 102))
         lines = axes.get_lines() + right.get_lines()
-    figure.legend(lines, [line.get_label() for line in lines], loc="outside lower center", ncols=len(lines), frameon=False)
+    figure.legend(
+        lines, [line.get_label() for line in lines], loc="outside lower center", ncols=len(lines), frameon=False
+    )
     figure.savefig(path, dpi=120)

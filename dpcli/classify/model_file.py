@@ -37,6 +37,9 @@ def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
     }  # fmt: skip
     part = path.with_name(f".{path.name}.part")
     save_file(tensors, part, header)
+    umask = os.umask(0)
+    os.umask(umask)
+    part.chmod(0o666 & ~umask)  # the library writes files that only their owner can read
     os.replace(part, path)
 
 

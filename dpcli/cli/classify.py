@@ -100,7 +100,9 @@ def train(
 @app.command()
 def predict(
     data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
-    model: Annotated[str, typer.Option("--model", help="A .safetensors file, a folder made by train, or a shipped model's name.")],
+    model: Annotated[
+        str, typer.Option("--model", help="A .safetensors file, a folder made by train, or a shipped model's name.")
+    ],
     output: Output,
     split: Annotated[
         str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")
