@@ -17,6 +17,7 @@ from dpcli.ops.backend import chosen_backend
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 
+_PIECE = 1 << 13  # rows between two matrix products: 2 to 8 MB of activations, which then stay in the cache
 _BLOCKS = 32  # pieces of work per kernel: more than threads, for balance; fixed, so that sums repeat exactly
 
 
@@ -134,13 +135,13 @@ class _GroupedMLP(torch.autograd.Function):
         mean1, var1 = _statistics(sums, rows)
         inverse1 = torch.rsqrt(var1 + eps1)
         scale1 = g1.detach() * inverse1
-        kernels.affine_relu(hidden.view(-1, c1).numpy(), scale1.numpy(), (b1.detach() - mean1 * scale1).numpy())
-        best, where, mean2, var2 = _pool_linear(hidden, weight2, bias2, g2)
+        best, where, gram, total = _pool_linear(hidden, scale1, b1.detach() - mean1 * scale1, weight2, bias2, g2)
+        mean2, var2 = _linear_statistics(gram, total, rows, weight2, bias2)
         inverse2 = torch.rsqrt(var2 + eps2)
         normal = (best - mean2) * inverse2
         out = torch.relu_(normal * g2 + b2)
         ctx.save_for_backward(idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
-                              mean1, inverse1, mean2, inverse2)  # fmt: skip
+                              mean1, inverse1, mean2, inverse2, gram, total)  # fmt: skip
         ctx.mark_non_differentiable(mean1, var1, mean2, var2)
         return out.view(batch, count, c2), mean1, var1, mean2, var2
 
@@ -148,7 +149,7 @@ class _GroupedMLP(torch.autograd.Function):
     def backward(ctx, grad, *unused):
         kernels = parallel_kernels("kernels_grouped")
         (idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
-         mean1, inverse1, mean2, inverse2) = ctx.saved_tensors  # fmt: skip
+         mean1, inverse1, mean2, inverse2, gram, total) = ctx.saved_tensors  # fmt: skip
         rows, c1, c2 = idx.numel(), len(g1), len(g2)
         grad = grad.reshape(-1, c2) * (out > 0)
         grad_b2, grad_g2 = grad.sum(0), (grad * normal).sum(0)
@@ -160,49 +161,66 @@ class _GroupedMLP(torch.autograd.Function):
         flat = hidden.view(rows, c1)
         lean = (v[:, None] * weight2).t()
         constant = -((u + v * bias2) @ weight2)
-        dense = torch.addmm(constant, flat, lean @ weight2, beta=1, alpha=-1)
-        parts = torch.zeros(_BLOCKS, c2, c1)
-        kernels.scatter_pooled(sparse.numpy(), where.numpy(), weight2.detach().contiguous().numpy(),
-                               hidden.view(-1, idx.shape[2], c1).numpy(), dense.view(-1, idx.shape[2], c1).numpy(),
-                               parts.numpy())  # fmt: skip
-        gram = flat.t() @ flat
-        grad_w2 = parts.sum(0) - torch.outer(u + v * bias2, flat.sum(0)) - v[:, None] * (weight2 @ gram)
-        safe = torch.where(g1.abs() < 1e-12, torch.full_like(g1, 1e-12), g1)
-        sums = torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
-        kernels.relu_norm_sums(
-            dense.numpy(), flat.numpy(), (1 / safe).numpy(), (-b1.detach() / safe.detach()).numpy(), sums.numpy()
-        )
+        safe = torch.where(g1.abs() < 1e-12, torch.full_like(g1, 1e-12), g1.detach())
+        recover = ((1 / safe).numpy(), (-b1.detach() / safe).numpy())
+        dense, mixed, plain = torch.empty_like(flat), lean @ weight2, weight2.detach().contiguous()
+        parts, sums = torch.zeros(_BLOCKS, c2, c1), torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
+        neighbors = idx.shape[2]
+        for first, last in _pieces(rows // neighbors, neighbors):
+            h, d = flat[first * neighbors : last * neighbors], dense[first * neighbors : last * neighbors]
+            torch.addmm(constant, h, mixed, alpha=-1, out=d)
+            kernels.scatter_pooled(
+                sparse[first:last].numpy(), where[first:last].numpy(), plain.numpy(),
+                h.view(-1, neighbors, c1).numpy(), d.view(-1, neighbors, c1).numpy(), parts.numpy(),
+            )  # fmt: skip
+            kernels.relu_norm_sums(d.numpy(), h.numpy(), *recover, sums.numpy())
+        grad_w2 = parts.sum(0) - torch.outer(u + v * bias2, total.float()) - v[:, None] * (weight2 @ gram.float())
         grad_b1, grad_g1 = sums.sum(0).float()
         first = _back_first(kernels, ctx.needs_input_grad, dense.view(*idx.shape, c1), idx, table, offset, weight1, bias1,
                             mean1, inverse1, g1 * inverse1, grad_b1 / rows, grad_g1 / rows)  # fmt: skip
         return None, *first, grad_g1, grad_b1, grad_g2, grad_b2, grad_w2, torch.zeros_like(bias2), None, None
 
 
-def _pool_linear(hidden: Tensor, weight: Tensor, bias: Tensor, sign: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Second linear layer and its pooling, a clip at a time so that the wide activations stay in one small buffer."""
+def _pieces(count: int, neighbors: int) -> list[tuple[int, int]]:
+    """Cut `count` centroids into ranges of about _PIECE rows."""
+    step = max(1, _PIECE // neighbors)
+    return [(first, min(first + step, count)) for first in range(0, count, step)]
+
+
+def _pool_linear(
+    hidden: Tensor, scale: Tensor, shift: Tensor, weight: Tensor, bias: Tensor, sign: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """First activation (in place), second linear layer and its pooling, piece by piece: the wide layer is never stored.
+
+    Returns the extremes (M,C2) and their rows, and of the hidden layer h the Gram matrix h'h and the sum, in float64.
+    """
     kernels = parallel_kernels("kernels_grouped")
-    batch, count, neighbors, c1 = hidden.shape
-    c2 = len(bias)
-    best, where = torch.empty(batch * count, c2), torch.empty(batch * count, c2, dtype=torch.uint8)
-    sums = torch.zeros(_BLOCKS, 2, c2, dtype=torch.float64)
-    step = max(1, min(count, (1 << 16) // neighbors))  # centroids at a time
-    buffer = torch.empty(step * neighbors, c2)
+    neighbors, c1, c2 = hidden.shape[2], hidden.shape[3], len(bias)
+    flat = hidden.view(-1, c1)
+    count = len(flat) // neighbors
+    best, where = torch.empty(count, c2), torch.empty(count, c2, dtype=torch.uint8)
+    gram, total = torch.zeros(c1, c1, dtype=torch.float64), torch.zeros(c1, dtype=torch.float64)
+    ones = torch.ones(1, _PIECE + neighbors)
+    buffer = torch.empty(max(last - first for first, last in _pieces(count, neighbors)) * neighbors, c2)
     weight, bias = weight.detach().t(), bias.detach()
     signs = torch.where(sign < 0, -1.0, 1.0).numpy()
-    flat = hidden.view(batch * count, neighbors * c1)
-    for start in range(0, batch * count, step):
-        piece = flat[start : start + step]
-        rows = buffer[: len(piece) * neighbors]
-        torch.addmm(bias, piece.view(-1, c1), weight, out=rows)
-        stop = start + len(piece)
-        kernels.extreme(
-            rows.view(-1, neighbors, c2).numpy(),
-            signs,
-            best[start:stop].numpy(),
-            where[start:stop].numpy(),
-            sums.numpy(),
-        )
-    return best, where, *_statistics(sums, batch * count * neighbors)
+    for first, last in _pieces(count, neighbors):
+        h, y = flat[first * neighbors : last * neighbors], buffer[: (last - first) * neighbors]
+        kernels.affine_relu(h.numpy(), scale.numpy(), shift.numpy())
+        torch.addmm(bias, h, weight, out=y)
+        gram += h.t() @ h
+        total += (ones[:, : len(h)] @ h)[0]
+        kernels.extreme(y.view(-1, neighbors, c2).numpy(), signs, best[first:last].numpy(), where[first:last].numpy())
+    return best, where, gram, total
+
+
+def _linear_statistics(gram: Tensor, total: Tensor, rows: int, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and biased variance of W h + b over the rows, from h'h and sum(h): no pass over the wide layer."""
+    weight = weight.detach().double()
+    mean = total / rows
+    covariance = gram / rows - torch.outer(mean, mean)
+    var = ((weight @ covariance) * weight).sum(1).clamp_min(0)
+    return (weight @ mean + bias.detach()).float(), var.float()
 
 
 def _back_first(kernels, needs, grad, idx, table, offset, weight1, bias1, mean, inverse, scale, t0, t1):

@@ -69,37 +69,26 @@ def affine_relu(rows, scale, shift):
 
 
 @parallel_kernel
-def extreme(rows, sign, best, where, sums):
-    """Per centroid and channel the largest (sign > 0) or smallest value over its K rows, which row, and sums as above.
+def extreme(rows, sign, best, where):
+    """Per centroid and channel the largest (sign > 0) or smallest value over its K rows, and which row.
 
     rows (M,K,C), sign (C), best (M,C), where (M,C) u8; ties: the first row.
     """
     count, neighbors, channels = rows.shape
-    blocks = sums.shape[0]
-    for block in prange(blocks):
-        for i in range(block * count // blocks, (block + 1) * count // blocks):
-            top = np.empty(channels, np.float32)
-            at = np.zeros(channels, np.int32)
-            total, squares = np.empty(channels, np.float32), np.empty(channels, np.float32)
+    for i in prange(count):
+        top = np.empty(channels, np.float32)
+        at = np.zeros(channels, np.int32)
+        for c in range(channels):
+            top[c] = rows[i, 0, c] * sign[c]
+        for k in range(1, neighbors):
             for c in range(channels):
-                value = rows[i, 0, c]
-                top[c] = value * sign[c]
-                total[c] = value
-                squares[c] = value * value
-            for k in range(1, neighbors):
-                for c in range(channels):
-                    value = rows[i, k, c]
-                    total[c] += value
-                    squares[c] += value * value
-                    signed = value * sign[c]
-                    if signed > top[c]:
-                        top[c] = signed
-                        at[c] = k
-            for c in range(channels):
-                best[i, c] = top[c] * sign[c]
-                where[i, c] = at[c]
-                sums[block, 0, c] += total[c]
-                sums[block, 1, c] += squares[c]
+                signed = rows[i, k, c] * sign[c]
+                better = signed > top[c]  # selects, not branches: the loop over channels then vectorises
+                top[c] = signed if better else top[c]
+                at[c] = np.int32(k) if better else at[c]
+        for c in range(channels):
+            best[i, c] = top[c] * sign[c]
+            where[i, c] = at[c]
 
 
 @parallel_kernel
