@@ -143,16 +143,17 @@ def compare(name: str, raw: Path, folder: Path, subset: int, jobs: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("raw", type=Path)
+    parser.add_argument("raw", type=Path, help="a folder of msraction3d/ and nvgesture/, or one of them")
     parser.add_argument("--subset", type=int, default=20)
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
-    found = [name for name in POINTS if (options.raw / name).is_dir()]
-    if not found:
-        sys.exit(f"{options.raw}: neither msraction3d/ nor nvgesture/ is in it")
-    for name in found:
+    found = {name: options.raw / name for name in POINTS if (options.raw / name).is_dir()}
+    if not found:  # RAW may be one data set's own folder
+        name = "nvgesture" if (options.raw / "Video_data").is_dir() else "msraction3d"
+        found = {name: options.raw}
+    for name, raw in found.items():
         with tempfile.TemporaryDirectory() as folder:
-            compare(name, options.raw / name, Path(folder), options.subset, options.jobs)
+            compare(name, raw, Path(folder), options.subset, options.jobs)
 
 
 if __name__ == "__main__":
