@@ -156,6 +156,29 @@ def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, d
     assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
 
 
+def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
+    from dpcli.classify.run_folder import RunFolder
+    from dpcli.classify.train import Schedule
+    from dpcli.errors import DataError, UsageError
+
+    for wrong in (
+        {"batch": 0},
+        {"epochs": (-1, 1)},
+        {"learning_rate": -1.0},
+        {"decay": "foo"},
+        {"workers": -1},
+        {"clips_per_video": -2},
+    ):
+        with pytest.raises(UsageError, match="expected"):
+            Schedule(**wrong)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="names a folder"):
+        RunFolder(tmp_path / "file", {})
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(DataError, match="--force"):
+        RunFolder(tmp_path, {})
+
+
 def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc, tmp_path, make_sequence):
     with CloudsWriter(tmp_path / "other.h5", class_names=["up", "down"]) as writer:
         writer.write(make_sequence("x", label=0, frames=6))

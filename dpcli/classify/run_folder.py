@@ -19,10 +19,15 @@ class RunFolder:
 
     def __init__(self, path: str | Path, config: dict, force: bool = False) -> None:
         self.path = Path(path)
+        if self.path.exists() and not self.path.is_dir():
+            raise UsageError(f"{self.path}: is a file; -o of train names a folder")
         self.path.mkdir(parents=True, exist_ok=True)
         saved = self.path / "config.json"
         if saved.exists() and not force:
-            before = json.loads(saved.read_text())
+            try:
+                before = json.loads(saved.read_text())
+            except ValueError:
+                raise DataError(f"{saved}: not JSON, the run can't be continued; --force starts over") from None
             differing = sorted(k for k in before.keys() | config.keys() if before.get(k) != config.get(k))
             if differing:
                 key = differing[0]

@@ -20,8 +20,11 @@ from dpcli.classify.kinet import STREAMS, Kinet, fuse
 from dpcli.classify.model_file import ModelInfo, save_model
 from dpcli.classify.predict import batches
 from dpcli.classify.run_folder import RunFolder
+from dpcli.errors import UsageError
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import StopRequest
+
+DECAYS = ("cosine", "staircase", "constant")
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,21 @@ class Schedule:
     validate_every: int = 1  # epochs
     validation_clips: int = 4  # per video
     workers: int = 0  # processes that load clips; 0: this one
+
+    def __post_init__(self) -> None:
+        rates = (self.learning_rate, self.learning_rate_dynamic)
+        problem = {
+            f"--batch {self.batch}: expected at least 1": self.batch < 1,
+            f"--epochs {self.epochs}: expected 0 or more": min(self.epochs) < 0,
+            f"--lr {rates}: expected numbers above 0": any(rate is not None and not rate > 0 for rate in rates),
+            f"--decay {self.decay}: expected cosine, staircase or constant": self.decay not in DECAYS,
+            f"--workers {self.workers}: expected 0 or more": self.workers < 0,
+            f"--clips-per-video {self.clips_per_video}: expected 0 (every start) or more": (self.clips_per_video or 1)
+            < 1,
+        }
+        for message, wrong in problem.items():
+            if wrong:
+                raise UsageError(message)
 
     def rate(self, stage: int, step: int, steps: int) -> float:
         """Learning rate at an optimiser step of a stage (0 static, 1 dynamic) with `steps` in all."""
