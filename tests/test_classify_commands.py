@@ -157,9 +157,9 @@ def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, d
 
 
 def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
-    from dpcli.classify.run_folder import RunFolder
     from dpcli.classify.train import Schedule
     from dpcli.errors import DataError, UsageError
+    from dpcli.runtime.run_folder import RunFolder
 
     for wrong in (
         {"batch": 0},
@@ -173,10 +173,10 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
             Schedule(**wrong)
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="names a folder"):
-        RunFolder(tmp_path / "file", {})
+        RunFolder(tmp_path / "file", {}, columns=["loss"])
     (tmp_path / "config.json").write_text("{")
     with pytest.raises(DataError, match="--force"):
-        RunFolder(tmp_path, {})
+        RunFolder(tmp_path, {}, columns=["loss"])
 
 
 def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc, tmp_path, make_sequence):

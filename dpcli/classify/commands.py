@@ -13,11 +13,11 @@ import torch
 from dpcli.classify.augment import PRESETS as AUGMENTATIONS
 from dpcli.classify.clips import ClipSource
 from dpcli.classify.config import KinetConfig
+from dpcli.classify.curves import COLUMNS, draw_curves
 from dpcli.classify.kinet import Kinet
 from dpcli.classify.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.predict import predict_videos
 from dpcli.classify.presets import find_preset
-from dpcli.classify.run_folder import RunFolder
 from dpcli.classify.split import carve_validation, class_table, default_rule
 from dpcli.classify.train import Schedule, Trainer
 from dpcli.errors import DataError, UsageError
@@ -25,6 +25,7 @@ from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
 
@@ -72,7 +73,7 @@ def run_training(
         record = {"network": json.loads(config.to_json()), "schedule": _content(plan), "augmentation": asdict(augmentation),
                   "timing": timing, "validation": rule, "drop_short": drop_short, "seed": seed, "static_from": static_from,
                   "data": provenance.file_digest(path)}  # fmt: skip
-        folder = RunFolder(output, json.loads(json.dumps(record)), force)
+        folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         training = ClipSource(
             reader, train_part, config, timing=timing, augmentation=augmentation, drop_short=drop_short, seed=seed
         )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+COLUMNS = ("stage", "epoch", "loss", "train_accuracy", "validation_accuracy", "learning_rate", "seconds")
+
 
 def draw_curves(rows: list[dict], path: Path) -> None:
     """Loss (left axis, log) and accuracies in % (right axis) of every stage, over epochs, as a PNG."""

@@ -19,9 +19,9 @@ from dpcli.classify.clips import Clip, ClipSource
 from dpcli.classify.kinet import STREAMS, Kinet, fuse
 from dpcli.classify.model_file import ModelInfo, save_model
 from dpcli.classify.predict import batches
-from dpcli.classify.run_folder import RunFolder
 from dpcli.errors import UsageError
 from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import StopRequest
 
 DECAYS = ("cosine", "staircase", "constant")

@@ -5,19 +5,26 @@ from __future__ import annotations
 import csv
 import json
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 
 from dpcli.errors import DataError, UsageError
 
-COLUMNS = ("stage", "epoch", "loss", "train_accuracy", "validation_accuracy", "learning_rate", "seconds")
-
 
 class RunFolder:
-    """`config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`, `curves.png`."""
+    """`config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`, `curves.png`.
 
-    def __init__(self, path: str | Path, config: dict, force: bool = False) -> None:
+    columns: what a row of the log holds. curves: draws the rows into a picture file. Raises UsageError when the folder
+    holds a run of another configuration and `force` is off.
+    """
+
+    def __init__(
+        self, path: str | Path, config: dict, force: bool = False, *, columns: Sequence[str],
+        curves: Callable[[list[dict], Path], None] | None = None,
+    ) -> None:  # fmt: skip
+        self.columns, self.curves = tuple(columns), curves
         self.path = Path(path)
         if self.path.exists() and not self.path.is_dir():
             raise UsageError(f"{self.path}: is a file; -o of train names a folder")
@@ -65,21 +72,19 @@ class RunFolder:
 
     def log(self, row: dict) -> None:
         """Append one epoch and rewrite the small log files whole, so that a reader never sees half a line."""
-        self.rows.append({key: row.get(key) for key in COLUMNS})
+        self.rows.append({key: row.get(key) for key in self.columns})
         _replace(self.path / "log.json", json.dumps(self.rows, indent=1))
         part = self.path / ".log.csv.part"
         with open(part, "w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
+            writer = csv.DictWriter(file, self.columns)
             writer.writeheader()
             writer.writerows(self.rows)
         os.replace(part, self.path / "log.csv")
 
     def draw_curves(self) -> None:
-        """Loss and accuracies over epochs, one panel a stage."""
-        from dpcli.classify.curves import draw_curves
-
-        if self.rows:
-            draw_curves(self.rows, self.path / "curves.png")
+        """The learning curves so far, by the function given."""
+        if self.rows and self.curves is not None:
+            self.curves(self.rows, self.path / "curves.png")
 
 
 def _replace(path: Path, text: str) -> None:

@@ -1,0 +1,1 @@
+"""Multi-body SE(3) equivariance (thesis chapter 4): rigid parts and their motions in a few frames, without labels."""
