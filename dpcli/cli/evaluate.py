@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,10 +14,14 @@ from dpcli.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, help="Compare what a model says with the truth.")
 
-
-@app.callback()
-def _group() -> None:
-    """Keeps `classification` a subcommand while it is the only one."""
+Markdown = Annotated[bool, typer.Option("--markdown", help="Print markdown tables.")]
+Parts = Annotated[str, typer.Argument(help="Parts file, or - for a pipe.")]
+Truth = Annotated[Path, typer.Option("--truth", help="Clouds file with the true parts, and poses for motion.")]
+Split = Annotated[
+    str | None, typer.Option("--split", help="Sequences of the truth that count, or all. Default: test if any.")
+]
+Intersect = Annotated[bool, typer.Option("--intersect", help="Compare what both files have, list the rest.")]
+Protocol = Annotated[str, typer.Option("--protocol", help="dpc, or release: the published code's numbers.")]
 
 
 @app.command()
@@ -27,20 +31,17 @@ def classification(
     split: Annotated[
         str | None, typer.Option("--split", help="Samples that count, or all. Default: test if there are any.")
     ] = None,
-    as_markdown: Annotated[bool, typer.Option("--markdown", help="Print markdown tables.")] = False,
+    as_markdown: Markdown = False,
     as_object: Json = False,
     picture: Picture = None,
 ) -> None:
     """Accuracy, per class and per stream, and the confusion matrix of a scores file."""
-    if as_object and as_markdown:
-        raise UsageError("--json and --markdown: choose one form of output")
-    from dpcli.evaluate.pictures import check_picture, confusion_picture
+    _check_output(as_object, as_markdown, picture)
+    from dpcli.evaluate.pictures import confusion_picture
     from dpcli.evaluate.protocol import as_json, evaluate_classification
     from dpcli.evaluate.tables import markdown, print_report
     from dpcli.store import ScoresReader, input_file
 
-    if picture is not None:
-        check_picture(picture)
     with input_file(scores) as path:
         report = evaluate_classification(path, truth, split)
         if picture is not None:
@@ -51,3 +52,93 @@ def classification(
             typer.echo(markdown(report))
         else:
             print_report(report, sys.stdout)
+
+
+@app.command()
+def segmentation(
+    parts: Parts,
+    truth: Truth,
+    protocol: Protocol = "dpc",
+    ignore_below: Annotated[
+        int, typer.Option("--ignore-below", min=0, help="True parts of fewer points are ignored.")
+    ] = 0,
+    split: Split = None,
+    intersect: Intersect = False,
+    as_markdown: Markdown = False,
+    as_object: Json = False,
+    picture: Picture = None,
+) -> None:
+    """AP, PQ, F1, precision and recall at IoU 0.5, mIoU and Rand index of a parts file."""
+    _check_output(as_object, as_markdown, picture)
+    from dpcli.evaluate.part_pictures import segmentation_picture
+    from dpcli.evaluate.part_tables import segmentation_notes, segmentation_tables
+    from dpcli.evaluate.segmentation_protocol import evaluate_segmentation, segmentation_json
+    from dpcli.store import input_file
+
+    with input_file(parts) as path:
+        report = evaluate_segmentation(
+            path, truth, protocol=protocol, ignore_below=ignore_below, split=split, intersect=intersect
+        )
+        if picture is not None:
+            segmentation_picture(report, picture)
+        if as_object:
+            _print_object(segmentation_json(report, parts, _provenance(path)))
+        else:
+            _print_tables(segmentation_tables(report), segmentation_notes(report), as_markdown)
+
+
+@app.command()
+def motion(
+    parts: Parts,
+    truth: Truth,
+    protocol: Protocol = "dpc",
+    split: Split = None,
+    intersect: Intersect = False,
+    as_markdown: Markdown = False,
+    as_object: Json = False,
+    picture: Picture = None,
+) -> None:
+    """EPE3D, AccS, AccR and Outlier of a parts file's flow, and the errors of its part motions."""
+    _check_output(as_object, as_markdown, picture)
+    from dpcli.evaluate.motion_protocol import evaluate_motion, motion_json
+    from dpcli.evaluate.part_pictures import motion_picture
+    from dpcli.evaluate.part_tables import motion_notes, motion_tables
+    from dpcli.store import input_file
+
+    with input_file(parts) as path:
+        report = evaluate_motion(path, truth, protocol=protocol, split=split, intersect=intersect)
+        if picture is not None:
+            motion_picture(report, picture)
+        if as_object:
+            _print_object(motion_json(report, parts, _provenance(path)))
+        else:
+            _print_tables(motion_tables(report), motion_notes(report), as_markdown)
+
+
+def _check_output(as_object: bool, as_markdown: bool, picture: Path | None) -> None:
+    """Wrong output options are said before the work."""
+    if as_object and as_markdown:
+        raise UsageError("--json and --markdown: choose one form of output")
+    if picture is not None:
+        from dpcli.evaluate.pictures import check_picture
+
+        check_picture(picture)
+
+
+def _provenance(path: Path) -> list[dict]:
+    from dpcli.store import PartsReader
+
+    return PartsReader(path).provenance
+
+
+def _print_object(found: dict[str, Any]) -> None:
+    typer.echo(json.dumps(found, allow_nan=False))
+
+
+def _print_tables(tables: list[Any], notes: list[str], as_markdown: bool) -> None:
+    from dpcli.evaluate.tables import markdown_tables, print_tables
+
+    if as_markdown:
+        typer.echo(markdown_tables(tables, notes))
+    else:
+        print_tables(tables, notes, sys.stdout)

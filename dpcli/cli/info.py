@@ -76,7 +76,8 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     if "counts" in found:
         counts = (f"{count:,} {name.replace('_', ' ')}" for name, count in found["counts"].items())
         lines.append(("counts", ", ".join(counts)))
-    for key, unit in (("frames_per_sequence", ""), ("points_per_frame", ""), ("frame_interval", " s")):
+    for key, unit in (("frames_per_sequence", ""), ("points_per_frame", ""), ("parts_per_sequence", ""),
+                      ("pairs_per_sequence", ""), ("frame_interval", " s")):  # fmt: skip
         if found.get(key):
             spread = " / ".join(f"{found[key][name]:.6g}" for name in ("min", "median", "max"))
             lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
@@ -92,7 +93,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((key, ", ".join(f"{name or 'none'} ({count})" for name, count in found[key].items())))
     if found.get("unknown_labels"):
         lines.append(("unknown labels", str(found["unknown_labels"])))
-    if found["kind"] not in ("clouds", "scores"):
+    if found["kind"] not in ("clouds", "parts", "scores"):
         lines += [(item["name"], f"{item['type']} {tuple(item['shape'])}") for item in found["datasets"]]
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]

@@ -94,15 +94,20 @@ def _class_title(label: int, name: str) -> str:
 
 def print_report(report: ClassificationReport, stream: TextIO) -> None:
     """Write the tables to a terminal, or plainly to a file; a matrix wider than the terminal is replaced by a hint."""
+    print_tables(tables(report), notes(report), stream)
+
+
+def print_tables(made: list[TextTable], lines: list[str], stream: TextIO) -> None:
+    """Write tables, then lines of text, as `print_report`."""
     from rich.console import Console
 
     console = Console(file=stream, highlight=False, width=None if stream.isatty() else _PIPE_WIDTH)
-    for table in tables(report):
+    for table in made:
         if table.width > console.width:
             console.print(f"{table.title}: {table.width} columns wide; widen the terminal, or use --picture.\n")
         else:
             console.print(_rich(table), "")
-    for line in notes(report):
+    for line in lines:
         console.print(line, markup=False)
 
 
@@ -122,8 +127,12 @@ def _rich(table: TextTable):
 
 def markdown(report: ClassificationReport) -> str:
     """The same tables for a document."""
-    parts = [f"**{table.title}**\n\n{_markdown_table(table)}" for table in tables(report)]
-    return "\n\n".join([*parts, *notes(report)])
+    return markdown_tables(tables(report), notes(report))
+
+
+def markdown_tables(made: list[TextTable], lines: list[str]) -> str:
+    """Tables, then lines of text, for a document."""
+    return "\n\n".join([*(f"**{table.title}**\n\n{_markdown_table(table)}" for table in made), *lines])
 
 
 def _markdown_table(table: TextTable) -> str:

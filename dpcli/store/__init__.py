@@ -1,12 +1,14 @@
 """The HDF5 contract: what a file holds, writing it whole, reading only what is needed, moving it through pipes.
 
-`CloudsWriter` / `CloudsReader` for point cloud sequences, `ScoresWriter` / `ScoresReader` for what a classifier says,
+`CloudsWriter` / `CloudsReader` for point cloud sequences, `PartsWriter` / `PartsReader` for what a segmenter says,
+`ScoresWriter` / `ScoresReader` for what a classifier says,
 `input_file` / `output_file` for paths and `-`. Nothing here knows where samples come from or what they are for.
 """
 
 from __future__ import annotations
 
 from dpcli.store.file import file_kind
+from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
 from dpcli.store.pipes import input_file, output_file
 from dpcli.store.reader import CloudsReader
 from dpcli.store.scores import ScoresReader, ScoresWriter
@@ -14,6 +16,6 @@ from dpcli.store.sequence import CloudSequence
 from dpcli.store.writer import CloudsWriter
 
 __all__ = [
-    "CloudSequence", "CloudsReader", "CloudsWriter", "ScoresReader", "ScoresWriter",
+    "CloudSequence", "CloudsReader", "CloudsWriter", "PartsReader", "PartsSample", "PartsWriter", "ScoresReader", "ScoresWriter",
     "file_kind", "input_file", "output_file",
 ]  # fmt: skip

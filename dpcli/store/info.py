@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 
 from dpcli.store.file import file_kind, open_store, read_provenance, root_attributes
+from dpcli.store.parts import PartsReader
 from dpcli.store.reader import CloudsReader
 from dpcli.store.scores import ScoresReader
 
@@ -31,7 +32,7 @@ def summary(path: str | Path) -> dict[str, Any]:
             "provenance": read_provenance(file),
             "datasets": _datasets(file),
         }
-    own = {"clouds": _clouds, "parts": _clouds, "scores": _scores}.get(kind)
+    own = {"clouds": _clouds, "parts": _parts, "scores": _scores}.get(kind)
     return {**common, **(own(path) if own else {})}
 
 
@@ -57,6 +58,7 @@ def _clouds(path: Path) -> dict[str, Any]:
             },
             "frames_per_sequence": _spread(reader.frame_counts),
             "points_per_frame": _spread(reader.frame_sizes),
+            "parts_per_sequence": _spread(_part_counts(reader)),
             "frame_interval": _spread(_intervals(reader), float),
             "fields": list(reader.fields),
             "range": ranges,
@@ -64,6 +66,26 @@ def _clouds(path: Path) -> dict[str, Any]:
             "subjects": _count(_known(reader.subjects)),
             "cameras": _count(_known(reader.cameras)),
         }  # fmt: skip
+
+
+def _parts(path: Path) -> dict[str, Any]:
+    found = _clouds(path)
+    with PartsReader(path) as reader:
+        found["counts"] |= {"part_slots": reader.num_parts, "frame_pairs": int(reader.pair_counts.sum())}
+        found["pairs_per_sequence"] = _spread(reader.pair_counts)
+    return found
+
+
+def _part_counts(reader: CloudsReader) -> np.ndarray:
+    """Different parts that the points of each sequence are in, i64 (S); empty when the file has none."""
+    if "part" not in reader.fields:
+        return np.zeros(0, np.int64)
+    ends = np.concatenate([[0], np.cumsum(reader.point_counts)])
+    counts = []
+    for start, stop in zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True):
+        ids = reader.file["part"][start:stop]
+        counts.append(int(np.count_nonzero(np.bincount(ids[ids >= 0]))))
+    return np.array(counts, np.int64)
 
 
 def _scores(path: Path) -> dict[str, Any]:

@@ -23,10 +23,12 @@ class CloudsReader:
     Raises DataError when the file is not what the contract says.
     """
 
+    kinds: tuple[str, ...] = ("clouds", "parts")
+
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._file: h5py.File | None = None
-        with open_store(self.path, ("clouds", "parts")) as file:
+        with open_store(self.path, self.kinds) as file:
             self._load_index(file)
 
     def _load_index(self, file: h5py.File) -> None:
@@ -102,7 +104,7 @@ class CloudsReader:
     def file(self) -> h5py.File:
         """The open handle of this process."""
         if self._file is None or not self._file.id.valid:
-            self._file = open_store(self.path, ("clouds", "parts"))
+            self._file = open_store(self.path, self.kinds)
         return self._file
 
     def read(

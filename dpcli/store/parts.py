@@ -1,0 +1,219 @@
+"""Files of kind `parts`: what a segmenter says of the points and frame pairs of each sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.store.reader import CloudsReader
+from dpcli.store.sequence import CloudSequence
+from dpcli.store.writer import PACKED, CloudsWriter
+
+_TOLERANCE = 1e-3  # of float32 probabilities and rotations
+
+
+@dataclass
+class PartsSample:
+    """What is said of one sequence, beside the hard ids in its `part`.
+
+    probability f32 (P,K) of each part, 0..1; pairs i32 (Q,2) source and target frame; motion f32 (Q,K,4,4) with
+    x_target = R x_source + t; flow: for each pair f32 (N_source,3), the displacement of the source frame's points.
+    """
+
+    probability: np.ndarray
+    pairs: np.ndarray
+    motion: np.ndarray
+    flow: list[np.ndarray]
+
+    def validate(self, sequence: CloudSequence, num_parts: int) -> None:
+        """Raise DataError unless shapes, ids, frames and values fit the sequence and the K parts of the file."""
+        where = f"sample {sequence.name!r}"
+        count, pairs = len(sequence.points), len(self.pairs)
+        for key, value, shape in (
+            ("probability", self.probability, (count, num_parts)),
+            ("pairs", self.pairs, (pairs, 2)),
+            ("motion", self.motion, (pairs, num_parts, 4, 4)),
+        ):
+            if value.shape != shape:
+                raise DataError(f"{where}: {key} has shape {value.shape}, expected {shape}")
+        self._check_ids(sequence, num_parts, where)
+        _check_probability(self.probability, where)
+        _check_motion(self.motion, where)
+        self._check_flow(sequence, where)
+
+    def _check_ids(self, sequence: CloudSequence, num_parts: int, where: str) -> None:
+        for key, values, low, high in (
+            ("part", sequence.part, -1, num_parts),
+            ("pairs", self.pairs, 0, sequence.num_frames),
+        ):
+            wrong = (values < low) | (values >= high)
+            if wrong.any():
+                raise DataError(f"{where}: {key} holds {values[wrong][0]}, expected {low}..{high - 1}")
+
+    def _check_flow(self, sequence: CloudSequence, where: str) -> None:
+        if len(self.flow) != len(self.pairs):
+            raise DataError(f"{where}: flow of {len(self.flow)} pairs, expected {len(self.pairs)}, one array for each")
+        sizes = np.diff(sequence.frame_offsets)
+        for (source, target), flow in zip(self.pairs.tolist(), self.flow, strict=True):
+            if flow.shape != (sizes[source], 3):
+                raise DataError(f"{where}: flow {source} -> {target} has shape {flow.shape}, expected one row for each "
+                                f"of the {sizes[source]} points of frame {source}")  # fmt: skip
+            if not np.isfinite(flow).all():
+                raise DataError(f"{where}: flow {source} -> {target} is NaN or infinite")
+
+
+def _check_probability(probability: np.ndarray, where: str) -> None:
+    wrong = ~((probability >= -_TOLERANCE) & (probability <= 1 + _TOLERANCE))  # NaN is wrong, too
+    if wrong.any():
+        raise DataError(f"{where}: probability holds {probability[wrong][0]}, expected 0..1")
+
+
+def _check_motion(motion: np.ndarray, where: str) -> None:
+    """Rigid: the last row 0 0 0 1, the first three columns a rotation."""
+    rotation = motion[..., :3, :3].astype(np.float64)
+    rigid = np.isfinite(motion).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        rigid &= (np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)) < _TOLERANCE).all((-1, -2))
+        rigid[rigid] = np.linalg.det(rotation[rigid]) > 0
+    if not rigid.all():
+        pair, part = np.argwhere(~rigid)[0]
+        raise DataError(f"{where}: motion of part {part} in pair {pair} is not a rigid one "
+                        "(a rotation and a translation, last row 0 0 0 1)")  # fmt: skip
+
+
+class PartsWriter(CloudsWriter):
+    """A CloudsWriter (same options and guarantees) whose samples come with a PartsSample; K = `num_parts`.
+
+    `part` is always among the fields. Motions of parts that a sequence lacks are the identity, probabilities 0.
+    """
+
+    kind = "parts"
+
+    def __init__(self, path: str | Path, *, num_parts: int, fields: Sequence[str] = (), **options: Any) -> None:
+        if num_parts < 1:
+            raise UsageError(f"a parts file of {num_parts} parts: expected at least one")
+        self.num_parts = num_parts
+        super().__init__(path, fields=fields if "part" in fields else (*fields, "part"), **options)
+
+    def _same_configuration(self, file: h5py.File) -> bool:
+        return super()._same_configuration(file) and file["part_probability"].shape[1] == self.num_parts
+
+    def _create(self) -> None:
+        super()._create()
+        self._create_floats("part_probability", self.num_parts)
+        self._create_floats("flow", 3)
+        file, shape = self._file, (self.num_parts, 4, 4)
+        file.create_dataset("part_motion", (0, *shape), np.float32, maxshape=(None, *shape), chunks=(64, *shape))
+        file.create_dataset("pair", (0, 2), np.int32, maxshape=(None, 2), chunks=(1024, 2), **PACKED)
+        for name in ("pair_offsets", "flow_offsets"):
+            file.create_dataset(name, data=np.zeros(1, np.int64), maxshape=(None,), chunks=(4096,), **PACKED)
+
+    def write(  # type: ignore[override]
+        self,
+        sequence: CloudSequence,
+        probability: np.ndarray,  # f32 (P,K)
+        pairs: np.ndarray,  # i32 (Q,2)
+        motion: np.ndarray,  # f32 (Q,K,4,4)
+        flow: Sequence[np.ndarray],  # Q times f32 (N_source,3)
+    ) -> None:
+        """Append one sample, whose `part` are the hard ids. DataError as `CloudsWriter.write`, `PartsSample.validate`."""
+        self._check(sequence)
+        said = PartsSample(
+            np.asarray(probability, np.float32),
+            np.asarray(pairs, np.int32).reshape(-1, 2),
+            np.asarray(motion, np.float32),
+            [np.asarray(one, np.float32) for one in flow],
+        )
+        said.validate(sequence, self.num_parts)
+        self._append_said(said)
+        self._append_sequence(sequence)
+        self._names.add(sequence.name)
+
+    def _append_said(self, said: PartsSample) -> None:
+        pairs, rows = len(self._file["pair"]), len(self._file["flow"])
+        self._append("part_probability", said.probability)
+        self._append("pair", said.pairs)
+        self._append("pair_offsets", np.array([pairs + len(said.pairs)]))
+        self._append("part_motion", said.motion)
+        self._append("flow", np.concatenate([np.zeros((0, 3), np.float32), *said.flow]))
+        self._append("flow_offsets", rows + np.cumsum([len(one) for one in said.flow], dtype=np.int64))
+
+    def _whole_rows(self) -> dict[str, int]:
+        rows, samples = super()._whole_rows(), len(self)
+        pairs = int(self._file["pair_offsets"][samples])
+        flow = int(self._file["flow_offsets"][pairs])
+        return rows | {
+            "part_probability": rows["points"], "pair_offsets": samples + 1, "pair": pairs, "part_motion": pairs,
+            "flow_offsets": pairs + 1, "flow": flow,
+        }  # fmt: skip
+
+    def _reader(self, path: Path) -> PartsReader:
+        return PartsReader(path)
+
+    def _copy(self, reader: PartsReader, index: int) -> None:  # type: ignore[override]
+        said = reader.read_parts(index)
+        self.write(reader.read(index), said.probability, said.pairs, said.motion, said.flow)
+
+
+class PartsReader(CloudsReader):
+    """A CloudsReader of a `parts` file; `read_parts` reads what is said of one sequence. `num_parts` = K.
+
+    The layout is checked on opening, the values of a sequence when it is read: DataError.
+    """
+
+    kinds = ("parts",)
+
+    def _load_index(self, file: h5py.File) -> None:
+        super()._load_index(file)
+        if "part" not in self.fields:
+            raise DataError(f"{self.path}: data set 'part' is missing; the file is incomplete, make it again")
+        probability = file.get("part_probability")
+        if probability is None or probability.ndim != 2 or len(probability) != self.num_points:
+            found = "is missing" if probability is None else f"has shape {probability.shape}"
+            raise DataError(f"{self.path}: part_probability {found}, expected ({self.num_points}, parts)")
+        self.num_parts = int(probability.shape[1])
+        self._pair_offsets = self._rising(file, "pair_offsets", len(self.names), len(self._data(file, "pair", (2,))))
+        pairs = int(self._pair_offsets[-1])
+        self._flow_offsets = self._rising(file, "flow_offsets", pairs, len(self._data(file, "flow", (3,))))
+        motions = len(self._data(file, "part_motion", (self.num_parts, 4, 4)))
+        if motions != pairs:
+            raise DataError(f"{self.path}: part_motion has {motions} rows for {pairs} pairs")
+
+    def _rising(self, file: h5py.File, name: str, spans: int, end: int) -> np.ndarray:
+        offsets = self._offsets(file, name, None)
+        if len(offsets) != spans + 1 or offsets[-1] != end:
+            raise DataError(f"{self.path}: {name} has {len(offsets)} rows ending at {offsets[-1]}, "
+                            f"expected {spans + 1} ending at {end}")  # fmt: skip
+        return offsets
+
+    @property
+    def pair_counts(self) -> np.ndarray:
+        """Frame pairs of each sequence, i64 (S)."""
+        return np.diff(self._pair_offsets)
+
+    def read_parts(self, index: int) -> PartsSample:
+        """What is said of sequence `index`; DataError when its values don't fit the sequence."""
+        frames = self._frame_offsets[self._sequence_offsets[index] : self._sequence_offsets[index + 1] + 1]
+        points = slice(int(frames[0]), int(frames[-1]))
+        pairs = slice(*map(int, self._pair_offsets[index : index + 2]))
+        offsets = self._flow_offsets[pairs.start : pairs.stop + 1]
+        flow = self.file["flow"][int(offsets[0]) : int(offsets[-1])]
+        said = PartsSample(
+            self.file["part_probability"][points],
+            self.file["pair"][pairs],
+            self.file["part_motion"][pairs],
+            np.split(flow, offsets[1:-1] - offsets[0]) if pairs.stop > pairs.start else [],
+        )
+        sequence = CloudSequence(self.names[index], np.empty((points.stop - points.start, 3), np.float32),
+                                 frames - frames[0], part=self.file["part"][points])  # fmt: skip
+        try:
+            said.validate(sequence, self.num_parts)
+        except DataError as error:
+            raise DataError(f"{self.path}: {error}; predict again") from None
+        return said
