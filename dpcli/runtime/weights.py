@@ -1,0 +1,61 @@
+"""Trained weights on disk: one safetensors file with text in its header. Nothing is unpickled."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+from dpcli import __version__
+from dpcli.errors import DataError, UsageError
+
+
+def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, str]) -> None:
+    """Write beside the target, then rename. header: text by name; `format` tells readers what it is."""
+    from safetensors.torch import save_file
+
+    part = path.with_name(f".{path.name}.part")
+    whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    save_file(whole, part, {"version": __version__, **header})
+    umask = os.umask(0)
+    os.umask(umask)
+    part.chmod(0o666 & ~umask)  # the library writes files that only their owner can read
+    os.replace(part, path)
+
+
+def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors and header. DataError when the file is not whole, of another format (made by `maker`), or holds NaN."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            header = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}
+    except (SafetensorError, OSError) as error:
+        raise DataError(f"{path}: not a complete safetensors file ({error})") from None
+    if header.get("format") != expected_format:
+        raise DataError(f"{path}: format {header.get('format')!r}, expected {expected_format!r}, written by `{maker}`")
+    if not all(torch.isfinite(value).all() for value in tensors.values()):
+        raise DataError(f"{path}: holds NaN or infinite weights; train again or use another checkpoint")
+    return tensors, header
+
+
+def shipped_models(folder: Path) -> list[str]:
+    """Names of the models that come with the package; each has a card `NAME.md` beside it."""
+    return sorted(path.stem for path in folder.glob("*.safetensors"))
+
+
+def find_weights(name: str, shipped: Path, maker: str, option: str = "--model") -> Path:
+    """A model's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
+    path = Path(name)
+    if path.is_dir():
+        path = path / "best.safetensors"
+    if path.is_file():
+        return path
+    if name in shipped_models(shipped):
+        return shipped / f"{name}.safetensors"
+    raise UsageError(
+        f"{option} {name}: no such file; give a .safetensors file, a folder made by `{maker}`"
+        f" or a shipped model ({', '.join(shipped_models(shipped)) or 'none in this installation'})"
+    )

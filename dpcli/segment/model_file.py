@@ -1,0 +1,34 @@
+"""A part network on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+
+from dpcli.errors import DataError
+from dpcli.runtime.weights import find_weights, load_weights, save_weights
+from dpcli.segment.config import PartConfig
+from dpcli.segment.network import PartNetwork
+
+_FORMAT, _MAKER = "dpc-parts-1", "dpc segment train"
+SHIPPED = Path(__file__).with_name("weights")
+
+
+def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
+    """Weights as float32, configuration and notes (a small JSON object) in the header."""
+    header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
+    save_weights(path, model.state_dict(), header)
+
+
+def load_model(name: str) -> tuple[PartNetwork, dict]:
+    """A part network in eval mode and its notes; name: a path, a training folder or a shipped model."""
+    path = find_weights(name, SHIPPED, _MAKER)
+    tensors, header = load_weights(path, _FORMAT, _MAKER)
+    model = PartNetwork(PartConfig.from_json(header["config"]))
+    try:
+        model.load_state_dict({key: value.to(torch.float32) for key, value in tensors.items()})
+    except RuntimeError as error:
+        raise DataError(f"{path}: weights don't fit the configuration: {str(error).splitlines()[1].strip()}") from None
+    return model.eval(), json.loads(header["notes"])

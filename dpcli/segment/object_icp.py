@@ -1,0 +1,44 @@
+"""Object-aware ICP: flow refined part by part, correspondences only between points of the same part (OGC)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.ops import rigid_flow, weighted_kabsch
+from dpcli.segment.matching import match_slots, permute_slots
+
+
+@torch.no_grad()
+def object_icp(
+    points1: Tensor,  # [B, N, 3]
+    points2: Tensor,  # [B, M, 3]
+    mask1: Tensor,  # [B, N, S]
+    mask2: Tensor,  # [B, M, S]
+    flow: Tensor,  # [B, N, 3]
+    iterations: int = 20,
+    temperature: float = 0.01,
+    order: Tensor | None = None,  # [B, S]
+) -> tuple[Tensor, Tensor, Tensor]:  # [B, N, 3], [B, S, 3, 3], [B, S, 3]
+    """Refined flow (B,N,3) and the motions (B,S,3,3), (B,S,3) of frame 1's slots, from a first flow.
+
+    Frame 2's slots are matched once (`order`: `match_slots`, if it is known already). In each iteration point i moved
+    by its flow corresponds to points n with weights softmax(-|p_i + f_i - q_n| / temperature) times the probability of
+    being in the same part, sum_s m1_is m2_ns; then each slot takes its weighted Kabsch motion, and the flow is their
+    blend. A point whose part has no point in frame 2 keeps its correspondence of before. temperature is in units of
+    length. Memory: (B,N,M). No iterations: the weighted Kabsch of the first flow.
+    """
+    order = match_slots(points1, flow, mask1, points2, mask2) if order is None else order
+    same_part = (mask1 @ permute_slots(mask2, order).mT).log_()  # [B, N, M]
+    lost = same_part.amax(-1, keepdim=True) == -torch.inf
+    same_part.masked_fill_(lost, 0.0)
+    for _ in range(iterations):
+        logits = torch.cdist(points1 + flow, points2, compute_mode="donot_use_mm_for_euclid_dist")
+        weights = logits.div_(-temperature).add_(same_part).softmax(-1)
+        flow = torch.where(lost, flow, weights @ points2 - points1)
+        rotation, translation = weighted_kabsch(points1, points1 + flow, mask1)
+        flow = rigid_flow(points1, mask1, rotation, translation)
+    if iterations == 0:
+        rotation, translation = weighted_kabsch(points1, points1 + flow, mask1)
+        flow = rigid_flow(points1, mask1, rotation, translation)
+    return flow, rotation, translation

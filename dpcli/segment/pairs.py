@@ -1,0 +1,98 @@
+"""Training pairs: two neighbouring frames of a sequence, thinned to the network's number of points and to size 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.runtime.seed import generator
+from dpcli.store import CloudSequence, CloudsReader
+
+_FRAME_KEY = 7001  # keeps these generators apart from those of epochs
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Frames `first` and `first + 1` of a sequence; `number` counts all pairs of a source."""
+
+    number: int
+    sequence: int
+    first: int
+
+
+@dataclass
+class LoadedPair:
+    """points f32 (2,N,3) in units of the sequence's diameter, centred; part i64 (2,N) (-1 unknown); flow f32 (2,N,3), the
+    true one each way, None without poses."""
+
+    points: np.ndarray
+    part: np.ndarray
+    flow: np.ndarray | None
+
+
+def sequence_scale(frames: list[np.ndarray]) -> float:
+    """1 / (twice the largest distance of a point from its frame's mean): a sequence times this has diameter 1 or less."""
+    reach = max((float(np.linalg.norm(f - f.mean(0), axis=1).max()) for f in frames if len(f)), default=0.0)
+    return 0.5 / reach if reach > 0 else 1.0
+
+
+def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices i64 (wanted) into `count` points: without repeats where there are enough, all of them and repeats else."""
+    if count >= wanted:
+        return rng.permutation(count)[:wanted]
+    return np.concatenate([rng.permutation(count), rng.integers(0, count, wanted - count)])
+
+
+class PairSource:
+    """All pairs of adjacent frames of some sequences. A frame's points are drawn once: its flow belongs to them."""
+
+    def __init__(self, reader: CloudsReader, sequences: list[int], points: int, seed: int) -> None:
+        self.reader, self.points, self.seed = reader, points, seed
+        spots = [(s, f) for s in sequences for f in range(int(reader.frame_counts[s]) - 1)]
+        self.pairs = [Pair(n, s, f) for n, (s, f) in enumerate(spots)]
+        if not self.pairs:
+            raise DataError(f"{reader.path}: no sequence of two frames or more to train on")
+        self.fields = [name for name in ("part", "pose") if name in reader.fields]
+
+    def load(self, pair: Pair) -> LoadedPair:
+        """One pair. DataError when a frame is empty."""
+        frames = [pair.first, pair.first + 1]
+        sample = self.reader.read(pair.sequence, frames, self.fields)
+        clouds = [sample.frame(t) for t in range(2)]
+        if min(map(len, clouds)) == 0:
+            raise DataError(f"{self.reader.path}: frame without points in {sample.name!r}; prepare without empty frames")
+        picks = [
+            choose_points(len(c), self.points, generator(self.seed, _FRAME_KEY, pair.sequence, f))
+            for c, f in zip(clouds, frames)
+        ]
+        parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
+        points = np.stack([cloud[pick] for cloud, pick in zip(clouds, picks)])
+        flow = None
+        if sample.pose is not None:
+            flow = np.stack([true_flow(points[t], parts[t], sample.pose[t], sample.pose[1 - t]) for t in range(2)])
+        scale = sequence_scale(clouds)
+        centre = np.float32(points.mean((0, 1)))
+        return LoadedPair(
+            np.float32((points - centre) * scale), parts, None if flow is None else np.float32(flow * scale)
+        )
+
+
+def frame_parts(sample: CloudSequence, t: int) -> np.ndarray:
+    """Part ids i64 of frame t, -1 where unknown."""
+    bounds = slice(sample.frame_offsets[t], sample.frame_offsets[t + 1])
+    count = bounds.stop - bounds.start
+    return np.full(count, -1) if sample.part is None else sample.part[bounds].astype(np.int64)
+
+
+def true_flow(points: np.ndarray, part: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Flow (N,3) of points whose parts have the poses source (parts,4,4), to the poses target. Unknown parts move as 0."""
+    motion = (target @ np.linalg.inv(source))[np.clip(part, 0, None)]
+    return np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
+
+
+def epoch_order(source: PairSource, epoch: int, most: int | None) -> list[Pair]:
+    """The epoch's pairs, shuffled; at most `most`, another draw each epoch."""
+    order = generator(source.seed, 7002, epoch).permutation(len(source.pairs))
+    return [source.pairs[i] for i in order[:most]]

@@ -1,0 +1,193 @@
+"""Parts and motions of one sequence: a segmenter says masks of thinned frames, everything after is the same for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.ops import fps, three_nn_interpolate, weighted_kabsch
+from dpcli.ops.rigid import apply_motions, rigid_flow, to_matrix
+from dpcli.runtime.seed import generator
+from dpcli.segment.matching import carry_mask, match_sequence, one_hot
+from dpcli.segment.network import PartNetwork
+from dpcli.segment.object_icp import object_icp
+from dpcli.segment.pairs import choose_points, sequence_scale
+from dpcli.store import CloudSequence
+from dpcli.store.parts import PartsSample
+
+_FEWEST = 16  # points of a frame; one with fewer is filled up by repeats
+_SPREAD = 8  # farthest points are searched among this many times the wanted number, drawn at random
+
+Estimate = Callable[[Tensor, Tensor], Tensor]  # (B,N,3), (B,M,3) -> flow (B,N,3)
+Segmenter = Callable[[list[Tensor], dict[tuple[int, int], Tensor]], list[Tensor]]  # frames, flows -> masks (N,S)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """points: most points of a frame that the segmenter sees. pairs: adjacent or all. icp: steps of object-aware ICP.
+    vote: blend each frame's mask with its neighbours' carried along the flow. smallest: parts below this share of a
+    sequence's points are given to each point's next best part."""
+
+    points: int = 512
+    pairs: str = "adjacent"
+    icp: int = 20
+    vote: bool = True
+    smallest: float = 0.01
+    normalize: bool = True
+
+
+def network_segmenter(model: PartNetwork, device: torch.device) -> Segmenter:
+    """Masks of the part network, frame by frame or together where frames have equally many points."""
+
+    @torch.inference_mode()
+    def segment(frames: list[Tensor], flows: dict[tuple[int, int], Tensor]) -> list[Tensor]:
+        if len({len(frame) for frame in frames}) == 1:
+            chunks = torch.stack(frames).split(8)
+            return [mask.cpu() for chunk in chunks for mask in model(chunk.to(device)).mask]
+        return [model(frame[None].to(device)).mask[0].cpu() for frame in frames]
+
+    return segment
+
+
+def needs_flows(frames: int, pairs: str) -> list[tuple[int, int]]:
+    """(source, target) frames to report: adjacent ones forward, or every ordered pair."""
+    if pairs == "all":
+        return [(i, j) for i in range(frames) for j in range(frames) if i != j]
+    return [(t, t + 1) for t in range(frames - 1)]
+
+
+def predict_parts(
+    sequence: CloudSequence, index: int, segmenter: Segmenter, estimate: Estimate, options: Refinement, seed: int
+) -> tuple[np.ndarray, PartsSample]:
+    """Hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
+
+    Frames are thinned to `points`, centred and scaled together to diameter 1 (so no unit or place matters); masks are
+    carried back to all points from the three nearest. One frame gives parts and no motion.
+    """
+    clouds = [np.float32(sequence.frame(t)) for t in range(sequence.num_frames)]
+    centre = np.float32(np.concatenate([c for c in clouds if len(c)] or [np.zeros((1, 3))]).mean(0))
+    scale = np.float32(sequence_scale([c for c in clouds if len(c)])) if options.normalize else np.float32(1)
+    whole = [torch.from_numpy((cloud - centre) * scale) for cloud in clouds]
+    thin = [_thinned(cloud, options.points, generator(seed, index, t)) for t, cloud in enumerate(whole)]
+    pairs = needs_flows(len(thin), options.pairs)
+    chain = [(t, t + 1) for t in range(len(thin) - 1)]
+    back = [(t + 1, t) for t in range(len(thin) - 1)] if options.vote else []
+    flows = _flows(thin, sorted({*pairs, *chain, *back}), estimate)
+    masks = segmenter(thin, flows)
+    masks = _consistent(thin, flows, masks, options.vote)
+    masks = _without_crumbs(masks, options.smallest)
+    full = [_carried_back(cloud, few, mask) for cloud, few, mask in zip(whole, thin, masks)]
+    labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
+    probability = torch.cat(full).numpy().astype(np.float32)
+    motion, flow = _motions(thin, whole, masks, full, flows, pairs, options, float(scale), centre)
+    return labels, PartsSample(probability, np.array(pairs, np.int32).reshape(-1, 2), motion, flow)
+
+
+def _thinned(cloud: Tensor, wanted: int, rng: np.random.Generator) -> Tensor:
+    if len(cloud) == 0:
+        return torch.zeros(_FEWEST, 3)
+    if len(cloud) <= wanted:
+        return cloud if len(cloud) >= _FEWEST else cloud[choose_points(len(cloud), _FEWEST, rng)]
+    some = cloud[np.sort(choose_points(len(cloud), min(len(cloud), _SPREAD * wanted), rng))]
+    return some[fps(some[None], wanted)[0]]
+
+
+def _flows(frames: list[Tensor], pairs: list[tuple[int, int]], estimate: Estimate) -> dict[tuple[int, int], Tensor]:
+    """All flows wanted; together where sizes allow."""
+    if pairs and len({len(frame) for frame in frames}) == 1:
+        stacked = torch.stack(frames)
+        found = torch.cat([
+            estimate(stacked[[i for i, _ in part]], stacked[[j for _, j in part]])
+            for part in (pairs[k : k + 16] for k in range(0, len(pairs), 16))
+        ])  # fmt: skip
+        return dict(zip(pairs, found))
+    return {(i, j): estimate(frames[i][None], frames[j][None])[0] for i, j in pairs}
+
+
+def _consistent(
+    frames: list[Tensor], flows: dict[tuple[int, int], Tensor], masks: list[Tensor], vote: bool
+) -> list[Tensor]:
+    """Slots in frame 0's order in every frame, and each mask averaged with its neighbours' as the flow brings them."""
+    if len(frames) == 1:
+        return masks
+    chain = [flows[t, t + 1] for t in range(len(frames) - 1)]
+    orders = match_sequence(frames, chain, masks)
+    masks = [mask[:, order] for mask, order in zip(masks, orders)]
+    if not vote:
+        return masks
+    voted = []
+    for t, mask in enumerate(masks):
+        total, count = 2 * mask, 2
+        for u in (t - 1, t + 1):
+            if 0 <= u < len(masks):
+                total = total + carry_mask(frames[u][None], flows[u, t][None], masks[u][None], frames[t][None])[0]
+                count += 1
+        voted.append(total / count)
+    return voted
+
+
+def _without_crumbs(masks: list[Tensor], smallest: float) -> list[Tensor]:
+    """Slots with less than `smallest` of the sequence's points lose them, unless that were all."""
+    share = torch.cat([one_hot(mask) for mask in masks]).mean(0)
+    kept = (share >= smallest).float()
+    if kept.sum() == 0:
+        return masks
+    return [(mask * kept + 1e-12 * kept) / (mask * kept + 1e-12 * kept).sum(1, keepdim=True) for mask in masks]
+
+
+def _carried_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
+    """The mask (n,S) of thin points (n,3) at all points of the cloud (N,3)."""
+    if len(cloud) == 0:
+        return mask[:0]
+    if cloud.shape == thin.shape and torch.equal(cloud, thin):
+        return mask
+    spread = torch.cat([three_nn_interpolate(part[None], thin[None], mask[None])[0] for part in cloud.split(1 << 16)])
+    return spread / spread.sum(1, keepdim=True).clamp(min=1e-12)
+
+
+def _motions(
+    thin: list[Tensor], whole: list[Tensor], masks: list[Tensor], full: list[Tensor],
+    flows: dict[tuple[int, int], Tensor], pairs: list[tuple[int, int]], options: Refinement, scale: float, centre: np.ndarray,
+) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+    """Motion f32 (Q,S,4,4) in the input's own coordinates and flow of all points, pair by pair."""
+    slots = masks[0].shape[1]
+    motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
+    middle = torch.from_numpy(centre)
+    same = torch.arange(slots)[None]
+    for q, (i, j) in enumerate(pairs):
+        rotation, shift = _fit(thin[i], thin[j], masks[i], masks[j], flows[i, j], options.icp, same)
+        flow.append((rigid_flow(whole[i][None], full[i][None], rotation, shift)[0] / scale).numpy())
+        used = one_hot(masks[i]).sum(0) > 0
+        own = shift[0] / scale + middle - (rotation[0] @ middle)
+        matrix = to_matrix(rotation[0], own)
+        motion[q] = torch.where(used[:, None, None], matrix, torch.eye(4)).numpy()
+    return motion, flow
+
+
+def _fit(
+    first: Tensor, second: Tensor, mask1: Tensor, mask2: Tensor, flow: Tensor, steps: int, same: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Motions (1,S,3,3), (1,S,3) by object-aware ICP from the flow; whichever of before and after lies nearer to frame 2."""
+    first, second, mask1, mask2, flow = (x[None] for x in (first, second, mask1, mask2, flow))
+    start = weighted_kabsch(first, first + flow, mask1)
+    if steps == 0:
+        return start
+    _, rotation, shift = object_icp(first, second, mask1, mask2, flow, steps, 0.01, same)
+    gaps = [_gap(first, second, mask1, mask2, *found) for found in (start, (rotation, shift))]  # [1, S] each
+    better = gaps[1] <= gaps[0]
+    return (
+        torch.where(better[..., None, None], rotation, start[0]),
+        torch.where(better[..., None], shift, start[1]),
+    )
+
+
+def _gap(first: Tensor, second: Tensor, mask1: Tensor, mask2: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
+    """Mean distance (1,S) of each part, moved, to frame 2."""
+    moved = apply_motions(first, rotation, shift)
+    nearest = torch.stack([torch.cdist(cloud, second[0]).amin(-1) for cloud in moved[0]])[None]
+    share = one_hot(mask1).mT
+    return (nearest * share).sum(-1) / share.sum(-1).clamp(min=1)
