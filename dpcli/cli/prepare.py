@@ -33,20 +33,74 @@ def _common(
     """The options that every reader shares; only the signature matters."""
 
 
-def _reads(group: typer.Typer, name: str | None = None) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a function that turns its own options into a Reader as a command that has the common options too."""
+def _articulated(
+    frames: Annotated[int, typer.Option("--frames", min=1, help="Frames per sequence.")] = 4,
+    points: Annotated[int, typer.Option("--points", min=1, help="Points per frame.")] = 512,
+    sampling: Annotated[
+        str, typer.Option("--sampling", help="random: by area; fps or voxel: chosen among 4x as many.")
+    ] = "random",
+    view: Annotated[str, typer.Option("--view", help="full surface, or single: what one camera sees of it.")] = "full",
+    orientation: Annotated[
+        str, typer.Option("--orientation", help="Of a sequence: random, or upright (turned about z, which is up).")
+    ] = "random",
+    rotation: Annotated[
+        float, typer.Option("--rotation", min=0.0, max=180.0, help="Most that each frame is turned besides, degrees.")
+    ] = 15.0,
+    translation: Annotated[
+        float, typer.Option("--translation", min=0.0, help="Most that each frame is shifted, per axis, in diameters.")
+    ] = 0.05,
+    joint_step: Annotated[
+        float,
+        typer.Option("--joint-step", help="Most that a joint changes between frames, of its range; 1: independent."),
+    ] = 0.3,
+    max_parts: Annotated[
+        int, typer.Option("--max-parts", min=2, help="Joints drawn at random stay still where there are more.")
+    ] = 8,
+    min_part: Annotated[
+        int, typer.Option("--min-part", min=0, help="Points that even a small part gets; tiny ones are glued on.")
+    ] = 8,
+    min_motion: Annotated[
+        float, typer.Option("--min-motion", min=0.0, help="Joints that move nothing by this, in diameters, stay still.")
+    ] = 0.02,
+    visible_only: Annotated[
+        bool, typer.Option("--visible-only", help="Joints that change no shape (a spinning wheel) stay still, too.")
+    ] = False,
+) -> None:
+    """The options of articulated objects; the fields of Articulation."""
+
+
+def _split_rule(test: str, validation: str, fractions: str) -> Any:
+    from dpcli.prepare.splits import SplitRule
+
+    try:
+        shares = tuple(float(word) for word in fractions.split(",") if word.strip())
+    except ValueError:
+        raise UsageError(f"--fractions {fractions}: expected three numbers, such as 0.8,0.1,0.1") from None
+    named = (tuple(word.strip() for word in text.split(",") if word.strip()) for text in (test, validation))
+    return SplitRule(*named, shares)
+
+
+def _reads(
+    group: typer.Typer, name: str | None = None, more: Callable[..., None] | None = None
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Register a function that turns its own options into a Reader as a command that has the common options too.
+
+    ``more``: a signature like ``_common`` whose options reach the function as the dict ``articulation``.
+    """
 
     def register(make_reader: Callable[..., Any]) -> Callable[..., Any]:
-        own = inspect.signature(make_reader, eval_str=True)
-        shared = inspect.signature(_common, eval_str=True)
+        own = {k: p for k, p in inspect.signature(make_reader, eval_str=True).parameters.items() if k != "articulation"}
+        shared = inspect.signature(_common, eval_str=True).parameters
+        extra = inspect.signature(more, eval_str=True).parameters if more else {}
 
         def run(**options: Any) -> None:
-            common = {key: options.pop(key) for key in shared.parameters}
-            if "seed" in own.parameters:
-                options["seed"] = common["seed"]
-            _convert(make_reader(**options), name or make_reader.__name__, **common)
+            given = {key: options[key] for key in own}
+            if more:
+                given["articulation"] = {key: options[key] for key in extra}
+            common = {key: options[key] for key in shared}
+            _convert(make_reader(**given), name or make_reader.__name__, **common)
 
-        parameters = {**own.parameters, **shared.parameters}
+        parameters = {**own, **shared, **extra}
         # a parameter without default may not follow one with: arguments first, then -o, then the rest
         ordered = sorted(parameters.values(), key=lambda p: p.default is not inspect.Parameter.empty)
         run.__signature__ = inspect.Signature([p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in ordered])  # type: ignore[attr-defined]
@@ -183,6 +237,46 @@ def clouds(
     return CloudFolders(raw, bin_columns, scale, unit, fps, stride, label_from_folder, labels)
 
 
+@_reads(app, more=_articulated)
+def sapien(
+    raw: Annotated[Path, typer.Argument(help="Folder of CATEGORY/ID/mobility.urdf, of ID/..., or any .urdf file.")],
+    articulation: dict[str, Any],
+    pairs_per_object: Annotated[
+        int,
+        typer.Option(
+            "--pairs-per-object", "--sequences-per-object", min=1, help="Sequences of --frames drawn of each object."
+        ),
+    ] = 8,
+    test_categories: Annotated[str, typer.Option("--test-categories", help="Split test, as A,B,C.")] = "",
+    validation_categories: Annotated[str, typer.Option("--validation-categories", help="Split validation.")] = "",
+    fractions: Annotated[
+        str,
+        typer.Option("--fractions", help="Of the other objects: train,validation,test. Default: see below."),
+    ] = "",
+    seed: Seed = 0,
+) -> Any:
+    """Articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
+
+    Lengths are diameters of the object in frame 0. Without --fractions: 0.8,0.1,0.1, or all the others train when
+    categories are named.
+    """
+    from dpcli.prepare.articulated_sequence import Articulation
+    from dpcli.prepare.sapien import Sapien
+
+    rule = _split_rule(test_categories, validation_categories, fractions)
+    return Sapien(raw, pairs_per_object, Articulation.of_options(articulation), rule, seed)
+
+
+@_reads(app)
+def mbs(
+    raw: Annotated[Path, typer.Argument(help="Folder of meta.json and data/000000.npz ..., as distributed.")],
+) -> Any:
+    """mbs-shapepart and mbs-sapien (MultiBodySync): four views of articulated objects, parts and poses."""
+    from dpcli.prepare.mbs import MultiBodySync
+
+    return MultiBodySync(raw)
+
+
 @_reads(synthetic)
 def gestures(
     videos_per_class: Annotated[int, typer.Option("--videos-per-class", help="Videos of each of the 10 classes.")] = 20,
@@ -196,3 +290,34 @@ def gestures(
     from dpcli.prepare.synthetic_gestures import SyntheticGestures
 
     return SyntheticGestures(videos_per_class, frames, subjects, size, noise, seed)
+
+
+@_reads(synthetic, more=_articulated)
+def articulated(
+    articulation: dict[str, Any],
+    objects: Annotated[int, typer.Option("--objects", min=1, help="Different objects, the kinds in turn.")] = 220,
+    sequences_per_object: Annotated[
+        int,
+        typer.Option("--sequences-per-object", "--pairs-per-object", min=1, help="Sequences of --frames of each."),
+    ] = 4,
+    kinds: Annotated[
+        str, typer.Option("--kinds", help="Only these, as laptop,scissors,lamp. Default: all 22, arm to window.")
+    ] = "",
+    test_categories: Annotated[str, typer.Option("--test-categories", help="Kinds that are split test.")] = "",
+    validation_categories: Annotated[str, typer.Option("--validation-categories", help="Split validation.")] = "",
+    fractions: Annotated[
+        str, typer.Option("--fractions", help="Of the other objects: train,validation,test. Default: see below.")
+    ] = "",
+    seed: Seed = 0,
+) -> Any:
+    """Procedural articulated objects: furniture, appliances, tools, lamps, ... with exact parts and poses.
+
+    Lengths are diameters of the object in frame 0. Without --fractions: 0.8,0.1,0.1, or all the others train when
+    kinds are named.
+    """
+    from dpcli.prepare.articulated_sequence import Articulation
+    from dpcli.prepare.synthetic_articulated import SyntheticArticulated
+
+    names = tuple(word.strip() for word in kinds.split(",") if word.strip())
+    rule = _split_rule(test_categories, validation_categories, fractions)
+    return SyntheticArticulated(objects, sequences_per_object, names, Articulation.of_options(articulation), rule, seed)
