@@ -37,11 +37,17 @@ def train(
     ] = None,
     pooling: Annotated[
         str | None,
-        typer.Option(help="point: each point chooses its rotations; global: the cloud does (ablation). Default: point."),
+        typer.Option(
+            help="point: each point chooses its rotations; global: the cloud does (ablation). Default: point."
+        ),
     ] = None,
     no_motion_head: Annotated[bool, typer.Option("--no-motion-head", help="Leave the motion head out.")] = False,
     smooth: Annotated[float, typer.Option(help="Weight of the smoothness of masks.")] = 0.1,
     invariance: Annotated[float, typer.Option(help="Weight of agreement between two turned copies.")] = 0.0,
+    cold_start: Annotated[
+        float, typer.Option(help="Weight, in the first part of the training, of the bodies that the flow alone shows.")
+    ] = 1.0,
+    cold_until: Annotated[float, typer.Option(help="Fraction of the training after which that ends.")] = 0.5,
     motion_after: Annotated[float, typer.Option(help="Fraction of the training before the motion head learns.")] = 0.3,
     update_after: Annotated[float, typer.Option(help="Fraction before flows are corrected.")] = 0.4,
     consensus_after: Annotated[float, typer.Option(help="Fraction before consensus weighs.")] = 0.5,
@@ -71,10 +77,15 @@ def train(
     network: dict[str, Any] = {"group": group, "pooling": pooling, "slots": slots}
     if no_motion_head:
         network["motion_width"] = 0
-    schedule = {"epochs": epochs, "pairs_per_epoch": pairs_per_epoch or None, "batch": batch, "learning_rate": lr, "augment": not no_augment}  # fmt: skip
+    schedule = {
+        "epochs": epochs, "pairs_per_epoch": pairs_per_epoch or None, "batch": batch, "learning_rate": lr,
+        "augment": not no_augment,
+    }  # fmt: skip
     objective = {
-        "form": loss, "smooth": smooth, "invariance": invariance, "supervised": supervised, "consensus": consensus, "tau": tau,
-        "flow_decay": flow_decay, "motion_after": motion_after, "update_after": update_after, "consensus_after": consensus_after,
+        "form": loss, "smooth": smooth, "invariance": invariance, "supervised": supervised,
+        "cold_start": cold_start, "cold_until": cold_until, "consensus": consensus, "tau": tau,
+        "flow_decay": flow_decay, "motion_after": motion_after, "update_after": update_after,
+        "consensus_after": consensus_after,
     }  # fmt: skip
     run_training(
         data, output, config=config, network=network, schedule=schedule, objective=objective, flow=flow, points=points,
@@ -87,7 +98,10 @@ def predict(
     data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
     output: Output,
     model: Annotated[
-        str | None, typer.Option("--model", help="A trained part network: file, training folder or shipped name. Default: the shipped one.")
+        str | None,
+        typer.Option(
+            "--model", help="A trained part network: file, training folder or shipped name. Default: the shipped one."
+        ),
     ] = None,
     method: Annotated[
         str | None, typer.Option(help="A classical method instead: dbscan, ward, ssc or trajaffn.")
@@ -95,7 +109,9 @@ def predict(
     method_option: Annotated[
         list[str] | None, typer.Option("--method-option", help="NAME=VALUE for --method; may be repeated.")
     ] = None,
-    parts: Annotated[int | None, typer.Option("--parts", min=1, help="Number of parts for --method. Default: found.")] = None,
+    parts: Annotated[
+        int | None, typer.Option("--parts", min=1, help="Number of parts for --method. Default: found.")
+    ] = None,
     flow: Annotated[str, typer.Option(help=_FLOW)] = "icp",
     pairs: Annotated[str, typer.Option(help="Motions between adjacent frames, or all pairs.")] = "adjacent",
     icp: Annotated[int, typer.Option(min=0, help="Steps of object-aware ICP that refine the motions.")] = 20,
@@ -106,8 +122,12 @@ def predict(
     smallest: Annotated[float, typer.Option(min=0, help="Parts below this share of the points are given up.")] = 0.01,
     split: Annotated[str, typer.Option("--split", help="Sequences of this split, or all.")] = "all",
     picture: Picture = None,
-    turntable: Annotated[Path | None, typer.Option("--turntable", help="Write an animation (.gif) to this file.")] = None,
-    ply: Annotated[Path | None, typer.Option("--ply", help="Write every frame as a coloured .ply into this folder.")] = None,
+    turntable: Annotated[
+        Path | None, typer.Option("--turntable", help="Write an animation (.gif) to this file.")
+    ] = None,
+    ply: Annotated[
+        Path | None, typer.Option("--ply", help="Write every frame as a coloured .ply into this folder.")
+    ] = None,
     seed: Seed = 0,
     device: Device = "auto",
     force: Force = False,

@@ -143,7 +143,11 @@ def classical_labels(
         options = classical_options(method, options)
     elif not isinstance(options, METHODS.get(method, ())):
         raise UsageError(f"--method {method}: options are {type(options).__name__}")
-    labels = [_frame_labels(frames, flows, t, num_parts, options, rng) for t in range(len(frames))]
+    import sklearn.cluster  # noqa: F401  (its threads must be there to be limited)
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):  # matrices this small only wait for one another's threads
+        labels = [_frame_labels(frames, flows, t, num_parts, options, rng) for t in range(len(frames))]
     return consistent_labels(frames, flows, labels, num_parts or options.max_parts)
 
 

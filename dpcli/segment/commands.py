@@ -25,12 +25,14 @@ from dpcli.segment.curves import COLUMNS, draw_curves
 from dpcli.segment.model_file import SHIPPED, load_model
 from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Objective
+from dpcli.segment.pair_flow import pair_flow
 from dpcli.segment.pairs import PairSource
 from dpcli.segment.predict import Estimate, Refinement, Segmenter, network_segmenter, predict_parts
 from dpcli.segment.train import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
 
+_SHOWN = 8  # sequences in a picture
 CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
 
 
@@ -55,10 +57,14 @@ def run_training(
         model = _new_model(shape, start_from)
         notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "supervised": aims.supervised,
                  "flow": flow, "trained_on": f"{len(train_part)} sequences, {len(training.pairs)} pairs"}  # fmt: skip
-        log.info(f"training on {chosen}: {notes['trained_on']}, {len(held)} sequences for validation; {plan.epochs} epochs")
+        log.info(
+            f"training on {chosen}: {notes['trained_on']}, {len(held)} sequences for validation; {plan.epochs} epochs"
+        )
         keep_freed_memory()
         with stop_requested() as stop:
-            estimate = None if aims.supervised else flow_estimator(flow)  # supervised: the true flow is at hand
+            estimate = (
+                None if aims.supervised else partial(pair_flow, method=flow)
+            )  # supervised: the true flow is at hand
             Trainer(model, folder, plan, aims, training, checking, estimate, notes, chosen, stop, seed).run()
     print(folder.file("best.safetensors"))
 
@@ -72,7 +78,9 @@ def _new_model(shape: PartConfig, start_from: str | None) -> PartNetwork:
     if start_from:
         other, _ = load_model(start_from)
         if other.config != shape:
-            raise UsageError(f"--start-from {start_from}: its network has another configuration; give the same --config and switches")
+            raise UsageError(
+                f"--start-from {start_from}: its network has another configuration; give the same --config and switches"
+            )
         model.load_state_dict(other.state_dict())
     return model
 
@@ -80,7 +88,9 @@ def _new_model(shape: PartConfig, start_from: str | None) -> PartNetwork:
 def _check_supervision(reader: CloudsReader, aims: Objective) -> None:
     missing = [name for name in ("part", "pose") if name not in reader.fields]
     if aims.supervised and missing:
-        raise DataError(f"{reader.path}: --supervised needs part ids and poses, but the file has no {' and no '.join(missing)}")
+        raise DataError(
+            f"{reader.path}: --supervised needs part ids and poses, but the file has no {' and no '.join(missing)}"
+        )
 
 
 def split_sequences(reader: CloudsReader, validation: str | None, seed: int) -> tuple[list[int], list[int]]:
@@ -111,7 +121,9 @@ def _hold_out_classes(reader: CloudsReader, train: list[int], names: str) -> tup
     wanted = [word.strip() for word in names.split(",")]
     unknown = [name for name in wanted if name not in reader.class_names]
     if unknown:
-        raise UsageError(f"--validation {names}: no class {unknown[0]!r}; the file has {', '.join(reader.class_names) or 'none'}")
+        raise UsageError(
+            f"--validation {names}: no class {unknown[0]!r}; the file has {', '.join(reader.class_names) or 'none'}"
+        )
     held = [i for i in train if reader.labels[i] >= 0 and reader.class_names[reader.labels[i]] in wanted]
     return [i for i in train if i not in set(held)], held
 
@@ -159,7 +171,8 @@ def _segmenter(
         raise UsageError(f"--method {method}: expected one of {', '.join(CLASSICAL)}; without it the network is used")
     chosen = classical_options(method, method_options)
     said = {"method": method, "options": asdict(chosen), "num_parts": num_parts}
-    return _classical_segmenter(method, method_options, num_parts, chosen.max_parts, seed), chosen.max_parts, said
+    slots = max(chosen.max_parts, num_parts or 0)
+    return _classical_segmenter(method, method_options, num_parts, slots, seed), slots, said
 
 
 def _classical_segmenter(
@@ -193,7 +206,9 @@ def _already_there(target: Path, entry: dict) -> bool:
     except DataError as error:
         raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
     if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(f"{target}: holds parts of another model, data or choice; use another -o, or --force to replace it")
+        raise UsageError(
+            f"{target}: holds parts of another model, data or choice; use another -o, or --force to replace it"
+        )
     log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
     return True
 
@@ -220,10 +235,19 @@ def _show(target: Path, picture: Path | None, ply: Path | None, turntable: Path 
     """Pictures of what was just written."""
     if picture is None and ply is None and turntable is None:
         return
-    from dpcli.segment.show import show_parts
+    from dpcli.segment.pictures import parts_picture
+    from dpcli.segment.pictures import turntable as write_turntable
+    from dpcli.segment.ply import write_ply_frames
 
     with PartsReader(target) as reader:
-        show_parts(reader, picture, ply, turntable)
+        if picture is not None:
+            shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _SHOWN)).astype(int))
+            parts_picture(picture, [reader.read(int(i)) for i in shown])
+        if turntable is not None:
+            write_turntable(turntable, reader.read(0))
+        if ply is not None:
+            for index in range(len(reader)):
+                write_ply_frames(ply / reader.names[index].replace("/", "_"), reader.read(index))
 
 
 def default_model() -> str:
@@ -232,5 +256,7 @@ def default_model() -> str:
 
     names = shipped_models(SHIPPED)
     if not names:
-        raise UsageError("no trained part network comes with this installation; train one (`dpc segment train`) and name it with --model")
+        raise UsageError(
+            "no trained part network comes with this installation; train one (`dpc segment train`) and name it with --model"
+        )
     return names[0]

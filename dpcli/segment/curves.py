@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-COLUMNS = ("epoch", "pairs", "loss", "dynamic", "smooth", "motion", "mask", "invariance", "consensus", "flow_error",
+COLUMNS = ("epoch", "pairs", "loss", "cold_start", "dynamic", "smooth", "motion", "mask", "invariance", "consensus", "flow_error",
            "validation_loss", "validation_rand_index", "learning_rate", "seconds")  # fmt: skip
 
 
@@ -15,7 +15,7 @@ def draw_curves(rows: list[dict], path: Path) -> None:
 
     figure = Figure(figsize=(10.5, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
-    for key in ("loss", "dynamic", "smooth", "motion", "mask"):
+    for key in ("loss", "cold_start", "dynamic", "smooth", "motion", "mask"):
         _line(left, rows, key)
     _line(right, rows, "validation_rand_index", "Rand index, validation")
     _line(right, rows, "flow_error", "flow error, training (diameters)")

@@ -129,7 +129,7 @@ def supervised_loss(
     known = (labels >= 0).to(mask.dtype)[..., None]
     parts = max(int(labels.max()) + 1, mask.shape[2])
     truth = torch.nn.functional.one_hot(labels.clamp(min=0), parts).to(mask.dtype) * known
-    inside, outside = (mask.log().clamp(min=-100) * known, (1 - mask).log().clamp(min=-100) * known)
+    inside, outside = _log(mask) * known, _log(1 - mask) * known
     gain = (inside.mT @ truth + outside.mT @ (1 - truth)) / mask.shape[1]  # [B, S, parts]
     order = assign(gain)
     bce = -gain.gather(2, order[..., None]).mean()
@@ -138,6 +138,11 @@ def supervised_loss(
     matched = permute_slots(truth, order)
     both, total = (mask * matched).sum(1), (mask * known + matched).sum(1)
     return bce_weight * bce + dice_weight * (1 - (2 * both + 1) / (total + 1)).mean()
+
+
+def _log(share: Tensor) -> Tensor:
+    """Logarithm, not below that of 1e-30; without a gradient there."""
+    return share.clamp(min=1e-30).log()
 
 
 def _length(vectors: Tensor) -> Tensor:

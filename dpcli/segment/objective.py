@@ -22,6 +22,7 @@ from dpcli.segment.matching import match_slots, permute_slots
 from dpcli.segment.motion_head import rotation_loss
 from dpcli.segment.network import FrameParts, PartNetwork
 from dpcli.segment.object_icp import object_icp
+from dpcli.segment.rigid_groups import rigid_groups
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Objective:
     smooth: float = 0.1
     invariance: float = 0.0
     motion: float = 0.1
+    cold_start: float = 1.0  # of the bodies that the flow itself shows, see `rigid_groups`
+    cold_until: float = 0.5
     supervised: bool = False
     consensus: str = "thesis"  # eq. 4.7; release: squared and gated; none
     tau: float = 20.0  # per unit of the object's diameter
@@ -99,6 +102,8 @@ def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: 
         terms["motion"] = objective.motion * _motion(model, batch, frames, matched, rotation)
         if objective.consensus != "none" and progress >= objective.consensus_after:
             beta = _consensus(model, batch, frames, order, objective)
+    if objective.cold_start and training and progress < objective.cold_until:
+        terms["cold_start"] = objective.cold_start * _cold_start(batch, mask)
     terms["dynamic"] = objective.dynamic * _rigidity(batch, mask, rotation, translation, beta, objective)
     if progress >= objective.smooth_after or not training:
         terms["smooth"] = objective.smooth * smoothness_loss(mask, smoothness_neighbours(batch.points))
@@ -110,6 +115,13 @@ def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: 
         values["consensus"] = float((beta * mask.detach()).sum(-1).mean())
     update = training and objective.flow_decay < 1 and progress >= objective.update_after
     return Outcome(loss, values, _corrected(batch, mask.detach(), order, objective) if update else None)
+
+
+def _cold_start(batch: Batch, mask: Tensor) -> Tensor:
+    """Cross-entropy with the bodies that each frame's flow shows; frames that show one body say nothing and are left out."""
+    bodies = rigid_groups(batch.points, batch.flow, most=mask.shape[-1])
+    telling = bodies.amax(1) > 0
+    return supervised_loss(mask[telling], bodies[telling]) if telling.any() else mask.sum() * 0
 
 
 def _rigidity(

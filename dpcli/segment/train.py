@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain, cycle, islice
 
 import numpy as np
 import torch
@@ -18,10 +20,12 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow_store import FlowStore
+from dpcli.segment.losses import supervised_loss
 from dpcli.segment.model_file import save_model
 from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Batch, Objective, pair_loss, turn_randomly
 from dpcli.segment.pairs import LoadedPair, Pair, PairSource, epoch_order
+from dpcli.segment.rigid_groups import rigid_groups
 
 _SAVE_EVERY = 100  # steps between checkpoints: their flows are what memory holds
 
@@ -53,12 +57,15 @@ class Schedule:
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(steps - warm, 1)))
 
 
+Estimate = Callable[[torch.Tensor], torch.Tensor]
+
+
 class Trainer:
-    """Trains one network. `estimate` gives the first flow of (B,N,3) points to (B,N,3) points."""
+    """Trains one network. `estimate` gives the first flow (2,N,3), forth and back, of a pair's points (2,N,3)."""
 
     def __init__(
         self, model: PartNetwork, folder: RunFolder, schedule: Schedule, objective: Objective, training: PairSource,
-        validation: PairSource | None, estimate, notes: dict, device: torch.device, stop: StopRequest, seed: int,
+        validation: PairSource | None, estimate: Estimate | None, notes: dict, device: torch.device, stop: StopRequest, seed: int,
     ) -> None:  # fmt: skip
         self.model, self.folder, self.schedule, self.objective = model.to(device), folder, schedule, objective
         self.training, self.validation, self.estimate = training, validation, estimate
@@ -66,7 +73,9 @@ class Trainer:
         self.epoch, self.step, self.best = 0, 0, math.inf
         self.sums: dict[str, list[float]] = {}
         self.spent = 0.0
-        self.optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
+        self.optimizer = torch.optim.AdamW(
+            model.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
+        )
         self.checking: list[Batch] | None = None
 
     def run(self) -> None:
@@ -90,10 +99,10 @@ class Trainer:
     def _run_epoch(self, bar: Progress) -> None:
         self.model.train()
         started = time.monotonic()
-        order = epoch_order(self.training, self.epoch, self.schedule.pairs_per_epoch)
         steps, rate = self._steps(), 0.0
+        chosen = self._epoch_pairs(steps)
         while self.step < steps:
-            pairs = order[self.step * self.schedule.batch : (self.step + 1) * self.schedule.batch]
+            pairs = list(islice(chosen, self.schedule.batch))
             rate = self._step(pairs, self.epoch * steps + self.step, steps * self.schedule.epochs)
             self.step += 1
             shown = {key: self._mean(key) for key in ("loss", "flow_error") if key in self.sums}
@@ -106,12 +115,31 @@ class Trainer:
             self.stop.check(f"saved at epoch {self.epoch + 1}, step {self.step}")
         self._end_epoch(rate, started)
 
+    def _epoch_pairs(self, steps: int) -> Iterator[Pair]:
+        """The epoch's pairs from `self.step` on. While the cold start lasts, only those whose flow shows several bodies:
+        the others, half of them or more in slow scenes, have nothing to say to it."""
+        cold = self.objective.cold_start > 0 and not self.objective.supervised
+        cold = cold and self.epoch < self.objective.cold_until * self.schedule.epochs
+        skip = self.step * self.schedule.batch
+        order = epoch_order(self.training, self.epoch, None)
+        picked = (pair for pair in order if not cold or self._telling(pair))
+        for count, pair in enumerate(chain(picked, cycle(order))):  # too few telling pairs: any, once more
+            if count >= skip:
+                yield pair
+
+    def _telling(self, pair: Pair) -> bool:
+        if self.flows.telling(pair.number) is None:
+            self._flow(pair, torch.from_numpy(self.training.load(pair).points))
+        return bool(self.flows.telling(pair.number))
+
     def _step(self, pairs: list[Pair], step: int, steps: int) -> float:
         loaded = [self.training.load(pair) for pair in pairs]
         batch = self._batch(pairs, loaded)
         rotation = None
         if self.schedule.augment:
-            rng = torch.Generator().manual_seed(int(np.random.SeedSequence([self.seed, 7003, step]).generate_state(1)[0]))
+            rng = torch.Generator().manual_seed(
+                int(np.random.SeedSequence([self.seed, 7003, step]).generate_state(1)[0])
+            )
             batch.points, rotation = turn_randomly(batch.points, rng)
             batch.flow = batch.flow @ rotation.mT
         rate = self.schedule.rate(step, steps)
@@ -145,8 +173,8 @@ class Trainer:
     def _flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
         known = self.flows.get(pair.number)
         if known is None:
-            known = self.estimate(frames, frames.flip(0))
-            self.flows.put(pair.number, known)
+            known = self.estimate(frames)
+            self.flows.put(pair.number, known, telling=bool((rigid_groups(frames, known) > 0).any()))
         return known
 
     def _keep_flow(self, pairs: list[Pair], flow: torch.Tensor) -> None:
@@ -188,17 +216,25 @@ class Trainer:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float | None]:
-        """The loss on held-out pairs with their first flow, and, where labels are known, the mean Rand index."""
+        """How well masks agree with the bodies that held-out pairs' first flow shows (with labels: the loss), and, where
+        labels are known, the mean Rand index, for people to watch; nothing is chosen by it."""
         self.model.eval()
         if self.checking is None:
             self.checking = self._validation_batches()
         losses, scores = [], []
         for batch in self.checking:
-            losses.append(float(pair_loss(self.model, batch, self.objective, 0.0, training=False).loss))
+            mask = self.model(batch.points).mask
+            bodies = (
+                batch.part if self.objective.supervised else rigid_groups(batch.points, batch.flow, most=mask.shape[-1])
+            )
+            telling = bodies.amax(1) > 0
+            if telling.any():
+                losses += [float(supervised_loss(mask[telling], bodies[telling]))] * int(telling.sum())
             if (batch.part >= 0).all():
-                labels = self.model(batch.points).mask.argmax(-1)
+                labels = mask.argmax(-1)
                 scores += [rand_index(a, b) for a, b in zip(labels, batch.part)]
-        return {"validation_loss": float(np.mean(losses)), "validation_rand_index": float(np.mean(scores)) if scores else None}
+        loss = float(np.mean(losses)) if losses else 0.0
+        return {"validation_loss": loss, "validation_rand_index": float(np.mean(scores)) if scores else None}
 
     def _validation_batches(self) -> list[Batch]:
         assert self.validation is not None
@@ -210,7 +246,7 @@ class Trainer:
             if self.objective.supervised:
                 flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
             else:
-                flow = torch.stack([self.estimate(frames, frames.flip(0)) for frames in points])
+                flow = torch.stack([self.estimate(frames) for frames in points])
             part = torch.from_numpy(np.stack([pair.part for pair in loaded]))
             batches.append(Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))))
         return batches
@@ -220,6 +256,7 @@ class Trainer:
         self.folder.save_state({
             "epoch": self.epoch, "step": self.step, "best": self.best, "sums": self.sums, "spent": self.spent,
             "model": self.model.state_dict(), "optimizer": self.optimizer.state_dict(), "flows": pending,
+            "telling": {str(pair): value for pair, value in self.flows.pending_telling.items()},
         })  # fmt: skip
         self.flows.flush()
 
@@ -229,6 +266,7 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.flows.pending = {int(pair): flow for pair, flow in state["flows"].items()}
+        self.flows.pending_telling = {int(pair): value for pair, value in state["telling"].items()}
         self.flows.flush()
         log.info(f"continuing {self.folder.path} at epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}")
 

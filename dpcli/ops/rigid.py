@@ -1,0 +1,109 @@
+"""Rigid motions: the weighted Kabsch fit, and moving points by several motions at once (thesis 4.4.4)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_EMPTY = 1e-12  # a slot with less weight in all has no motion to be fitted
+_TOWARDS_IDENTITY = 1e-6  # share of the covariance's norm; decides the turns that the points leave open
+
+
+def weighted_kabsch(
+    source: Tensor,  # [B, N, 3]
+    target: Tensor,  # [B, N, 3]
+    weights: Tensor,  # [B, N, S]
+) -> tuple[Tensor, Tensor]:  # [B, S, 3, 3], [B, S, 3]
+    """Rotation R (B,S,3,3), det +1, and translation t (B,S,3) that minimise sum_i w_is |R_s x_i + t_s - y_i|^2.
+
+    Kabsch 1976 with the sign of the determinant fixed (Umeyama 1991); the thesis's T-hat of section 4.4.4. Weights are
+    zero or more and need no norm. What the points leave open (all equal, on a line) is settled towards no turn.
+    A slot of weight below 1e-12 in all, or with NaN or infinite values, gets the identity and zero.
+    Differentiable in all three, once; the gradient of the rotation is the polar factor's, finite also where singular
+    values coincide (a gradient through the SVD itself is not), and zero along turns that the points leave open.
+    Raises ValueError on shapes that don't fit.
+    """
+    _check(source, target, weights)
+    total = weights.sum(1)  # [B, S]
+    share = (weights / total.clamp(min=_EMPTY)[:, None]).mT  # [B, S, N]
+    x_mean, y_mean = share @ source, share @ target
+    centred = source[:, None] - x_mean[:, :, None]  # [B, S, N, 3]
+    spread = target[:, None] - y_mean[:, :, None]
+    covariance = spread.mT @ (centred * share[..., None])  # [B, S, 3, 3]
+    sound = (total >= _EMPTY) & covariance.isfinite().all(-1).all(-1)
+    sound &= x_mean.isfinite().all(-1) & y_mean.isfinite().all(-1)
+    eye = torch.eye(3, dtype=source.dtype, device=source.device)
+    noise = _rounding(x_mean, spread, share) + _rounding(y_mean, centred, share)
+    rotation = _Rotation.apply(torch.where(sound[..., None, None], covariance, eye), noise)
+    moved = y_mean - (rotation @ x_mean[..., None]).squeeze(-1)
+    return rotation, torch.where(sound[..., None], moved, 0.0)
+
+
+def apply_motions(
+    points: Tensor,  # [B, N, 3]
+    rotation: Tensor,  # [B, S, 3, 3]
+    translation: Tensor,  # [B, S, 3]
+) -> Tensor:  # [B, S, N, 3]
+    """Every point moved by every motion: out[b,s,n] = R_s x_n + t_s."""
+    return points[:, None] @ rotation.mT + translation[:, :, None]
+
+
+def rigid_flow(
+    points: Tensor,  # [B, N, 3]
+    mask: Tensor,  # [B, N, S]
+    rotation: Tensor,  # [B, S, 3, 3]
+    translation: Tensor,  # [B, S, 3]
+) -> Tensor:  # [B, N, 3]
+    """Displacement of each point by its slots' motions, blended by the mask: sum_s m_ns (R_s x_n + t_s) - x_n."""
+    return torch.einsum("bns,bsnd->bnd", mask, apply_motions(points, rotation, translation)) - points
+
+
+def to_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Rotations (...,3,3) and translations (...,3) as matrices (...,4,4) for column vectors: x_target = M x_source."""
+    top = torch.cat([rotation, translation[..., None]], -1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
+    return torch.cat([top, bottom], -2)
+
+
+def _check(source: Tensor, target: Tensor, weights: Tensor) -> None:
+    if source.ndim != 3 or source.shape[-1] != 3 or source.shape != target.shape:
+        raise ValueError(f"source and target must both have shape (B,N,3): {tuple(source.shape)}, {tuple(target.shape)}")
+    if weights.ndim != 3 or weights.shape[:2] != source.shape[:2]:
+        raise ValueError(f"weights must have shape (B,N,S) for points {tuple(source.shape)}: {tuple(weights.shape)}")
+
+
+@torch.no_grad()
+def _rounding(mean: Tensor, other: Tensor, share: Tensor) -> Tensor:
+    """How large a covariance (B,S) rounding alone makes: of points about `mean`, with others (B,S,N,3) that do spread."""
+    deviation = (share * other.square().sum(-1)).sum(-1).sqrt()
+    return 4 * torch.finfo(mean.dtype).eps * mean.square().sum(-1).sqrt() * deviation
+
+
+class _Rotation(torch.autograd.Function):
+    """The rotation nearest to M = sum w (y - y_mean)(x - x_mean)^T: V diag(1,1,det) U^T of M = V diag(s) U^T."""
+
+    @staticmethod
+    def forward(ctx, matrix: Tensor, noise: Tensor) -> Tensor:
+        norm = matrix.square().sum((-2, -1), keepdim=True).sqrt()
+        eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
+        scaled = torch.where(norm > 0, matrix / norm.clamp(min=torch.finfo(matrix.dtype).tiny), eye)
+        least = noise[..., None, None] / norm.clamp(min=torch.finfo(matrix.dtype).tiny)
+        pull = torch.where(norm > 0, least.nan_to_num(0.0, 0.0).clamp(max=1e6), 0.0) + _TOWARDS_IDENTITY
+        left, values, right = torch.linalg.svd(scaled + pull * eye)
+        flip = torch.det(left @ right).sign()[..., None]
+        left = torch.cat([left[..., :2], left[..., 2:] * flip[..., None]], -1)
+        values = torch.cat([values[..., :2], values[..., 2:] * flip], -1)
+        ctx.save_for_backward(left, values, right, norm)
+        return left @ right
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+        # A small change dM turns R by V A U^T with A_ij = (K_ij - K_ji) / (s_i + s_j), K = V^T dM U.
+        left, values, right, norm = ctx.saved_tensors
+        inner = left.mT @ grad @ right.mT
+        sums = values[..., :, None] + values[..., None, :]
+        open_turn = sums.abs() < 10 * _TOWARDS_IDENTITY
+        inner = torch.where(open_turn, 0.0, (inner - inner.mT) / torch.where(open_turn, 1.0, sums))
+        return left @ inner @ right / norm.clamp(min=_EMPTY), None

@@ -1,0 +1,235 @@
+"""Parts in colour: a contact sheet of sequences, predictions above the truth, and an object on a turntable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.segment.balls import draw_balls, view_matrix
+from dpcli.store import CloudSequence
+
+# Okabe & Ito's colours without black (Color Universal Design, 2008), then Tol's muted ones that differ from them
+PALETTE = np.array(
+    [
+        [0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66],
+        [136, 34, 85], [51, 34, 136], [153, 153, 51], [68, 170, 153], [170, 68, 153], [17, 119, 51], [221, 204, 119],
+    ],
+    np.uint8,
+)  # fmt: skip
+UNKNOWN = (128, 128, 128)  # of part -1
+_WHITE, _DARK = (255, 255, 255), (17, 20, 26)
+_GAP, _TITLE = 8, 22
+_AZIMUTH, _ELEVATION = np.deg2rad(-60.0), np.deg2rad(22.0)
+_MARGIN = 1.12  # of the picture around what is seen
+_RATE = 15  # images per second of an animation
+
+
+@dataclass(frozen=True)
+class Look:
+    """How parts are drawn. cell: pixels of a picture's side; up: the axis that points upwards, such as z or -y;
+    azimuth, elevation: of the camera, radians; dark: on a dark background."""
+
+    cell: int = 200
+    up: str = "z"
+    azimuth: float = _AZIMUTH
+    elevation: float = _ELEVATION
+    dark: bool = False
+
+    def __post_init__(self) -> None:
+        if self.up not in ("x", "y", "z", "-x", "-y", "-z"):
+            raise UsageError(f"up axis {self.up!r}: expected x, y, z, -x, -y or -z")
+
+    @property
+    def background(self) -> tuple[int, int, int]:
+        return _DARK if self.dark else _WHITE
+
+    @property
+    def ink(self) -> tuple[int, int, int]:
+        return (226, 230, 236) if self.dark else (40, 44, 52)
+
+
+def part_colours(part: np.ndarray) -> np.ndarray:
+    """Colour u8 (N,3) of part ids (N): the same id has the same colour everywhere; -1 is grey, others repeat after 14."""
+    colours = PALETTE[np.maximum(part, 0) % len(PALETTE)]
+    colours[np.asarray(part) < 0] = UNKNOWN
+    return colours
+
+
+def matched_ids(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """`found` i64 (N) renamed after the true parts it covers, so that colours agree.
+
+    Parts are paired such that the sum of IoU is largest; those left over take ids beyond the true ones; -1 stays.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    found, truth = np.asarray(found, np.int64), np.asarray(truth, np.int64)
+    shared = np.zeros((found.max(initial=-1) + 2, truth.max(initial=-1) + 2))  # the last row and column: unknown
+    np.add.at(shared, (found, truth), 1)
+    union = shared.sum(1, keepdims=True) + shared.sum(0) - shared
+    iou = (shared / np.maximum(union, 1))[:-1, :-1]
+    rows, columns = linear_sum_assignment(-iou)
+    names = np.full(len(shared), -1)
+    good = iou[rows, columns] > 0
+    names[rows[good]] = columns[good]
+    spare = np.flatnonzero((names[:-1] < 0) & (shared[:-1].sum(1) > 0))
+    names[spare] = iou.shape[1] + np.arange(len(spare))
+    return names[found]
+
+
+def parts_picture(
+    path: Path,
+    sequences: Sequence[CloudSequence],
+    *,
+    truth: Sequence[CloudSequence | None] | None = None,
+    titles: Sequence[str] | None = None,
+    frames: int = 4,
+    look: Look | None = None,
+) -> None:
+    """Write a contact sheet: a row per sequence, its frames as columns, points coloured by `part`.
+
+    truth: for each sequence the same points with their true parts, or None; drawn in a row below, in the same colours.
+    At most `frames` frames are shown, spread over the sequence. DataError on sequences without parts, truth of other
+    size, or when the picture can't be written.
+    """
+    if not sequences:
+        raise DataError(f"{path}: no sequences to draw")
+    look = look or Look()
+    rows = []
+    for index, sequence in enumerate(sequences):
+        real = truth[index] if truth is not None else None
+        found = _parts_of(sequence)
+        title = titles[index] if titles is not None else sequence.name
+        if real is not None:
+            found = matched_ids(found, _true_parts(sequence, real))
+        shown = np.unique(np.linspace(0, sequence.num_frames - 1, frames).round().astype(int)).tolist()
+        rows.append((title, found, _draw_row(sequence, found, shown, look)))
+        if real is not None:
+            rows.append(("truth", real.part, _draw_row(sequence, real.part, shown, look)))
+    _save(_assemble(rows, look), path)
+
+
+def _parts_of(sequence: CloudSequence) -> np.ndarray:
+    if sequence.part is None:
+        raise DataError(f"sample {sequence.name!r} has no parts to draw; `dpc segment predict` finds them")
+    return sequence.part
+
+
+def _true_parts(sequence: CloudSequence, real: CloudSequence) -> np.ndarray:
+    part = _parts_of(real)
+    if len(part) != len(sequence.points):
+        raise DataError(f"sample {sequence.name!r} has {len(sequence.points)} points, its truth {len(part)}")
+    return part
+
+
+def _draw_row(sequence: CloudSequence, part: np.ndarray, shown: list[int], look: Look) -> list[np.ndarray]:
+    """Cells u8 (cell,cell,3), all of one scale."""
+    matrix = view_matrix(look.azimuth, look.elevation, look.up)
+    seen = sequence.points @ matrix.T
+    low, high = np.percentile(seen, [0.1, 99.9], axis=0)
+    scale = look.cell / (_MARGIN * max(float((high - low)[:2].max()), 1e-9))
+    offsets, colours = sequence.frame_offsets, part_colours(part)
+    spans = [slice(offsets[t], offsets[t + 1]) for t in shown]
+    size, centre, depth = (look.cell, look.cell), (low + high)[:2] / 2, (float(low[2]), float(high[2]))
+    return [draw_balls(seen[span], colours[span], size, centre, scale, look.background, depth) for span in spans]
+
+
+def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) -> Any:
+    from PIL import Image, ImageDraw
+
+    columns = max(len(cells) for _, _, cells in rows)
+    step = look.cell + _TITLE
+    sheet = Image.new("RGB", (columns * look.cell + 2 * _GAP, len(rows) * step + 2 * _GAP), look.background)
+    draw = ImageDraw.Draw(sheet)
+    for place, (title, part, cells) in enumerate(rows):
+        top = _GAP + place * step
+        room = _legend(draw, top, sheet.width - _GAP, part, look)
+        _write(draw, (_GAP, top + 3), title, room - 2 * _GAP, look)
+        for column, cell in enumerate(cells):
+            sheet.paste(Image.fromarray(cell), (_GAP + column * look.cell, top + _TITLE))
+    return sheet
+
+
+def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> int:
+    """Swatches of the parts with their share of the points, right-aligned as far as half the row; where they start."""
+    ids, counts = np.unique(part, return_counts=True)
+    font, start, left = _font(11), right // 2, right
+    for own, count in reversed(list(zip(ids.tolist(), counts.tolist(), strict=True))):
+        text = f"{'?' if own < 0 else own}: {100 * count / len(part):.0f} %"
+        width = int(draw.textlength(text, font=font)) + 20
+        if left - width < start:
+            draw.text((left - 14, top + 4), "…", fill=look.ink, font=font)
+            return left - 14
+        left -= width
+        colour = tuple(part_colours(np.array([own]))[0].tolist())
+        draw.ellipse((left, top + 6, left + 9, top + 15), fill=colour)
+        draw.text((left + 13, top + 4), text, fill=look.ink, font=font)
+    return left
+
+
+def _write(draw: Any, place: tuple[int, int], text: str, room: int, look: Look) -> None:
+    """Text in one line, shortened to the room (pixels) there is."""
+    font = _font(13)
+    while draw.textlength(text, font=font) > room and len(text) > 2:
+        text = text[:-2] + "…"
+    draw.text(place, text, fill=look.ink, font=font)
+
+
+def _font(size: int) -> Any:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size=size)
+
+
+def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look: Look | None = None) -> None:
+    """Write an animation (.gif): one turn about the upright axis, while the frames pass to the last one and back.
+
+    Points are coloured by `part`. DataError on a sequence without parts or when the file can't be written.
+    """
+    if path.suffix.lower() != ".gif":
+        raise UsageError(f"{path}: unknown kind of animation {path.suffix!r}; expected .gif")
+    look = look or Look(cell=320)
+    colours, offsets = part_colours(_parts_of(sequence)), sequence.frame_offsets
+    low, high = np.percentile(sequence.points, [0.1, 99.9], axis=0)
+    centred = sequence.points - (low + high) / 2
+    radius = max(float(np.percentile(np.linalg.norm(centred, axis=1), 99.9)), 1e-9)
+    scale, count = look.cell / (2 * radius * _MARGIN), max(int(seconds * _RATE), 1)
+    images = []
+    for image, t in enumerate(there_and_back(sequence.num_frames, count)):
+        matrix = view_matrix(look.azimuth + 2 * np.pi * image / count, look.elevation, look.up)
+        span = slice(offsets[t], offsets[t + 1])
+        size, depth = (look.cell, look.cell), (-radius, radius)
+        seen = centred[span] @ matrix.T
+        images.append(draw_balls(seen, colours[span], size, np.zeros(2), scale, look.background, depth))
+    _save_animation(images, path)
+
+
+def there_and_back(frames: int, count: int) -> list[int]:
+    """Which of the frames each of `count` images shows: from the first to the last and back, resting at both ends."""
+    phase = np.arange(count) / count
+    swing = (1 - np.cos(2 * np.pi * phase)) / 2
+    return np.minimum((swing.round(9) * frames).astype(int), frames - 1).tolist()
+
+
+def _save_animation(images: list[np.ndarray], path: Path) -> None:
+    """All images with one table of colours, so that nothing flickers."""
+    from PIL import Image
+
+    some = np.concatenate(images[:: max(1, len(images) // 4)], axis=1)
+    table = Image.fromarray(some).quantize(255)
+    frames = [Image.fromarray(image).quantize(palette=table, dither=Image.Dither.NONE) for image in images]
+    _save(frames[0], path, save_all=True, append_images=frames[1:], duration=round(1000 / _RATE), loop=0)
+
+
+def _save(image: Any, path: Path, **options: Any) -> None:
+    kind = ".gif" if options else ".png"
+    try:
+        image.save(path, **options)
+    except (ValueError, OSError) as error:
+        raise DataError(
+            f"{path}: the picture cannot be written ({error}); name a {kind} in an existing folder"
+        ) from None

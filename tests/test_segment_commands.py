@@ -1,0 +1,297 @@
+"""`dpc segment` as its users run it: train, stop, continue, predict, pipes, mistakes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.errors import DataError, UsageError
+from dpcli.segment.commands import split_sequences
+from dpcli.segment.flow_store import FlowStore
+from dpcli.segment.objective import Batch, Objective, pair_loss, turn_randomly
+from dpcli.segment.pairs import PairSource, choose_points, sequence_scale
+from dpcli.segment.predict import Refinement, predict_parts
+from dpcli.segment.train import Schedule, rand_index
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.parts import PartsReader
+
+TRAIN = ("--flow", "nearest", "--points", 48, "--batch", 2, "--epochs", 2, "--pairs-per-epoch", 6, "--seed", 3)
+
+
+def drawer(name: str, seed: int, frames: int = 3, points: int = 60, **fields) -> CloudSequence:
+    """A box and a drawer that slides out of it while both turn; the truth beside."""
+    rng = np.random.default_rng(seed)
+    clouds, parts, poses = [], [], []
+    for t in range(frames):
+        body = rng.uniform(-0.5, 0.5, (points // 2, 3)) * [0.4, 0.6, 0.5]
+        front = rng.uniform(-0.5, 0.5, (points - points // 2, 3)) * [0.1, 0.5, 0.3]
+        angle = 0.1 * t
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        pose = np.tile(np.eye(4), (2, 1, 1))
+        pose[:, :3, :3] = turn
+        pose[1, :3, 3] = turn @ [0.25 + 0.1 * t, 0, 0]
+        clouds.append(np.float32(np.concatenate([body @ turn.T, front @ turn.T + pose[1, :3, 3]])))
+        parts.append(np.repeat([0, 1], [points // 2, points - points // 2]).astype(np.int16))
+        poses.append(pose)
+    return CloudSequence.from_frames(name, clouds, part=parts, pose=np.stack(poses), **fields)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("parts") / "clouds.h5"
+    with CloudsWriter(path, class_names=["drawer"], fields=["part", "pose"]) as writer:
+        for i in range(6):
+            writer.write(drawer(f"d{i}", i, split="train" if i < 4 else "test", label=0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def run_folder(dpc, data, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "model"
+    done = dpc("segment", "train", data, "-o", folder, *TRAIN)
+    assert done.returncode == 0, done.stderr.decode()
+    assert done.stdout.decode().strip() == str(folder / "best.safetensors")
+    return folder
+
+
+def test_training_leaves_what_people_look_for(run_folder):
+    rows = json.loads((run_folder / "log.json").read_text())
+    assert [row["epoch"] for row in rows] == [1, 2] and all(np.isfinite(row["loss"]) for row in rows)
+    assert rows[0]["flow_error"] > 0 and rows[1]["motion"] is not None and rows[1]["consensus"] is not None
+    assert (run_folder / "curves.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_running_again_continues_and_another_configuration_is_refused(dpc, data, run_folder):
+    again = dpc("segment", "train", data, "-o", run_folder, *TRAIN)
+    assert again.returncode == 0 and b"continuing" in again.stderr
+    other = dpc("segment", "train", data, "-o", run_folder, *TRAIN[:-1], 4)
+    assert other.returncode == 2 and b"another configuration" in other.stderr
+
+
+def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, tmp_path):
+    """SIGTERM saves and exits 75; kill -9 loses what came after the last checkpoint; weights and flows come out equal."""
+    folder = tmp_path / "killed"
+    command = [sys.executable, "-m", "dpcli", "segment", "train", data, "-o", folder, *TRAIN]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    codes = []
+    for number, wait_for in ((signal.SIGTERM, "config.json"), (signal.SIGKILL, "state.pt")):
+        process = subprocess.Popen([str(w) for w in command], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        deadline = time.time() + 120
+        while not (folder / wait_for).exists() and process.poll() is None and time.time() < deadline:
+            time.sleep(0.02)
+        time.sleep(0.3)
+        process.send_signal(number)
+        process.communicate(timeout=120)
+        codes.append(process.returncode)
+    assert codes[0] in (75, 0) and codes[1] in (-9, 0)
+    assert subprocess.run([str(w) for w in command], env=environment, capture_output=True, timeout=200).returncode == 0
+    from safetensors.torch import load_file
+
+    ours, theirs = (load_file(f / "last.safetensors") for f in (folder, run_folder))
+    distance = sum(float((ours[k] - theirs[k]).square().sum()) for k in ours) ** 0.5
+    assert distance <= 1e-3 * sum(float(v.square().sum()) for v in theirs.values()) ** 0.5
+    flows = [np.load(f / "flows.npy") for f in (folder, run_folder)]
+    assert np.abs(flows[0] - flows[1]).max() < 1e-3
+
+
+def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tmp_path):
+    predict = ("segment", "predict", data, "--model", run_folder, "--flow", "nearest", "--points", 48, "--pairs", "all")
+    done = dpc(*predict, "-o", tmp_path / "parts.h5", "--picture", tmp_path / "parts.png", "--ply", tmp_path / "ply")
+    assert done.returncode == 0, done.stderr.decode()
+    assert (tmp_path / "parts.png").read_bytes()[:4] == b"\x89PNG" and len(list((tmp_path / "ply").rglob("*.ply"))) == 18
+    piped = dpc(*predict, "-o", "-")
+    assert piped.returncode == 0
+    judged = dpc("evaluate", "segmentation", "-", "--truth", data, "--json", stdin=piped.stdout)
+    assert judged.returncode == 0, judged.stderr.decode()
+    with PartsReader(tmp_path / "parts.h5") as reader:
+        assert len(reader) == 6 and reader.num_parts == 8
+        sample, sequence = reader.read_parts(0), reader.read(0)
+        assert sample.pairs.tolist() == [[i, j] for i in range(3) for j in range(3) if i != j]
+        assert np.allclose(sample.probability.sum(1), 1, atol=1e-4)
+        assert (sequence.part == sample.probability.argmax(1)).all()
+    motion = dpc("evaluate", "motion", tmp_path / "parts.h5", "--truth", data, "--json")
+    assert motion.returncode == 0 and np.isfinite(json.loads(motion.stdout)["metrics"]["epe3d"])
+
+
+@pytest.mark.parametrize("method", ["dbscan", "ward", "ssc", "trajaffn"])
+def test_classical_methods_write_the_same_kind_of_file(dpc, data, tmp_path, method):
+    done = dpc("segment", "predict", data, "--method", method, "--flow", "nearest", "-o", tmp_path / "p.h5", "--split", "test")
+    assert done.returncode == 0, done.stderr.decode()
+    with PartsReader(tmp_path / "p.h5") as reader:
+        assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("train", "DATA", "-o", "OUT", "--config", "huge"), 2, b"compact, release"),
+        (("train", "DATA", "-o", "OUT", "--validation", "lamp"), 2, b"no class 'lamp'"),
+        (("train", "DATA", "-o", "OUT", "--loss", "l2"), 2, b"blended or per-part"),
+        (("train", "DATA", "-o", "OUT", "--lr", "0"), 2, b"above 0"),
+        (("train", "DATA", "-o", "OUT", "--flow", "nowhere.safetensors"), 2, b"nowhere.safetensors"),
+        (("predict", "DATA", "-o", "OUT", "--model", "nowhere"), 2, b"no such file"),
+        (("predict", "DATA", "-o", "OUT", "--method", "kmeans"), 2, b"dbscan, ward, ssc, trajaffn"),
+        (("predict", "DATA", "-o", "OUT", "--parts", "3"), 2, b"belong to --method"),
+        (("predict", "DATA", "-o", "OUT", "--method", "ward", "--pairs", "some"), 2, b"adjacent or all"),
+        (("predict", "DATA", "-o", "OUT", "--method", "ward", "--split", "none"), 3, b"no sequence of split"),
+        (("predict", "nothing.h5", "-o", "OUT", "--method", "ward"), 2, b"no such file"),
+    ],
+)
+def test_mistakes_end_with_a_sentence(dpc, data, tmp_path, words, code, message):
+    words = [str(data) if w == "DATA" else str(tmp_path / "out") if w == "OUT" else w for w in words]
+    done = dpc("segment", *words)
+    assert done.returncode == code and message in done.stderr, done.stderr.decode()
+    assert b"a bug" not in done.stderr and not (tmp_path / "out").is_file()
+
+
+def two_halves(frames, flows):
+    """A segmenter that knows the answer of points in the order of `drawer`."""
+    masks = []
+    for frame in frames:
+        mask = torch.full((len(frame), 3), 0.01)
+        mask[: len(frame) // 2, 0], mask[len(frame) // 2 :, 2] = 0.98, 0.98
+        masks.append(mask)
+    return masks
+
+
+def true_flows(sequence: CloudSequence, scale: float):
+    """An estimator that knows the answer; frames are told apart by their first point."""
+    from dpcli.segment.pairs import frame_parts, true_flow
+
+    clouds = [sequence.frame(t) for t in range(sequence.num_frames)]
+    centre = np.concatenate(clouds).mean(0)
+    whole = [(c - centre) * scale for c in clouds]
+
+    def which(points):
+        return int(np.argmin([np.abs(c[0] - points[0].numpy()).max() for c in whole]))
+
+    def estimate(first, second):
+        flows = []
+        for a, b in zip(first, second):
+            i, j = which(a), which(b)
+            flow = true_flow(clouds[i], frame_parts(sequence, i), sequence.pose[i], sequence.pose[j])
+            flows.append(torch.tensor(np.float32(flow * scale)))
+        return torch.stack(flows)
+
+    return estimate
+
+
+@pytest.mark.parametrize("pairs", ["adjacent", "all"])
+def test_motions_are_the_true_ones_in_the_inputs_own_coordinates(pairs):
+    """With the right masks and flows, part_motion is pose_j pose_i^-1 and flow follows, whatever place and unit."""
+    sequence = drawer("d", 5)
+    sequence.points = np.float32(sequence.points * 7 + [100, -50, 3])
+    sequence.pose[:, :, :3, 3] = sequence.pose[:, :, :3, 3] * 7 + [100, -50, 3]
+    scale = sequence_scale([sequence.frame(t) for t in range(3)])
+    options = Refinement(pairs=pairs, icp=0)
+    labels, sample = predict_parts(sequence, 0, two_halves, true_flows(sequence, scale), options, 0)
+    assert rand_index(torch.tensor(labels), torch.tensor(np.int64(sequence.part))) == 1
+    for (i, j), motion, flow in zip(sample.pairs, sample.motion, sample.flow):
+        truth = sequence.pose[j] @ np.linalg.inv(sequence.pose[i])
+        assert np.abs(motion[[0, 2], :3, :3] - truth[:, :3, :3]).max() < 2e-3
+        points = sequence.frame(i)
+        moved = np.einsum("nij,nj->ni", truth[sequence.part[:60], :3, :3], points) + truth[sequence.part[:60], :3, 3]
+        assert np.abs(flow - (moved - points)).max() < 0.15  # 2 % of the mask is elsewhere
+
+
+def test_poor_sequences_get_an_answer():
+    def anything(frames, flows):
+        return [torch.softmax(torch.randn(len(f), 4, generator=torch.Generator().manual_seed(0)), 1) for f in frames]
+
+    def still(first, second):
+        return torch.zeros_like(first)
+
+    for name, frames in {
+        "one frame": [np.random.default_rng(0).normal(size=(50, 3))],
+        "one point": [np.zeros((1, 3)), np.ones((1, 3))],
+        "an empty frame": [np.zeros((0, 3)), np.random.default_rng(0).normal(size=(9, 3))],
+        "all equal": [np.ones((30, 3)), np.ones((40, 3))],
+    }.items():
+        sequence = CloudSequence.from_frames(name, [np.float32(f) for f in frames])
+        labels, sample = predict_parts(sequence, 0, anything, still, Refinement(points=32), 0)
+        assert len(labels) == len(sequence.points) and np.isfinite(sample.probability).all(), name
+        assert np.isfinite(sample.motion).all() and all(np.isfinite(f).all() for f in sample.flow), name
+
+
+def test_the_right_masks_cost_less_than_wrong_ones_in_every_form(data):
+    """The unsupervised loss prefers the truth to one part, to a shuffle, to a random mask."""
+    reader = CloudsReader(data)
+    source = PairSource(reader, [0, 1], 48, 0)
+    loaded = [source.load(pair) for pair in source.pairs]
+    stacked = [torch.tensor(np.stack([getattr(p, key) for p in loaded])).transpose(0, 1).flatten(0, 1) for key in ("points", "flow", "part")]
+    batch = Batch(*stacked)
+
+    class Fixed(torch.nn.Module):
+        motion = None
+
+        def __init__(self, mask):
+            super().__init__()
+            self.mask = mask
+
+        def forward(self, points):
+            return self
+
+    right = torch.nn.functional.one_hot(batch.part, 4).float()
+    wrong = {
+        "one part": torch.nn.functional.one_hot(torch.zeros_like(batch.part), 4).float(),
+        "shuffled": right[:, torch.randperm(48, generator=torch.Generator().manual_seed(0))],
+        "even": torch.full_like(right, 0.25),
+    }
+    for form in ("blended", "per-part"):
+        objective = Objective(form=form)
+        best = float(pair_loss(Fixed(right), batch, objective, 0.0).loss)
+        assert best < 1e-3
+        for name, mask in wrong.items():
+            assert float(pair_loss(Fixed(mask), batch, objective, 0.0).loss) > 5 * best + 1e-3, (form, name)
+
+
+def test_true_flow_of_loaded_pairs_maps_parts_onto_parts(data):
+    source = PairSource(CloudsReader(data), [0], 60, 0)
+    pair = source.load(source.pairs[0])
+    moved = pair.points[0] + pair.flow[0]
+    for part in (0, 1):  # independent samples of the same solid: the same extent within sampling
+        a, b = moved[pair.part[0] == part], pair.points[1][pair.part[1] == part]
+        assert np.abs(a.mean(0) - b.mean(0)).max() < 0.08
+
+
+def test_flow_store_changes_nothing_twice(tmp_path):
+    store = FlowStore(tmp_path, 3, 5, fresh=True)
+    assert store.get(1) is None
+    store.put(1, torch.ones(2, 5, 3))
+    pending = dict(store.pending)
+    store.flush()
+    again = FlowStore(tmp_path, 3, 5, fresh=False)
+    again.pending = pending  # as after a kill between saving the state and flushing
+    again.flush()
+    assert torch.equal(again.get(1), torch.ones(2, 5, 3)) and again.get(2) is None and not again.pending
+
+
+def test_turning_keeps_pairs_together():
+    points = torch.randn(6, 20, 3)
+    turned, rotation = turn_randomly(points, torch.Generator().manual_seed(0))
+    assert torch.equal(rotation[:3], rotation[3:]) and not torch.allclose(rotation[0], rotation[1])
+    assert torch.allclose(torch.cdist(points, points), torch.cdist(turned, turned), atol=1e-4)
+
+
+def test_splits_and_choices(data):
+    reader = CloudsReader(data)
+    assert split_sequences(reader, None, 0) == ([0, 1, 2, 3], [])
+    train, held = split_sequences(reader, "0.25", 0)
+    assert len(train) == 3 and len(held) == 1 and not set(train) & set(held)
+    with pytest.raises(UsageError, match="fraction"):
+        split_sequences(reader, "1.5", 0)
+    rng = np.random.default_rng(0)
+    assert sorted(choose_points(5, 5, rng)) == [0, 1, 2, 3, 4] and set(choose_points(3, 8, rng)) == {0, 1, 2}
+    with pytest.raises(UsageError, match="--batch"):
+        Schedule(batch=0)
+    with pytest.raises(DataError, match="two frames"):
+        PairSource(reader, [], 8, 0)
