@@ -83,7 +83,7 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, tmp_path)
     command = [sys.executable, "-m", "dpcli", "segment", "train", data, "-o", folder, *TRAIN]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
     codes = []
-    for number, wait_for in ((signal.SIGTERM, "config.json"), (signal.SIGKILL, "state.pt")):
+    for number, wait_for in ((signal.SIGTERM, "flows.npy"), (signal.SIGKILL, "state.pt")):
         process = subprocess.Popen([str(w) for w in command], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
         deadline = time.time() + 120
         while not (folder / wait_for).exists() and process.poll() is None and time.time() < deadline:
@@ -174,13 +174,13 @@ def true_flows(sequence: CloudSequence, scale: float):
     def which(points):
         return int(np.argmin([np.abs(c[0] - points[0].numpy()).max() for c in whole]))
 
+    def one(first, second):
+        i, j = which(first), which(second)
+        flow = true_flow(clouds[i], frame_parts(sequence, i), sequence.pose[i], sequence.pose[j])
+        return torch.tensor(np.float32(flow * scale))
+
     def estimate(first, second):
-        flows = []
-        for a, b in zip(first, second):
-            i, j = which(a), which(b)
-            flow = true_flow(clouds[i], frame_parts(sequence, i), sequence.pose[i], sequence.pose[j])
-            flows.append(torch.tensor(np.float32(flow * scale)))
-        return torch.stack(flows)
+        return one(first, second), one(second, first)
 
     return estimate
 
@@ -208,7 +208,7 @@ def test_poor_sequences_get_an_answer():
         return [torch.softmax(torch.randn(len(f), 4, generator=torch.Generator().manual_seed(0)), 1) for f in frames]
 
     def still(first, second):
-        return torch.zeros_like(first)
+        return torch.zeros_like(first), torch.zeros_like(second)
 
     for name, frames in {
         "one frame": [np.random.default_rng(0).normal(size=(50, 3))],
@@ -227,8 +227,8 @@ def test_the_right_masks_cost_less_than_wrong_ones_in_every_form(data):
     reader = CloudsReader(data)
     source = PairSource(reader, [0, 1], 48, 0)
     loaded = [source.load(pair) for pair in source.pairs]
-    stacked = [torch.tensor(np.stack([getattr(p, key) for p in loaded])).transpose(0, 1).flatten(0, 1) for key in ("points", "flow", "part")]
-    batch = Batch(*stacked)
+    stacked = (torch.tensor(np.stack([getattr(p, key) for p in loaded])) for key in ("points", "flow", "part"))
+    batch = Batch(*(values.transpose(0, 1).flatten(0, 1) for values in stacked))
 
     class Fixed(torch.nn.Module):
         motion = None
@@ -263,16 +263,21 @@ def test_true_flow_of_loaded_pairs_maps_parts_onto_parts(data):
         assert np.abs(a.mean(0) - b.mean(0)).max() < 0.08
 
 
-def test_flow_store_changes_nothing_twice(tmp_path):
+def test_flow_store_changes_nothing_twice_and_hands_first_flows_on(tmp_path):
     store = FlowStore(tmp_path, 3, 5, fresh=True)
-    assert store.get(1) is None
-    store.put(1, torch.ones(2, 5, 3))
-    pending = dict(store.pending)
+    assert store.get(1) is None and store.telling(1) is None
+    store.put_first(1, torch.ones(2, 5, 3), True)
+    store.put(1, torch.full((2, 5, 3), 2.0))
+    pending = store.pending()
     store.flush()
     again = FlowStore(tmp_path, 3, 5, fresh=False)
-    again.pending = pending  # as after a kill between saving the state and flushing
-    again.flush()
-    assert torch.equal(again.get(1), torch.ones(2, 5, 3)) and again.get(2) is None and not again.pending
+    again.restore(pending)  # as after a kill between saving the state and flushing
+    assert float(again.get(1).mean()) == 2 and again.telling(1) and again.get(2) is None
+    (tmp_path / "other").mkdir()
+    other = FlowStore(tmp_path / "other", 3, 5, fresh=True, take_from=tmp_path)
+    assert float(other.get(1).mean()) == 1 and other.telling(1) and other.get(0) is None
+    with pytest.raises(UsageError, match="--flows-of"):
+        FlowStore(tmp_path / "other", 4, 5, fresh=True, take_from=tmp_path)
 
 
 def test_turning_keeps_pairs_together():

@@ -47,7 +47,7 @@ def train(
     cold_start: Annotated[
         float, typer.Option(help="Weight, in the first part of the training, of the bodies that the flow alone shows.")
     ] = 1.0,
-    cold_until: Annotated[float, typer.Option(help="Fraction of the training after which that ends.")] = 0.5,
+    cold_until: Annotated[float, typer.Option(help="Fraction of the training after which that ends.")] = 1.0,
     motion_after: Annotated[float, typer.Option(help="Fraction of the training before the motion head learns.")] = 0.3,
     update_after: Annotated[float, typer.Option(help="Fraction before flows are corrected.")] = 0.4,
     consensus_after: Annotated[float, typer.Option(help="Fraction before consensus weighs.")] = 0.5,
@@ -66,6 +66,9 @@ def train(
     ] = None,
     start_from: Annotated[
         str | None, typer.Option(help="A trained part network to start from: file, folder or shipped name.")
+    ] = None,
+    flows_of: Annotated[
+        Path | None, typer.Option(help="Folder of a run on the same pairs, whose first flows are taken over.")
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",
@@ -89,7 +92,7 @@ def train(
     }  # fmt: skip
     run_training(
         data, output, config=config, network=network, schedule=schedule, objective=objective, flow=flow, points=points,
-        validation=validation, start_from=start_from, seed=seed, device=device, force=force,
+        validation=validation, start_from=start_from, flows_of=flows_of, seed=seed, device=device, force=force,
     )  # fmt: skip
 
 

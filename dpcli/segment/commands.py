@@ -38,7 +38,8 @@ CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
 
 def run_training(
     data: str, output: str, *, config: str, network: dict[str, Any], schedule: dict[str, Any], objective: dict[str, Any],
-    flow: str, points: int | None, validation: str | None, start_from: str | None, seed: int, device: str, force: bool,
+    flow: str, points: int | None, validation: str | None, start_from: str | None, flows_of: Path | None, seed: int,
+    device: str, force: bool,
 ) -> None:  # fmt: skip
     """`dpc segment train`."""
     chosen = choose_device(device)
@@ -50,6 +51,7 @@ def run_training(
         _check_supervision(reader, aims)
         record = {"network": json.loads(shape.to_json()), "schedule": asdict(plan), "objective": asdict(aims), "flow": flow,
                   "validation": validation, "start_from": start_from, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
+        _check_flows_of(flows_of, record)
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         training = PairSource(reader, train_part, shape.points, seed)
         checking = PairSource(reader, held, shape.points, seed) if held else None
@@ -65,8 +67,22 @@ def run_training(
             estimate = (
                 None if aims.supervised else partial(pair_flow, method=flow)
             )  # supervised: the true flow is at hand
-            Trainer(model, folder, plan, aims, training, checking, estimate, notes, chosen, stop, seed).run()
+            Trainer(model, folder, plan, aims, training, checking, estimate, notes, chosen, stop, seed, flows_of).run()
     print(folder.file("best.safetensors"))
+
+
+def _check_flows_of(folder: Path | None, record: dict) -> None:
+    """Another run's flows are of the same pairs only if data, points, seed, validation and method are the same."""
+    if folder is None:
+        return
+    try:
+        other = json.loads((folder / "config.json").read_text())
+    except (OSError, ValueError):
+        raise UsageError(f"--flows-of {folder}: no folder of a `dpc segment train` run") from None
+    mine = json.loads(json.dumps(record))
+    for key in ("data", "seed", "validation", "flow"):
+        if other.get(key) != mine[key]:
+            raise UsageError(f"--flows-of {folder}: its {key} is {other.get(key)!r}, here {mine[key]!r}; flows don't fit")
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:
@@ -128,13 +144,6 @@ def _hold_out_classes(reader: CloudsReader, train: list[int], names: str) -> tup
     return [i for i in train if i not in set(held)], held
 
 
-def flow_estimator(name: str) -> Estimate:
-    """nearest, icp, or a trained estimator's file or folder."""
-    from dpcli.segment.flow import estimate_flow
-
-    return partial(estimate_flow, method=name)
-
-
 def run_prediction(
     data: str, model: str, output: str, *, method: str | None, method_options: dict[str, Any], num_parts: int | None,
     flow: str, refinement: dict[str, Any], split: str, seed: int, device: str, force: bool,
@@ -155,7 +164,7 @@ def run_prediction(
             with PartsWriter(target, num_parts=slots, class_names=reader.class_names, length_unit=reader.length_unit, seed=seed,
                              source=reader.path.name if data != "-" else "stdin", provenance=history, fields=[*fields, "part"],
                              force=force, resume=True) as writer:  # fmt: skip
-                _predict_all(reader, sequences, segmenter, flow_estimator(flow), options, seed, writer, fields)
+                _predict_all(reader, sequences, segmenter, partial(pair_flow, method=flow), options, seed, writer, fields)
         _show(target, picture, ply, turntable)
     if output != "-":
         print(f"{output}: parts of {len(sequences)} sequences")

@@ -1,4 +1,4 @@
-"""The flow of every training pair, kept in a file of the run folder and corrected while the network learns (eq. 4.6)."""
+"""The flow of every training pair, kept in files of the run folder and corrected while the network learns (eq. 4.6)."""
 
 from __future__ import annotations
 
@@ -7,52 +7,95 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dpcli.errors import UsageError
+
+_FIRST, _NOW, _KNOWN = "flows_first.npy", "flows.npy", "flows_known.npy"
+_THERE, _TELLING, _CORRECTED = 1, 2, 4  # bits of `flows_known.npy`
+
 
 class FlowStore:
-    """flow f32 (pairs,2,N,3), forth and back, in `flows.npy`; u8 (pairs) beside tells which are there: 0 not yet, 1 there,
-    2 there and telling (the first flow showed more than one body).
+    """Flows f32 (pairs,2,N,3), forth and back: `flows_first.npy` as estimated, `flows.npy` as corrected since; u8 (pairs)
+    beside tells what is there. ``take_from``: another run's folder whose first flows a fresh run begins with.
 
     Changes wait in memory until `flush`, which the trainer calls after it has saved them with its own state: a run that
     is killed finds either both or neither, and changes nothing twice. Memory: the changes since the last checkpoint.
     """
 
-    def __init__(self, folder: Path, pairs: int, points: int, fresh: bool) -> None:
-        self._flow = self._open(folder / "flows.npy", (pairs, 2, points, 3), np.float32, fresh)
-        self._known = self._open(folder / "flows_known.npy", (pairs,), np.uint8, fresh)
-        self.pending: dict[int, torch.Tensor] = {}
-        self.pending_telling: dict[int, bool] = {}
+    def __init__(self, folder: Path, pairs: int, points: int, fresh: bool, take_from: Path | None = None) -> None:
+        shape = (pairs, 2, points, 3)
+        self._first = _open(folder / _FIRST, shape, np.float32, fresh)
+        self._now = _open(folder / _NOW, shape, np.float32, fresh)
+        self._known = _open(folder / _KNOWN, (pairs,), np.uint8, fresh)
+        self.estimated: dict[int, tuple[torch.Tensor, bool]] = {}
+        self.corrected: dict[int, torch.Tensor] = {}
+        if fresh and take_from is not None:
+            self._take(take_from)
 
-    @staticmethod
-    def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
-        if not fresh and path.exists():
-            array = np.lib.format.open_memmap(path, "r+")
-            if array.shape == shape:
-                return array
-        return np.lib.format.open_memmap(path, "w+", dtype, shape)
+    def _take(self, folder: Path) -> None:
+        """Copy what is already estimated there. UsageError when it is of other pairs."""
+        try:
+            first, known = (np.load(folder / name, mmap_mode="r") for name in (_FIRST, _KNOWN))
+        except (OSError, ValueError) as error:
+            raise UsageError(f"--flows-of {folder}: no flows of a `dpc segment train` run there ({error})") from None
+        if first.shape != self._first.shape:
+            raise UsageError(f"--flows-of {folder}: flows of {first.shape} pairs, frames, points; here {self._first.shape}")
+        for pair in np.flatnonzero(known):
+            self._first[pair] = first[pair]
+        self._known[:] = known & (_THERE | _TELLING)
 
     def get(self, pair: int) -> torch.Tensor | None:
         """(2,N,3), or None when it has not been estimated yet."""
-        if pair in self.pending:
-            return self.pending[pair]
-        return torch.from_numpy(np.array(self._flow[pair])) if self._known[pair] else None
+        if pair in self.corrected:
+            return self.corrected[pair]
+        if pair in self.estimated:
+            return self.estimated[pair][0]
+        known = self._known[pair]
+        return torch.from_numpy(np.array((self._now if known & _CORRECTED else self._first)[pair])) if known else None
 
     def telling(self, pair: int) -> bool | None:
         """Whether the pair's first flow showed more than one body; None when it has not been estimated yet."""
-        if pair in self.pending_telling:
-            return self.pending_telling[pair]
-        return bool(self._known[pair] == 2) if self._known[pair] else None
+        if pair in self.estimated:
+            return self.estimated[pair][1]
+        return bool(self._known[pair] & _TELLING) if self._known[pair] else None
 
-    def put(self, pair: int, flow: torch.Tensor, telling: bool | None = None) -> None:
-        """Keep a flow (2,N,3); telling is given with the first one."""
-        self.pending[pair] = flow.detach().clone()
-        if telling is not None:
-            self.pending_telling[pair] = telling
+    def put_first(self, pair: int, flow: torch.Tensor, telling: bool) -> None:
+        """Keep an estimate (2,N,3)."""
+        self.estimated[pair] = (flow.detach().clone(), telling)
+
+    def put(self, pair: int, flow: torch.Tensor) -> None:
+        """Keep a corrected flow (2,N,3)."""
+        self.corrected[pair] = flow.detach().clone()
+
+    def pending(self) -> dict[str, dict[str, torch.Tensor]]:
+        """What `flush` will write, for the trainer's own state; `restore` takes it back."""
+        return {
+            "first": {str(pair): flow for pair, (flow, _) in self.estimated.items()},
+            "telling": {str(pair): torch.tensor(telling) for pair, (_, telling) in self.estimated.items()},
+            "corrected": {str(pair): flow for pair, flow in self.corrected.items()},
+        }
+
+    def restore(self, pending: dict[str, dict[str, torch.Tensor]]) -> None:
+        """Write what a run that was killed may not have written."""
+        self.estimated = {int(p): (flow, bool(pending["telling"][p])) for p, flow in pending["first"].items()}
+        self.corrected = {int(p): flow for p, flow in pending["corrected"].items()}
+        self.flush()
 
     def flush(self) -> None:
         """Write what is pending."""
-        for pair, flow in self.pending.items():
-            self._flow[pair] = flow.numpy()
-            self._known[pair] = max(self._known[pair], 1 + int(self.pending_telling.get(pair, False)))
-        self._flow.flush()
-        self._known.flush()
-        self.pending, self.pending_telling = {}, {}
+        for pair, (flow, telling) in self.estimated.items():
+            self._first[pair] = flow.numpy()
+            self._known[pair] |= _THERE + _TELLING * telling
+        for pair, flow in self.corrected.items():
+            self._now[pair] = flow.numpy()
+            self._known[pair] |= _CORRECTED
+        for array in (self._first, self._now, self._known):
+            array.flush()
+        self.estimated, self.corrected = {}, {}
+
+
+def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+    if not fresh and path.exists():
+        array = np.lib.format.open_memmap(path, "r+")
+        if array.shape == shape:
+            return array
+    return np.lib.format.open_memmap(path, "w+", dtype, shape)

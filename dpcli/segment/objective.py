@@ -35,7 +35,7 @@ class Objective:
     invariance: float = 0.0
     motion: float = 0.1
     cold_start: float = 1.0  # of the bodies that the flow itself shows, see `rigid_groups`
-    cold_until: float = 0.5
+    cold_until: float = 1.0
     supervised: bool = False
     consensus: str = "thesis"  # eq. 4.7; release: squared and gated; none
     tau: float = 20.0  # per unit of the object's diameter

@@ -1,4 +1,4 @@
-"""The first flow of a training pair, both ways."""
+"""The first flow of a pair of frames, both ways."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 
-def pair_flow(points: Tensor, method: str) -> Tensor:
-    """Flow f32 (2,N,3), forth and back, of a pair's points (2,N,3), by `estimate_flow`.
+def pair_flow(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
+    """Flow forth (N,3) and back (M,3) between two frames (N,3), (M,3), by `estimate_flow`.
 
     ICP runs once: its bodies' motions are inverted for the way back, and each point of frame 2 belongs to the body of
     the nearest point that was moved there, so that both frames tell of the same bodies.
@@ -16,16 +16,17 @@ def pair_flow(points: Tensor, method: str) -> Tensor:
     from dpcli.segment.flow.estimate import estimate_flow, rigid_bodies
 
     if method != "icp":
-        return estimate_flow(points, points.flip(0), method=method)
+        both = [estimate_flow(a[None], b[None], method=method)[0] for a, b in ((first, second), (second, first))]
+        return both[0], both[1]
     from scipy.spatial import cKDTree
 
-    first, second = (cloud.numpy().astype(np.float64) for cloud in points)
-    bodies = rigid_bodies(first, second)
-    moved = _apply(bodies.motion[bodies.label], first)
-    label = bodies.label[cKDTree(moved).query(second)[1]]
+    one, two = (cloud.numpy().astype(np.float64) for cloud in (first, second))
+    bodies = rigid_bodies(one, two)
+    moved = _apply(bodies.motion[bodies.label], one)
+    label = bodies.label[cKDTree(moved).query(two)[1]]
     rotation = bodies.motion[:, :, :3].swapaxes(1, 2)
     inverse = np.concatenate([rotation, -rotation @ bodies.motion[:, :, 3:]], 2)
-    return torch.from_numpy(np.float32(np.stack([moved - first, _apply(inverse[label], second) - second])))
+    return torch.from_numpy(np.float32(moved - one)), torch.from_numpy(np.float32(_apply(inverse[label], two) - two))
 
 
 def _apply(motion: np.ndarray, points: np.ndarray) -> np.ndarray:

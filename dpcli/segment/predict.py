@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ from dpcli.store.parts import PartsSample
 _FEWEST = 16  # points of a frame; one with fewer is filled up by repeats
 _SPREAD = 8  # farthest points are searched among this many times the wanted number, drawn at random
 
-Estimate = Callable[[Tensor, Tensor], Tensor]  # (B,N,3), (B,M,3) -> flow (B,N,3)
+Estimate = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (N,3), (M,3) -> flow forth (N,3) and back (M,3)
 Segmenter = Callable[[list[Tensor], dict[tuple[int, int], Tensor]], list[Tensor]]  # frames, flows -> masks (N,S)
 
 
@@ -75,8 +76,7 @@ def predict_parts(
     thin = [_thinned(cloud, options.points, generator(seed, index, t)) for t, cloud in enumerate(whole)]
     pairs = needs_flows(len(thin), options.pairs)
     chain = [(t, t + 1) for t in range(len(thin) - 1)]
-    back = [(t + 1, t) for t in range(len(thin) - 1)] if options.vote else []
-    flows = _flows(thin, sorted({*pairs, *chain, *back}), estimate)
+    flows = _flows(thin, [*pairs, *chain], estimate)
     masks = segmenter(thin, flows)
     masks = _consistent(thin, flows, masks, options.vote)
     masks = _without_crumbs(masks, options.smallest)
@@ -97,15 +97,11 @@ def _thinned(cloud: Tensor, wanted: int, rng: np.random.Generator) -> Tensor:
 
 
 def _flows(frames: list[Tensor], pairs: list[tuple[int, int]], estimate: Estimate) -> dict[tuple[int, int], Tensor]:
-    """All flows wanted; together where sizes allow."""
-    if pairs and len({len(frame) for frame in frames}) == 1:
-        stacked = torch.stack(frames)
-        found = torch.cat([
-            estimate(stacked[[i for i, _ in part]], stacked[[j for _, j in part]])
-            for part in (pairs[k : k + 16] for k in range(0, len(pairs), 16))
-        ])  # fmt: skip
-        return dict(zip(pairs, found))
-    return {(i, j): estimate(frames[i][None], frames[j][None])[0] for i, j in pairs}
+    """All flows wanted: of every two frames both ways at once, two pairs of frames at a time."""
+    both = sorted({(min(pair), max(pair)) for pair in pairs})
+    with ThreadPoolExecutor(min(2, torch.get_num_threads())) as pool:
+        found = list(pool.map(lambda pair: estimate(frames[pair[0]], frames[pair[1]]), both))
+    return {key: flow for (i, j), (forth, back) in zip(both, found) for key, flow in (((i, j), forth), ((j, i), back))}
 
 
 def _consistent(

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, cycle, islice
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -57,19 +58,20 @@ class Schedule:
         return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(steps - warm, 1)))
 
 
-Estimate = Callable[[torch.Tensor], torch.Tensor]
+Estimate = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 class Trainer:
-    """Trains one network. `estimate` gives the first flow (2,N,3), forth and back, of a pair's points (2,N,3)."""
+    """Trains one network. `estimate` gives the first flow, forth and back, of two frames (N,3)."""
 
     def __init__(
         self, model: PartNetwork, folder: RunFolder, schedule: Schedule, objective: Objective, training: PairSource,
         validation: PairSource | None, estimate: Estimate | None, notes: dict, device: torch.device, stop: StopRequest, seed: int,
+        flows_of: Path | None = None,
     ) -> None:  # fmt: skip
         self.model, self.folder, self.schedule, self.objective = model.to(device), folder, schedule, objective
         self.training, self.validation, self.estimate = training, validation, estimate
-        self.notes, self.device, self.stop, self.seed = notes, device, stop, seed
+        self.notes, self.device, self.stop, self.seed, self.flows_of = notes, device, stop, seed, flows_of
         self.epoch, self.step, self.best = 0, 0, math.inf
         self.sums: dict[str, list[float]] = {}
         self.spent = 0.0
@@ -81,7 +83,8 @@ class Trainer:
     def run(self) -> None:
         """From wherever the folder's state says to the last epoch."""
         state = self.folder.load_state()
-        self.flows = FlowStore(self.folder.path, len(self.training.pairs), self.training.points, state is None)
+        shape = (len(self.training.pairs), self.training.points)
+        self.flows = FlowStore(self.folder.path, *shape, state is None, self.flows_of)
         if state is not None:
             self._restore(state)
         total = self.schedule.epochs * self._steps() * self.schedule.batch
@@ -173,8 +176,8 @@ class Trainer:
     def _flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
         known = self.flows.get(pair.number)
         if known is None:
-            known = self.estimate(frames)
-            self.flows.put(pair.number, known, telling=bool((rigid_groups(frames, known) > 0).any()))
+            known = torch.stack(self.estimate(*frames))
+            self.flows.put_first(pair.number, known, bool((rigid_groups(frames, known) > 0).any()))
         return known
 
     def _keep_flow(self, pairs: list[Pair], flow: torch.Tensor) -> None:
@@ -246,17 +249,15 @@ class Trainer:
             if self.objective.supervised:
                 flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
             else:
-                flow = torch.stack([self.estimate(frames) for frames in points])
+                flow = torch.stack([torch.stack(self.estimate(*frames)) for frames in points])
             part = torch.from_numpy(np.stack([pair.part for pair in loaded]))
             batches.append(Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))))
         return batches
 
     def _save(self) -> None:
-        pending = {str(pair): flow for pair, flow in self.flows.pending.items()}
         self.folder.save_state({
             "epoch": self.epoch, "step": self.step, "best": self.best, "sums": self.sums, "spent": self.spent,
-            "model": self.model.state_dict(), "optimizer": self.optimizer.state_dict(), "flows": pending,
-            "telling": {str(pair): value for pair, value in self.flows.pending_telling.items()},
+            "model": self.model.state_dict(), "optimizer": self.optimizer.state_dict(), "flows": self.flows.pending(),
         })  # fmt: skip
         self.flows.flush()
 
@@ -265,9 +266,7 @@ class Trainer:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.flows.pending = {int(pair): flow for pair, flow in state["flows"].items()}
-        self.flows.pending_telling = {int(pair): value for pair, value in state["telling"].items()}
-        self.flows.flush()
+        self.flows.restore(state["flows"])
         log.info(f"continuing {self.folder.path} at epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}")
 
 
