@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 
 import pytest
@@ -9,8 +10,10 @@ import torch
 
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinet import Kinet, fuse
-from dpcli.classify.profile import body_like_clip, count_parameters, macs, paper_parameters
+from dpcli.classify.pointnet2 import GlobalHead, he_init
+from dpcli.classify.profile import body_like_clip, count_parameters, macs, measure, paper_parameters, render
 from dpcli.errors import DataError, UsageError
+from dpcli.ops import fps
 
 TINY = {"num_classes": 5, "num_frames": 4, "points_per_frame": 64, "centroids": (32, 16), "neighbors": 8,
         "widths": ((16, 16), (16, 32), (32, 64))}  # fmt: skip
@@ -150,6 +153,39 @@ def test_config_survives_json_and_refuses_nonsense():
             KinetConfig(**bad)
 
 
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"points_per_frame": -1}, "--points -1: expected at least 1"),
+        ({"num_frames": 0}, "--frames 0: expected at least 1"),
+        ({"group_size": 0}, "--group-size 0: expected at least 1"),
+        ({"temporal_radius": -1}, "--temporal-radius -1: expected at least 0"),
+        ({"temporal_radius": 32}, "--temporal-radius 32: balanced grouping shares 64 neighbours among 65 frames"),
+        ({"dropout": 1.0}, "--dropout 1.0: expected a probability"),
+        ({"dropout": float("nan")}, "--dropout nan: expected a probability"),
+        ({"radii": (-0.5, -1.0)}, "--radius -0.5: expected a number above 0"),
+        ({"radii": (float("inf"), float("inf"))}, "--radius inf: expected a number above 0"),
+        ({"centroids": (256, 512)}, "the second not above the first"),
+        ({"num_classes": 0}, "number of classes 0: expected at least 1"),
+    ],
+)
+def test_wrong_values_end_with_a_sentence(bad, message):
+    with pytest.raises(UsageError) as error:
+        KinetConfig(**bad)
+    assert message in str(error.value)
+
+
+def test_the_second_stage_takes_the_first_centroids_as_farthest_points():
+    """group_clip relies on it: any first few of a farthest point sample are one, ties and doubled points included."""
+    clip = body_like_clip(4, 64)
+    clip[:, 2:] = clip[:, :2]  # every position twice
+    for points in (clip, (clip * 8).round() / 8):
+        first, second = Kinet(KinetConfig(**TINY)).group(points)
+        chosen = fps(first.centers, second.centers.shape[1])
+        picked = torch.gather(first.centers, 1, chosen[..., None].expand(-1, -1, 3))
+        assert torch.equal(second.centers, picked)
+
+
 def test_shipped_models_load_and_have_a_card():
     from dpcli.classify.model_file import SHIPPED, load_model, shipped_models
 
@@ -178,3 +214,43 @@ def test_the_shipped_model_recognises_real_depth_videos(shared_data, tmp_path, d
     assert scored.returncode == 0, scored.stderr.decode()
     report = dpc("evaluate", "classification", tmp_path / "scores.h5", "--json")
     assert json.loads(report.stdout)["metrics"]["accuracy"] >= 0.8
+
+
+def test_the_global_head_in_training_is_batch_norm_written_out():
+    """Pooled as it is made, against torch's own layers in float64: values, gradients and running statistics."""
+    torch.manual_seed(0)
+    head = GlobalHead(6, (20, 24), 3, 0.0)
+    he_init(head)
+    centers, features = torch.randn(3, 40, 3), torch.randn(3, 40, 6)
+    plain = copy.deepcopy(head).double()
+    ours = features.clone().requires_grad_()
+    theirs = features.double().requires_grad_()
+    values = torch.cat([centers.double(), theirs], -1).view(120, -1)
+    hidden = torch.relu(plain.norm1(plain.linear1(values)))
+    expected = torch.relu(plain.norm2(plain.linear2(hidden))).view(3, 40, -1).amax(1)
+    got = head.embed(centers, ours)
+    torch.testing.assert_close(got.double(), expected, rtol=0, atol=2e-5)
+    weight = torch.randn(3, 24)
+    (got * weight).sum().backward()
+    (expected * weight).sum().backward()
+    torch.testing.assert_close(ours.grad.double(), theirs.grad, rtol=1e-4, atol=1e-5)
+    for name in ("linear1", "norm1", "linear2", "norm2"):
+        mine, other = getattr(head, name).weight.grad, getattr(plain, name).weight.grad
+        torch.testing.assert_close(mine.double(), other, rtol=1e-4, atol=1e-4)
+    for norm in ("norm1", "norm2"):
+        mine, other = getattr(head, norm), getattr(plain, norm)
+        torch.testing.assert_close(mine.running_mean.double(), other.running_mean, rtol=1e-5, atol=1e-6)
+        torch.testing.assert_close(mine.running_var.double(), other.running_var, rtol=1e-5, atol=1e-6)
+
+
+def test_profile_splits_a_training_step_into_its_parts():
+    result = measure(Kinet(KinetConfig(**TINY)).eval(), torch.device("cpu"), steps=True)
+    step = result["static_step"]
+    assert 0 < step["matrix_products_share"] < 1 and set(step["ms_per_clip"]) == {
+        "matrix_products",
+        "neighbours",
+        "other",
+    }
+    total = sum(step["ms_per_clip"].values())
+    assert total == pytest.approx(1000 * step["seconds"] / step["batch"], rel=0.1, abs=0.05)
+    assert "in matrix products" in render(result)

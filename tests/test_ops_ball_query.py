@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.ops import space_time_ball_query, space_time_ball_query_reference
-from tests.ops_helpers import BACKENDS, KINDS, SEEDS, assert_ball_query, backend, cloud
+from tests.ops_helpers import BACKENDS, KINDS, SEEDS, assert_ball_query, backend, brute_ball_query, cloud
 
 ORDERS = ("first", "nearest")
 
@@ -147,3 +147,65 @@ def test_rejects_an_unknown_order() -> None:
         space_time_ball_query(
             torch.zeros(1, 5, 3), torch.zeros(1, 5), torch.zeros(1, 2, 3), torch.zeros(1, 2), [1.0], 3, order="any"
         )
+
+
+def brute_balanced(points, times, centroid, time, radii, k: int) -> tuple[list[int], int]:
+    """One centroid's slots by the definition, frame by frame."""
+    reach = len(radii) - 1
+    frames = 2 * reach + 1
+    shares = [k * (i + 1) // frames - k * i // frames for i in range(frames)]
+    found = []
+    for offset, share in zip(range(-reach, reach + 1), shares):
+        alone = np.where(times == time + offset, 0, 1)  # only this frame is at distance 0
+        found.append(brute_ball_query(points, alone, centroid, 0, radii[abs(offset) :][:1], share, "first"))
+    own = found[reach][0]
+    slots = [row if hits else [own[i % len(own)] for i in range(len(row))] for row, hits in found]
+    return sum(slots, []), sum(hits for _, hits in found)
+
+
+def assert_balanced(function, points, times, centroids, centroid_times, radii, k: int) -> None:
+    tensors = (torch.from_numpy(np.ascontiguousarray(a)) for a in (points, times, centroids, centroid_times))
+    index, count = function(*tensors, radii, k, order="balanced")
+    assert index.dtype == count.dtype == torch.int64 and index.shape == (*centroids.shape[:2], k)
+    for b in range(len(points)):
+        for m in range(centroids.shape[1]):
+            want = brute_balanced(points[b], times[b], centroids[b, m], centroid_times[b, m], radii, k)
+            assert (index[b, m].tolist(), int(count[b, m])) == want
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@settings(deadline=None, max_examples=60)
+@given(
+    seed=SEEDS,
+    kind=KINDS,
+    size=st.tuples(st.integers(1, 2), st.integers(1, 300), st.integers(1, 12), st.integers(1, 6)),
+    ordered=st.booleans(),
+    radii=st.lists(st.sampled_from([0.0, 0.25, 0.5, 0.7, 1.5, 100.0]), min_size=1, max_size=3),
+    extra=st.integers(0, 30),
+)
+def test_balanced_matches_the_definition(
+    name: str, seed: int, kind: str, size: tuple, ordered: bool, radii: list[float], extra: int
+) -> None:
+    with backend(name):
+        assert_balanced(space_time_ball_query, *clip(seed, kind, *size, ordered), radii, 2 * len(radii) - 1 + extra)
+
+
+def test_balanced_checker_rejects_the_other_order() -> None:
+    arguments = (*clip(5, "grid", 1, 200, 10, 4, False), [0.5, 0.25], 30)
+    assert_balanced(space_time_ball_query_reference, *arguments)
+    with pytest.raises(AssertionError):
+        assert_balanced(lambda *a, order: space_time_ball_query_reference(*a, order="first"), *arguments)
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+def test_balanced_kernel_equals_reference_on_a_clip(ordered: bool) -> None:
+    arguments = [torch.from_numpy(a) for a in clip(7, "random", 2, 3000, 150, 8, ordered)]
+    got = space_time_ball_query(*arguments, [0.5, 0.51], 64, order="balanced")
+    reference = space_time_ball_query_reference(*arguments, [0.5, 0.51], 64, order="balanced")
+    assert all(torch.equal(a, b) for a, b in zip(got, reference, strict=True))
+
+
+def test_balanced_needs_a_slot_per_frame() -> None:
+    arguments = (torch.zeros(1, 5, 3), torch.zeros(1, 5), torch.zeros(1, 2, 3), torch.zeros(1, 2), [1.0, 1.0])
+    with pytest.raises(ValueError, match="per frame"):
+        space_time_ball_query(*arguments, 2, order="balanced")

@@ -300,3 +300,12 @@ def test_splits_and_choices(data):
         Schedule(batch=0)
     with pytest.raises(DataError, match="two frames"):
         PairSource(reader, [], 8, 0)
+
+
+def test_a_flow_estimator_is_trained_and_used(dpc, data, tmp_path):
+    folder = tmp_path / "flow"
+    done = dpc("segment", "flow", data, "-o", folder, "--steps", 3, "--batch", 2, OMP_NUM_THREADS="1")
+    assert done.returncode == 0, done.stderr.decode()
+    assert (folder / "curves.png").exists() and done.stdout.decode().strip().endswith("best.safetensors")
+    used = dpc("segment", "predict", data, "--method", "ward", "--flow", folder, "-o", tmp_path / "p.h5", OMP_NUM_THREADS="1")
+    assert used.returncode == 0, used.stderr.decode()

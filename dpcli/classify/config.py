@@ -50,12 +50,33 @@ class KinetConfig:
         for name, legal in _LEGAL.items():
             if getattr(self, name) not in legal:
                 raise UsageError(f"{name} = {getattr(self, name)!r}: expected one of {', '.join(map(str, legal))}")
+        for name, (least, called) in _LEAST.items():
+            if getattr(self, name) < least:
+                raise UsageError(f"{called} {getattr(self, name)}: expected at least {least}")
+        self._check_ranges()
+        self._check_sizes()
+
+    def _check_ranges(self) -> None:
         if not 0 < self.reduction <= 1:
             raise UsageError(f"reduction = {self.reduction}: expected a ratio in (0, 1]")
-        if self.num_frames < 1 or self.points_per_frame * self.num_frames < self.centroids[0]:
-            have = self.points_per_frame * self.num_frames
+        if not 0 <= self.dropout < 1:
+            raise UsageError(f"--dropout {self.dropout}: expected a probability in [0, 1)")
+        if not all(0 < radius < float("inf") for radius in self.radii):
+            raise UsageError(f"--radius {self.radii[0]}: expected a number above 0")
+
+    def _check_sizes(self) -> None:
+        first, second = self.centroids
+        if not 1 <= second <= first:
+            raise UsageError(f"centroids = {self.centroids}: expected two counts, the second not above the first")
+        have = self.points_per_frame * self.num_frames
+        if have < first:
             raise UsageError(
-                f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {self.centroids[0]} centroids"
+                f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {first} centroids"
+            )
+        reach = 2 * self.temporal_radius + 1
+        if self.grouping == "balanced" and self.neighbors < reach:
+            raise UsageError(
+                f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
             )
 
     @classmethod
@@ -98,6 +119,14 @@ class KinetConfig:
         return cls(**values)
 
 
+_LEAST = {
+    "num_classes": (1, "number of classes"),
+    "num_frames": (1, "--frames"),
+    "points_per_frame": (1, "--points"),
+    "neighbors": (1, "neighbors"),
+    "group_size": (1, "--group-size"),
+    "temporal_radius": (0, "--temporal-radius"),
+}
 _LEGAL = {
     "variant": VARIANTS,
     "normalize": ("none", "center", "unit", "image"),

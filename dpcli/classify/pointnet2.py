@@ -36,7 +36,8 @@ def group_clip(points: Tensor, times: Tensor, config: KinetConfig) -> list[Group
     """Both stages' centroids (farthest points of the union of frames) and space-time neighbours. points (B,N,3), times (B,N)."""
     stages = []
     for stage, count in enumerate(config.centroids):
-        chosen = fps(points, count)
+        # centroids are in the order of farthest point sampling, so any first few of them are such a sample, too
+        chosen = fps(points, count) if stage == 0 else torch.arange(count, device=points.device).expand(len(points), -1)
         centers = gather_points(points, chosen)
         center_times = gather_points(times[..., None], chosen)[..., 0]
         idx = _neighbors(points, times, centers, center_times, config, stage)
@@ -48,32 +49,15 @@ def group_clip(points: Tensor, times: Tensor, config: KinetConfig) -> list[Group
 def _neighbors(
     points: Tensor, times: Tensor, centers: Tensor, center_times: Tensor, config: KinetConfig, stage: int
 ) -> Tensor:
-    radii = config.radius_table(stage)
-    query = (points, times, centers)
-    if config.grouping != "balanced" or config.temporal_radius == 0:
-        order = "nearest" if config.grouping == "nearest" else "first"
-        return space_time_ball_query(*query, center_times, radii, config.neighbors, order=order)[0]
     # `first` fills all slots from the earliest frame when frames are dense, and then no surface in time can be fitted:
     # so every frame gets an equal share. Points come in random order, hence the first hits of a frame are a random draw.
-    offsets = range(-config.temporal_radius, config.temporal_radius + 1)
-    shares = [
-        config.neighbors * (i + 1) // len(offsets) - config.neighbors * i // len(offsets) for i in range(len(offsets))
-    ]
-    found = {}
-    for offset, share in zip(offsets, shares):
-        exact = radii[abs(offset) : abs(offset) + 1]  # one radius: only the frame at this offset
-        found[offset] = space_time_ball_query(*query, center_times + offset, exact, share)
-    own = found[0][0]
-    pieces = []
-    for offset, share in zip(offsets, shares):
-        idx, count = found[offset]
-        fallback = own[..., torch.arange(share, device=own.device) % own.shape[-1]]
-        pieces.append(torch.where(count[..., None] > 0, idx, fallback))  # at the clip's ends: more of the own frame
-    return torch.cat(pieces, -1)
+    order = "first" if config.temporal_radius == 0 and config.grouping == "balanced" else config.grouping
+    radii = config.radius_table(stage)
+    return space_time_ball_query(points, times, centers, center_times, radii, config.neighbors, order=order)[0]
 
 
-class SetAbstraction(nn.Module):
-    """Two shared linear layers with batch norm and ReLU over [relative xyz, feature], max-pooled over neighbours."""
+class SharedLayers(nn.Module):
+    """Two linear layers shared by all neighbours, each with batch norm and ReLU, over [relative xyz, feature]."""
 
     def __init__(self, inputs: int, widths: tuple[int, int]) -> None:
         super().__init__()
@@ -88,11 +72,11 @@ class SetAbstraction(nn.Module):
         mean, var = (None, None) if self.training else (norm.running_mean, norm.running_var)
         return Norm(norm.weight, norm.bias, mean, var, norm.eps)
 
-    def forward(self, group: Grouping, features: Tensor | None) -> Tensor:
-        """(B,M,C2) from features (B,N,F) of the points that were grouped."""
-        pooled, statistics = grouped_mlp(group.points, group.centers, group.idx, features, *self._arguments())
+    def pool(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
+        """Maximum over the neighbours, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
+        pooled, statistics = grouped_mlp(points, centers, idx, features, *self._arguments())
         if self.training:
-            self._update(statistics, group.idx.numel())
+            self._update(statistics, idx.numel())
         return pooled
 
     def _update(self, statistics: list[Tensor], rows: int) -> None:
@@ -102,26 +86,35 @@ class SetAbstraction(nn.Module):
                 norm.running_mean.lerp_(mean, norm.momentum)
                 norm.running_var.lerp_(var * (rows / max(rows - 1, 1)), norm.momentum)
 
+
+class SetAbstraction(SharedLayers):
+    """The shared layers, max-pooled over each centroid's neighbours."""
+
+    def forward(self, group: Grouping, features: Tensor | None) -> Tensor:
+        """(B,M,C2) from features (B,N,F) of the points that were grouped."""
+        return self.pool(group.points, group.centers, group.idx, features)
+
     def taps(self, group: Grouping, features: Tensor | None) -> list[Tensor]:
         """Both layers' activations before pooling with running statistics: (B,M,K,C1), (B,M,K,C2)."""
         assert not self.training, "the dynamic stream reads a frozen static network"
         return grouped_activations(group.points, group.centers, group.idx, features, *self._arguments())[0]
 
 
-class GlobalHead(nn.Module):
+class GlobalHead(SharedLayers):
     """[xyz, feature] of every centroid -> two shared layers -> max over the clip -> class logits."""
 
     def __init__(self, inputs: int, widths: tuple[int, int], classes: int, dropout: float) -> None:
-        super().__init__()
-        self.linear1, self.norm1 = nn.Linear(3 + inputs, widths[0]), nn.BatchNorm1d(widths[0], eps=1e-3)
-        self.linear2, self.norm2 = nn.Linear(widths[0], widths[1]), nn.BatchNorm1d(widths[1], eps=1e-3)
+        super().__init__(inputs, widths)
         self.dropout = nn.Dropout(dropout)
         self.classify = nn.Linear(widths[1], classes)
 
     def embed(self, centers: Tensor, features: Tensor) -> Tensor:
         """The clip's feature vector, (B, widths[1])."""
+        batch, count = centers.shape[:2]
+        if self.training:  # as one group: its centre is the origin, its neighbours are all centroids
+            everyone = torch.arange(count, device=centers.device).expand(batch, 1, count)
+            return self.pool(centers, centers.new_zeros(batch, 1, 3), everyone, features)[:, 0]
         values = torch.cat([centers, features], -1)
-        batch, count = values.shape[:2]
         hidden = torch.relu_(self.norm1(self.linear1(values.view(batch * count, -1))))
         return torch.relu_(self.norm2(self.linear2(hidden))).view(batch, count, -1).amax(1)
 

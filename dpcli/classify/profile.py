@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -133,9 +135,10 @@ def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
 
 
 def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, Any]:
-    """Where a training step of the static stream spends its time: share of matrix products, the largest other parts."""
-    from torch.profiler import ProfilerActivity, profile
+    """Where a training step of the static stream (grouping, forward, loss, backward) spends its time; medians of steps.
 
+    Matrix products are the calls of BLAS, as torch's profiler sees them in steps of their own; all else is outside.
+    """
     from dpcli.runtime.memory import keep_freed_memory
 
     keep_freed_memory()
@@ -144,23 +147,35 @@ def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str,
     points = body_like_clip(config.num_frames, config.points_per_frame, batch).to(device)
     labels = torch.arange(batch, device=device) % config.num_classes
 
-    def step() -> None:
-        loss = nn.functional.cross_entropy(static(model.group(points)), labels)
+    def step() -> tuple[float, float]:
+        began = _now(device)
+        groups = model.group(points)
+        grouped = _now(device)
+        loss = nn.functional.cross_entropy(static(groups), labels)
         static.zero_grad(set_to_none=True)
         loss.backward()
+        return grouped - began, _now(device) - began
 
     for _ in range(2):
         step()
-    began = _now(device)
-    for _ in range(3):
-        step()
-    seconds = (_now(device) - began) / 3
+    grouping, seconds = (statistics.median(times) for times in zip(*(step() for _ in range(5))))
+    inside = statistics.median(_product_seconds(step) for _ in range(3))
+    model.eval()
+    parts = {"matrix_products": inside, "neighbours": grouping, "other": seconds - inside - grouping}
+    return {
+        "batch": batch, "seconds": round(seconds, 4), "matrix_products_share": round(inside / seconds, 3),
+        "ms_per_clip": {name: round(1000 * value / batch, 2) for name, value in parts.items()},
+    }  # fmt: skip
+
+
+def _product_seconds(step: Callable[[], Any]) -> float:
+    """Seconds that a step spends in matrix products."""
+    from torch.profiler import ProfilerActivity, profile
+
     with profile(activities=[ProfilerActivity.CPU]) as trace:
         step()
-    products = [e for e in trace.key_averages() if e.key in ("aten::addmm", "aten::mm", "aten::bmm", "aten::addmm_")]
-    model.eval()
-    inside = sum(e.self_cpu_time_total for e in products) / 1e6
-    return {"batch": batch, "seconds": round(seconds, 4), "matrix_products_share": round(inside / seconds, 3)}
+    products = ("aten::addmm", "aten::mm", "aten::bmm", "aten::addmm_")
+    return sum(event.self_cpu_time_total for event in trace.key_averages() if event.key in products) / 1e6
 
 
 def render(result: dict[str, Any]) -> str:
@@ -186,7 +201,9 @@ def render(result: dict[str, Any]) -> str:
     lines.append(f"peak memory   {result['peak_memory_mb']} MB of the process")
     if "static_step" in result:
         step = result["static_step"]
+        parts = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in step["ms_per_clip"].items())
         lines.append(
             f"static step   {step['seconds']} s for {step['batch']} clips, {100 * step['matrix_products_share']:.0f} % in matrix products"
         )
+        lines.append(f"  per clip    {parts} ms")
     return "\n".join(lines)

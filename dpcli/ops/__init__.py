@@ -23,6 +23,10 @@ _HOME = {
     "small_inverse_reference": "linalg",
     "normal_equations": "plane_fit",
     "plane_deviations": "plane_fit",
+    "weighted_kabsch": "rigid",
+    "apply_motions": "rigid",
+    "rigid_flow": "rigid",
+    "to_matrix": "rigid",
     "chosen_backend": "backend",
 }
 

@@ -17,7 +17,7 @@ from dpcli.ops.backend import (
     squared_distances,
 )
 
-_ROW_NS = {"first": 1e3, "nearest": 1.5e4}  # measured on a 16 x 2048 clip
+_ROW_NS = {"first": 1e3, "nearest": 1.5e4, "balanced": 1.5e3}  # measured on a 16 x 2048 clip
 
 
 def space_time_ball_query(
@@ -36,17 +36,24 @@ def space_time_ball_query(
     compared squared, in float32. times are whole frame indices (integers, or floats holding integers), in any order.
     order "first": the k neighbours of lowest index, ascending; unused slots repeat the first. Frame-major points thus
     favour the earlier frame, as the released Kinet does. order "nearest": the k nearest in space, ascending, ties to
-    the lowest index; unused slots repeat the nearest. A centroid without any neighbour has count 0 and index 0 in all
-    slots.
+    the lowest index; unused slots repeat the nearest. order "balanced": `balanced_shares` of the slots for each frame
+    within reach, from the earliest on, filled with the frame's first hits; its unused slots repeat the first; a frame
+    without hits gets the centroid's own frame's share, repeated. A centroid without any neighbour has count 0 and index
+    0 in all slots.
     Indices carry no gradient: gather with them. Backends: numba on CPU (frames found by bisection when the times are
-    sorted), torch elsewhere; same indices. Raises ValueError on wrong shapes, non-finite values, or fractional times.
+    sorted), torch elsewhere; same indices. Raises ValueError on wrong shapes, non-finite values, fractional times, or
+    fewer slots than frames within reach ("balanced").
     """
-    points, times, centroids, centroid_times, limits = _checked(
-        points, times, centroids, centroid_times, radii, k, order
-    )
+    arguments = (*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
     if chosen_backend(points.device) == "torch":
-        return _query_torch(points, times, centroids, centroid_times, limits, k, order)
-    return _query_numba(points, times, centroids, centroid_times, limits, k, order)
+        return _any_torch(*arguments)
+    return _balanced_numba(*arguments[:-1]) if order == "balanced" else _query_numba(*arguments)
+
+
+def balanced_shares(k: int, reach: int) -> list[int]:
+    """How k slots are shared among the frames from `reach` before to `reach` after: equally, to one."""
+    frames = 2 * reach + 1
+    return [k * (i + 1) // frames - k * i // frames for i in range(frames)]
 
 
 def space_time_ball_query_reference(
@@ -60,7 +67,7 @@ def space_time_ball_query_reference(
     order: str = "first",
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """The torch twin of `space_time_ball_query`: all pairs, in blocks of bounded memory."""
-    return _query_torch(*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
+    return _any_torch(*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
 
 
 def _checked(
@@ -75,14 +82,17 @@ def _checked(
     points, centroids = positions("points", points), positions("centroids", centroids)
     if points.shape[0] != centroids.shape[0] or points.shape[1] == 0:
         raise ValueError(f"points {tuple(points.shape)} and centroids {tuple(centroids.shape)} need one batch, N >= 1")
-    if k < 1 or order not in ("first", "nearest"):
-        raise ValueError(f"k must be at least 1 and order first or nearest, but they are {k} and {order!r}")
+    if k < 1 or order not in _ROW_NS:
+        raise ValueError(f"k must be at least 1 and order one of {', '.join(_ROW_NS)}, but they are {k} and {order!r}")
+    limits = _squared_radii(radii, points.device, trim=order != "balanced")
+    if order == "balanced" and k < 2 * len(limits) - 1:
+        raise ValueError(f"k must be at least 1 per frame within reach, {2 * len(limits) - 1}, but is {k}")
     return (
         points,
         _frame_indices("times", times, points),
         centroids,
         _frame_indices("centroid_times", centroid_times, centroids),
-        _squared_radii(radii, points.device),
+        limits,
     )
 
 
@@ -95,15 +105,16 @@ def _frame_indices(name: str, times: torch.Tensor, owner: torch.Tensor) -> torch
     return whole.to(owner.device)
 
 
-def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device) -> torch.Tensor:
-    """(R,) squared radii without trailing zeros, which accept nothing but would widen the window in time."""
+def _squared_radii(radii: torch.Tensor | Sequence[float], device: torch.device, trim: bool) -> torch.Tensor:
+    """(R,) squared radii; `trim`: without trailing zeros, which accept nothing but would widen the window in time."""
     radii = torch.as_tensor(radii, dtype=torch.float32, device="cpu").detach()
     if radii.ndim != 1 or not bool((torch.isfinite(radii) & (radii >= 0)).all()):
         raise ValueError(
             f"radii must be a list of finite numbers >= 0, one per frame distance, but is {radii.tolist()}"
         )
-    last = int(radii.nonzero().max()) + 1 if bool(radii.any()) else 0
-    return (radii[:last] * radii[:last]).to(device)
+    if trim:
+        radii = radii[: int(radii.nonzero().max()) + 1 if bool(radii.any()) else 0]
+    return (radii * radii).to(device)
 
 
 def _query_numba(
@@ -125,6 +136,48 @@ def _query_numba(
     arguments = (xyz, *rest, order == "nearest", index.numpy(), count.numpy())
     run_in_threads(ball_query_kernel, arguments, batch * rows, _ROW_NS[order])
     return index, count
+
+
+def _balanced_numba(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    limits: torch.Tensor,
+    k: int,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    from dpcli.ops.kernels_neighbours import balanced_query_kernel
+
+    batch, rows = centroid_times.shape
+    index = torch.empty((batch, rows, k), dtype=torch.int64)
+    count = torch.empty((batch, rows), dtype=torch.int64)
+    shares = np.array(balanced_shares(k, len(limits) - 1), np.int64)
+    arrays = (tensor.contiguous().numpy() for tensor in (points, times, centroids, centroid_times, limits))
+    arguments = (*arrays, shares, index.numpy(), count.numpy())
+    run_in_threads(balanced_query_kernel, arguments, batch * rows, _ROW_NS["balanced"])
+    return index, count
+
+
+def _any_torch(
+    points: torch.Tensor,
+    times: torch.Tensor,
+    centroids: torch.Tensor,
+    centroid_times: torch.Tensor,
+    limits: torch.Tensor,
+    k: int,
+    order: str,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    if order != "balanced":
+        return _query_torch(points, times, centroids, centroid_times, limits, k, order)
+    reach, shares = len(limits) - 1, balanced_shares(k, len(limits) - 1)
+    found = []
+    for offset, share in zip(range(-reach, reach + 1), shares, strict=True):
+        only = limits[abs(offset) : abs(offset) + 1]  # one radius: just the frame at this offset
+        found.append(_query_torch(points, times, centroids, centroid_times + offset, only, share, "first"))
+    own = found[reach][0]
+    slots = torch.arange(k, device=own.device) % own.shape[-1]
+    pieces = [torch.where(hits[..., None] > 0, idx, own[..., slots[: idx.shape[-1]]]) for idx, hits in found]
+    return torch.cat(pieces, -1), sum(hits for _, hits in found)
 
 
 def _query_torch(

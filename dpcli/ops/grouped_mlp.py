@@ -8,8 +8,10 @@ C1 x C1 matrix instead of two with C1 x C2. Both give the same numbers; tests co
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,8 +19,10 @@ from dpcli.ops.backend import chosen_backend
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 
-_PIECE = 1 << 13  # rows between two matrix products: 2 to 8 MB of activations, which then stay in the cache
-_BLOCKS = 32  # pieces of work per kernel: more than threads, for balance; fixed, so that sums repeat exactly
+_PIECE = 1 << 22  # bytes of activations between two matrix products, which then stay in the cache
+_BLOCKS = 32  # pieces of work of a sum: more than threads, for balance; fixed, so that sums repeat exactly
+_HELD = 8  # pieces summed in float32
+_SPLITS = 4  # the same where each needs a copy of a large target
 
 
 @dataclass
@@ -47,12 +51,7 @@ def grouped_mlp(
     Returns (pooled (B,M,C2), [mean1, var1, mean2, var2]): the biased batch statistics, or the given ones.
     Differentiable in features, weights, biases and norms; not in positions. float32 on the fast path.
     """
-    fast = (
-        chosen_backend(points.device) == "numba"
-        and norm1.mean is None
-        and idx.shape[2] <= 256
-        and points.dtype == torch.float32
-    )
+    fast = chosen_backend(points.device) == "numba" and norm1.mean is None and points.dtype == torch.float32
     if fast:
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
     taps, statistics = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
@@ -102,137 +101,274 @@ def _norm_relu(values: Tensor, norm: Norm) -> tuple[Tensor, tuple[Tensor, Tensor
 
 
 def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):
+    weight1, bias1 = linear1
+    inputs = (points.detach().contiguous(), centers.detach().contiguous(), idx.contiguous())
+    table, offset = (None, None) if features is None else _project(points, centers, features, linear1)
     norms = (norm1.weight, norm1.bias, norm2.weight, norm2.bias)
-    if features is None:
-        first = (points.contiguous(), centers.contiguous(), *linear1)
-    else:
-        first = (*_project(points, centers, features, linear1), None, None)
-    pooled, *statistics = _GroupedMLP.apply(idx.contiguous(), *first, *norms, *linear2, norm1.eps, norm2.eps)
+    pooled, *statistics = _GroupedMLP.apply(
+        *inputs, table, offset, weight1, bias1, *norms, *linear2, norm1.eps, norm2.eps
+    )
     return pooled, statistics
 
 
-def _statistics(sums: Tensor, rows: int) -> tuple[Tensor, Tensor]:
-    total = sums.sum(0) / rows
-    return total[0].float(), (total[1] - total[0] ** 2).clamp_min(0).float()
-
-
 class _GroupedMLP(torch.autograd.Function):
-    """The training path on a CPU. `table`/`offset` are points and centres when weight1 is given, else projected ones."""
+    """The training path on a CPU. With `table` and `offset` (the projected points and centres), the gradient of the first
+    layer's weights reaches them through those two; without, weight1 and bias1 act on the relative positions alone."""
 
     @staticmethod
-    def forward(ctx, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):
-        kernels = parallel_kernels("kernels_grouped")
-        batch, count, neighbors = idx.shape
-        rows, c1, c2 = idx.numel(), len(g1), len(g2)
-        hidden = torch.empty(batch, count, neighbors, c1)
-        sums = torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
-        if weight1 is not None:
-            kernels.project_xyz(table.numpy(), offset.numpy(), idx.numpy(), weight1.detach().t().contiguous().numpy(),
-                                bias1.detach().numpy(), hidden.numpy(), sums.numpy())  # fmt: skip
-        else:
-            table, offset = table.detach().contiguous(), offset.detach().contiguous()
-            kernels.gather_difference(table.numpy(), offset.numpy(), idx.numpy(), hidden.numpy(), sums.numpy())
-        mean1, var1 = _statistics(sums, rows)
-        inverse1 = torch.rsqrt(var1 + eps1)
-        scale1 = g1.detach() * inverse1
-        best, where, gram, total = _pool_linear(hidden, scale1, b1.detach() - mean1 * scale1, weight2, bias2, g2)
-        mean2, var2 = _linear_statistics(gram, total, rows, weight2, bias2)
+    def forward(ctx, points, centers, idx, table, offset, weight1, bias1, g1, b1, g2, b2, weight2, bias2, eps1, eps2):
+        first = _FromPositions(points, centers, idx, weight1, bias1)
+        if table is not None:
+            first = _FromTable(points, centers, idx, table.detach(), offset.detach(), weight1)
+        mean1, var1 = first.statistics()
+        first.fold(g1.detach() * torch.rsqrt(var1 + eps1), torch.rsqrt(var1 + eps1), b1.detach())
+        best, where, gram, total = _pool_linear(first, weight2.detach(), bias2.detach(), g2.detach())
+        mean2, var2 = _linear_statistics(gram, total, idx.numel(), weight2.detach(), bias2.detach())
         inverse2 = torch.rsqrt(var2 + eps2)
         normal = (best - mean2) * inverse2
         out = torch.relu_(normal * g2 + b2)
-        ctx.save_for_backward(idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
-                              mean1, inverse1, mean2, inverse2, gram, total)  # fmt: skip
+        ctx.first = first
+        ctx.save_for_backward(g2, weight2, bias2, where, normal, out, mean2, inverse2, gram, total)
         ctx.mark_non_differentiable(mean1, var1, mean2, var2)
-        return out.view(batch, count, c2), mean1, var1, mean2, var2
+        return out.view(*idx.shape[:2], -1), mean1, var1, mean2, var2
 
     @staticmethod
+    @torch.autograd.function.once_differentiable
     def backward(ctx, grad, *unused):
-        kernels = parallel_kernels("kernels_grouped")
-        (idx, table, offset, weight1, bias1, g1, b1, g2, weight2, bias2, hidden, where, normal, out,
-         mean1, inverse1, mean2, inverse2, gram, total) = ctx.saved_tensors  # fmt: skip
-        rows, c1, c2 = idx.numel(), len(g1), len(g2)
+        g2, weight2, bias2, where, normal, out, mean2, inverse2, gram, total = ctx.saved_tensors
+        rows, c2 = ctx.first.rows, len(g2)
         grad = grad.reshape(-1, c2) * (out > 0)
         grad_b2, grad_g2 = grad.sum(0), (grad * normal).sum(0)
         # d(linear output) = sparse - u - v * output, the last two from the batch statistics
         scale2 = g2 * inverse2
         v = scale2 * grad_g2 * inverse2 / rows
         u = scale2 * grad_b2 / rows - v * mean2
-        sparse = (grad * scale2).contiguous()
-        flat = hidden.view(rows, c1)
-        lean = (v[:, None] * weight2).t()
-        constant = -((u + v * bias2) @ weight2)
-        safe = torch.where(g1.abs() < 1e-12, torch.full_like(g1, 1e-12), g1.detach())
-        recover = ((1 / safe).numpy(), (-b1.detach() / safe).numpy())
-        dense, mixed, plain = torch.empty_like(flat), lean @ weight2, weight2.detach().contiguous()
-        parts, sums = torch.zeros(_BLOCKS, c2, c1), torch.zeros(_BLOCKS, 2, c1, dtype=torch.float64)
-        neighbors = idx.shape[2]
-        for first, last in _pieces(rows // neighbors, neighbors):
-            h, d = flat[first * neighbors : last * neighbors], dense[first * neighbors : last * neighbors]
-            torch.addmm(constant, h, mixed, alpha=-1, out=d)
-            kernels.scatter_pooled(
-                sparse[first:last].numpy(), where[first:last].numpy(), plain.numpy(),
-                h.view(-1, neighbors, c1).numpy(), d.view(-1, neighbors, c1).numpy(), parts.numpy(),
-            )  # fmt: skip
-            kernels.relu_norm_sums(d.numpy(), h.numpy(), *recover, sums.numpy())
-        grad_w2 = parts.sum(0) - torch.outer(u + v * bias2, total.float()) - v[:, None] * (weight2 @ gram.float())
-        grad_b1, grad_g1 = sums.sum(0).float()
-        first = _back_first(kernels, ctx.needs_input_grad, dense.view(*idx.shape, c1), idx, table, offset, weight1, bias1,
-                            mean1, inverse1, g1 * inverse1, grad_b1 / rows, grad_g1 / rows)  # fmt: skip
-        return None, *first, grad_g1, grad_b1, grad_g2, grad_b2, grad_w2, torch.zeros_like(bias2), None, None
+        shift = u + v * bias2
+        mixed, constant = (weight2 * -v[:, None]).t() @ weight2, -(shift @ weight2)
+        parts = _back_pool(ctx.first, (grad * scale2).contiguous(), where, weight2, mixed, constant)
+        grad_w2 = parts - torch.outer(shift, total.float()) - v[:, None] * (weight2 @ gram.float())
+        table, offset, weight1, bias1, grad_g1, grad_b1 = ctx.first.gradients()
+        return (None, None, None, table, offset, weight1, bias1, grad_g1, grad_b1, grad_g2, grad_b2,
+                grad_w2, torch.zeros_like(bias2), None, None)  # fmt: skip
 
 
-def _pieces(count: int, neighbors: int) -> list[tuple[int, int]]:
-    """Cut `count` centroids into ranges of about _PIECE rows."""
-    step = max(1, _PIECE // neighbors)
-    return [(first, min(first + step, count)) for first in range(0, count, step)]
+class _FromPositions:
+    """First layer on relative positions x alone: W x + b. Its statistics and gradients follow from moments of x."""
+
+    def __init__(self, points: Tensor, centers: Tensor, idx: Tensor, weight: Tensor, bias: Tensor) -> None:
+        self.kernels = parallel_kernels("kernels_grouped")
+        self.idx, self.rows, self.channels = idx, idx.numel(), len(bias)
+        self.arrays = (points.numpy(), centers.numpy(), idx.numpy())
+        self.weight, self.bias = weight.detach(), bias.detach()
+
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and biased variance (C) over all rows, and the kept moments of x."""
+        sums = torch.zeros(_BLOCKS, 9, dtype=torch.float64)
+        self.kernels.moments_xyz(*self.arrays, sums.numpy())
+        moments = sums.sum(0) / self.rows
+        self.mean = moments[:3]
+        square = moments[[3, 4, 5, 4, 6, 7, 5, 7, 8]].view(3, 3)
+        self.covariance = square - torch.outer(self.mean, self.mean)
+        weight = self.weight.double()
+        var = ((weight @ self.covariance) * weight).sum(1).clamp_min(0)
+        return (weight @ self.mean + self.bias).float(), var.float()
+
+    def fold(self, scale: Tensor, inverse: Tensor, shift: Tensor) -> None:
+        """Take batch norm into the weights: relu(scale * (W x + b - mean) + shift)."""
+        self.scale, self.inverse = scale, inverse
+        weight = self.weight * scale[:, None]
+        bias = shift - (weight.double() @ self.mean).float()
+        self.folded = (weight.t().contiguous().numpy(), bias.numpy())
+
+    def hidden(self, first: int, out: np.ndarray) -> None:
+        """The layer's activations of a piece (rows,C) from centroid `first` on."""
+        self.kernels.hidden_xyz(*self.arrays, *self.folded, first, out)
+
+    def begin_backward(self) -> None:
+        self.sums = torch.zeros(_SPLITS, 4, self.channels, dtype=torch.float64)
+
+    def back(self, grad: np.ndarray, hidden: np.ndarray, constant: np.ndarray, first: int) -> None:
+        """Take in a piece's gradient, constant to be added, that arrives at the activations `hidden`."""
+        self.kernels.back_xyz(grad, hidden, constant, *self.arrays, first, self.sums.numpy(),
+                              _width(self.channels, _SPLITS))  # fmt: skip
+
+    def gradients(self) -> tuple[Tensor | None, ...]:
+        """Of (table, offset, weight, bias, norm weight, norm bias); table and offset are not inputs here."""
+        total, moments = self.sums.sum(0)[0], self.sums.sum(0)[1:].t()
+        inverse, weight = self.inverse.double(), self.weight.double()
+        centered = moments - torch.outer(total, self.mean)
+        grad_norm = inverse * (weight * centered).sum(1)
+        spread = (inverse * grad_norm)[:, None] * (weight @ self.covariance)
+        grad_weight = self.scale[:, None] * (centered - spread)
+        return None, None, grad_weight.float(), torch.zeros_like(self.bias), grad_norm.float(), total.float()
+
+
+class _FromTable:
+    """First layer as a difference of projected points and centres: table[j] - offset[i], offset = W_x centre."""
+
+    def __init__(self, points, centers, idx, table: Tensor, offset: Tensor, weight: Tensor) -> None:
+        self.kernels = parallel_kernels("kernels_grouped")
+        self.idx, self.rows, self.channels = idx, idx.numel(), table.shape[2]
+        self.centers, self.weight_x = centers, weight.detach()[:, :3].t().contiguous()  # (3,C)
+        self.table, self.offset = table.contiguous(), offset.contiguous()
+
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and biased variance (C) over all rows."""
+        self.sums = torch.empty(self.idx.shape[0] * self.idx.shape[1], self.channels)
+        squares = torch.zeros(_BLOCKS, self.channels, dtype=torch.float64)
+        self.kernels.moments_table(self.table.numpy(), self.offset.numpy(), self.idx.numpy(), self.sums.numpy(),
+                                   squares.numpy())  # fmt: skip
+        mean = self.sums.sum(0, dtype=torch.float64) / self.rows
+        self.mean = mean.float()
+        return self.mean, (squares.sum(0) / self.rows - mean**2).clamp_min(0).float()
+
+    def fold(self, scale: Tensor, inverse: Tensor, shift: Tensor) -> None:
+        """Take batch norm into the table: relu(scale * (table - offset - mean) + shift)."""
+        self.scale, self.inverse = scale, inverse
+        self.folded = ((self.table * scale + (shift - self.mean * scale)).numpy(), (self.offset * scale).numpy())
+
+    def hidden(self, first: int, out: np.ndarray) -> None:
+        """The layer's activations of a piece (rows,C) from centroid `first` on."""
+        self.kernels.hidden_table(*self.folded, self.idx.numpy(), first, out)
+
+    def begin_backward(self) -> None:
+        self.to_table, self.to_offset = torch.zeros_like(self.table), torch.zeros_like(self.sums)
+
+    def back(self, grad: np.ndarray, hidden: np.ndarray, constant: np.ndarray, first: int) -> None:
+        """Take in a piece's gradient, constant to be added, that arrives at the activations `hidden`."""
+        self.kernels.back_table(grad, hidden, constant, self.idx.numpy(), first,
+                                self.to_table.numpy(), self.to_offset.numpy(), _width(self.channels))  # fmt: skip
+
+    def gradients(self) -> tuple[Tensor | None, ...]:
+        """Of (table, offset, weight, bias, norm weight, norm bias); weight and bias are reached through the table."""
+        neighbors = self.idx.shape[2]
+        reach = torch.zeros(*self.table.shape[:2], 4, dtype=torch.float64)
+        self.kernels.reach(self.idx.numpy(), self.centers.numpy(), reach.numpy())
+        total = self.to_offset.sum(0)
+        products = self._products(self.to_table, self.table, self.mean)
+        grad_norm = self.inverse * (products - self._products(self.to_offset, self.offset, torch.zeros_like(self.mean)))
+        t0, t1 = total / self.rows, self.inverse * grad_norm / self.rows
+        vectors = (self.mean.numpy(), self.scale.numpy(), t0.numpy(), t1.numpy())
+        self.kernels.back_norm(
+            self.to_table.numpy(), self.table.numpy(), reach.numpy(), self.weight_x.numpy(), *vectors
+        )
+        offset = self.scale * (neighbors * t0 + (self.sums - neighbors * self.mean) * t1 - self.to_offset)
+        return self.to_table, offset.view_as(self.offset), None, None, grad_norm, total
+
+    def _products(self, first: Tensor, second: Tensor, shift: Tensor) -> Tensor:
+        """Per channel the sum over all rows of first * (second - shift)."""
+        parts, shape = torch.zeros(_BLOCKS, self.channels, dtype=torch.float64), (-1, self.channels)
+        self.kernels.products(first.view(shape).numpy(), second.view(shape).numpy(), shift.numpy(), parts.numpy())
+        return parts.sum(0).float()
+
+
+def _width(channels: int, splits: int = 1) -> int:
+    """Channels per task, whole cache lines: every thread has a task, the rows being cut into `splits`. No sum depends on it."""
+    tasks = -(-torch.get_num_threads() // splits)
+    return max(16, -(-channels // tasks // 16) * 16)
+
+
+@dataclass
+class _Room:
+    """Where a piece's activations live, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
+
+    hidden: Tensor
+    wide: Tensor
+
+    def __post_init__(self) -> None:
+        self.arrays = (self.hidden.numpy(), self.wide.numpy())
+
+    def groups(self, neighbors: int) -> tuple[np.ndarray, np.ndarray]:
+        """The arrays as (centroids,K,C)."""
+        return tuple(array.reshape(-1, neighbors, array.shape[1]) for array in self.arrays)
+
+
+def _pieces(first: _FromPositions | _FromTable, widest: int) -> Iterator[tuple[slice, _Room]]:
+    """Centroids in ranges of about _PIECE bytes of activations, (rows,C1) and (rows,widest), which share their room."""
+    neighbors = first.idx.shape[2]
+    count = first.rows // neighbors
+    step = min(count, max(1, _PIECE // (4 * neighbors * (first.channels + widest))))
+    room = _Room(torch.empty(step * neighbors, first.channels), torch.empty(step * neighbors, widest))
+    for low in range(0, count, step):
+        if count - low < step:
+            rows = (count - low) * neighbors
+            room = _Room(room.hidden[:rows], room.wide[:rows])
+        yield slice(low, min(low + step, count)), room
+
+
+class _Moments:
+    """Of hidden layers h (rows,C) the Gram matrix h'h and the sum: float32 within a few pieces, float64 in all."""
+
+    def __init__(self, channels: int) -> None:
+        self.gram, self.total = (torch.zeros(shape, dtype=torch.float64) for shape in ((channels, channels), channels))
+        self.parts = torch.empty(channels, channels), torch.empty(1, channels)
+        self.ones, self.held = torch.ones(1, 0), 0
+
+    def add(self, hidden: Tensor) -> None:
+        """One more piece."""
+        if self.ones.shape[1] != len(hidden):
+            self.ones = torch.ones(1, len(hidden))
+        for part, left in zip(self.parts, (hidden.t(), self.ones)):
+            torch.addmm(part, left, hidden, beta=1 if self.held else 0, out=part)
+        self.held += 1
+        if self.held == _HELD:
+            self.flush()
+
+    def flush(self) -> None:
+        """Bring the float64 sums up to date."""
+        if self.held:
+            self.gram += self.parts[0]
+            self.total += self.parts[1][0]
+        self.held = 0
 
 
 def _pool_linear(
-    hidden: Tensor, scale: Tensor, shift: Tensor, weight: Tensor, bias: Tensor, sign: Tensor
+    first: _FromPositions | _FromTable, weight: Tensor, bias: Tensor, sign: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """First activation (in place), second linear layer and its pooling, piece by piece: the wide layer is never stored.
+    """Second linear layer and its pooling, piece by piece: neither layer's activations are ever stored.
 
-    Returns the extremes (M,C2) and their rows, and of the hidden layer h the Gram matrix h'h and the sum, in float64.
+    Returns the extremes (M,C2), largest where sign >= 0 and else smallest, and their rows i32, and of the hidden layer h
+    the Gram matrix h'h and the sum, in float64.
     """
-    kernels = parallel_kernels("kernels_grouped")
-    neighbors, c1, c2 = hidden.shape[2], hidden.shape[3], len(bias)
-    flat = hidden.view(-1, c1)
-    count = len(flat) // neighbors
-    best, where = torch.empty(count, c2), torch.empty(count, c2, dtype=torch.uint8)
-    gram, total = torch.zeros(c1, c1, dtype=torch.float64), torch.zeros(c1, dtype=torch.float64)
-    ones = torch.ones(1, _PIECE + neighbors)
-    buffer = torch.empty(max(last - first for first, last in _pieces(count, neighbors)) * neighbors, c2)
-    weight, bias = weight.detach().t(), bias.detach()
-    signs = torch.where(sign < 0, -1.0, 1.0).numpy()
-    for first, last in _pieces(count, neighbors):
-        h, y = flat[first * neighbors : last * neighbors], buffer[: (last - first) * neighbors]
-        kernels.affine_relu(h.numpy(), scale.numpy(), shift.numpy())
-        torch.addmm(bias, h, weight, out=y)
-        gram += h.t() @ h
-        total += (ones[:, : len(h)] @ h)[0]
-        kernels.extreme(y.view(-1, neighbors, c2).numpy(), signs, best[first:last].numpy(), where[first:last].numpy())
-    return best, where, gram, total
+    neighbors, c2 = first.idx.shape[2], len(bias)
+    count = first.rows // neighbors
+    best, where = torch.empty(count, c2), torch.empty(count, c2, dtype=torch.int32)
+    targets = (best.numpy(), where.numpy())
+    moments, signs = _Moments(first.channels), torch.where(sign < 0, -1.0, 1.0)
+    signed, width = (weight * signs[:, None]).t(), _width(c2)
+    for piece, room in _pieces(first, c2):
+        first.hidden(piece.start, room.arrays[0])
+        torch.mm(room.hidden, signed, out=room.wide)
+        moments.add(room.hidden)
+        first.kernels.largest(room.groups(neighbors)[1], *(array[piece] for array in targets), width)
+    moments.flush()
+    return best.mul_(signs).add_(bias), where, moments.gram, moments.total
+
+
+def _back_pool(
+    first: _FromPositions | _FromTable, sparse: Tensor, where: Tensor, weight: Tensor, mixed: Tensor, constant: Tensor
+) -> Tensor:
+    """Send d(linear output) = sparse (M,C2, at row `where`) and its affine part h -> h @ mixed + constant into `first`.
+
+    Returns the sparse part's share of the gradient of the weight, (C2,C1).
+    """
+    neighbors, c1 = first.idx.shape[2], first.channels
+    first.begin_backward()
+    splits = _SPLITS if neighbors <= 256 else 1  # few and large groups: each weight matrix is worth more than a copy
+    parts, width = torch.zeros(splits, *weight.shape), _width(c1, splits)
+    arrays, weight = (sparse.numpy(), where.numpy()), weight.detach().contiguous().numpy()
+    for piece, room in _pieces(first, c1):
+        first.hidden(piece.start, room.arrays[0])
+        torch.mm(room.hidden, mixed, out=room.wide)
+        grad = (array[piece] for array in arrays)
+        first.kernels.back_pooled(*grad, weight, *room.groups(neighbors), parts.numpy(), width)
+        first.back(*room.arrays[::-1], constant.numpy(), piece.start)
+    return parts.sum(0)
 
 
 def _linear_statistics(gram: Tensor, total: Tensor, rows: int, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and biased variance of W h + b over the rows, from h'h and sum(h): no pass over the wide layer."""
-    weight = weight.detach().double()
     mean = total / rows
-    covariance = gram / rows - torch.outer(mean, mean)
+    covariance = (gram / rows - torch.outer(mean, mean)).float()  # the cancellation is over: the rest in float32
     var = ((weight @ covariance) * weight).sum(1).clamp_min(0)
-    return (weight @ mean + bias.detach()).float(), var.float()
-
-
-def _back_first(kernels, needs, grad, idx, table, offset, weight1, bias1, mean, inverse, scale, t0, t1):
-    """Gradients of (table, offset, weight1, bias1) from the gradient after the first ReLU."""
-    statistics = (mean.numpy(), inverse.numpy(), scale.detach().numpy(), t0.numpy(), t1.numpy())
-    if weight1 is not None:
-        parts = torch.zeros(_BLOCKS, 3, len(bias1), dtype=torch.float64)
-        kernels.back_xyz(grad.numpy(), table.numpy(), offset.numpy(), idx.numpy(), weight1.detach().t().contiguous().numpy(),
-                         bias1.detach().numpy(), *statistics, parts.numpy())  # fmt: skip
-        return None, None, parts.sum(0).float().t().contiguous(), torch.zeros_like(bias1)
-    grad_table, grad_offset = torch.zeros_like(table), torch.zeros_like(offset)
-    kernels.back_gather(
-        grad.numpy(), table.numpy(), offset.numpy(), idx.numpy(), *statistics, grad_table.numpy(), grad_offset.numpy()
-    )
-    return grad_table, grad_offset, None, None
+    return torch.mv(weight.double(), mean).add_(bias).float(), var

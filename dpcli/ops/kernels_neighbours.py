@@ -191,6 +191,83 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, in
 
 
 @kernel
+def _frame_hits(x, y, z, low, high, cx, cy, cz, limit, block, row):
+    """As `_first_hits` among points low..high-1 of one frame, whose limit is the same for all."""
+    filled = 0
+    for first in range(low, high, _BLOCK):
+        size = min(_BLOCK, high - first)
+        if _measure(x, y, z, first, size, cx, cy, cz, block) >= limit:
+            continue
+        for i in range(size):  # written first, kept if a hit: a branch on every second point would be guessed wrong
+            row[filled] = first + i
+            filled += block[i] < limit
+            if filled == row.size:
+                return filled
+    return filled
+
+
+@kernel
+def _balanced_row(x, y, z, times, centroid, t, limits, shares, block, row):
+    """Fill one row by frames, from the earliest; returns the number of hits."""
+    reach = limits.size - 1
+    own = row[shares[:reach].sum() :][: shares[reach]]
+    total = _frame_share(x, y, z, times, centroid, t, limits[0], block, own)
+    start = 0
+    for i in range(shares.size):
+        part = row[start : start + shares[i]]
+        start += shares[i]
+        if i == reach:
+            continue
+        filled = _frame_share(x, y, z, times, centroid, t + i - reach, limits[abs(i - reach)], block, part)
+        total += filled
+        if filled == 0:
+            for slot in range(part.size):
+                part[slot] = own[slot % own.size]
+    return total
+
+
+@kernel
+def _frame_share(x, y, z, times, centroid, t, limit, block, part):
+    """The first hits of frame t, the first repeated in unused slots, -1 in all if there is none; returns how many."""
+    low, high = _lower_bound(times, t), _lower_bound(times, t + 1)
+    filled = _frame_hits(x, y, z, low, high, centroid[0], centroid[1], centroid[2], limit, block, part)
+    part[filled:] = part[0] if filled else -1
+    return filled
+
+
+@kernel
+def _balanced_clip(points, times, centroids, centroid_times, limits, shares, low_row, high_row, index, count):
+    in_order = _is_sorted(times)
+    order = np.empty(0, np.int64)
+    if not in_order:
+        order = np.argsort(times, kind="mergesort")  # stable: within a frame the lowest index stays first
+        points, times = points[order], times[order]
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    block = np.empty(_BLOCK + 1, np.float32)
+    for m in range(low_row, high_row):
+        row = index[m]
+        count[m] = _balanced_row(x, y, z, times, centroids[m], centroid_times[m], limits, shares, block, row)
+        for slot in range(row.size):
+            if row[slot] < 0:
+                row[slot] = 0
+            elif not in_order:
+                row[slot] = order[row[slot]]
+
+
+@kernel
+def balanced_query_kernel(points, times, centroids, centroid_times, limits, shares, index, count, first, last):
+    """As `ball_query_kernel`, but slots are shared among frames: shares (2R-1,) i64. points (B,N,3) f32."""
+    rows = centroids.shape[1]
+    while first < last:
+        b = first // rows
+        low, high = first - b * rows, min(last - b * rows, rows)
+        _balanced_clip(
+            points[b], times[b], centroids[b], centroid_times[b], limits, shares, low, high, index[b], count[b]
+        )
+        first += high - low
+
+
+@kernel
 def _box_bounds(box, cx, cy, cz, lower, upper):
     """Squared distances to the near and the far side of every box; returns the box with the closest far side.
 

@@ -68,7 +68,9 @@ def to_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
 
 def _check(source: Tensor, target: Tensor, weights: Tensor) -> None:
     if source.ndim != 3 or source.shape[-1] != 3 or source.shape != target.shape:
-        raise ValueError(f"source and target must both have shape (B,N,3): {tuple(source.shape)}, {tuple(target.shape)}")
+        raise ValueError(
+            f"source and target must both have shape (B,N,3): {tuple(source.shape)}, {tuple(target.shape)}"
+        )
     if weights.ndim != 3 or weights.shape[:2] != source.shape[:2]:
         raise ValueError(f"weights must have shape (B,N,S) for points {tuple(source.shape)}: {tuple(weights.shape)}")
 

@@ -64,7 +64,7 @@ def video_frames(path: Path, start: int = 0, stop: int | None = None, stride: in
                 ok, frame = capture.retrieve()
                 if not ok:
                     raise DataError(f"{path}: frame {index} cannot be decoded")
-                yield frame[..., 0] if frame.ndim == 3 else frame
+                yield np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
             index += 1
     finally:
         capture.release()

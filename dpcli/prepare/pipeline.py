@@ -6,6 +6,7 @@ import errno
 import hashlib
 import json
 import signal
+import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from typing import Any
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.thin import Thinning
-from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.pool import ordered_map, start_early
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seed import generator
@@ -99,6 +100,8 @@ def convert(
     if on_error not in ("skip", "stop"):
         raise UsageError(f"--on-error {on_error}: expected skip or stop")
     thinning = Thinning(points, sampling)
+    if jobs > 1:
+        start_early(_needed_by_workers(reader, thinning))
     items = reader.items()
     for line in reader.summary(items):
         log.info(line)
@@ -122,6 +125,14 @@ def convert(
             raise
         raise DpcError(f"{output}: no space left on the device; nothing was left under this name") from None
     return _count(report, output)
+
+
+def _needed_by_workers(reader: Reader, thinning: Thinning) -> list[str]:
+    """Modules that every worker imports and that take long: the main program's, the reader's, the sampling's."""
+    video = ["dpcli.prepare.warm_video"] if "dpcli.prepare.depth_files" in sys.modules else []
+    sampling = ["dpcli.prepare.warm_fps"] if thinning.points and thinning.sampling == "fps" else []
+    program = [name for name in ("dpcli.cli.app",) if name in sys.modules]
+    return [*program, type(reader).__module__, __name__, *video, *sampling]
 
 
 def _stream(

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import forkserver
@@ -39,17 +39,37 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
+def start_early(modules: Sequence[str]) -> None:
+    """Start the server that worker processes are forked from, with `modules` imported: once for all, while this goes on.
+
+    For what every worker needs and what takes long to import; a module that fails to import is left to the workers.
+    Without effect where the server runs already. The modules must start no threads: a fork would lose them.
+    """
+    multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
+    _ensure_server()
+
+
+def _ensure_server() -> None:
+    """The server ignores stop signals: if one killed it, its workers would be left behind for ever."""
+    before = {name: os.environ.get(name) for name in _SINGLE_THREAD}
+    os.environ.update({name: "1" for name in _SINGLE_THREAD})  # read by libraries as the server imports them
+    main = threading.current_thread() is threading.main_thread()
+    previous = [signal.signal(number, signal.SIG_IGN) for number in _STOPPING] if main else []
+    try:
+        forkserver.ensure_running()
+    finally:
+        for number, handler in zip(_STOPPING, previous):
+            signal.signal(number, handler)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
-    """Processes from a forkserver that ignores stop signals: if one killed it, its workers would be left behind for ever."""
-    context = multiprocessing.get_context("forkserver")
-    if threading.current_thread() is threading.main_thread():
-        previous = [signal.signal(number, signal.SIG_IGN) for number in _STOPPING]  # inherited by the server it starts
-        try:
-            forkserver.ensure_running()
-        finally:
-            for number, handler in zip(_STOPPING, previous):
-                signal.signal(number, handler)
-    return ProcessPoolExecutor(jobs, context, initializer=_start_worker)
+    _ensure_server()
+    return ProcessPoolExecutor(jobs, multiprocessing.get_context("forkserver"), initializer=_start_worker)
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:

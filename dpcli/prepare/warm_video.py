@@ -1,0 +1,10 @@
+"""Imported once by the server of worker processes: OpenCV, silenced. See `pool.start_early`."""
+
+from __future__ import annotations
+
+try:
+    from dpcli.prepare.depth_files import load_cv2
+
+    load_cv2()
+except Exception:  # a worker that needs it will say what is wrong
+    pass

@@ -1,0 +1,76 @@
+"""One door to every way of estimating flow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.errors import UsageError
+from dpcli.ops import fps_numpy, gather_points, knn
+from dpcli.segment.flow.bodies import Bodies, BodySearch, find_bodies
+
+METHODS = ("icp", "nearest")
+_FEWEST, _MOST = 16, 1024  # points of a frame that ICP works with
+
+
+def estimate_flow(points1: Tensor, points2: Tensor, method: str = "icp", *, device: str = "cpu") -> Tensor:
+    """Flow (B,N,3) f32 that takes points1 (B,N,3) to where they are in the second frame, points2 (B,M,3).
+
+    method "nearest": to the nearest point, ties to the lowest index. "icp": few rigid bodies found by propose and
+    verify (`find_bodies`), each point moved by its own. Anything else is the file or run folder of a trained estimator
+    (`dpc segment flow`), run on `device`. Deterministic; the result lies on the inputs' device and carries no gradient.
+    Raises UsageError for an unknown name, DataError for a damaged file, ValueError for shapes that don't fit.
+    """
+    if points1.ndim != 3 or points1.shape[-1] != 3 or points1.shape[::2] != points2.shape[::2]:
+        raise ValueError(f"points must be (B,N,3) and (B,M,3), but are {tuple(points1.shape)}, {tuple(points2.shape)}")
+    first, second = points1.detach().float(), points2.detach().float()
+    if method == "nearest":
+        _, nearest = knn(first, second, 1)
+        return gather_points(second, nearest[..., 0]) - first
+    if method == "icp":
+        pairs = zip(first.cpu().numpy(), second.cpu().numpy())
+        return torch.from_numpy(np.stack([body_flow(*pair) for pair in pairs])).to(points1.device)
+    if not Path(method).exists():
+        raise UsageError(f"--flow {method}: expected {', '.join(METHODS)}, or a trained estimator's file or folder")
+    from dpcli.segment.flow.model_file import trained_flow
+
+    return trained_flow(first, second, method, device)
+
+
+def body_flow(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> np.ndarray:
+    """Flow f32 (N,3) of the rigid bodies of points1 (N,3), found towards points2 (M,3); any unit of length.
+
+    Clouds of more than 1,024 points are thinned by farthest points for the search; every point then takes the body of
+    the nearest one kept. Below 16 points, or without extent, all points shift by the difference of the means.
+    """
+    found = rigid_bodies(points1, points2, search)
+    own = found.motion[found.label]
+    moved = np.einsum("nij,nj->ni", own[:, :, :3], points1.astype(np.float64)) + own[:, :, 3]
+    return (moved - points1).astype(np.float32)
+
+
+def rigid_bodies(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> Bodies:
+    """As `find_bodies`, for clouds of any size and unit: label i64 (N) of every point, motion f64 (K,3,4)."""
+    centre = points1.mean(0, dtype=np.float64)
+    size = 2 * np.sqrt(((points1 - centre) ** 2).sum(1).max())
+    if min(len(points1), len(points2)) < _FEWEST or not size > 0:
+        shift = points2.mean(0, dtype=np.float64) - centre
+        motion = np.concatenate([np.eye(3), shift[:, None]], 1)[None]
+        return Bodies(np.zeros(len(points1), np.int64), motion)
+    kept1, kept2 = _thinned(points1), _thinned(points2)
+    found = find_bodies((points1[kept1] - centre) / size, (points2[kept2] - centre) / size, search)
+    rotation = found.motion[:, :, :3]
+    offset = size * found.motion[:, :, 3] + centre - rotation @ centre
+    label = found.label
+    if len(kept1) < len(points1):
+        from scipy.spatial import cKDTree
+
+        label = label[cKDTree(points1[kept1]).query(points1)[1]]
+    return Bodies(label, np.concatenate([rotation, offset[:, :, None]], 2), found.energy, found.cost)
+
+
+def _thinned(points: np.ndarray) -> np.ndarray:
+    return np.arange(len(points)) if len(points) <= _MOST else fps_numpy(points, _MOST)
