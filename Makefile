@@ -49,7 +49,10 @@ demo: $(READY)
 	$(DPC) classify train $(DEMO)/clouds.h5 -o $(DEMO)/model $(DEMO_TRAIN)
 	$(DPC) classify predict $(DEMO)/clouds.h5 --model $(DEMO)/model -o $(DEMO)/scores.h5 --clips-per-video 3 --force
 	$(DPC) evaluate classification $(DEMO)/scores.h5 --split test --picture $(DEMO)/confusion.png
-	@echo "The pictures are $(DEMO)/clouds.png and $(DEMO)/confusion.png."
+	$(DPC) prepare synthetic articulated -o demo/objects.h5 --objects 11 --sequences-per-object 1 --force
+	$(DPC) segment predict demo/objects.h5 -o demo/parts.h5 --picture demo/parts.png --turntable demo/parts.gif --force
+	$(DPC) evaluate segmentation demo/parts.h5 --truth demo/objects.h5
+	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png and demo/parts.gif."
 
 test: $(READY)
 	$(BIN)/python -m pytest -q

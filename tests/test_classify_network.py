@@ -246,7 +246,7 @@ def test_the_global_head_in_training_is_batch_norm_written_out():
 def test_profile_splits_a_training_step_into_its_parts():
     result = measure(Kinet(KinetConfig(**TINY)).eval(), torch.device("cpu"), steps=True)
     step = result["static_step"]
-    assert 0 < step["matrix_products_share"] < 1 and set(step["ms_per_clip"]) == {
+    assert 0 < step["matrix_products_share"] <= 1 and set(step["ms_per_clip"]) == {
         "matrix_products",
         "neighbours",
         "other",

@@ -122,7 +122,10 @@ def predict(
         int, typer.Option(min=32, help="Points of a frame the segmenter sees; its answer is carried back to all.")
     ] = 512,
     no_vote: Annotated[bool, typer.Option("--no-vote", help="Don't blend masks of neighbouring frames.")] = False,
-    smallest: Annotated[float, typer.Option(min=0, help="Parts below this share of the points are given up.")] = 0.01,
+    no_split: Annotated[
+        bool, typer.Option("--no-split", help="Keep a part whole even if its points move as several bodies.")
+    ] = False,
+    smallest: Annotated[float, typer.Option(min=0, help="Parts below this share of the points are given up.")] = 0.03,
     split: Annotated[str, typer.Option("--split", help="Sequences of this split, or all.")] = "all",
     picture: Picture = None,
     turntable: Annotated[
@@ -143,7 +146,8 @@ def predict(
     if method is None and (parts is not None or method_option):
         raise UsageError("--parts and --method-option belong to --method; the network finds its own number of parts")
     options = dict(word.split("=", 1) if "=" in word else (word, "") for word in method_option or [])
-    refinement = {"points": points, "pairs": pairs, "icp": icp, "vote": not no_vote, "smallest": smallest}
+    divide = not no_split and method is None
+    refinement = {"points": points, "pairs": pairs, "icp": icp, "vote": not no_vote, "split": divide, "smallest": smallest}
     run_prediction(
         data, model or ("" if method else default_model()), output, method=method, method_options=options, num_parts=parts,
         flow=flow, refinement=refinement, split=split, seed=seed, device=device, force=force, picture=picture, ply=ply,

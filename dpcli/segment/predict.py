@@ -17,6 +17,7 @@ from dpcli.segment.matching import carry_mask, match_sequence, one_hot
 from dpcli.segment.network import PartNetwork
 from dpcli.segment.object_icp import object_icp
 from dpcli.segment.pairs import choose_points, sequence_scale
+from dpcli.segment.split_parts import split_by_motion
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
 
@@ -37,8 +38,9 @@ class Refinement:
     pairs: str = "adjacent"
     icp: int = 20
     vote: bool = True
-    smallest: float = 0.01
+    smallest: float = 0.03
     normalize: bool = True
+    split: bool = True  # slots whose points move apart are divided, see `split_by_motion`
 
 
 def network_segmenter(model: PartNetwork, device: torch.device) -> Segmenter:
@@ -78,6 +80,11 @@ def predict_parts(
     chain = [(t, t + 1) for t in range(len(thin) - 1)]
     flows = _flows(thin, [*pairs, *chain], estimate)
     masks = segmenter(thin, flows)
+    if options.split and len(thin) > 1:
+        masks = [
+            split_by_motion(cloud, flows[t, t + 1 if t + 1 < len(thin) else t - 1], mask)
+            for t, (cloud, mask) in enumerate(zip(thin, masks))
+        ]
     masks = _consistent(thin, flows, masks, options.vote)
     masks = _without_crumbs(masks, options.smallest)
     full = [_carried_back(cloud, few, mask) for cloud, few, mask in zip(whole, thin, masks)]
