@@ -143,7 +143,7 @@ def test_classical_methods_write_the_same_kind_of_file(dpc, data, tmp_path, meth
         (("predict", "DATA", "-o", "OUT", "--parts", "3"), 2, b"belong to --method"),
         (("predict", "DATA", "-o", "OUT", "--method", "ward", "--pairs", "some"), 2, b"adjacent or all"),
         (("predict", "DATA", "-o", "OUT", "--method", "ward", "--split", "none"), 3, b"no sequence of split"),
-        (("predict", "nothing.h5", "-o", "OUT", "--method", "ward"), 2, b"no such file"),
+        (("predict", "nothing.h5", "-o", "OUT", "--method", "ward"), 3, b"no such file"),
     ],
 )
 def test_mistakes_end_with_a_sentence(dpc, data, tmp_path, words, code, message):
@@ -157,8 +157,8 @@ def two_halves(frames, flows):
     """A segmenter that knows the answer of points in the order of `drawer`."""
     masks = []
     for frame in frames:
-        mask = torch.full((len(frame), 3), 0.01)
-        mask[: len(frame) // 2, 0], mask[len(frame) // 2 :, 2] = 0.98, 0.98
+        mask = torch.full((len(frame), 3), 1e-6)
+        mask[: len(frame) // 2, 0], mask[len(frame) // 2 :, 2] = 1 - 2e-6, 1 - 2e-6
         masks.append(mask)
     return masks
 
@@ -192,7 +192,7 @@ def test_motions_are_the_true_ones_in_the_inputs_own_coordinates(pairs):
     sequence.points = np.float32(sequence.points * 7 + [100, -50, 3])
     sequence.pose[:, :, :3, 3] = sequence.pose[:, :, :3, 3] * 7 + [100, -50, 3]
     scale = sequence_scale([sequence.frame(t) for t in range(3)])
-    options = Refinement(pairs=pairs, icp=0)
+    options = Refinement(pairs=pairs, icp=0, vote=False)  # where parts touch, a neighbour frame votes otherwise
     labels, sample = predict_parts(sequence, 0, two_halves, true_flows(sequence, scale), options, 0)
     assert rand_index(torch.tensor(labels), torch.tensor(np.int64(sequence.part))) == 1
     for (i, j), motion, flow in zip(sample.pairs, sample.motion, sample.flow):
@@ -200,7 +200,7 @@ def test_motions_are_the_true_ones_in_the_inputs_own_coordinates(pairs):
         assert np.abs(motion[[0, 2], :3, :3] - truth[:, :3, :3]).max() < 2e-3
         points = sequence.frame(i)
         moved = np.einsum("nij,nj->ni", truth[sequence.part[:60], :3, :3], points) + truth[sequence.part[:60], :3, 3]
-        assert np.abs(flow - (moved - points)).max() < 0.15  # 2 % of the mask is elsewhere
+        assert np.abs(flow - (moved - points)).max() < 1e-2  # of 7 units an object
 
 
 def test_poor_sequences_get_an_answer():
@@ -247,7 +247,7 @@ def test_the_right_masks_cost_less_than_wrong_ones_in_every_form(data):
         "even": torch.full_like(right, 0.25),
     }
     for form in ("blended", "per-part"):
-        objective = Objective(form=form)
+        objective = Objective(form=form, cold_start=0)
         best = float(pair_loss(Fixed(right), batch, objective, 0.0).loss)
         assert best < 1e-3
         for name, mask in wrong.items():
