@@ -51,7 +51,7 @@ demo: $(READY)
 	$(DPC) evaluate classification $(DEMO)/scores.h5 --split test --picture $(DEMO)/confusion.png
 	$(DPC) prepare synthetic articulated -o demo/objects.h5 --objects 11 --sequences-per-object 1 --force
 	$(DPC) segment predict demo/objects.h5 -o demo/parts.h5 --picture demo/parts.png --turntable demo/parts.gif --force
-	$(DPC) evaluate segmentation demo/parts.h5 --truth demo/objects.h5
+	$(DPC) evaluate segmentation demo/parts.h5 --truth demo/objects.h5 --split all
 	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png and demo/parts.gif."
 
 test: $(READY)
