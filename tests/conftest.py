@@ -26,6 +26,31 @@ def shared_data() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_file(shared_data: Path) -> Callable[[str], dict[str, np.ndarray]]:
+    """The arrays of a file of independent golden values, which lie beside the real data; skipped where those are not."""
+    folder = shared_data.parent / "golden"
+    if not folder.is_dir():
+        pytest.skip(f"no golden values at {folder}")
+
+    def load(name: str) -> dict[str, np.ndarray]:
+        with np.load(folder / name) as arrays:
+            return dict(arrays)
+
+    return load
+
+
+@pytest.fixture
+def one_thread():
+    """Small tensors: on a busy machine torch's threads wait for each other a hundred times longer than they work."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
 def dpc() -> Callable[..., subprocess.CompletedProcess]:
     """Run `dpc` as a process of its own; stdout and stderr come back as bytes."""
 

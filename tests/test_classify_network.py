@@ -187,10 +187,12 @@ def test_the_second_stage_takes_the_first_centroids_as_farthest_points():
 
 
 def test_shipped_models_load_and_have_a_card():
-    from dpcli.classify.model_file import SHIPPED, load_model, shipped_models
+    from dpcli.classify.model_file import SHIPPED, load_model
+    from dpcli.runtime.weights import shipped_models
 
-    assert shipped_models()
-    for name in shipped_models():
+    names = shipped_models(SHIPPED)
+    assert names
+    for name in names:
         model, info = load_model(name)
         assert model.config.num_classes == len(info.class_names) and not model.training
         card = (SHIPPED / f"{name}.md").read_text()
@@ -199,7 +201,7 @@ def test_shipped_models_load_and_have_a_card():
         with torch.no_grad():
             static, dynamic = model(body_like_clip(model.config.num_frames, model.config.points_per_frame))
         assert torch.isfinite(static).all() and torch.isfinite(dynamic).all()
-    with pytest.raises(UsageError, match=shipped_models()[0]):
+    with pytest.raises(UsageError, match=names[0]):
         load_model("nonesuch")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,18 +25,15 @@ from dpcli.evaluate.motion import (
 TOLERANCE = 1e-6
 
 
-def test_golden_cases_of_the_published_code(shared_data: Path) -> None:
-    path = shared_data.parent / "golden" / "seg_metrics.npz"
-    if not path.is_file():
-        pytest.skip(f"no golden values at {path}")
-    with np.load(path) as arrays:
-        cases = sorted({key[:6] for key in arrays.files})
-        for case in cases:
-            pairs = zip(arrays[f"{case}_pred_flow"], arrays[f"{case}_gt_flow"], strict=True)
-            metrics = motion_compute(motion_merge(flow_update(*pair) for pair in pairs))
-            found = metrics.shares[float(arrays[f"{case}_epe_norm_thresh"])]
-            values = [metrics.epe3d, found.accs, found.accr, found.outlier]
-            np.testing.assert_allclose(values, arrays[f"{case}_flow_scores"], atol=TOLERANCE, err_msg=case)
+def test_golden_cases_of_the_published_code(golden_file) -> None:
+    arrays = golden_file("seg_metrics.npz")
+    cases = sorted({key[:6] for key in arrays})
+    for case in cases:
+        pairs = zip(arrays[f"{case}_pred_flow"], arrays[f"{case}_gt_flow"], strict=True)
+        metrics = motion_compute(motion_merge(flow_update(*pair) for pair in pairs))
+        found = metrics.shares[float(arrays[f"{case}_epe_norm_thresh"])]
+        values = [metrics.epe3d, found.accs, found.accr, found.outlier]
+        np.testing.assert_allclose(values, arrays[f"{case}_flow_scores"], atol=TOLERANCE, err_msg=case)
     assert len(cases) >= 10
 
 

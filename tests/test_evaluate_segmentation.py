@@ -31,15 +31,11 @@ TOLERANCE = 1e-6
 
 
 @pytest.fixture(scope="module")
-def golden(shared_data: Path) -> dict[str, dict[str, np.ndarray]]:
+def golden(golden_file) -> dict[str, dict[str, np.ndarray]]:
     """Cases of the published metric code: inputs and outputs."""
-    path = shared_data.parent / "golden" / "seg_metrics.npz"
-    if not path.is_file():
-        pytest.skip(f"no golden values at {path}")
     cases: dict[str, dict[str, np.ndarray]] = {}
-    with np.load(path) as arrays:
-        for key in arrays.files:
-            cases.setdefault(key[:6], {})[key[7:]] = arrays[key]
+    for key, value in golden_file("seg_metrics.npz").items():
+        cases.setdefault(key[:6], {})[key[7:]] = value
     return cases
 
 

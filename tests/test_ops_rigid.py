@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -13,22 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from dpcli.ops import apply_motions, rigid_flow, to_matrix, weighted_kabsch
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small tensors: on a busy machine torch's threads wait for each other a hundred times longer than they work."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def golden(shared_data: Path) -> dict[str, torch.Tensor]:
-    path = shared_data.parent / "golden" / "multibody_ops.npz"
-    if not path.exists():
-        pytest.skip(f"no golden values at {path}")
-    return {key: torch.from_numpy(value) for key, value in np.load(path).items()}
+def golden(golden_file) -> dict[str, torch.Tensor]:
+    return {key: torch.from_numpy(value) for key, value in golden_file("multibody_ops.npz").items()}
 
 
 def scene(seed: int, count: int = 12, slots: int = 3, dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:

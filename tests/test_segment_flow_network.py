@@ -23,13 +23,7 @@ from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 TINY = FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbours=6, iterations=3)
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small tensors: on a busy machine torch's threads wait for each other a hundred times longer than they work."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def clouds(seed: int, count: int = 64) -> tuple[torch.Tensor, torch.Tensor]:
@@ -106,11 +100,8 @@ def test_chamfer_by_brute_force_and_its_gradient() -> None:
     assert not same.grad.any()
 
 
-def test_golden_chamfer(shared_data: Path) -> None:
-    path = shared_data.parent / "golden" / "multibody_ops.npz"
-    if not path.exists():
-        pytest.skip(f"no golden values at {path}")
-    golden = {key: torch.from_numpy(value) for key, value in np.load(path).items()}
+def test_golden_chamfer(golden_file) -> None:
+    golden = {key: torch.from_numpy(value) for key, value in golden_file("multibody_ops.npz").items()}
     ours = chamfer(golden["pc1"] + golden["flow"], golden["pc2"])
     torch.testing.assert_close(ours, golden["flow_chamfer"], rtol=0, atol=1e-6)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import permutations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,22 +22,12 @@ from dpcli.segment.losses import (
 from dpcli.segment.matching import assign, carry_mask, match_sequence, match_slots, one_hot, permute_slots, soft_iou
 from dpcli.segment.object_icp import object_icp
 
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Small tensors: on a busy machine torch's threads wait for each other a hundred times longer than they work."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
-def golden(shared_data: Path) -> dict[str, torch.Tensor]:
-    path = shared_data.parent / "golden" / "multibody_ops.npz"
-    if not path.exists():
-        pytest.skip(f"no golden values at {path}")
-    return {key: torch.from_numpy(value) for key, value in np.load(path).items()}
+def golden(golden_file) -> dict[str, torch.Tensor]:
+    return {key: torch.from_numpy(value) for key, value in golden_file("multibody_ops.npz").items()}
 
 
 def scene(seed: int = 0, count: int = 40, slots: int = 3, dtype: torch.dtype = torch.float64) -> tuple:

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.protocol import LeftOut
+from dpcli.evaluate.protocol import LeftOut, listing
 from dpcli.runtime.progress import Progress
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
-
-_SHOWN = 5  # names in a message
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,10 @@ class Comparison:
 
     def _same_names(self, unknown: list[str], unsaid: list[str]) -> None:
         if unknown:
-            raise DataError(f"{self.truth.path}: has no {_listing(unknown)}, which {self.predicted.path} has; "
+            raise DataError(f"{self.truth.path}: has no {listing(unknown)}, which {self.predicted.path} has; "
                             "was it predicted from another? --intersect compares what both have")  # fmt: skip
         if unsaid:
-            raise DataError(f"{self.predicted.path}: has no {_listing(unsaid)} of split {self.split!r} of "
+            raise DataError(f"{self.predicted.path}: has no {listing(unsaid)} of split {self.split!r} of "
                             f"{self.truth.path}; predict them too, or --intersect compares what both have")  # fmt: skip
 
     def _leave_out(self, reason: str, names: list[str]) -> None:
@@ -119,8 +117,3 @@ class Comparison:
 
 def _point(xyz: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.7g}" for value in xyz.tolist()) + ")"
-
-
-def _listing(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(repr(name) for name in names[:_SHOWN]) + more

@@ -100,14 +100,14 @@ def _matched_truth(scores: ScoresReader, truth: str | Path, split: str | None) -
     unknown = [name for name in scores.names if name not in where]
     if unknown:
         raise DataError(
-            f"{truth}: has no {_listing(unknown)}, which {scores.path} scores; was it predicted from another?"
+            f"{truth}: has no {listing(unknown)}, which {scores.path} scores; was it predicted from another?"
         )
     wanted = _counted(split, splits)
     scored = set(scores.names)
     unscored = [name for name, own in zip(names, splits, strict=True) if wanted in ("all", own) and name not in scored]
     if unscored:
         kind = "samples" if wanted == "all" else f"{wanted} samples"
-        raise DataError(f"{scores.path}: scores no {_listing(unscored)} among the {kind} of {truth}; "
+        raise DataError(f"{scores.path}: scores no {listing(unscored)} among the {kind} of {truth}; "
                         "predict them too, or choose another --split")  # fmt: skip
     rows = np.array([where[name] for name in scores.names], np.int64)
     labels = labels[rows].astype(np.int64)
@@ -128,7 +128,8 @@ def _same_classes(scores: ScoresReader, truth: str | Path, class_names: Sequence
     raise DataError(f"{truth}: class {label} is {ours!r}, in {scores.path} it is {theirs!r}")
 
 
-def _listing(names: Sequence[str]) -> str:
+def listing(names: Sequence[str]) -> str:
+    """A few names in quotes, and how many more there are."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return ", ".join(repr(name) for name in names[:_SHOWN]) + more
 

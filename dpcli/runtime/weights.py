@@ -41,6 +41,14 @@ def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str
     return tensors, header
 
 
+def load_state(model: torch.nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
+    """Put the tensors of a file into a model, in the model's precision. DataError when names or shapes differ."""
+    try:
+        model.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise DataError(f"{path}: weights don't fit the configuration: {str(error).splitlines()[1].strip()}") from None
+
+
 def shipped_models(folder: Path) -> list[str]:
     """Names of the models that come with the package; each has a card `NAME.md` beside it."""
     return sorted(path.stem for path in folder.glob("*.safetensors"))

@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import torch
-
-from dpcli.errors import DataError
-from dpcli.runtime.weights import find_weights, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.config import PartConfig
 from dpcli.segment.network import PartNetwork
 
@@ -27,8 +24,5 @@ def load_model(name: str) -> tuple[PartNetwork, dict]:
     path = find_weights(name, SHIPPED, _MAKER)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = PartNetwork(PartConfig.from_json(header["config"]))
-    try:
-        model.load_state_dict({key: value.to(torch.float32) for key, value in tensors.items()})
-    except RuntimeError as error:
-        raise DataError(f"{path}: weights don't fit the configuration: {str(error).splitlines()[1].strip()}") from None
+    load_state(model, tensors, path)
     return model.eval(), json.loads(header["notes"])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from dpcli.errors import UsageError
-from dpcli.ops import weighted_kabsch
+from dpcli.ops import apply_motions, weighted_kabsch
 from dpcli.segment.losses import (
     consensus_weights,
     dynamic_loss,
@@ -19,7 +19,7 @@ from dpcli.segment.losses import (
     supervised_loss,
 )
 from dpcli.segment.matching import match_slots, permute_slots
-from dpcli.segment.motion_head import rotation_loss
+from dpcli.segment.motion_head import quaternion_to_matrix, rotation_loss
 from dpcli.segment.network import FrameParts, PartNetwork
 from dpcli.segment.object_icp import object_icp
 from dpcli.segment.rigid_groups import rigid_groups
@@ -136,8 +136,6 @@ def _rigidity(
 
 
 def _weighted_dynamic(batch: Batch, mask: Tensor, rotation: Tensor, translation: Tensor, trust: Tensor) -> Tensor:
-    from dpcli.ops import apply_motions
-
     moved = apply_motions(batch.points, rotation, translation).detach()
     gap = torch.einsum("bns,bsnd->bnd", mask, moved) - (batch.points + batch.flow)
     return (trust * (gap.square().sum(-1) + 1e-12).sqrt()).mean()
@@ -207,8 +205,6 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
 def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
-    from dpcli.segment.motion_head import quaternion_to_matrix
-
     rotation = quaternion_to_matrix(torch.randn(half, 4, generator=rng)).to(points)
     rotation = torch.cat([rotation, rotation])
     return points @ rotation.mT, rotation

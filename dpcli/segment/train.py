@@ -164,14 +164,19 @@ class Trainer:
 
     def _batch(self, pairs: list[Pair], loaded: list[LoadedPair]) -> Batch:
         """Points, labels and the flows as they stand, estimated now where a pair is new."""
+        batch, flow = self._assemble(loaded, lambda i, frames: self._flow(pairs[i], frames))
+        self._compare(flow, loaded)
+        return batch
+
+    def _assemble(self, loaded: list[LoadedPair], estimate: Callable[[int, torch.Tensor], torch.Tensor]) -> tuple[Batch, torch.Tensor]:
+        """A batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames of pair i)."""
         points = torch.from_numpy(np.stack([pair.points for pair in loaded]))  # [B, 2, N, 3]
         if self.objective.supervised:
             flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
         else:
-            flow = torch.stack([self._flow(pair, frames) for pair, frames in zip(pairs, points)])
-        self._compare(flow, loaded)
+            flow = torch.stack([estimate(i, frames) for i, frames in enumerate(points)])
         part = torch.from_numpy(np.stack([pair.part for pair in loaded]))
-        return Batch(*(values.transpose(0, 1).flatten(0, 1).to(self.device) for values in (points, flow, part)))
+        return Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))), flow
 
     def _flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
         known = self.flows.get(pair.number)
@@ -245,13 +250,7 @@ class Trainer:
         batches = []
         for start in range(0, len(pairs), self.schedule.batch):
             loaded = [self.validation.load(pair) for pair in pairs[start : start + self.schedule.batch]]
-            points = torch.from_numpy(np.stack([pair.points for pair in loaded]))
-            if self.objective.supervised:
-                flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
-            else:
-                flow = torch.stack([torch.stack(self.estimate(*frames)) for frames in points])
-            part = torch.from_numpy(np.stack([pair.part for pair in loaded]))
-            batches.append(Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))))
+            batches.append(self._assemble(loaded, lambda _, frames: torch.stack(self.estimate(*frames)))[0])
         return batches
 
     def _save(self) -> None:

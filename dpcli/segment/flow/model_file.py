@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.errors import DataError
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.weights import find_weights, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.flow.config import FlowConfig
 from dpcli.segment.flow.network import FlowNetwork
 
@@ -36,10 +35,7 @@ def load_flow_model(name: str) -> tuple[FlowNetwork, dict]:
 def _loaded(path: Path, _changed: int) -> tuple[FlowNetwork, dict]:
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = FlowNetwork(FlowConfig.from_json(header["config"]))
-    try:
-        model.load_state_dict(tensors)
-    except RuntimeError as error:
-        raise DataError(f"{path}: weights don't fit the configuration: {str(error).splitlines()[1].strip()}") from None
+    load_state(model, tensors, path)
     return model.eval(), json.loads(header["notes"])
 
 
