@@ -1,0 +1,38 @@
+"""Pinhole cameras on an orbit: one convention for data readers, fitting, rendering and scoring.
+
+World: right-handed, y up. Azimuth 0 looks from +z, positive azimuth moves towards +x; positive elevation moves up (+y).
+Cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Angles in radians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+DEFAULT_RADIUS = 2.0  # of a camera nobody knows: what Zero123-type models assume (SC4D, DreamGaussian)
+DEFAULT_FOVY = np.deg2rad(49.1)
+
+
+def orbit_pose(azimuth: float, elevation: float, radius: float = DEFAULT_RADIUS) -> np.ndarray:
+    """world_to_camera f64 (4,4) of a camera at (azimuth, elevation, radius) that looks at the origin, upright."""
+    position = radius * np.array(
+        [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
+    )
+    forward = -position / np.linalg.norm(position)
+    right = np.array([np.cos(azimuth), 0.0, -np.sin(azimuth)])  # stays defined straight above and below
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    return pose
+
+
+def orbit_of(world_to_camera: np.ndarray) -> tuple[float, float, float]:
+    """(azimuth, elevation, radius) of a camera's centre; the inverse of `orbit_pose` for cameras that look at the origin."""
+    x, y, z = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
+    radius = float(np.sqrt(x * x + y * y + z * z))
+    return float(np.arctan2(x, z)), float(np.arcsin(y / radius)) if radius else 0.0, radius
+
+
+def pinhole(fovy: float, width: int, height: int) -> np.ndarray:
+    """intrinsics f64 (3,3) of a centred pinhole camera with square pixels; fovy: vertical field of view."""
+    focal = 0.5 * height / np.tan(0.5 * fovy)
+    return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
