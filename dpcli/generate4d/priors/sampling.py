@@ -1,0 +1,27 @@
+"""Random new cameras for a prior to judge."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.generate4d.targets import Targets
+from dpcli.ops.cameras import orbit_of, orbit_pose
+
+_ELEVATION = np.deg2rad(30.0)  # offsets drawn from +-30 degrees, azimuth from all around (SC4D)
+
+
+def novel_cameras(
+    targets: Targets, count: int, size: int, rng: torch.Generator
+) -> tuple[list[tuple[float, float, float]], Tensor, Tensor]:
+    """(azimuth, elevation, radius) offsets from the reference, world_to_camera (count,4,4), intrinsics (count,3,3)."""
+    azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
+    drawn = torch.rand(count, 2, generator=rng).numpy()
+    offsets = [(float((a * 2 - 1) * np.pi), float((e * 2 - 1) * _ELEVATION), 0.0) for a, e in drawn]
+    poses = np.stack([orbit_pose(azimuth + a, np.clip(elevation + e, -1.5, 1.5), radius) for a, e, _ in offsets])
+    matrix = targets.intrinsics[targets.reference].copy()
+    matrix[:2] *= size / max(targets.size)
+    matrix[:2, 2] = size / 2
+    intrinsics = torch.from_numpy(matrix).float().expand(count, 3, 3)
+    return offsets, torch.from_numpy(poses).float(), intrinsics

@@ -1,0 +1,98 @@
+"""The pictures a fit has to match, as tensors at the size of the moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.errors import DataError
+from dpcli.store.views import ViewsReader
+
+
+@dataclass
+class Targets:
+    """Pictures of V views by T frames, their cameras and times; colour is multiplied by alpha.
+
+    pictures: f16 (V,T,S,S',4); intrinsics f64 (V,3,3) for that size; reference: the index of the input view among them.
+    """
+
+    name: str
+    pictures: Tensor
+    intrinsics: np.ndarray
+    world_to_camera: np.ndarray
+    seconds: np.ndarray
+    reference: int
+    length_unit: str = ""
+    history: list[dict] = field(default_factory=list)  # provenance of the file
+
+    @property
+    def num_views(self) -> int:
+        return self.pictures.shape[0]
+
+    @property
+    def num_frames(self) -> int:
+        return self.pictures.shape[1]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)"""
+        return self.pictures.shape[3], self.pictures.shape[2]
+
+    def times(self) -> Tensor:
+        """Frame times in 0..1, what the networks are asked."""
+        return torch.linspace(0, 1, self.num_frames) if self.num_frames > 1 else torch.zeros(1)
+
+    def at(self, views: list[int], frames: list[int], shrink: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+        """Pictures f32 (C,H,W,4), intrinsics (C,3,3) and world_to_camera (C,4,4) of (view, frame) pairs, 1/shrink the size."""
+        chosen = self.pictures[views, frames].float()
+        matrices = torch.from_numpy(self.intrinsics[views]).float()
+        if shrink > 1:
+            chosen = torch.nn.functional.avg_pool2d(chosen.permute(0, 3, 1, 2), shrink).permute(0, 2, 3, 1).contiguous()
+            matrices = matrices.clone()
+            matrices[:, :2] /= shrink
+        return chosen, matrices, torch.from_numpy(self.world_to_camera[views]).float()
+
+    def picture(self, view: int, frame: int) -> np.ndarray:
+        """f32 (H,W,4) with straight colour, 0..1."""
+        value = self.pictures[view, frame].float().numpy().copy()
+        value[..., :3] /= np.maximum(value[..., 3:], 1e-3)
+        return value.clip(0, 1)
+
+
+def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
+    """The views of a file that have one of the roles, resized so that the longer side has `size` pixels (never enlarged).
+
+    DataError when the reference view is empty in every frame.
+    """
+    with ViewsReader(path) as reader:
+        header = reader.header
+        chosen = [view for view, role in enumerate(header.role) if role in roles or view == header.reference]
+        scale = min(1.0, size / max(header.size))
+        width, height = (max(int(round(side * scale)), 1) for side in header.size)
+        pictures = torch.empty(len(chosen), reader.num_frames, height, width, 4, dtype=torch.float16)
+        for row, view in enumerate(chosen):
+            for frame in range(reader.num_frames):
+                pictures[row, frame] = _resize(reader.rgba(view, frame), width, height)
+        factor = np.array([width / header.size[0], height / header.size[1], 1.0])[:, None]
+        reference = chosen.index(header.reference)
+        if not pictures[reference, :, :, :, 3].any():
+            raise DataError(f"{path}: the reference view shows nothing in any frame (alpha is zero); prepare the clip again")
+        return Targets(
+            header.name, pictures, np.asarray(header.intrinsics)[chosen] * factor,
+            np.asarray(header.world_to_camera)[chosen], np.asarray(header.time), reference, header.length_unit,
+            list(reader.provenance),
+        )  # fmt: skip
+
+
+def _resize(rgba: np.ndarray, width: int, height: int) -> Tensor:  # [H, W, 4]
+    """Colour times alpha and alpha, area-averaged to the size."""
+    value = torch.from_numpy(rgba).float() / 255
+    value[..., :3] *= value[..., 3:]
+    if rgba.shape[:2] == (height, width):
+        return value
+    stacked = value.permute(2, 0, 1)[None]
+    return torch.nn.functional.interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0)
