@@ -18,6 +18,7 @@ from dpcli.generate4d.model import Model4D
 from dpcli.generate4d.preview import write_preview
 from dpcli.generate4d.scene_out import to_scene
 from dpcli.generate4d.targets import Targets, load_targets
+from dpcli.ops.cameras import orbit_of
 from dpcli.runtime import provenance
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
@@ -89,7 +90,8 @@ def _prior(name: str, model: str | None, targets: Targets, device: str):
 
     from dpcli.generate4d.priors.zero123 import Zero123
 
-    prior = Zero123.load(model, device)
+    elevation = orbit_of(targets.world_to_camera[targets.reference])[1]
+    prior = Zero123.load(model, device, reference_elevation=elevation)
     frames = [targets.picture(targets.reference, frame) for frame in range(targets.num_frames)]
     prior.prepare(np.stack([(frame * 255).round().astype(np.uint8) for frame in frames]))
     return prior

@@ -18,8 +18,9 @@ def novel_cameras(
     """(azimuth, elevation, radius) offsets from the reference, world_to_camera (count,4,4), intrinsics (count,3,3)."""
     azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
     drawn = torch.rand(count, 2, generator=rng).numpy()
-    offsets = [(float((a * 2 - 1) * np.pi), float((e * 2 - 1) * _ELEVATION), 0.0) for a, e in drawn]
-    poses = np.stack([orbit_pose(azimuth + a, np.clip(elevation + e, -1.5, 1.5), radius) for a, e, _ in offsets])
+    heights = np.clip(elevation + (drawn[:, 1] * 2 - 1) * _ELEVATION, -1.5, 1.5)  # never straight above or below
+    offsets = [(float((a * 2 - 1) * np.pi), float(e - elevation), 0.0) for a, e in zip(drawn[:, 0], heights)]
+    poses = np.stack([orbit_pose(azimuth + a, elevation + e, radius) for a, e, _ in offsets])
     matrix = targets.intrinsics[targets.reference].copy()
     matrix[:2] *= size / max(targets.size)
     matrix[:2, 2] = size / 2

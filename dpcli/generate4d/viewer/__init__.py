@@ -1,0 +1,115 @@
+"""One HTML file that shows a scene: page, scripts and quantised data in it; no server, no network."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+import zlib
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli import __version__
+from dpcli.errors import DataError
+from dpcli.generate4d.colours import WEIGHTS, part_colours
+from dpcli.generate4d.paths import clip_rate
+from dpcli.ops.cameras import orbit_of
+from dpcli.store.gaussians import GaussianScene
+
+SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")
+_POSITIONS, _TURNS, _BYTE = 65535, 127, 255  # steps of a coordinate in the box, of a quaternion's number, of a fraction
+
+
+def write_page(
+    scene: GaussianScene, path: Path, *, title: str, history: Sequence[dict] = (), fps: float | None = None
+) -> int:
+    """Write the page; returns its size in bytes. DataError when it can't be written.
+
+    Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colours, opacities and weights
+    to 1/255; colour terms that depend on the direction are left out. Equal scenes give equal bytes.
+    """
+    arrays = packed(scene)
+    blob = b"".join(values.tobytes() for values in arrays.values())
+    header = describe(scene, arrays, title=title, history=history, fps=fps or clip_rate(scene))
+    page = _filled(title, header, base64.b64encode(zlib.compress(blob, 9)).decode("ascii")).encode("utf-8")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_bytes(page)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+    return len(page)
+
+
+def _filled(title: str, header: dict[str, Any], data: str) -> str:
+    source = files(__package__)
+    script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
+    inside = json.dumps(header, allow_nan=False, sort_keys=True).replace("<", "\\u003c")  # nothing may end the script
+    page = source.joinpath("page.html").read_text(encoding="utf-8")
+    for mark, content in (("TITLE", html.escape(title)), ("HEADER", inside), ("SCRIPT", script), ("DATA", data)):
+        before, after = page.split(f"<!--{mark}-->", 1)
+        page = before + content + after
+    return page
+
+
+def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest corner and extent (3) of all means of all frames; an extent is never 0."""
+    low, high = scene.frame_mean.min((0, 1)).astype(np.float64), scene.frame_mean.max((0, 1)).astype(np.float64)
+    return low, np.maximum(high - low, 1e-9)
+
+
+def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
+    """What the page reads, in its order. Moving things are differences to the frame before, which compress better;
+    bytes of 16-bit numbers lie apart, low bytes first: position u8 (2,T,3,N), turn u8 (T,4,N), weight u8 (T,N), scale
+    f32 (3,N), colour u8 (4,N) with opacity, part u8 (N) = id + 1."""
+    low, extent = _box(scene)
+    steps = np.rint((scene.frame_mean - low) / extent * _POSITIONS).astype(np.uint16).transpose(0, 2, 1)
+    change = _differences(steps)
+    turns = np.rint(_continuous(scene.frame_quaternion) * _TURNS).astype(np.int8).view(np.uint8).transpose(0, 2, 1)
+    weight = np.rint(np.clip(scene.rigid_weight, 0, 1) * _BYTE).astype(np.uint8)
+    rgba = np.concatenate([scene.color.T, np.rint(scene.opacity * _BYTE).astype(np.uint8)[None]])
+    return {
+        "position": np.stack([(change & 255).astype(np.uint8), (change >> 8).astype(np.uint8)]),
+        "turn": _differences(turns), "weight": _differences(weight), "scale": scene.scale.T.astype("<f4"), "colour": rgba,
+        "part": np.clip(scene.part + 1, 0, 255).astype(np.uint8),
+    }  # fmt: skip
+
+
+def _differences(values: np.ndarray) -> np.ndarray:
+    """Each frame minus the one before, modulo the type; the first as it is. Contiguous."""
+    return np.concatenate([values[:1], values[1:] - values[:-1]])
+
+
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """(T,N,4) with signs such that no Gaussian jumps from q to -q between frames."""
+    flips = np.where((quaternions[1:] * quaternions[:-1]).sum(-1, keepdims=True) < 0, -1.0, 1.0)
+    return quaternions * np.concatenate([np.ones_like(flips[:1]), np.cumprod(flips, 0)])
+
+
+def describe(
+    scene: GaussianScene, arrays: dict[str, np.ndarray], *, title: str, history: Sequence[dict], fps: float
+) -> dict[str, Any]:
+    """The page's header: counts, where each array begins, camera, parts, provenance."""
+    low, extent = _box(scene)
+    lens, pose = scene.camera_intrinsics[scene.reference], scene.camera_world_to_camera[scene.reference]
+    azimuth, elevation, radius = orbit_of(pose)
+    starts = np.cumsum([0, *(values.nbytes for values in arrays.values())]).tolist()
+    ids, counts = np.unique(scene.part, return_counts=True)
+    return {
+        "title": title, "version": __version__, "count": scene.num_gaussians, "frames": scene.num_frames,
+        "time": scene.time.tolist(), "rate": fps / clip_rate(scene), "tail": 1 / clip_rate(scene),
+        "low": low.tolist(), "extent": extent.tolist(), "starts": dict(zip(arrays, starts)), "bytes": starts[-1],
+        "camera": {"azimuth": azimuth, "elevation": elevation, "radius": radius,
+                   "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1]))},
+        "parts": [{"id": int(i), "count": int(c), "colour": part_colours(np.array([i]))[0].tolist()}
+                  for i, c in zip(ids, counts)],
+        "weights": WEIGHTS.tolist(), "metrics": scene.metrics, "sh_degree": scene.sh_degree,
+        "control_points": len(scene.control_point),
+        "history": [{key: entry.get(key) for key in ("command", "version", "seed")} for entry in history],
+    }  # fmt: skip

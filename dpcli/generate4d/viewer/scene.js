@@ -1,0 +1,127 @@
+// The scene: unpacking what the page carries, Gaussians at a time, their order from far to near.
+
+async function unpacked(text, bytes) {
+  const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const whole = new Uint8Array(await new Response(stream).arrayBuffer());
+  if (whole.length !== bytes) throw new Error(`the page is damaged: ${whole.length} bytes of data, expected ${bytes}`);
+  return whole;
+}
+
+// Frames are stored as differences to the frame before, modulo the type's range; typed arrays wrap by themselves.
+function summed(values, frame) {
+  for (let i = frame; i < values.length; i++) values[i] += values[i - frame];
+  return values;
+}
+
+class Scene {
+  constructor(header, blob) {
+    const { count, frames, starts } = header;
+    const cut = (name, length) => blob.slice(starts[name], starts[name] + length);
+    Object.assign(this, { header, count, frames, time: header.time });
+    const bytes = cut("position", 6 * frames * count), planes = 3 * frames * count;
+    const position = new Uint16Array(planes);
+    for (let i = 0; i < planes; i++) position[i] = bytes[i] | (bytes[planes + i] << 8);
+    this.position = summed(position, 3 * count);
+    this.turn = summed(new Int8Array(cut("turn", 4 * frames * count).buffer), 4 * count);
+    this.weight = summed(cut("weight", frames * count), count);
+    this.scale = new Float32Array(cut("scale", 12 * count).buffer);
+    this.colour = cut("colour", 4 * count);
+    this.part = cut("part", count);
+    this.mean = new Float32Array(3 * count);
+    this.covariance = new Float32Array(6 * count);
+    this.order = new Uint32Array(count);
+    this.buckets = new Uint32Array(65537);
+    this.depth = new Uint16Array(count);
+    this.now = NaN;
+  }
+
+  get start() { return this.time[0]; }
+  get length() { return this.time[this.frames - 1] - this.time[0]; }
+
+  // The frames around a time, and the weight of the later one.
+  between(time) {
+    let b = this.time.findIndex((value) => value > time);
+    if (b === 0) return [0, 0, 0];
+    if (b < 0) return [this.frames - 1, this.frames - 1, 0];
+    return [b - 1, b, (time - this.time[b - 1]) / (this.time[b] - this.time[b - 1])];
+  }
+
+  moveTo(time) {
+    if (time === this.now) return;
+    this.now = time;
+    const { count, position, turn, scale, mean, covariance, header } = this;
+    const [a, b, w] = this.between(time), step = header.extent.map((length) => length / 65535);
+    for (let axis = 0; axis < 3; axis++) {
+      const one = (3 * a + axis) * count, two = (3 * b + axis) * count;
+      for (let i = 0; i < count; i++)
+        mean[3 * i + axis] = header.low[axis] + step[axis] * ((1 - w) * position[one + i] + w * position[two + i]);
+    }
+    const q = [0, 0, 0, 0];
+    for (let i = 0; i < count; i++) {
+      let norm = 0;
+      for (let k = 0; k < 4; k++) {
+        q[k] = (1 - w) * turn[(4 * a + k) * count + i] + w * turn[(4 * b + k) * count + i];
+        norm += q[k] * q[k];
+      }
+      norm = Math.sqrt(norm) || 1;
+      this.spread(i, q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm, scale[i], scale[count + i], scale[2 * count + i]);
+    }
+  }
+
+  // Covariance R diag(s^2) R^T of Gaussian i: xx xy xz yy yz zz.
+  spread(i, w, x, y, z, s0, s1, s2) {
+    const a0 = (1 - 2 * (y * y + z * z)) * s0, a1 = 2 * (x * y - w * z) * s1, a2 = 2 * (x * z + w * y) * s2;
+    const b0 = 2 * (x * y + w * z) * s0, b1 = (1 - 2 * (x * x + z * z)) * s1, b2 = 2 * (y * z - w * x) * s2;
+    const c0 = 2 * (x * z - w * y) * s0, c1 = 2 * (y * z + w * x) * s1, c2 = (1 - 2 * (x * x + y * y)) * s2;
+    const out = this.covariance, o = 6 * i;
+    out[o] = a0 * a0 + a1 * a1 + a2 * a2; out[o + 1] = a0 * b0 + a1 * b1 + a2 * b2; out[o + 2] = a0 * c0 + a1 * c1 + a2 * c2;
+    out[o + 3] = b0 * b0 + b1 * b1 + b2 * b2; out[o + 4] = b0 * c0 + b1 * c1 + b2 * c2; out[o + 5] = c0 * c0 + c1 * c1 + c2 * c2;
+  }
+
+  // Indices of the Gaussians that are shown, far to near along `forward`: a counting sort over 65536 depths.
+  sorted(forward, hidden) {
+    const { count, mean, part, order, buckets, depth } = this;
+    let low = Infinity, high = -Infinity;
+    const along = this.along || (this.along = new Float32Array(count));
+    for (let i = 0; i < count; i++) {
+      const d = mean[3 * i] * forward[0] + mean[3 * i + 1] * forward[1] + mean[3 * i + 2] * forward[2];
+      along[i] = d;
+      if (d < low) low = d;
+      if (d > high) high = d;
+    }
+    const factor = 65535 / Math.max(high - low, 1e-9);
+    buckets.fill(0);
+    for (let i = 0; i < count; i++) {
+      if (hidden.has(part[i])) continue;
+      depth[i] = 65535 - (along[i] - low) * factor;
+      buckets[depth[i] + 1]++;
+    }
+    for (let k = 1; k < buckets.length; k++) buckets[k] += buckets[k - 1];
+    let shown = 0;
+    for (let i = 0; i < count; i++) {
+      if (hidden.has(part[i])) continue;
+      order[buckets[depth[i]]++] = i;
+      shown++;
+    }
+    return order.subarray(0, shown);
+  }
+
+  // r g b a (0..255) of all Gaussians.
+  colours(kind) {
+    const { count, colour, part, header } = this, out = this.rgba || (this.rgba = new Uint8ClampedArray(4 * count));
+    const byPart = new Map(header.parts.map((one) => [one.id + 1, one.colour]));
+    const [a, b, w] = this.between(this.now), stops = header.weights.length - 1;
+    for (let i = 0; i < count; i++) {
+      let rgb;
+      if (kind === "part") rgb = byPart.get(part[i]);
+      else if (kind === "rigid") {
+        const value = ((1 - w) * this.weight[a * count + i] + w * this.weight[b * count + i]) / 255 * stops;
+        const k = Math.min(Math.floor(value), stops - 1), f = value - k, one = header.weights[k], two = header.weights[k + 1];
+        rgb = [one[0] + f * (two[0] - one[0]), one[1] + f * (two[1] - one[1]), one[2] + f * (two[2] - one[2])];
+      } else rgb = [colour[i], colour[count + i], colour[2 * count + i]];
+      out[4 * i] = rgb[0]; out[4 * i + 1] = rgb[1]; out[4 * i + 2] = rgb[2]; out[4 * i + 3] = colour[3 * count + i];
+    }
+    return out;
+  }
+}
