@@ -27,7 +27,13 @@ def _rotations(count: int, seed: int) -> tuple[torch.Tensor, np.ndarray]:
 def _field(**switches) -> MotionField:
     torch.manual_seed(0)
     field = MotionField(3, 16, 3, **switches)
-    for head in (field.deformation_shift, field.deformation_turn, field.movement_turn, field.movement_shift, field.weighing_head):
+    for head in (
+        field.deformation_shift,
+        field.deformation_turn,
+        field.movement_turn,
+        field.movement_shift,
+        field.weighing_head,
+    ):
         torch.nn.init.normal_(head.weight, std=0.2)
     return field
 
@@ -66,7 +72,9 @@ def test_the_blend_is_equation_5_6_with_the_displacement():
     alone = _field(rigid=False)(points, TIMES).displacement
     for b in range(3):
         for n in range(5):
-            moved = sum(motion.part[b, n, s] * (matrix[b, s, :3, :3] @ points[n] + matrix[b, s, :3, 3]) for s in range(3))
+            moved = sum(
+                motion.part[b, n, s] * (matrix[b, s, :3, :3] @ points[n] + matrix[b, s, :3, 3]) for s in range(3)
+            )
             w = motion.weight[b, n]
             torch.testing.assert_close(motion.displacement[b, n], w * (moved - points[n]) + (1 - w) * alone[b, n])
             assert not torch.allclose(motion.displacement[b, n], w * moved + (1 - w) * alone[b, n], atol=1e-3)
@@ -173,7 +181,10 @@ def test_gradients_through_skinning_are_those_of_finite_differences():
         control.__dict__["_parameters"].update(position=position, log_radius=radius)
         return control.carry(points, nearest, _motion(normalise(torch.cat([turn[..., :1] * 0 + 1, turn], -1)), shift))
 
-    position, radius = control.position.detach().clone().requires_grad_(), control.log_radius.detach().clone().requires_grad_()
+    position, radius = (
+        control.position.detach().clone().requires_grad_(),
+        control.log_radius.detach().clone().requires_grad_(),
+    )
     assert torch.autograd.gradcheck(outputs, (points, turn, shift, position, radius))
 
 
@@ -185,4 +196,6 @@ def test_arap_is_zero_for_rigid_motions_and_sees_a_stretch():
     rigid = torch.stack([_rigid_motion(points, q, torch.ones(3)) for q in turn])
     assert arap_loss(points, rigid, neighbours) < 1e-9
     assert arap_loss(points, points[None] * torch.tensor([1.0, 1.5, 1.0]), neighbours) > 1e-2
-    assert arap_loss(points, points[None] * torch.tensor([-1.0, 1.0, 1.0]), neighbours) > 1e-2  # a mirror is no rotation
+    assert (
+        arap_loss(points, points[None] * torch.tensor([-1.0, 1.0, 1.0]), neighbours) > 1e-2
+    )  # a mirror is no rotation

@@ -59,7 +59,9 @@ def test_the_hull_is_inside_every_silhouette_and_takes_the_near_colour():
     back[..., :3] = [0, 0, 1]
     points, colours = hull([front, back], intrinsics, poses, 800, RNG)
     near, far = points[:, 2] > 0.3, points[:, 2] < -0.3
-    assert len(points) == 800 and (colours[near, 0] > colours[near, 2]).all() and (colours[far, 2] > colours[far, 0]).all()
+    assert (
+        len(points) == 800 and (colours[near, 0] > colours[near, 2]).all() and (colours[far, 2] > colours[far, 0]).all()
+    )
     side = np.stack([orbit_pose(0, 0), orbit_pose(np.pi / 2, 0)])
     off = np.roll(_disc(64, 4), 28, axis=0)
     with pytest.raises(DataError, match="no point in common"):

@@ -111,8 +111,8 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
 def test_other_kinds_are_listed_by_their_data_sets(tmp_path: Path) -> None:
     path = tmp_path / "v.h5"
     with h5py.File(path, "w") as file:
-        file.attrs.update({"dpc_kind": "views", "dpc_schema": 1, "dpc_version": "9"})
-        file.create_dataset("rgba", data=np.zeros((1, 2, 4, 4, 4), np.uint8))
+        file.attrs.update({"dpc_kind": "gaussians", "dpc_schema": 1, "dpc_version": "9"})
+        file.create_dataset("mean", data=np.zeros((5, 3), np.float32))
     found = summary(path)
-    assert found["kind"] == "views"
-    assert found["datasets"] == [{"name": "rgba", "shape": [1, 2, 4, 4, 4], "type": "uint8", "compression": None}]
+    assert found["kind"] == "gaussians"
+    assert found["datasets"] == [{"name": "mean", "shape": [5, 3], "type": "float32", "compression": None}]

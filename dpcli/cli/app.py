@@ -9,7 +9,7 @@ import sys
 import typer
 
 from dpcli import __version__
-from dpcli.cli import classify, evaluate, info, prepare, segment
+from dpcli.cli import classify, evaluate, generate4d, info, prepare, segment
 from dpcli.errors import DpcError
 
 app = typer.Typer(
@@ -19,12 +19,13 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    help="Dynamic point clouds: recognise actions, find rigid parts and their motions.",
+    help="Dynamic point clouds: recognise actions, find rigid parts and their motions, rebuild a scene in 4D.",
     epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
 )
 app.add_typer(prepare.app, name="prepare")
 app.add_typer(classify.app, name="classify")
 app.add_typer(segment.app, name="segment")
+app.add_typer(generate4d.app, name="generate4d")
 app.add_typer(evaluate.app, name="evaluate")
 app.command("info")(info.info)
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dpcli.cli.options import Json, Picture
+from dpcli.cli.options import Json, Picture, Seed
 from dpcli.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, help="Compare what a model says with the truth.")
@@ -113,6 +113,52 @@ def motion(
             _print_object(motion_json(report, parts, _provenance(path)))
         else:
             _print_tables(motion_tables(report), motion_notes(report), as_markdown)
+
+
+@app.command()
+def video(
+    predicted: Annotated[
+        str, typer.Argument(help="Views or gaussians file (- for a pipe), folder of images, .npy, or video file.")
+    ],
+    truth: Annotated[Path, typer.Option("--truth", help="The true video; a views file for a gaussians file.")],
+    metrics: Annotated[
+        str | None,
+        typer.Option(
+            "--metrics", help="Of psnr, psnr_foreground, ssim, ms_ssim, parts, tracks. Default: all but ms_ssim."
+        ),
+    ] = None,
+    protocol: Annotated[
+        str, typer.Option("--protocol", help="dpc, thesis, consistent4d or torchmetrics: ranges, borders, views.")
+    ] = "dpc",
+    background: Annotated[
+        str | None, typer.Option("--background", help="white or black behind the object. Default: the protocol's.")
+    ] = None,
+    intersect: Annotated[bool, typer.Option("--intersect", help="Compare what both have, list the rest.")] = False,
+    seed: Seed = 0,
+    as_markdown: Markdown = False,
+    as_object: Json = False,
+    picture: Picture = None,
+) -> None:
+    """PSNR and SSIM per view of a video or a 4D scene; a scene's parts and tracks where the truth has them."""
+    _check_output(as_object, as_markdown, picture)
+    from dpcli.evaluate.video import evaluate_video
+    from dpcli.evaluate.video_protocol import BACKGROUNDS, check_picture_of, parse_metrics, video_protocol
+    from dpcli.evaluate.video_strip import Strip
+    from dpcli.evaluate.video_tables import video_json, video_notes, video_tables
+    from dpcli.store import input_file
+
+    names, chosen = parse_metrics(metrics), video_protocol(protocol, background)
+    check_picture_of(names, picture)
+    strip = Strip(BACKGROUNDS[chosen.background]) if picture is not None else None
+    with input_file(predicted) as path:
+        report = evaluate_video(path, truth, metrics=names, protocol=protocol, background=background,
+                                intersect=intersect, seed=seed, watch=strip)  # fmt: skip
+        if strip is not None:
+            strip.save(picture)
+        if as_object:
+            _print_object(video_json(report, predicted))
+        else:
+            _print_tables(video_tables(report), video_notes(report), as_markdown)
 
 
 def _check_output(as_object: bool, as_markdown: bool, picture: Path | None) -> None:

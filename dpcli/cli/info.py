@@ -45,13 +45,26 @@ def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
     from dpcli.evaluate.pictures import check_picture
     from dpcli.store import CloudsReader
 
-    if kind not in ("clouds", "parts"):
+    if kind not in ("clouds", "parts", "views"):
         raise UsageError(
-            f"--picture draws point clouds, this file holds {kind!r}; for scores: dpc evaluate classification"
+            f"--picture draws point clouds and views, this file holds {kind!r}; for scores: dpc evaluate classification"
         )
     check_picture(picture)
+    if kind == "views":
+        _draw_views(path, picture, **options)
+        return
     with CloudsReader(path) as reader:
         contact_sheet(reader, picture, **options)
+
+
+def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str | None) -> None:
+    from dpcli.evaluate.views_sheet import views_sheet
+    from dpcli.store.views import ViewsReader
+
+    if view is not None:
+        raise UsageError("--view turns point clouds; a file of views has pictures, which stay as they are")
+    with ViewsReader(path) as reader:
+        views_sheet(reader, picture, samples=samples, frames=frames)
 
 
 def _show(found: dict[str, Any]) -> None:
@@ -93,10 +106,22 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((key, ", ".join(f"{name or 'none'} ({count})" for name, count in found[key].items())))
     if found.get("unknown_labels"):
         lines.append(("unknown labels", str(found["unknown_labels"])))
-    if found["kind"] not in ("clouds", "parts", "scores"):
+    if found["kind"] == "views":
+        lines += _view_lines(found)
+    elif found["kind"] not in ("clouds", "parts", "scores"):
         lines += [(item["name"], f"{item['type']} {tuple(item['shape'])}") for item in found["datasets"]]
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
+
+
+def _view_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
+    lines = [("name", found["name"]), ("size", f"{found['size'][0]}x{found['size'][1]} pixels")]
+    lines.append(("duration", f"{found['duration']:.4g} s from the first frame to the last"))
+    for camera in found["orbit"]:
+        angles = f"azimuth {camera['azimuth'] + 0.0:.1f}, elevation {camera['elevation'] + 0.0:.1f} degrees"
+        rest = f"radius {camera['radius']:.4g}, fovy {camera['fovy']:.4g} degrees"
+        lines.append((f"view {camera['view']}", f"{camera['role']:<9} {angles}, {rest}"))
+    return lines
 
 
 def _class_table(found: dict[str, Any]) -> Any:

@@ -9,10 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from dpcli.cli import prepare_animation, prepare_views
 from dpcli.cli.options import Force, Jobs, OnError, Output, Seed
 from dpcli.errors import UsageError
 
-app = typer.Typer(no_args_is_help=True, help="Turn raw data into a file of point cloud sequences.")
+app = typer.Typer(no_args_is_help=True, help="Turn raw data into a file of point cloud sequences, or of views.")
 synthetic = typer.Typer(no_args_is_help=True, help="Make data out of nothing, with ground truth.")
 app.add_typer(synthetic, name="synthetic")
 
@@ -321,3 +322,7 @@ def articulated(
     names = tuple(word.strip() for word in kinds.split(",") if word.strip())
     rule = _split_rule(test_categories, validation_categories, fractions)
     return SyntheticArticulated(objects, sequences_per_object, names, Articulation.of_options(articulation), rule, seed)
+
+
+prepare_views.register(app)
+prepare_animation.register(app, synthetic)

@@ -195,25 +195,25 @@ def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], width: int, 
         for column, (number, cell) in enumerate(zip(shown, cells, strict=True)):
             left = _GAP + column * (width + _GAP)
             sheet.paste(Image.fromarray(cell), (left, top + _TITLE))
-            draw.text((left + 4, top + _TITLE + 2), str(number), fill=_FAINT, font=_font(10))
-    _save(sheet, path)
+            draw.text((left + 4, top + _TITLE + 2), str(number), fill=_FAINT, font=text_font(10))
+    save_sheet(sheet, path)
 
 
 def _write(draw: Any, place: tuple[int, int], text: str, room: int) -> None:
     """Text in one line, shortened to the room (pixels) there is."""
-    font = _font(13)
+    font = text_font(13)
     while draw.textlength(text, font=font) > room and len(text) > 2:
         text = text[:-2] + "…"
     draw.text(place, text, fill=_INK, font=font)
 
 
-def _font(size: int) -> Any:
+def text_font(size: int) -> Any:
     from PIL import ImageFont
 
     return ImageFont.load_default(size=size)
 
 
-def _save(sheet: Any, path: Path) -> None:
+def save_sheet(sheet: Any, path: Path) -> None:
     try:
         sheet.save(path)
     except (ValueError, OSError) as error:

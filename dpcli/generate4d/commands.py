@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from dpcli.errors import DataError, UsageError
-from dpcli.generate4d.config import PRIORS, FitConfig, preset
+from dpcli.generate4d.config import PRIORS, preset
 from dpcli.generate4d.curves import draw_curves
 from dpcli.generate4d.fit import COLUMNS, Fit
 from dpcli.generate4d.model import Model4D

@@ -65,6 +65,7 @@ class Fit:
                     self.spent, started = self.spent + time.monotonic() - started, time.monotonic()
                     self._save()
                 self.stop.check(f"saved at step {self.step}")
+        self.folder.draw_curves()
         return self.model
 
     def _start(self) -> None:

@@ -29,7 +29,6 @@ def arap_loss(
 
     The best rotation of each point is found without gradient. A row's own index, where neighbours lack, adds nothing.
     """
-    from dpcli.ops.rigid import weighted_kabsch
 
     before = (rest[neighbours] - rest[:, None]).detach()  # [N, H, 3]
     after = moved[:, neighbours] - moved[:, :, None]  # [B, N, H, 3]

@@ -30,6 +30,7 @@ from dpcli.store import ViewsReader, input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
+_SHEET_SIDE = 160  # pixels of its pictures
 
 
 def run_render(
@@ -94,7 +95,7 @@ def _render_sheet(renderer, look, picture: Path, lens: Lens, columns: int, time:
     if picture.suffix.lower() != ".png":
         raise UsageError(f"--picture {picture}: expected a name that ends in .png")
     look = replace(look, background=look.background or (255, 255, 255))
-    scene, small = renderer.scene, replace(lens, size=lens.size or min(max(renderer.scene.size), 192))
+    scene, small = renderer.scene, replace(lens, size=lens.size or _SHEET_SIDE)
     span = np.linspace(scene.time[0], scene.time[-1], min(columns, scene.num_frames)) if time is None else [time]
     azimuth = small.place(scene)[0]
     rows = []

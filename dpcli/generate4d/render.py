@@ -21,6 +21,7 @@ COLOURS = ("appearance", "part", "rigid", "depth")
 _TRAILS = 64  # Gaussians that draw trails in a scene without control points
 _TRAIL_SHARE = 0.4  # of the clip that a trail reaches back
 _FINE = 4  # fractional bits of line ends
+_TRAIL_SHADE = 0.45  # of the part's colour, so that trails show on it
 
 
 @dataclass(frozen=True)
@@ -98,14 +99,14 @@ class Renderer:
         first = max(0, a - max(2, round(_TRAIL_SHARE * self.scene.num_frames)))
         now = (1 - w) * tracks[a] + w * tracks[b]
         pixels, ahead = _project(np.concatenate([tracks[first : a + 1], now[None]]), shot)
-        image = np.ascontiguousarray(image)
+        image, thick = np.ascontiguousarray(image), max(1, round(max(shot.size) / 300))
         for track in range(tracks.shape[1]):
             if not ahead[:, track].all():
                 continue
             colour = tuple(int(c) for c in colours[track]) + (255,) * (image.shape[2] - 3)
             line = np.round(pixels[:, track] * 2**_FINE).astype(np.int32)
-            cv2.polylines(image, [line], False, colour, 1, cv2.LINE_AA, _FINE)
-            cv2.circle(image, line[-1].tolist(), 2 * 2**_FINE, colour, -1, cv2.LINE_AA, _FINE)
+            cv2.polylines(image, [line], False, colour, thick, cv2.LINE_AA, _FINE)
+            cv2.circle(image, line[-1].tolist(), 2 * thick * 2**_FINE, colour, -1, cv2.LINE_AA, _FINE)
         return image
 
     def pictures(self, shots: Sequence[Shot], look: Look = Look()) -> Iterator[np.ndarray]:
@@ -119,10 +120,10 @@ def _owners(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
         from scipy.spatial import cKDTree
 
         nearest = cKDTree(scene.mean).query(scene.control_point)[1]
-        return scene.control_position, (part_colours(scene.part[nearest]) * 0.75).astype(np.uint8)
+        return scene.control_position, (part_colours(scene.part[nearest]) * _TRAIL_SHADE).astype(np.uint8)
     opaque = np.argsort(-scene.opacity_logit, kind="stable")[: scene.num_gaussians // 2 + 1]
     chosen = opaque[np.linspace(0, len(opaque) - 1, min(_TRAILS, len(opaque))).round().astype(int)]
-    return scene.frame_mean[:, chosen], (part_colours(scene.part[chosen]) * 0.75).astype(np.uint8)
+    return scene.frame_mean[:, chosen], (part_colours(scene.part[chosen]) * _TRAIL_SHADE).astype(np.uint8)
 
 
 def _project(points: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """The HDF5 contract: what a file holds, writing it whole, reading only what is needed, moving it through pipes.
 
 `CloudsWriter` / `CloudsReader` for point cloud sequences, `PartsWriter` / `PartsReader` for what a segmenter says,
-`ScoresWriter` / `ScoresReader` for what a classifier says,
+`ScoresWriter` / `ScoresReader` for what a classifier says, `ViewsWriter` / `ViewsReader` for an object in pictures,
 `input_file` / `output_file` for paths and `-`. Nothing here knows where samples come from or what they are for.
 """
 
@@ -13,9 +13,10 @@ from dpcli.store.pipes import input_file, output_file
 from dpcli.store.reader import CloudsReader
 from dpcli.store.scores import ScoresReader, ScoresWriter
 from dpcli.store.sequence import CloudSequence
+from dpcli.store.views import ViewsHeader, ViewsReader, ViewsWriter
 from dpcli.store.writer import CloudsWriter
 
 __all__ = [
     "CloudSequence", "CloudsReader", "CloudsWriter", "PartsReader", "PartsSample", "PartsWriter", "ScoresReader", "ScoresWriter",
-    "file_kind", "input_file", "output_file",
+    "ViewsHeader", "ViewsReader", "ViewsWriter", "file_kind", "input_file", "output_file",
 ]  # fmt: skip

@@ -11,9 +11,11 @@ import h5py
 import numpy as np
 
 from dpcli.store.file import file_kind, open_store, read_provenance, root_attributes
+from dpcli.store.gaussians import read_scene
 from dpcli.store.parts import PartsReader
 from dpcli.store.reader import CloudsReader
 from dpcli.store.scores import ScoresReader
+from dpcli.store.views import ViewsReader
 
 _ROWS = 1 << 20  # points read at a time for the ranges: 12 MiB
 _WIDE = 1024  # points side by side in one row while reducing
@@ -32,7 +34,7 @@ def summary(path: str | Path) -> dict[str, Any]:
             "provenance": read_provenance(file),
             "datasets": _datasets(file),
         }
-    own = {"clouds": _clouds, "parts": _parts, "scores": _scores}.get(kind)
+    own = {"clouds": _clouds, "parts": _parts, "scores": _scores, "views": _views, "gaussians": _gaussians}.get(kind)
     return {**common, **(own(path) if own else {})}
 
 
@@ -96,6 +98,51 @@ def _scores(path: Path) -> dict[str, Any]:
         "range": {"scores": _ends(reader.scores)},
         **_who(reader.class_names, reader.labels, reader.splits),
     }
+
+
+def _views(path: Path) -> dict[str, Any]:
+    with ViewsReader(path) as reader:
+        header = reader.header
+        track, part = reader.track, reader.part
+        centres = header.camera_centres()
+    angles = np.rad2deg(
+        [np.arctan2(centres[:, 0], centres[:, 2]), np.arctan2(centres[:, 1], np.hypot(*centres[:, ::2].T))]
+    )
+    fovy = np.rad2deg(2 * np.arctan(0.5 * header.size[1] / header.intrinsics[:, 1, 1]))
+    cameras = [
+        {"view": view, "role": role, "azimuth": float(azimuth), "elevation": float(elevation), "radius": float(radius),
+         "fovy": float(view_angle)}
+        for view, (role, azimuth, elevation, radius, view_angle) in enumerate(
+            zip(header.role, *angles, np.linalg.norm(centres, axis=1), fovy, strict=True))
+    ]  # fmt: skip
+    return {
+        "name": header.name,
+        "counts": {"views": header.num_views, "frames": header.num_frames, "tracks": 0 if track is None else track.shape[1],
+                   "parts": 0 if part is None else len(np.unique(part[part >= 0]))},
+        "size": list(header.size),
+        "reference": header.reference,
+        "duration": float(header.time[-1] - header.time[0]),
+        "frame_interval": _spread(np.diff(header.time), float),
+        "fields": list(reader.fields),
+        "orbit": cameras,
+    }  # fmt: skip
+
+
+def _gaussians(path: Path) -> dict[str, Any]:
+    scene = read_scene(path)
+    low, high = scene.frame_mean.min((0, 1)).tolist(), scene.frame_mean.max((0, 1)).tolist()
+    return {
+        "counts": {"gaussians": scene.num_gaussians, "frames": scene.num_frames, "parts": scene.num_parts,
+                   "control_points": len(scene.control_point), "cameras": len(scene.camera_intrinsics)},
+        "size": list(scene.size),
+        "reference": scene.reference,
+        "sh_degree": scene.sh_degree,
+        "duration": float(scene.time[-1] - scene.time[0]),
+        "frame_interval": _spread(np.diff(scene.time), float),
+        "range": {axis: [a, b] for axis, a, b in zip("xyz", low, high, strict=True)},
+        "gaussians_per_part": _count(scene.part),
+        "metrics": scene.metrics,
+    }  # fmt: skip
 
 
 def point_ranges(reader: CloudsReader) -> tuple[dict[str, list[float] | None], int]:

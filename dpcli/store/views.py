@@ -238,7 +238,13 @@ class ViewsReader:
         """The open handle of this process."""
         if self._file is None or not self._file.id.valid:
             self._file = open_store(self.path, ["views"])
+            self._pictures = self._file["rgba"]  # looking a data set up costs as much as decoding a picture
         return self._file
+
+    @property
+    def _rgba(self) -> h5py.Dataset:
+        assert self.file
+        return self._pictures
 
     def rgba(self, view: int, frame: int) -> np.ndarray:
         """The picture u8 (H,W,4) of a view at a frame, straight alpha. One chunk is read."""
@@ -247,7 +253,7 @@ class ViewsReader:
                 f"{self.path}: view {view}, frame {frame}; the file has {self.num_views} views, {self.num_frames} frames"
             )
         try:
-            return self.file["rgba"][view, frame]
+            return self._rgba[view, frame]
         except OSError:
             raise DataError(f"{self.path}: view {view}, frame {frame} is damaged; make the file again") from None
 

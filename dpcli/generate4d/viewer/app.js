@@ -1,5 +1,6 @@
 // The page: state, camera, controls. The part after # in the address sets the state, such as
-// #time=0.5&colour=part&azimuth=40&elevation=10&radius=2&background=black&play=0&panel=1&renderer=2d (seconds, degrees).
+// #time=0.5&colour=part&azimuth=40&elevation=10&radius=2&background=black&play=0&panel=1&controls=0&renderer=2d
+// (seconds, degrees).
 
 const $ = (id) => document.getElementById(id), root = document.documentElement;
 const GROUNDS = { white: [255, 255, 255], grey: [118, 122, 130], black: [12, 14, 18] };
@@ -64,6 +65,7 @@ class App {
     if (GROUNDS[given.get("background")]) state.background = given.get("background");
     if (["appearance", "part", "rigid"].includes(given.get("colour"))) state.colour = given.get("colour");
     if (given.has("panel")) $("panel").hidden = given.get("panel") !== "1";
+    root.toggleAttribute("data-bare", given.get("controls") === "0");
     this.change({});
   }
 
