@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.ops import fps, three_nn_interpolate, weighted_kabsch
-from dpcli.ops.rigid import apply_motions, rigid_flow, to_matrix
+from dpcli.ops import fps, knn, three_nn_interpolate, weighted_kabsch
+from dpcli.ops.rigid import rigid_flow, to_matrix
 from dpcli.runtime.seed import generator
 from dpcli.segment.matching import carry_mask, match_sequence, one_hot
 from dpcli.segment.network import PartNetwork
@@ -22,6 +23,8 @@ from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
 
 _FEWEST = 16  # points of a frame; one with fewer is filled up by repeats
+_SMALL = 1024  # points of a frame up to which one thread is enough after the network
+_TOGETHER = 8  # pairs of frames whose motions are refined at once
 _SPREAD = 8  # farthest points are searched among this many times the wanted number, drawn at random
 
 Estimate = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (N,3), (M,3) -> flow forth (N,3) and back (M,3)
@@ -81,10 +84,11 @@ def predict_parts(
     flows = _flows(thin, [*pairs, *chain], estimate)
     masks = segmenter(thin, flows)
     if options.split and len(thin) > 1:
-        masks = [
-            split_by_motion(cloud, flows[t, t + 1 if t + 1 < len(thin) else t - 1], mask)
-            for t, (cloud, mask) in enumerate(zip(thin, masks))
-        ]
+        with _threads_for(thin):
+            masks = [
+                split_by_motion(cloud, flows[t, t + 1 if t + 1 < len(thin) else t - 1], mask)
+                for t, (cloud, mask) in enumerate(zip(thin, masks))
+            ]
     masks = _consistent(thin, flows, masks, options.vote)
     masks = _without_crumbs(masks, options.smallest)
     full = [_carried_back(cloud, few, mask) for cloud, few, mask in zip(whole, thin, masks)]
@@ -160,27 +164,55 @@ def _motions(
     slots = masks[0].shape[1]
     motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
     middle = torch.from_numpy(centre)
-    same = torch.arange(slots)[None]
-    for q, (i, j) in enumerate(pairs):
-        rotation, shift = _fit(thin[i], thin[j], masks[i], masks[j], flows[i, j], options.icp, same)
-        flow.append((rigid_flow(whole[i][None], full[i][None], rotation, shift)[0] / scale).numpy())
+    with _threads_for(thin):
+        fitted = _fitted(thin, masks, flows, pairs, options.icp)
+    for q, ((i, _), (rotation, shift)) in enumerate(zip(pairs, fitted)):
+        flow.append((rigid_flow(whole[i][None], full[i][None], rotation[None], shift[None])[0] / scale).numpy())
         used = one_hot(masks[i]).sum(0) > 0
-        own = shift[0] / scale + middle - (rotation[0] @ middle)
-        matrix = to_matrix(rotation[0], own)
-        motion[q] = torch.where(used[:, None, None], matrix, torch.eye(4)).numpy()
+        own = shift / scale + middle - (rotation @ middle)
+        motion[q] = torch.where(used[:, None, None], to_matrix(rotation, own), torch.eye(4)).numpy()
     return motion, flow
 
 
+@contextmanager
+def _threads_for(frames: list[Tensor]) -> Iterator[None]:
+    """One thread of torch's for many small operations: two gain nothing, and wait for one another on a busy machine."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1 if max(len(frame) for frame in frames) <= _SMALL else threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _fitted(
+    thin: list[Tensor], masks: list[Tensor], flows: dict[tuple[int, int], Tensor], pairs: list[tuple[int, int]], steps: int
+) -> list[tuple[Tensor, Tensor]]:  # fmt: skip
+    """Motions (S,3,3), (S,3) of every pair of frames; pairs of equally many points together, `_TOGETHER` at a time."""
+    found: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
+    alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in pairs:
+        alike.setdefault((len(thin[i]), len(thin[j])), []).append((i, j))
+    for group in alike.values():
+        for start in range(0, len(group), _TOGETHER):
+            some = group[start : start + _TOGETHER]
+            first, second = (torch.stack([own[pair[side]] for pair in some]) for own, side in ((thin, 0), (thin, 1)))
+            mask1, mask2 = (torch.stack([masks[pair[side]] for pair in some]) for side in (0, 1))
+            rotation, shift = _fit(first, second, mask1, mask2, torch.stack([flows[pair] for pair in some]), steps)
+            found |= {pair: (r, t) for pair, r, t in zip(some, rotation, shift)}
+    return [found[pair] for pair in pairs]
+
+
 def _fit(
-    first: Tensor, second: Tensor, mask1: Tensor, mask2: Tensor, flow: Tensor, steps: int, same: Tensor
+    first: Tensor, second: Tensor, mask1: Tensor, mask2: Tensor, flow: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Motions (1,S,3,3), (1,S,3) by object-aware ICP from the flow; whichever of before and after lies nearer to frame 2."""
-    first, second, mask1, mask2, flow = (x[None] for x in (first, second, mask1, mask2, flow))
+    """Motions (B,S,3,3), (B,S,3) by object-aware ICP from the flow; whichever of before and after lies nearer to frame 2."""
     start = weighted_kabsch(first, first + flow, mask1)
     if steps == 0:
         return start
+    same = torch.arange(mask1.shape[2]).expand(len(first), -1)
     _, rotation, shift = object_icp(first, second, mask1, mask2, flow, steps, 0.01, same)
-    gaps = [_gap(first, second, mask1, mask2, *found) for found in (start, (rotation, shift))]  # [1, S] each
+    gaps = [_gap(first, second, mask1, *found) for found in (start, (rotation, shift))]  # [B, S] each
     better = gaps[1] <= gaps[0]
     return (
         torch.where(better[..., None, None], rotation, start[0]),
@@ -188,9 +220,8 @@ def _fit(
     )
 
 
-def _gap(first: Tensor, second: Tensor, mask1: Tensor, mask2: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
-    """Mean distance (1,S) of each part, moved, to frame 2."""
-    moved = apply_motions(first, rotation, shift)
-    nearest = torch.stack([torch.cdist(cloud, second[0]).amin(-1) for cloud in moved[0]])[None]
-    share = one_hot(mask1).mT
-    return (nearest * share).sum(-1) / share.sum(-1).clamp(min=1)
+def _gap(first: Tensor, second: Tensor, mask1: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
+    """Mean distance (B,S) of each part's own points, moved, to frame 2."""
+    share = one_hot(mask1)  # [B, N, S]
+    squared, _ = knn(first + rigid_flow(first, share, rotation, shift), second, 1)
+    return (share * squared.sqrt()).sum(1) / share.sum(1).clamp(min=1)

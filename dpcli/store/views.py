@@ -287,4 +287,4 @@ class ViewsReader:
         self.close()
 
     def __getstate__(self) -> dict:
-        return {**self.__dict__, "_file": None}
+        return {**self.__dict__, "_file": None, "_pictures": None}

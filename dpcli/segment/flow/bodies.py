@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from dpcli.segment.flow import starts
-from dpcli.segment.flow.kernels_icp import assign_kernel
+from dpcli.segment.flow.kernels_icp import assign_kernel, energy_kernel
 from dpcli.segment.flow.surface import Surface
 
 _IDENTITY = np.eye(3, 4)
@@ -147,25 +147,13 @@ class _Search:
         return self._bodies(nobody, motion[None], self._cost(motion)[None])
 
     def _bodies(self, label: np.ndarray, motion: np.ndarray, cost: np.ndarray) -> Bodies:
-        """With its energy: both clouds' mean saturated residuals, and the borders."""
-        own = motion[label]
-        moved = np.einsum("nij,nj->ni", own[:, :, :3], self.points) + own[:, :, 3]
-        normals = np.einsum("nij,nj->ni", own[:, :, :3], self.source.normals)
-        seen = self._saturated(self.target.covered_by(moved, normals, self.options.share))
-        energy = cost[label, np.arange(len(label))].mean() + seen.mean() + self._torn(label, motion, moved)
-        return Bodies(label, motion, float(energy), cost)
-
-    def _torn(self, label: np.ndarray, motion: np.ndarray, moved: np.ndarray) -> float:
-        """Cost of the borders, higher where the bodies part; and of going far from the first body."""
-        others = label[self.source.neighbours]
-        row, column = np.nonzero(others != label[:, None])
-        foreign = motion[others[row, column]]
-        gap = np.linalg.norm(
-            np.einsum("nij,nj->ni", foreign[:, :, :3], self.points[row]) + foreign[:, :, 3] - moved[row], axis=1
-        )
-        border = (1 - self.options.tear + self.options.tear * np.minimum(gap / 0.15, 1)).sum() / others.size
-        far = np.linalg.norm(moved - self.points @ motion[0, :, :3].T - motion[0, :, 3], axis=1).mean()
-        return float(0.5 * self.options.border * border + self.options.far * far)
+        """With its energy: both clouds' mean saturated residuals, the borders, and the way from the first body."""
+        options = self.options
+        energy = energy_kernel(
+            self.points, self.source.normals, label, motion, cost, self.source.neighbours, self.target.columns,
+            options.share, self.scale, options.tear, options.border, options.far,
+        )  # fmt: skip
+        return Bodies(label, motion, energy, cost)
 
     def _assign(self, label: np.ndarray, cost: np.ndarray) -> np.ndarray:
         """Each point to the body that explains it and its neighbours best, neighbours preferring the same (ICM)."""

@@ -35,8 +35,10 @@ class Surface:
         cells = np.ceil(extent / cell).astype(int) + 1
         self.columns = columns(self.points)
         grid = np.full(cells, -1, np.int32)
+        near = np.full((len(self.points), 3, 16), 1e9, np.float32)
+        near[:, :, :_AROUND] = self.points[found].transpose(0, 2, 1)
         self._search = (
-            self.columns, columns(self.normals), found.astype(np.int32), grid, origin, np.float32(1 / cell),
+            self.columns, columns(self.normals), found.astype(np.int32), near, grid, origin, np.float32(1 / cell),
         )  # fmt: skip
 
     def icp(self, source: np.ndarray, motion: np.ndarray, steps: int, wide: float, narrow: float) -> np.ndarray:
