@@ -83,7 +83,10 @@ table-4.2: $(READY)
 	done; done | tee $(T42)/table.md
 
 bench: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m tests.bench.bench_ops
+	$(BIN)/python -m tests.bench.bench_splatting
+	$(BIN)/python -m tests.bench.bench_video_metrics
 	$(DPC) classify profile --preset thesis --steps
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
 
