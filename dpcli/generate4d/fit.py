@@ -292,6 +292,7 @@ class Fit:
             "step": self.step, "spent": self.spent, "gaussians": gaussians.state_dict(), "field": self.model.field.state_dict(),
             "control": None if self.model.control is None else self.model.control.state_dict(),
             "control_reference": self.control_reference, "optimizer": self.optimizer.state_dict(), "recent": self.recent,
+            "nearest": self.model.nearest, "neighbours": self._neighbours,
         }  # fmt: skip
         self.folder.save_state(state)
 
@@ -309,5 +310,4 @@ class Fit:
                 self.optimizer.add_param_group({"params": [getattr(self.model.control, key)], "lr": 0.0, "name": name})
             self.control_reference = state["control_reference"]
         self.optimizer.load_state_dict(state["optimizer"])
-        self.model.refresh_neighbours()
-        self._neighbours = None
+        self.model.nearest, self._neighbours = state["nearest"], state["neighbours"]

@@ -34,16 +34,16 @@ class Model4D(nn.Module):
             config.parts, config.width, config.depth, config.rigid, config.fusion, config.partition == "time"
         )
         self.control: ControlPoints | None = None
-        self._nearest: Tensor | None = None
+        self.nearest: Tensor | None = None  # [N, k] control points that move each Gaussian
 
     def start_control(self) -> None:
         """From now on K control points, chosen among the Gaussians, carry them all."""
         self.control = ControlPoints.among(self.gaussians.mean, self.config.control_points, self.config.neighbours)
-        self._nearest = None
+        self.nearest = None
 
     def refresh_neighbours(self) -> None:
         """Look again which control points are nearest to each Gaussian."""
-        self._nearest = self.control.nearest(self.gaussians.mean) if self.control is not None else None
+        self.nearest = self.control.nearest(self.gaussians.mean) if self.control is not None else None
 
     def at(self, times: Tensor) -> Instant:  # [B]
         """Positions and orientations at times in 0..1: eq. 5.6 for the dense stage, eq. 5.8 for the sparse one."""
@@ -51,10 +51,10 @@ class Model4D(nn.Module):
         if self.control is None:
             motion = self.field(own.mean, times)
             return Instant(own.mean + motion.displacement, turn_frames(motion.quaternion, own.quaternion), motion, own.mean)
-        if self._nearest is None or len(self._nearest) != len(own):
+        if self.nearest is None or len(self.nearest) != len(own):
             self.refresh_neighbours()
         motion = self.field(self.control.position, times)
-        mean, turn = self.control.carry(own.mean, self._nearest, motion)
+        mean, turn = self.control.carry(own.mean, self.nearest, motion)
         return Instant(mean, turn_frames(turn, own.quaternion), motion, self.control.position)
 
     def render(

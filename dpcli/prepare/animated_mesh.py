@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Texture:
-    """A picture on a surface: linear colour f32 (H,W,4), alpha in the last channel; wrap: repeat | mirror | clamp.
+    """A picture on a surface: sRGB u8 (H,W,4), alpha in the last channel; wrap: repeat | mirror | clamp.
 
     change: f64 (2,3) affine map of the coordinates before they are looked up, or None.
     """

@@ -53,10 +53,7 @@ def _texture(file: Gltf, index: Any, change: dict[str, Any]) -> Texture:
         raise file.fail(f"texture {index} has no image that can be read (PNG, JPEG or WebP); export it again")
     sampler = file.item("samplers", entry["sampler"]) if "sampler" in entry else {}
     wrap = tuple(_WRAP.get(sampler.get(key, 10497), "repeat") for key in ("wrapS", "wrapT"))
-    encoded, levels = file.image(source), np.arange(256) / 255
-    pixels = levels.astype(np.float32)[encoded]
-    pixels[..., :3] = to_linear(levels).astype(np.float32)[encoded[..., :3]]
-    return Texture(pixels, wrap, _uv_matrix(change))
+    return Texture(file.image(source), wrap, _uv_matrix(change))
 
 
 def _uv_matrix(change: dict[str, Any]) -> np.ndarray | None:

@@ -120,6 +120,7 @@ def convert(
         ) as writer:  # fmt: skip
             with stop_requested() as stop:
                 _stream(work, items, writer, report, stop, jobs=jobs, on_error=on_error, task=task)
+            writer.skipped = report.skipped
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
@@ -225,5 +226,6 @@ def _count(report: Report, output: Path) -> Report:
     """What the finished file holds, whether this run wrote all of it or continued another."""
     with CloudsReader(output) as reader:
         report.written = len(reader)
+        report.skipped = reader.skipped
         report.frames, report.points = int(reader.frame_counts.sum()), int(reader.point_counts.sum())
     return report

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.prepare.animated_mesh import AnimatedMesh, Material, Texture
-from dpcli.prepare.gltf_material import to_srgb
+from dpcli.prepare.gltf_material import to_linear, to_srgb
 from dpcli.prepare.open3d_import import load_open3d
 
-_LIGHT = np.array([0.37, 0.74, 0.56])  # unit, where the light comes from: above, in front, a little to the right
+_LIGHT = np.array(
+    [0.37, 0.74, 0.56], np.float32
+)  # unit, where the light comes from: above, in front, a little to the right
+_DECODED = to_linear(np.arange(256) / 255).astype(np.float32)
 _LAYERS = 8  # most surfaces that one ray passes through
 _NUDGE = 1e-4  # a ray goes on this far behind a transparent surface
 
@@ -94,14 +97,22 @@ class FrameCaster:
         """sRGB and alpha f32 (N,4) of points on triangles, lit; direction: where the rays go."""
         mesh, corners = self.mesh, self.mesh.triangles[triangle]
         color = surface_color(mesh, mesh.material[triangle], corners, weights)
-        unlit = np.array([m.unlit for m in mesh.materials])[mesh.material[triangle]]
-        normal = np.einsum("nk,nka->na", weights, self.normals[corners])
-        facing = np.where((normal * direction).sum(1) > 0, -1, 1)
-        slope = facing * (normal @ _LIGHT) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
-        half = 0.5 + 0.5 * slope  # wraps around: no side is black, as under an open sky
-        light = np.where(unlit, 1, 1 - self.shading * (1 - (0.3 + 0.8 * half)))
-        color[:, :3] = to_srgb(np.clip(color[:, :3] * light[:, None], 0, 1))
+        if self.shading and not all(m.unlit for m in mesh.materials):
+            color[:, :3] *= self._light(triangle, corners, weights, direction)[:, None]
+        color[:, :3] = to_srgb(np.clip(color[:, :3], 0, 1))
         return color
+
+    def _light(
+        self, triangle: np.ndarray, corners: np.ndarray, weights: np.ndarray, direction: np.ndarray
+    ) -> np.ndarray:
+        """How much light (N) comes from each point, 1 on a plain or unlit surface."""
+        normal = np.einsum("nk,nka->na", weights, self.normals[corners])
+        length = np.sqrt(np.einsum("na,na->n", normal, normal))
+        facing = np.where(np.einsum("na,na->n", normal, direction) > 0, -1, 1)
+        half = 0.5 + 0.5 * facing * (normal @ _LIGHT) / np.maximum(length, 1e-9)
+        light = 1 - self.shading * (0.7 - 0.8 * half)  # wraps around: no side is black, as under an open sky
+        unlit = np.array([m.unlit for m in self.mesh.materials])
+        return np.where(unlit[self.mesh.material[triangle]], 1, light).astype(np.float32)
 
 
 def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: slice, samples: int) -> np.ndarray:
@@ -109,12 +120,12 @@ def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: s
     y = np.arange(rows.start * samples, rows.stop * samples).reshape(-1, samples)
     x = np.arange(columns.start * samples, columns.stop * samples).reshape(-1, samples)
     y, x = (y + 0.5) / samples, (x + 0.5) / samples
-    grid = np.ones((*y.shape, *x.shape, 3))
-    grid[..., 0], grid[..., 1] = x[None, None], y[:, :, None, None]
-    direction = grid @ (np.linalg.inv(intrinsics).T @ pose[:3, :3])
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    origin = np.broadcast_to(-pose[:3, :3].T @ pose[:3, 3], direction.shape)
-    return np.concatenate([origin, direction], axis=-1).astype(np.float32)
+    across, down, ahead = np.linalg.inv(intrinsics).T @ pose[:3, :3]  # direction = x across + y down + ahead
+    direction = (y[..., None] * down + ahead)[:, :, None, None] + x[..., None] * across
+    rays = np.empty((*direction.shape[:-1], 6), np.float32)
+    rays[..., :3] = -pose[:3, :3].T @ pose[:3, 3]
+    rays[..., 3:] = direction / np.sqrt(np.einsum("...a,...a->...", direction, direction))[..., None]
+    return rays
 
 
 def surface_color(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -122,19 +133,19 @@ def surface_color(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray,
 
     Base colour factor x vertex colour x texture; alpha is 1 where the material is opaque, 0 or 1 where it is masked.
     """
-    factors = np.array([m.color for m in mesh.materials], np.float32)[material]
-    color = factors * np.einsum("nk,nka->na", weights, mesh.color[corners]).astype(np.float32)
+    color = np.array([m.color for m in mesh.materials], np.float32)[material]
+    if mesh.color.min() < 1:
+        color *= np.einsum("nk,nka->na", weights, mesh.color[corners])
     uv = None
     for index, entry in enumerate(mesh.materials):
         if entry.texture is None and entry.blend == "opaque":
             continue
-        here = material == index
+        here = slice(None) if len(mesh.materials) == 1 else material == index
         if entry.texture is not None:
             uv = np.einsum("nk,nka->na", weights, mesh.uv[corners]) if uv is None else uv
             color[here] *= sample_texture(entry.texture, uv[here])
         color[here, 3] = _alpha(entry, color[here, 3])
-    opaque = np.array([m.blend == "opaque" for m in mesh.materials])[material]
-    color[opaque, 3] = 1
+    color[np.array([m.blend == "opaque" for m in mesh.materials])[material], 3] = 1
     return color
 
 
@@ -152,8 +163,16 @@ def sample_texture(texture: Texture, uv: np.ndarray) -> np.ndarray:
     fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)
     xs = [_wrapped(x0 + k, width, texture.wrap[0]) for k in (0, 1)]
     ys = [_wrapped(y0 + k, height, texture.wrap[1]) for k in (0, 1)]
-    above, below = ((1 - fx) * texture.pixels[row, xs[0]] + fx * texture.pixels[row, xs[1]] for row in ys)
+    above, below = ((1 - fx) * _linear(texture, row, xs[0]) + fx * _linear(texture, row, xs[1]) for row in ys)
     return (1 - fy) * above + fy * below
+
+
+def _linear(texture: Texture, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Linear RGBA f32 (N,4) of pixels; a table is decoded, not the picture, which also travels to workers."""
+    encoded = texture.pixels[row, column]
+    decoded = _DECODED[encoded]
+    decoded[:, 3] = encoded[:, 3] / np.float32(255)
+    return decoded
 
 
 def _wrapped(index: np.ndarray, size: int, how: str) -> np.ndarray:
