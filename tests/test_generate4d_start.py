@@ -68,6 +68,18 @@ def test_the_hull_is_inside_every_silhouette_and_takes_the_near_colour():
         hull([_disc(64, 4), off], intrinsics, side, 100, RNG)
 
 
+def test_two_views_at_a_right_angle_make_a_rod_round_not_square():
+    intrinsics = np.stack([pinhole(np.deg2rad(49.1), 96, 96)] * 2)
+    poses = np.stack([orbit_pose(0, 0), orbit_pose(np.pi / 2, 0)])
+    bar = np.zeros((96, 96, 4), np.float32)
+    bar[16:80, 36:60] = 1.0
+    points, _ = hull([bar, bar], intrinsics, poses, 2000, RNG)
+    points = points[np.abs(points[:, 1]) < 0.2]
+    half = 12 / intrinsics[0, 0, 0] * 2  # of the bar, in the world
+    radius = np.linalg.norm(points[:, [0, 2]], axis=1)
+    assert 0.9 * half < radius.max() < 1.2 * half  # a square's corners are at 1.41
+
+
 def test_sphere_points_fill_the_volume_evenly():
     radius = np.linalg.norm(in_sphere(20_000, 0.5, RNG), axis=1)
     assert radius.max() <= 0.5 and np.mean(radius < 0.25) == pytest.approx(1 / 8, abs=0.01)

@@ -12,6 +12,9 @@ from dpcli import __version__
 from dpcli.cli import classify, evaluate, generate4d, info, prepare, segment
 from dpcli.errors import DpcError
 
+# Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 app = typer.Typer(
     name="dpc",
     no_args_is_help=True,

@@ -205,9 +205,10 @@ class Fit:
             total = total + config.control * drift.square().sum(-1).mean()
         if config.arap:
             total = total + config.arap * arap_loss(points, points + moved, self._neighbours)
-        if self.regularise:
+        if self.regularise and self.targets.num_views == 1:
             axis = torch.from_numpy(self.targets.world_to_camera[self.targets.reference][2, :3]).float()
             total = total + config.thickness * thickness_loss(self.model.gaussians, axis)
+        if self.regularise:
             total = total + config.roundness * roundness_loss(self.model.gaussians, config.aspect)
         return total
 

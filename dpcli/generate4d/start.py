@@ -71,17 +71,24 @@ def ball_thickness(mask: np.ndarray) -> np.ndarray:
 def hull(
     pictures: list[np.ndarray], intrinsics: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and colours (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1).
+    """Positions and colours (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
 
+    The common hull of few silhouettes has corners that no view contradicts: two views at a right angle make a box of every
+    body. With u the distance from a silhouette's middle line as a share of its half width, points are kept whose
+    u_i^2 + u_j^2 is at most 1 for every two views that look across each other, which makes that box an ellipse.
     A colour is the mean over views, weighted towards the view whose camera is nearest to the point.
     """
+    offsets = [np.dstack([picture, _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
+    across = np.abs(poses[:, 2, :3] @ poses[:, 2, :3].T) < 0.7  # viewing directions at more than 45 degrees
     kept: list[np.ndarray] = []
     total = 0
     for _ in range(200):
         points = in_sphere(20_000, 0.85, rng)
-        inside = np.ones(len(points), bool)
-        for picture, matrix, pose in zip(pictures, intrinsics, poses):
-            inside &= _sample(picture, points, matrix, pose)[0][:, 3] > 0.5
+        seen = np.stack([_sample(o, points, k, p)[0][:, 3:] for o, k, p in zip(offsets, intrinsics, poses)])
+        inside = (seen[..., 0] > 0.5).all(0)
+        squared = seen[..., 1] ** 2
+        for i, j in zip(*np.nonzero(np.triu(across))):
+            inside &= squared[i] + squared[j] <= 1
         kept.append(points[inside])
         total += int(inside.sum())
         if total >= count:
@@ -98,15 +105,25 @@ def hull(
     return points, (colours / np.maximum(weights, 1e-8)).astype(np.float32)
 
 
+def _share_of_width(mask: np.ndarray) -> np.ndarray:
+    """u (H,W): 0 on the middle line of a silhouette, 1 on its outline, from its distance d and ball thickness h:
+    h^2 = 2 R d - d^2 gives the half width R, and u = 1 - d / R."""
+    from scipy import ndimage
+
+    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    width = (ball_thickness(mask) ** 2 + distance**2) / np.maximum(2 * distance, 1e-6)
+    return np.where(mask, (1 - distance / np.maximum(width, 1e-6)).clip(0, 1), 1.0).astype(np.float32)
+
+
 def _sample(picture: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel values (N,4) under the points, zero outside the picture, and their depths (N,)."""
+    """Pixel values (N,channels) under the points, zero outside the picture, and their depths (N,)."""
     camera = points @ pose[:3, :3].T + pose[:3, 3]
     depth = np.maximum(camera[:, 2], 1e-6)
     column = np.floor(camera[:, 0] / depth * intrinsics[0, 0] + intrinsics[0, 2]).astype(int)
     row = np.floor(camera[:, 1] / depth * intrinsics[1, 1] + intrinsics[1, 2]).astype(int)
     height, width = picture.shape[:2]
     good = (row >= 0) & (row < height) & (column >= 0) & (column < width) & (camera[:, 2] > 0)
-    values = np.zeros((len(points), 4), np.float32)
+    values = np.zeros((len(points), picture.shape[2]), np.float32)
     values[good] = picture[row[good], column[good]]
     return values, depth
 

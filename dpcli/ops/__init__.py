@@ -27,6 +27,11 @@ _HOME = {
     "apply_motions": "rigid",
     "rigid_flow": "rigid",
     "to_matrix": "rigid",
+    "rasterization": "splatting",
+    "rasterization_reference": "splatting",
+    "orbit_pose": "cameras",
+    "orbit_of": "cameras",
+    "pinhole": "cameras",
     "chosen_backend": "backend",
 }
 
