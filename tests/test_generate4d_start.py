@@ -77,7 +77,7 @@ def test_two_views_at_a_right_angle_make_a_rod_round_not_square():
     points = points[np.abs(points[:, 1]) < 0.2]
     half = 12 / intrinsics[0, 0, 0] * 2  # of the bar, in the world
     radius = np.linalg.norm(points[:, [0, 2]], axis=1)
-    assert 0.9 * half < radius.max() < 1.2 * half  # a square's corners are at 1.41
+    assert 0.9 * half < np.percentile(radius, 99) < 1.2 * half  # a square's corners are at 1.41
 
 
 def test_sphere_points_fill_the_volume_evenly():

@@ -12,7 +12,7 @@ from dpcli.cli.options import Json, Picture
 from dpcli.errors import UsageError
 
 _PIPE_WIDTH = 120
-_CLASSES_SHOWN, _COMMAND_SHOWN = 100, 300
+_CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
 
 
 def info(
@@ -106,12 +106,21 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
             lines.append((key, ", ".join(f"{name or 'none'} ({count})" for name, count in found[key].items())))
     if found.get("unknown_labels"):
         lines.append(("unknown labels", str(found["unknown_labels"])))
+    lines += _skipped_lines(found.get("skipped", []))
     if found["kind"] == "views":
         lines += _view_lines(found)
     elif found["kind"] not in ("clouds", "parts", "scores"):
         lines += [(item["name"], f"{item['type']} {tuple(item['shape'])}") for item in found["datasets"]]
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
+
+
+def _skipped_lines(skipped: list[dict[str, str]]) -> list[tuple[str, str]]:
+    """Samples that were left out when the file was made, and why."""
+    lines = [("skipped", f"{entry['name']}: {entry['reason']}") for entry in skipped[:_SKIPPED_SHOWN]]
+    if len(skipped) > _SKIPPED_SHOWN:
+        lines.append(("skipped", f"... and {len(skipped) - _SKIPPED_SHOWN} more; --json lists all"))
+    return lines
 
 
 def _view_lines(found: dict[str, Any]) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dpcli.cli import prepare_animation, prepare_views
+from dpcli.cli import prepare_animation, prepare_scenes, prepare_views
 from dpcli.cli.options import Force, Jobs, OnError, Output, Seed
 from dpcli.errors import UsageError
 
@@ -342,3 +342,4 @@ def articulated(
 
 prepare_views.register(app)
 prepare_animation.register(app, synthetic)
+prepare_scenes.register(app, _reads)

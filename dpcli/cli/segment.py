@@ -12,6 +12,10 @@ from dpcli.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, help="Find rigid parts and their motions in a few frames, without labels.")
 
+Amp = Annotated[
+    bool | None,
+    typer.Option("--amp/--no-amp", help="Products in bfloat16, geometry in float32. Default: on CUDA only."),
+]
 _FLOW = "First flow: icp (rigid pieces), nearest (point), or a trained estimator's file or folder (dpc segment flow)."
 
 
@@ -70,6 +74,7 @@ def train(
     flows_of: Annotated[
         Path | None, typer.Option(help="Folder of a run on the same pairs, whose first flows are taken over.")
     ] = None,
+    amp: Amp = None,
     seed: Seed = 0,
     device: Device = "auto",
     force: Force = False,
@@ -93,6 +98,7 @@ def train(
     run_training(
         data, output, config=config, network=network, schedule=schedule, objective=objective, flow=flow, points=points,
         validation=validation, start_from=start_from, flows_of=flows_of, seed=seed, device=device, force=force,
+        amp=amp,
     )  # fmt: skip
 
 
@@ -134,6 +140,7 @@ def predict(
     ply: Annotated[
         Path | None, typer.Option("--ply", help="Write every frame as a coloured .ply into this folder.")
     ] = None,
+    amp: Amp = None,
     seed: Seed = 0,
     device: Device = "auto",
     force: Force = False,
@@ -151,7 +158,7 @@ def predict(
     run_prediction(
         data, model or ("" if method else default_model()), output, method=method, method_options=options, num_parts=parts,
         flow=flow, refinement=refinement, split=split, seed=seed, device=device, force=force, picture=picture, ply=ply,
-        turntable=turntable,
+        turntable=turntable, amp=amp,
     )  # fmt: skip
 
 

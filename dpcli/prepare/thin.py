@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.errors import UsageError
 from dpcli.prepare.reader import offsets
 from dpcli.store import CloudSequence
+from dpcli.store.sequence import POINT_FIELDS
 
 METHODS = ("random", "fps", "voxel")
 _SEARCH_STEPS = 20
@@ -53,7 +54,7 @@ class Thinning:
             chosen.append(index + start)
         sequence.frame_offsets = offsets(np.array([len(c) for c in chosen], np.int64))
         index = np.concatenate(chosen)
-        for name in ("points", "color", "part", "track"):
+        for name in ("points", *POINT_FIELDS):
             values = getattr(sequence, name)
             if values is not None:
                 setattr(sequence, name, values[index])

@@ -27,6 +27,7 @@ from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Objective
 from dpcli.segment.pair_flow import pair_flow
 from dpcli.segment.pairs import PairSource
+from dpcli.segment.precision import wanted
 from dpcli.segment.predict import Estimate, Refinement, Segmenter, network_segmenter, predict_parts
 from dpcli.segment.train import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file
@@ -39,7 +40,7 @@ CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
 def run_training(
     data: str, output: str, *, config: str, network: dict[str, Any], schedule: dict[str, Any], objective: dict[str, Any],
     flow: str, points: int | None, validation: str | None, start_from: str | None, flows_of: Path | None, seed: int,
-    device: str, force: bool,
+    device: str, force: bool, amp: bool | None = None,
 ) -> None:  # fmt: skip
     """`dpc segment train`."""
     chosen = choose_device(device)
@@ -51,12 +52,15 @@ def run_training(
         _check_supervision(reader, aims)
         record = {"network": json.loads(shape.to_json()), "schedule": asdict(plan), "objective": asdict(aims), "flow": flow,
                   "validation": validation, "start_from": start_from, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
+        mixed = wanted(amp, chosen)
+        record |= {"amp": True} if mixed else {}
         _check_flows_of(flows_of, record)
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         training = PairSource(reader, train_part, shape.points, seed)
         checking = PairSource(reader, held, shape.points, seed) if held else None
         torch.manual_seed(seed)
         model = _new_model(shape, start_from)
+        model.mixed = mixed
         notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "supervised": aims.supervised,
                  "flow": flow, "trained_on": f"{len(train_part)} sequences, {len(training.pairs)} pairs"}  # fmt: skip
         log.info(
@@ -147,7 +151,7 @@ def _hold_out_classes(reader: CloudsReader, train: list[int], names: str) -> tup
 def run_prediction(
     data: str, model: str, output: str, *, method: str | None, method_options: dict[str, Any], num_parts: int | None,
     flow: str, refinement: dict[str, Any], split: str, seed: int, device: str, force: bool,
-    picture: Path | None, ply: Path | None, turntable: Path | None,
+    picture: Path | None, ply: Path | None, turntable: Path | None, amp: bool | None = None,
 ) -> None:  # fmt: skip
     """`dpc segment predict`."""
     chosen = choose_device(device)
@@ -156,7 +160,7 @@ def run_prediction(
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         sequences = _select(reader, split)
-        segmenter, slots, said = _segmenter(method, method_options, num_parts, model, chosen, seed)
+        segmenter, slots, said = _segmenter(method, method_options, num_parts, model, chosen, seed, wanted(amp, chosen))
         config = {"split": split, "flow": flow, "refinement": asdict(options), **said}
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
         fields = [name for name in reader.fields if name not in ("part", "pose")]
@@ -171,11 +175,14 @@ def run_prediction(
 
 
 def _segmenter(
-    method: str | None, method_options: dict[str, Any], num_parts: int | None, model_name: str, device: torch.device, seed: int
+    method: str | None, method_options: dict[str, Any], num_parts: int | None, model_name: str, device: torch.device, seed: int,
+    mixed: bool = False,
 ) -> tuple[Segmenter, int, dict[str, Any]]:  # fmt: skip
     if method is None:
         model, notes = load_model(model_name)
-        return network_segmenter(model.to(device), device), model.config.slots, {"model": notes}
+        model.mixed = mixed
+        said = {"model": notes, **({"amp": True} if mixed else {})}
+        return network_segmenter(model.to(device), device), model.config.slots, said
     if method not in CLASSICAL:
         raise UsageError(f"--method {method}: expected one of {', '.join(CLASSICAL)}; without it the network is used")
     chosen = classical_options(method, method_options)

@@ -12,6 +12,7 @@ from dpcli.ops.gather import gather_points
 from dpcli.segment.config import PartConfig
 from dpcli.segment.icosahedron import GROUPS
 from dpcli.segment.neighbourhood import RULES, Neighbourhood
+from dpcli.segment.precision import full_precision
 from dpcli.segment.se3_conv import SeparableConv
 
 
@@ -43,12 +44,18 @@ class InvariantPooling(nn.Module):
             centred = -near.offsets.mean(2) / near.offsets.square().sum(-1).mean().sqrt().clamp(min=1e-6)
         else:
             centred = points - points.mean(1, keepdim=True)
-        local = torch.einsum("gij,bpi->bpgj", rotations, centred).to(features.dtype)
+        local = _turned_back(rotations, centred).to(features.dtype)
         logits = self.logit(torch.cat([features, local], -1))
         if self.config.pooling == "global":
             logits = logits.mean(1, keepdim=True).expand_as(logits)
         weights = torch.softmax(logits.float(), 2).to(features.dtype)  # [B, P, G, H]
         return (weights.transpose(2, 3) @ features).flatten(2)
+
+
+@full_precision
+def _turned_back(rotations: Tensor, offsets: Tensor) -> Tensor:
+    """R_a^T x of offsets (B,P,3) for every rotation (G,3,3): (B,P,G,3)."""
+    return torch.einsum("gij,bpi->bpgj", rotations, offsets)
 
 
 class Encoder(nn.Module):
@@ -103,7 +110,11 @@ class CanonicalFrames(nn.Module):
 
     def forward(self, level: Level) -> Tensor:
         """Maps (B,H,3,3) that take centred coordinates into the canonical frames."""
-        summary = nn.functional.normalize(level.equivariant.float().mean(1), dim=-1)
+        return self._maps(level.equivariant)
+
+    @full_precision
+    def _maps(self, features: Tensor) -> Tensor:
+        summary = nn.functional.normalize(features.float().mean(1), dim=-1)
         weights = torch.softmax(4 * self.logit(summary), 1)  # [B, G, H]
         rotations = GROUPS[self.group]().rotations_like(weights)
         return torch.einsum("bgh,gij->bhji", weights, rotations)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from dpcli.ops import three_nn_interpolate
 from dpcli.segment.config import PartConfig
 from dpcli.segment.encoder import CanonicalFrames, Level
+from dpcli.segment.precision import full_precision
 
 
 class PointMLP(nn.Module):
@@ -85,8 +86,7 @@ class SegmentationHead(nn.Module):
         if hasattr(self, "point_out"):
             hidden = self.point_out(hidden)
         slots = self._slots(torch.cat(memory, -1))
-        match = nn.functional.normalize(hidden, dim=-1) @ nn.functional.normalize(slots, dim=-1).transpose(1, 2)
-        return torch.softmax(match / self.config.temperature, -1)
+        return torch.softmax(_cosine(hidden, slots) / self.config.temperature, -1)
 
     def _coordinates(self, points: Tensor, coarse: Level):
         """A function from positions (B,P,3) to what the decoder may know of them: raw, or in invariant frames (B,P,3H)."""
@@ -94,7 +94,7 @@ class SegmentationHead(nn.Module):
             return lambda positions: positions
         maps = self.frames(coarse)
         centre = points.mean(1, keepdim=True)
-        return lambda positions: torch.einsum("bhij,bpj->bphi", maps, positions - centre).flatten(2)
+        return lambda positions: _read_in(maps, positions - centre)
 
     def _slots(self, memory: Tensor) -> Tensor:
         memory = self.memory(memory)
@@ -102,3 +102,15 @@ class SegmentationHead(nn.Module):
         for layer in self.layers:
             slots = layer(slots, memory)
         return self.slot_out(self.slot_mlp(slots))
+
+
+@full_precision
+def _cosine(hidden: Tensor, slots: Tensor) -> Tensor:
+    """Cosine (B,N,S) between points' and slots' vectors; divided by a small temperature, so not in bfloat16."""
+    return nn.functional.normalize(hidden, dim=-1) @ nn.functional.normalize(slots, dim=-1).transpose(1, 2)
+
+
+@full_precision
+def _read_in(maps: Tensor, offsets: Tensor) -> Tensor:
+    """Offsets (B,P,3) in every one of the frames (B,H,3,3): (B,P,3H)."""
+    return torch.einsum("bhij,bpj->bphi", maps, offsets).flatten(2)

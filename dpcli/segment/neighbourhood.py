@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dpcli.ops import knn
 from dpcli.ops.gather import gather_points
+from dpcli.segment.precision import full_precision
 
 
 @dataclass
@@ -61,6 +62,7 @@ def first_neighbourhood(points: Tensor, centres: Tensor, radius: float, count: i
 RULES = {"nearest": nearest_neighbourhood, "first": first_neighbourhood}
 
 
+@full_precision
 def kernel_weights(offsets: Tensor, positions: Tensor, sigma: float) -> Tensor:
     """max(0, 1 - ||x_n - x_p - k||^2 / sigma) for positions k (D,3): (B,P,n,3) -> (B,P,n,D)."""
     apart = offsets.square().sum(-1, keepdim=True) + positions.square().sum(-1) - 2 * offsets @ positions.T

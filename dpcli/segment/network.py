@@ -12,6 +12,7 @@ from dpcli.segment.config import PartConfig
 from dpcli.segment.encoder import Encoder, Level
 from dpcli.segment.heads import SegmentationHead
 from dpcli.segment.motion_head import MotionHead, choose_motion
+from dpcli.segment.precision import reduced_products
 
 
 @dataclass
@@ -28,6 +29,7 @@ class PartNetwork(nn.Module):
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
         self.config = config
+        self.mixed = False  # products in bfloat16: see `precision`
         self.encoder = Encoder(config)
         self.segmentation = SegmentationHead(config)
         self.motion = MotionHead(config) if config.motion_width else None
@@ -36,8 +38,10 @@ class PartNetwork(nn.Module):
         """points (B,N,3) f32, N >= 2 -> mask (B,N,S) and features. The cloud's place doesn't matter: it is centred first."""
         if self.config.canonical_heads:  # far from the origin, float32 would blur the neighbours' distances
             points = points - points.mean(1, keepdim=True)
-        levels = self.encoder(points)
-        return FrameParts(self.segmentation(points, levels), levels[-1])
+        with reduced_products(points.device, self.mixed):
+            levels = self.encoder(points)
+            mask = self.segmentation(points, levels)
+        return FrameParts(mask.float(), levels[-1])
 
     def pair(self, points: Tensor, frames: FrameParts, matched: Tensor) -> tuple[Tensor, Tensor]:
         """Confidence and residuals of the motion head. points (2B,N,3): frames 1, then frames 2; matched (2B,N,S): masks

@@ -13,6 +13,7 @@ from dpcli.segment.config import Layer, PartConfig
 from dpcli.segment.icosahedron import GROUPS
 from dpcli.segment.kernel_points import kernel_points
 from dpcli.segment.neighbourhood import Neighbourhood, kernel_weights
+from dpcli.segment.precision import REDUCED, is_reduced
 
 
 class SpatialConv(nn.Module):
@@ -74,6 +75,7 @@ class GroupConv(nn.Module):
         nn.init.normal_(self.weight, std=(2 / ((channels + out_channels) * len(group.nearby))) ** 0.5 * 2**0.5)
 
     def forward(self, features: Tensor) -> Tensor:
+        features = features.to(REDUCED) if is_reduced(features) else features
         return _GroupConv.apply(features, self.weight, self.table, self.back)
 
 
@@ -97,10 +99,13 @@ class _GroupConv(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             given = _multiply_turned(grad, back, weight.transpose(1, 2).flatten(0, 1).to(grad.dtype))
         if ctx.needs_input_grad[1]:
-            to_weight = torch.zeros_like(weight.flatten(0, 1), dtype=grad.dtype)
+            to_weight = torch.zeros_like(weight.flatten(0, 1), dtype=torch.promote_types(grad.dtype, weight.dtype))
             rows = grad.flatten(0, 1)
             for piece, turned in _turned(features, table):
-                to_weight.addmm_(turned.T, rows[piece].flatten(0, 1))
+                if grad.dtype == to_weight.dtype:
+                    to_weight.addmm_(turned.T, rows[piece].flatten(0, 1))
+                else:  # a sum of many pieces would stand still in bfloat16
+                    to_weight += turned.T @ rows[piece].flatten(0, 1)
             to_weight = to_weight.view(weight.shape).to(weight.dtype)
         return given, to_weight, None, None
 
@@ -127,6 +132,7 @@ def _turned(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 def instance_norm(features: Tensor) -> Tensor:
     """Zero mean and unit variance of every channel over points and rotations, which only permute under the group."""
+    features = features.to(torch.promote_types(features.dtype, torch.float32))  # sums of thousands: not in bfloat16
     mean = features.mean((1, 2), keepdim=True)
     variance = (features - mean).square().mean((1, 2), keepdim=True)
     return (features - mean) * torch.rsqrt(variance + 1e-5)

@@ -114,6 +114,27 @@ def read_provenance(file: h5py.File) -> list[dict]:
         raise DataError(f"{file.filename}: provenance is not JSON; the file was changed by another program") from None
 
 
+def write_skipped(file: h5py.File, skipped: Sequence[tuple[str, str]]) -> None:
+    """Samples that were passed over, (name, reason): how many as an attribute, who and why as a data set (n,2).
+
+    A data set, because an attribute ends at 64 KiB. Nothing is written when there are none.
+    """
+    if not skipped:
+        return
+    clean = [[text.encode("utf-8", "replace").decode().replace("\0", " ") for text in row] for row in skipped]
+    file.attrs["skipped"] = len(clean)
+    file.create_dataset("skipped", data=np.array(clean, dtype=object), dtype=STRING)
+
+
+def read_skipped(file: h5py.File) -> list[tuple[str, str]]:
+    """(name, reason) of the samples that were passed over when the file was made; DataError on a wrong shape."""
+    if "skipped" not in file:
+        return []
+    if file["skipped"].ndim != 2 or file["skipped"].shape[1] != 2:
+        raise DataError(f"{file.filename}: skipped has shape {file['skipped'].shape}, expected (n, 2): name, reason")
+    return [(str(name), str(reason)) for name, reason in file["skipped"].asstr()[:]]
+
+
 def read_strings(file: h5py.File, name: str) -> list[str]:
     """A string data set as a list; DataError when it is absent."""
     if name not in file:
@@ -137,6 +158,7 @@ class AtomicFile:
             raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
         try:
             self.file = h5py.File(self.part, mode)
+            self._handle = self.file.id.get_vfd_handle()
         except OSError as error:
             busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
             why = "another dpc is writing it" if busy else str(error).splitlines()[0]
@@ -159,8 +181,11 @@ class AtomicFile:
                 os.fsync(whole.fileno())
             os.replace(self.part, self.target)
         except (OSError, RuntimeError) as error:
+            worded = self.problem(error)
+            if worded is not None:
+                self._let_go()
             self.discard()
-            raise self.problem(error) or DpcError(f"{self.target}: could not be finished ({error})") from None
+            raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
 
     def suspend(self) -> None:
         self.file.close()
@@ -176,10 +201,24 @@ class AtomicFile:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Discard after an exception; re-raise a failed write in words."""
-        self.discard()
         worded = self.problem(error) if error is not None else None
         if worded is not None:
+            self._let_go()
+        self.discard()
+        if worded is not None:
             raise worded from None
+
+    def _let_go(self) -> None:
+        """After a failed write: what HDF5 still holds goes into memory nobody reads, instead of to the full disk.
+
+        It would try again on every close, complain each time, and crash as the process ends.
+        """
+        try:
+            elsewhere = os.open(os.devnull, os.O_RDWR)
+            os.dup2(elsewhere, self._handle, inheritable=False)
+            os.close(elsewhere)
+        except OSError:  # closed already
+            pass
 
 
 def write_root(file: h5py.File, kind: str, *, length_unit: str, source: str, seed: int, class_names: Sequence[str],

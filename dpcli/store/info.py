@@ -67,6 +67,7 @@ def _clouds(path: Path) -> dict[str, Any]:
             **_who(reader.class_names, reader.labels, reader.splits),
             "subjects": _count(_known(reader.subjects)),
             "cameras": _count(_known(reader.cameras)),
+            "skipped": [{"name": name, "reason": reason} for name, reason in reader.skipped],
         }  # fmt: skip
 
 

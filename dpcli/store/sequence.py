@@ -13,6 +13,7 @@ POINT_FIELDS = {
     "color": (np.uint8, (3,)),
     "part": (np.int16, ()),
     "track": (np.int64, ()),
+    "scene_flow": (np.float32, (3,)),
 }  # name -> dtype, shape of one point
 
 
@@ -22,7 +23,8 @@ class CloudSequence:
 
     points f32 (P,3) in the file's length unit; frame_offsets i64 (T+1), from 0 to P; label counts from 0, -1 = unknown;
     time f64 (T) seconds; color u8 (P,3); part i16 (P) rigid part; track i64 (P) identity of a point over frames;
-    pose f64 (T,parts,4,4) part-to-world.
+    scene_flow f32 (P,3) true displacement to the next frame, in the last frame to the one before; for motion that no
+    pose tells; pose f64 (T,parts,4,4) part-to-world.
     """
 
     name: str
@@ -36,6 +38,7 @@ class CloudSequence:
     color: np.ndarray | None = None
     part: np.ndarray | None = None
     track: np.ndarray | None = None
+    scene_flow: np.ndarray | None = None
     pose: np.ndarray | None = None
 
     @classmethod
@@ -87,6 +90,8 @@ class CloudSequence:
             if value is not None and (value.shape != (len(self.points), *shape) or value.dtype != dtype):
                 expected = (len(self.points), *shape)
                 raise DataError(f"{where}: {key} is {value.dtype} {value.shape}, expected {np.dtype(dtype)} {expected}")
+        if self.scene_flow is not None and not np.isfinite(self.scene_flow).all():
+            raise DataError(f"{where}: scene_flow holds NaN or infinity; drop the points whose motion is unknown")
         if self.time is not None and self.time.shape != (self.num_frames,):
             raise DataError(f"{where}: time has shape {self.time.shape}, expected ({self.num_frames},)")
         if self.pose is not None and (self.pose.ndim != 4 or self.pose.shape[::3] != (self.num_frames, 4)):

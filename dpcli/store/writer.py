@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, Stopped, UsageError
-from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, write_root
+from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, write_root, write_skipped
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
 if TYPE_CHECKING:
@@ -29,7 +29,8 @@ class CloudsWriter:
     Leaving the block without an exception finishes the file; an exception removes the part, except that with
     `resume=True` a stop (Stopped, KeyboardInterrupt) keeps it, and the next writer with the same provenance continues:
     `written_names` lists what is already there. `fields` names the optional ones the samples carry
-    (time, color, part, track, pose). Raises UsageError when `path` exists and `force` is off.
+    (time, color, part, track, pose). `skipped`, set before the block ends: (name, reason) of samples left out, kept in
+    the file. Raises UsageError when `path` exists and `force` is off.
     """
 
     kind = "clouds"
@@ -56,6 +57,7 @@ class CloudsWriter:
         self.fields, self.compression = tuple(fields), compression
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self._root = {"length_unit": length_unit, "source": source, "seed": seed}
+        self.skipped: list[tuple[str, str]] = []
         self.written_names: list[str] = self._resumable() if resume and not force else []
         self.resumed = bool(self.written_names)
         self._atomic = AtomicFile(self.path, "r+" if self.resumed else "w")
@@ -146,6 +148,7 @@ class CloudsWriter:
         start = len(data)
         data.resize(start + len(values), axis=0)
         data[start:] = values
+        data.flush()  # as its closing would do, which can't say that the disk is full
 
     def __len__(self) -> int:
         return len(self._names)
@@ -187,6 +190,11 @@ class CloudsWriter:
             self.resumed
         ):  # a file that was closed and reopened has another layout: copy, so that equal work gives equal bytes
             self._repack()
+        try:
+            write_skipped(self._file, self.skipped)
+        except BaseException as error:
+            self._atomic.failed(type(error), error, None)
+            raise
         self._atomic.commit()
 
     def _repack(self) -> None:
