@@ -62,6 +62,8 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
+    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--dense-steps", 60, "--sparse-steps", 60)
+    assert same.returncode == 0 and "finished" in same.stderr.decode()
     again = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
     assert again.returncode == 2 and "--force" in again.stderr.decode()
 

@@ -70,11 +70,11 @@ class CanonicalGaussians(nn.Module):
         old, new = keep.nonzero()[:, 0], chosen.nonzero()[:, 0]
         size = self.log_scale.max(1).values
         split = new[size[new] > size.median()]
-        offset = torch.randn(len(new), 3, generator=rng) * self.log_scale[new].exp()
+        offset = torch.randn(len(new), 3, generator=rng).to(self.mean.device) * self.log_scale[new].exp()
         offset = rotate(normalise(self.quaternion[new]), offset)
         self._take(optimizer, torch.cat([old, new]), fresh=len(new))
-        kept = torch.full((len(mean_gradient),), -1, dtype=torch.long)
-        kept[old] = torch.arange(len(old))
+        kept = torch.full((len(mean_gradient),), -1, dtype=torch.long, device=old.device)
+        kept[old] = torch.arange(len(old), device=old.device)
         self.mean[len(old) :] += offset * 0.5
         self.log_scale[kept[split]] -= 0.47  # log 1.6
         self.log_scale[len(old) :][torch.isin(new, split)] -= 0.47
@@ -96,7 +96,7 @@ class CanonicalGaussians(nn.Module):
             group["params"] = [new]
             setattr(self, name, new)
         self.anchor = self.anchor[index].clone()
-        self.gradient, self.seen = torch.zeros(len(index)), torch.zeros(len(index))
+        self.gradient, self.seen = index.new_zeros(len(index)).float(), index.new_zeros(len(index)).float()
 
     @classmethod
     def empty(cls, count: int) -> CanonicalGaussians:

@@ -20,12 +20,13 @@ from dpcli.generate4d.scene_out import to_scene
 from dpcli.generate4d.targets import Targets, load_targets
 from dpcli.ops.cameras import orbit_of
 from dpcli.runtime import provenance
+from dpcli.runtime.device import choose_device
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import input_file, output_file
-from dpcli.store.gaussians import write_scene
+from dpcli.store.gaussians import scene_origin, write_scene
 
 
 def run_fit(
@@ -36,26 +37,28 @@ def run_fit(
     config = preset(preset_name, **changes)
     if prior not in PRIORS:
         raise UsageError(f"--prior {prior}: expected one of {', '.join(PRIORS)}")
-    if output != "-" and Path(output).exists() and not force:
-        raise UsageError(f"{output}: exists already; --force fits again")
+    chosen = choose_device(device)
     where = _run_folder(output, run)
     with input_file(views) as path:
+        record = {"config": json.loads(json.dumps(asdict(config))), "prior": prior, "prior_model": prior_model,
+                  "regularise": regularise, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
+        if output != "-" and Path(output).exists() and not force:
+            return _finished_before(Path(output), record)
         targets = load_targets(path, config.size, ("train",) if prior == "views" else ())
         if prior == "views" and targets.num_views < 2:
             raise DataError(f"{path}: --prior views needs views of the role 'train', but there is none; give them to"
                             " `dpc prepare video --views`, or use --prior none")  # fmt: skip
-        record = {"config": json.loads(json.dumps(asdict(config))), "prior": prior, "prior_model": prior_model,
-                  "regularise": regularise, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
         folder = RunFolder(where, record, force, columns=COLUMNS, curves=draw_curves)
         judge = _prior(prior, prior_model, targets, device)
         log.info(
-            f"fitting {targets.name}: {targets.num_views} view(s) x {targets.num_frames} frames of"
+            f"fitting {targets.name} on {chosen}: {targets.num_views} view(s) x {targets.num_frames} frames of"
             f" {targets.size[0]} x {targets.size[1]}, {config.dense_steps} dense + {config.sparse_steps} sparse steps"
         )
         keep_freed_memory()
         with stop_requested() as stop:
-            fit = Fit(targets, config, folder, stop, seed, judge, _previews(folder, targets), regularise)
-            model = fit.run()
+            fit = Fit(targets, config, folder, stop, seed, judge, chosen, _previews(folder, targets), regularise)
+            model = fit.run().cpu()
+            model.refresh_neighbours()
         scene = to_scene(model, targets, _metrics(model, targets, fit))
         if picture is not None:
             write_preview(model, targets, picture)
@@ -65,6 +68,17 @@ def run_fit(
                         length_unit=targets.length_unit, force=force)  # fmt: skip
     log.info(f"reference view {scene.metrics['psnr_reference']:.2f} dB PSNR, {scene.metrics['gaussians']} Gaussians,"
              f" {scene.metrics['seconds']:.0f} s")  # fmt: skip
+
+
+def _finished_before(output: Path, record: dict) -> None:
+    """Nothing to do when the file there is this very fit; UsageError when it is anything else."""
+    try:
+        history = scene_origin(output)[1]
+    except DataError:
+        history = []
+    if not history or history[-1].get("config") != record:
+        raise UsageError(f"{output}: exists already and is no scene of this fit; --force replaces it")
+    log.info(f"{output}: this fit is finished; --force fits again")
 
 
 def _run_folder(output: str, run: str | None) -> Path:

@@ -37,16 +37,18 @@ class Fit:
 
     def __init__(
         self, targets: Targets, config: FitConfig, folder: RunFolder, stop: StopRequest, seed: int,
-        prior: object | None = None, preview: Callable[[Model4D, int], None] | None = None, regularise: bool = True,
+        prior: object | None = None, device: torch.device | None = None,
+        preview: Callable[[Model4D, int], None] | None = None, regularise: bool = True,
     ) -> None:  # fmt: skip
         self.targets, self.config, self.folder, self.stop, self.seed = targets, config, folder, stop, seed
         self.prior, self.preview, self.regularise = prior, preview, regularise
+        self.device = device or torch.device("cpu")
         self.step, self.spent = 0, 0.0
         self.control_reference: Tensor | None = None  # [T, K, 3] p-bar of C.13
         self._neighbours: Tensor | None = None
         self._notes: dict = {}
         self.recent: dict[str, list[float]] = {}
-        self.times = targets.times()
+        self.times = targets.times().to(self.device)
 
     # ---- the run -------------------------------------------------------------------------------------------------
 
@@ -81,6 +83,7 @@ class Fit:
                 field.start_parts(mean, spread_seeds(mean, self.config.parts))
             else:
                 field.update_centres(mean)
+        self.model.to(self.device)
         self.optimizer = self._new_optimizer()
 
     def _start_kind(self) -> str:
@@ -161,10 +164,10 @@ class Fit:
 
     def _picture_terms(self, instant: Instant, views: list[int], frames: list[int], rng: torch.Generator) -> tuple[Tensor, float]:
         config = self.config
-        wanted, intrinsics, poses = self.targets.at(views, frames, self._shrink())
+        wanted, intrinsics, poses = (t.to(self.device) for t in self.targets.at(views, frames, self._shrink()))
         height, width = wanted.shape[1:3]
         black = torch.rand(len(views), 1, generator=rng) < config.inversion
-        background = torch.where(black, torch.zeros(1, 3), torch.ones(1, 3))
+        background = torch.where(black, torch.zeros(1, 3), torch.ones(1, 3)).to(self.device)
         rendered, alpha, notes = self.model.render(instant, poses, intrinsics, width, height, background)
         if notes["means2d"].requires_grad:
             notes["means2d"].retain_grad()
@@ -184,13 +187,14 @@ class Fit:
         """What a generative prior says of random new views of the step's frames (C.11)."""
         size = min(max(self.targets.size), 256)
         cameras, poses, intrinsics = novel_cameras(self.targets, len(frames), size, rng)
-        rendered, _, _ = self.model.render(instant, poses, intrinsics, size, size, torch.ones(len(frames), 3))
+        white = torch.ones(len(frames), 3, device=self.device)
+        rendered, _, _ = self.model.render(instant, poses.to(self.device), intrinsics.to(self.device), size, size, white)
         return self.prior.loss(rendered, cameras, frames, self.step / self.config.steps, rng)
 
     def _motion_terms(self, instant: Instant, frames: list[int]) -> Tensor:
         """Losses on what carries the Gaussians: parts, shape over time, and the drift of control points."""
         config, motion, carriers = self.config, instant.motion, instant.carriers
-        total = torch.zeros(())
+        total = torch.zeros((), device=self.device)
         picked = self._picked(len(carriers))
         points, moved, part = carriers[picked], motion.displacement[:, picked], motion.part[:, picked]
         if self._neighbours is None or len(self._neighbours) != len(points):
@@ -206,7 +210,7 @@ class Fit:
         if config.arap:
             total = total + config.arap * arap_loss(points, points + moved, self._neighbours)
         if self.regularise and self.targets.num_views == 1:
-            axis = torch.from_numpy(self.targets.world_to_camera[self.targets.reference][2, :3]).float()
+            axis = torch.from_numpy(self.targets.world_to_camera[self.targets.reference][2, :3]).float().to(self.device)
             total = total + config.thickness * thickness_loss(self.model.gaussians, axis)
         if self.regularise:
             total = total + config.roundness * roundness_loss(self.model.gaussians, config.aspect)
@@ -303,12 +307,15 @@ class Fit:
         gaussians.load_state_dict(state["gaussians"])
         self.model = Model4D(gaussians, self.config)
         self.model.field.load_state_dict(state["field"])
+        self.model.to(self.device)
         self.optimizer = self._new_optimizer()
         if state["control"] is not None:
-            self.model.control = ControlPoints(state["control"]["position"], self.config.neighbours)
+            self.model.control = ControlPoints(state["control"]["position"], self.config.neighbours).to(self.device)
             self.model.control.load_state_dict(state["control"])
             for name, key in (("control", "position"), ("radius", "log_radius")):
                 self.optimizer.add_param_group({"params": [getattr(self.model.control, key)], "lr": 0.0, "name": name})
-            self.control_reference = state["control_reference"]
+            self.control_reference = state["control_reference"].to(self.device)
         self.optimizer.load_state_dict(state["optimizer"])
-        self.model.nearest, self._neighbours = state["nearest"], state["neighbours"]
+        self.model.nearest, self._neighbours = (
+            None if state[key] is None else state[key].to(self.device) for key in ("nearest", "neighbours")
+        )

@@ -38,7 +38,8 @@ class Model4D(nn.Module):
 
     def start_control(self) -> None:
         """From now on K control points, chosen among the Gaussians, carry them all."""
-        self.control = ControlPoints.among(self.gaussians.mean, self.config.control_points, self.config.neighbours)
+        own = self.gaussians.mean
+        self.control = ControlPoints.among(own, self.config.control_points, self.config.neighbours).to(own.device)
         self.nearest = None
 
     def refresh_neighbours(self) -> None:

@@ -29,18 +29,21 @@ def write_preview(model: Model4D, targets: Targets, path: Path, columns: int = 5
     shrink = max(targets.size[1] // side, 1)
     wanted, intrinsics, poses = targets.at([targets.reference] * len(frames), frames, shrink)
     height, width = wanted.shape[1:3]
-    instant = model.at(targets.times()[frames])
-    field = model.field(model.gaussians.mean, targets.times()[frames])
-    parts = _COLOURS[field.part.argmax(-1) % len(_COLOURS)]
+    device = model.gaussians.mean.device
+    wanted, intrinsics, poses = wanted.to(device), intrinsics.to(device), poses.to(device)
+    times = targets.times()[frames].to(device)
+    instant = model.at(times)
+    field = model.field(model.gaussians.mean, times)
+    parts = _COLOURS.to(device)[field.part.argmax(-1) % len(_COLOURS)]
     rigid = torch.cat([1 - field.weight, torch.full_like(field.weight, 0.3), field.weight], -1)
     azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
-    aside = torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius)).float().expand(len(frames), 4, 4)
+    aside = torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius)).float().expand(len(frames), 4, 4).to(device)
 
     def draw(colours: Tensor, cameras: Tensor) -> Tensor:
         own = model.gaussians
         return rasterization(
             instant.mean, instant.quaternion, own.log_scale.exp(), own.opacity_logit.sigmoid(), colours, cameras,
-            intrinsics, width, height, backgrounds=torch.ones(len(frames), 3),
+            intrinsics, width, height, backgrounds=torch.ones(len(frames), 3, device=device),
         )[0]  # fmt: skip
 
     own_colour = model.gaussians.colour.expand(len(frames), -1, -1)
@@ -48,5 +51,5 @@ def write_preview(model: Model4D, targets: Targets, path: Path, columns: int = 5
             draw(own_colour, aside)]  # fmt: skip
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
     part = path.with_name(f".{path.stem}.part.png")
-    imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().numpy())
+    imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().cpu().numpy())
     os.replace(part, path)
