@@ -44,7 +44,7 @@ def film(meshes: Path, clip: str, out: Path, size: int) -> Path:
         sys.exit(f"{meshes}: no {model}.glb in it")
     path = out / f"{model}-{motion}.h5"
     if not path.exists():
-        dpc("prepare", "animation", found[0], "--clip", motion, "-o", path, "--size", size, "--yaw", 55,
+        dpc("prepare", "animation", found[0], "--clip", motion, "-o", path, "--size", size, "--yaw", 90,
             "--train-azimuths", "15,-75,105,195", "--azimuths", "60,-30,150,240")  # fmt: skip
     return path
 
