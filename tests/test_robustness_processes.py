@@ -1,0 +1,211 @@
+"""Real processes in bad surroundings: a disk that is full, signals in the middle, pipes of three commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.file import read_skipped, write_skipped
+from tests.prepare_helpers import ROOT, write_msr
+
+DPC = [sys.executable, "-m", "dpcli"]
+NAMES = [f"a{1 + n % 20:02}_s{1 + n % 8:02}_e{1 + n // 20:02}" for n in range(40)]
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory) -> Path:
+    """Forty videos of MSR-Action3D's format: 160 x 120, 12 frames, half of the pixels valid; 11 MB of points."""
+    return write_msr(tmp_path_factory.mktemp("robust") / "raw", NAMES, frames=12, height=120, width=160)
+
+
+def leftovers(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def namespace(script: str, **env: str) -> subprocess.CompletedProcess:
+    """A shell script as root of a user and mount namespace of its own."""
+    return subprocess.run(
+        ["unshare", "-rm", "sh", "-ec", script], cwd=ROOT, capture_output=True, text=True, timeout=300,
+        env={**os.environ, **env},
+    )  # fmt: skip
+
+
+def can_mount(folder: Path) -> bool:
+    if shutil.which("unshare") is None:
+        return False
+    return namespace('mount -t tmpfs -o size=1m none "$D" && touch "$D/x"', D=str(folder)).returncode == 0
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_full_disk_ends_with_a_sentence_and_leaves_nothing(raw, tmp_path, jobs):
+    """A file system of 2 MiB for 11 MB of points."""
+    if not can_mount(tmp_path):
+        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
+    script = (
+        'mount -t tmpfs -o size=2m none "$D"; set +e\n'
+        f'"{sys.executable}" -m dpcli prepare msraction3d "$RAW" -o "$D/out.h5" --jobs {jobs}\n'
+        'echo "code $?"; ls -A "$D"'
+    )
+    done = namespace(script, D=str(tmp_path), RAW=str(raw))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["code", "1"], done.stdout + done.stderr
+    assert "out.h5: no space left on the device; nothing was left under that name" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc):
+    """`-o -` spools beside nothing the user named: the message still says what was full."""
+    if not can_mount(tmp_path):
+        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
+    script = (
+        'mount -t tmpfs -o size=2m none "$TMPDIR"; set +e\n'
+        f'"{sys.executable}" -m dpcli prepare msraction3d "$RAW" -o - --jobs 1 | wc -c; ls -A "$TMPDIR"'
+    )
+    done = namespace(script, TMPDIR=str(tmp_path), RAW=str(raw))
+    assert done.stdout.split() == ["0"], done.stdout + done.stderr
+    assert "no space left on the device" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_file_size_limit_is_told_like_a_full_disk(raw, tmp_path):
+    """Where nobody may mount: the shell's limit on a file's size stops the same write."""
+
+    def limited() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2 << 20, 2 << 20))
+
+    done = subprocess.run(
+        [*DPC, "prepare", "msraction3d", raw, "-o", tmp_path / "out.h5", "--jobs", "1"],
+        cwd=ROOT, capture_output=True, text=True, timeout=300, preexec_fn=limited,
+    )  # fmt: skip
+    assert done.returncode == 1 and "the file size limit is reached" in done.stderr
+    assert leftovers(tmp_path) == []
+
+
+def start(raw: Path, output: Path, count: int) -> subprocess.Popen:
+    """A conversion in two worker processes, returned once `count` samples are in the part file."""
+    process = subprocess.Popen(
+        [*DPC, "-v", "prepare", "msraction3d", raw, "-o", output, "--jobs", "2", "--points", "4000", "--sampling", "fps"],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    part, limit = output.with_name(f".{output.name}.part"), time.monotonic() + 120
+    while time.monotonic() < limit and process.poll() is None:
+        if part.exists() and part.stat().st_size > count * 300_000:
+            break
+        time.sleep(0.01)
+    return process
+
+
+def alive(session: int) -> list[str]:
+    """Processes of a session that still run."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == session and fields[0] not in "ZX":
+            found.append(folder.name)
+    return found
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
+@pytest.mark.parametrize("everyone", [True, False])
+def test_a_signal_in_the_middle_keeps_what_is_done(raw, tmp_path, number, code, everyone):
+    """To the process alone (kill) or to its whole group (a terminal, a batch system); then the same command continues."""
+    output = tmp_path / "out.h5"
+    process = start(raw, output, 2)
+    if process.poll() is not None:
+        pytest.skip("the conversion was over before the signal came")
+    os.killpg(process.pid, number) if everyone else os.kill(process.pid, number)
+    _, told = process.communicate(timeout=120)
+    if process.returncode == 0:
+        pytest.skip("the conversion was over before the signal came")
+    assert process.returncode == code, told
+    assert "Traceback" not in told and "samples are kept" in told
+    assert leftovers(tmp_path) == [".out.h5.part"]
+    limit = time.monotonic() + 20
+    while alive(process.pid) and time.monotonic() < limit:
+        time.sleep(0.05)
+    assert alive(process.pid) == []
+    again = start(raw, output, 10**6)
+    _, told = again.communicate(timeout=300)
+    assert again.returncode == 0 and "continuing: " in told, told
+    assert leftovers(tmp_path) == ["out.h5"]
+    with CloudsReader(output) as reader:
+        assert sorted(reader.names) == sorted(NAMES) and reader.skipped == []
+
+
+def test_three_commands_in_a_pipe_with_all_points(raw, tmp_path):
+    """prepare | predict | evaluate as the issue writes it, all points kept; a bad video is left out and named."""
+    few = tmp_path / "raw"
+    few.mkdir()
+    for name in NAMES[:3]:
+        shutil.copy(raw / f"{name}_sdepth.bin", few)
+    (few / "a09_s01_e01_sdepth.bin").write_bytes(b"\x01\x02")
+    dpc = f'"{sys.executable}" -m dpcli'
+    script = (
+        f'set -o pipefail; {dpc} prepare msraction3d "{few}" -o - | {dpc} classify predict - --model msraction3d-16 -o -'
+        f" --clips-per-video 1 | {dpc} evaluate classification - --split all --json"
+    )
+    done = subprocess.run(["bash", "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "a09_s01_e01" in done.stderr and json.loads(done.stdout)["metrics"]
+
+
+def test_a_dead_end_of_the_pipe_ends_the_chain(raw):
+    """When the last command can't start, the first ones end without a trace of Python."""
+    dpc = f'"{sys.executable}" -m dpcli'
+    script = f'{dpc} prepare msraction3d "{raw}" -o - --limit 4 | {dpc} info - --samples 0'
+    done = subprocess.run(["bash", "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_the_file_says_what_was_skipped_and_why(tmp_path, dpc, jobs):
+    folder = write_msr(tmp_path / "raw", NAMES[:3])
+    (folder / "a09_s01_e01_sdepth.bin").write_bytes(b"")
+    output = tmp_path / "out.h5"
+    words = ("prepare", "msraction3d", folder, "-o", output, "--jobs", jobs)
+    assert dpc(*words).returncode == 0
+    with h5py.File(output) as file:
+        assert file.attrs["skipped"] == 1
+    told = json.loads(dpc("info", output, "--json").stdout)["skipped"]
+    assert [entry["name"] for entry in told] == ["a09_s01_e01"] and "0 bytes" in told[0]["reason"]
+    assert "skipped              a09_s01_e01: " in dpc("info", output).stdout.decode()
+    again = dpc(*words)
+    assert "already complete" in again.stderr.decode() and b"1 skipped" in again.stdout
+
+
+def test_nothing_skipped_leaves_no_word(tmp_path, dpc):
+    folder = write_msr(tmp_path / "raw", NAMES[:2])
+    assert dpc("prepare", "msraction3d", folder, "-o", tmp_path / "out.h5", "--jobs", "1").returncode == 0
+    with h5py.File(tmp_path / "out.h5") as file:
+        assert "skipped" not in file and "skipped" not in file.attrs
+    assert b"\nskipped" not in dpc("info", tmp_path / "out.h5").stdout
+
+
+def test_many_and_odd_reasons_survive(tmp_path):
+    """More than an attribute holds, and names that are no UTF-8."""
+    rows = [(f"video {n}\udcff", "because " * 30) for n in range(2000)]
+    path = tmp_path / "many.h5"
+    with CloudsWriter(path) as writer:
+        writer.write(CloudSequence.from_frames("one", [np.zeros((3, 3), np.float32)]))
+        writer.skipped = rows
+    with CloudsReader(path) as reader:
+        assert len(reader.skipped) == 2000
+        assert reader.skipped[7] == ("video 7?", "because " * 30)
+    with h5py.File(tmp_path / "odd.h5", "w") as file:
+        write_skipped(file, [("a\0b", "c")])
+        assert read_skipped(file) == [("a b", "c")]
