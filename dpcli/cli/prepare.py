@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from dpcli.cli import prepare_animation, prepare_scenes, prepare_views
-from dpcli.cli.options import Force, Jobs, OnError, Output, Seed
+from dpcli.cli import prepare_animation, prepare_files, prepare_gestures, prepare_scenes, prepare_views
+from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, help="Turn raw data into a file of point cloud sequences, or of views.")
@@ -19,7 +20,7 @@ app.add_typer(synthetic, name="synthetic")
 
 
 def _common(
-    output: Output,
+    output: Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")] = "",
     points: Annotated[
         int, typer.Option("--points", min=0, help="At most this many points per frame; 0 keeps all.")
     ] = 0,
@@ -28,6 +29,15 @@ def _common(
     compression: Annotated[str, typer.Option("--compression", help="Of the coordinates: none, lzf or gzip.")] = "none",
     on_error: OnError = "skip",
     jobs: Jobs = None,
+    shard: Annotated[
+        str, typer.Option("--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1, for merge.")
+    ] = "",
+    dask: Annotated[
+        str, typer.Option("--dask", metavar="ADDRESS", help="Read on a Dask cluster: tcp://HOST:PORT, or local.")
+    ] = "",
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare the folder with its recipe; list what is missing.")
+    ] = False,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -100,8 +110,15 @@ def _reads(
             if more:
                 given["articulation"] = {key: options[key] for key in extra}
             common = {key: options[key] for key in shared}
-            _warm_up(warm, **common)
-            _convert(make_reader(**given), name or make_reader.__name__, **common)
+            command = name or make_reader.__name__
+            if common.pop("check"):
+                _check(command, partial(make_reader, **given), given)
+                return
+            if not common["output"]:
+                raise UsageError("-o/--output FILE is missing: the file to write, or - for a pipe")
+            if not common["dask"]:
+                _warm_up(warm, **common)
+            _convert(make_reader(**given), command, **common)
 
         parameters = {**own, **shared, **extra}
         # a parameter without default may not follow one with: arguments first, then -o, then the rest
@@ -129,14 +146,31 @@ def _warm_up(modules: tuple[str, ...], *, jobs: int | None, points: int, samplin
     ])  # fmt: skip
 
 
-def _convert(reader: Any, name: str, *, output: str, jobs: int | None, **options: Any) -> None:
+def _check(name: str, make_reader: Callable[[], Any], given: dict[str, Any]) -> None:
+    from dpcli.prepare.recipe_check import check_folder
+
+    raw = next((value for value in given.values() if isinstance(value, Path)), None)
+    for line in check_folder(name, raw, make_reader):
+        typer.echo(line)
+
+
+def _convert(reader: Any, name: str, *, output: str, jobs: int | None, shard: str, dask: str, **options: Any) -> None:
     from dpcli.prepare.pipeline import convert
+    from dpcli.prepare.shards import Shard
     from dpcli.runtime.device import cpu_count
     from dpcli.runtime.progress import log
     from dpcli.store.pipes import output_file
 
+    options |= {"shard": Shard.parse(shard) if shard else None, "task": f"prepare {name}", "resume": output != "-"}
+    jobs = jobs or cpu_count()
     with output_file(output) as path:
-        report = convert(reader, path, jobs=jobs or cpu_count(), task=f"prepare {name}", **options)
+        if dask:
+            from dpcli.prepare.cluster import cluster_executor
+
+            with cluster_executor(dask, jobs) as (executor, slots):
+                report = convert(reader, path, jobs=slots, executor=executor, **options)
+        else:
+            report = convert(reader, path, jobs=jobs, **options)
     for line in report.lines():
         log.warn(line)
     if output != "-":
@@ -341,5 +375,7 @@ def articulated(
 
 
 prepare_views.register(app)
+prepare_files.register(app)
+prepare_gestures.register(app, _reads)
 prepare_animation.register(app, synthetic)
 prepare_scenes.register(app, _reads)

@@ -73,13 +73,14 @@ def back_project(depth: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray,
     frames, height, width = depth.shape
     rays = pixel_rays(height, width, intrinsics)
     flat = depth.reshape(frames, height * width)
-    pixels = [np.flatnonzero(frame if frame.dtype.kind == "u" else frame > 0) for frame in flat]
+    pixels = [np.flatnonzero(frame > 0) for frame in flat]
     counts = np.array([len(p) for p in pixels], np.int64)
     points = np.empty((int(counts.sum()), 3), np.float32)
     start = 0
     for frame, index in zip(flat, pixels, strict=True):
         block = points[start : start + len(index)]
         # float64 z would double the traffic for nothing: raw depths are integers below 2**24 or metres
-        np.multiply(rays[index], frame[index].astype(np.float32)[:, None], out=block)
+        rays.take(index, axis=0, out=block, mode="clip")
+        block *= frame[index].astype(np.float32)[:, None]
         start += len(index)
     return points, counts

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,6 +19,7 @@ from typing import Any
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.prepare.reader import Item, Reader, Sample
+from dpcli.prepare.shards import WHOLE, Shard, describe_shard
 from dpcli.prepare.thin import Thinning
 from dpcli.runtime.pool import ordered_map, start_early
 from dpcli.runtime.progress import Progress, log
@@ -25,6 +27,7 @@ from dpcli.runtime.provenance import record
 from dpcli.runtime.seed import generator
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
+from dpcli.store.journal import sweep
 
 _LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
 
@@ -90,42 +93,49 @@ def convert(
     force: bool = False,
     limit: int | None = None,
     task: str = "prepare",
+    shard: Shard | None = None,
+    executor: Executor | None = None,
+    resume: bool = True,
 ) -> Report:
-    """Convert every item of a reader into one clouds file; running again continues where a stopped run ended.
+    """Convert every item of a reader into one clouds file; running again continues where a stopped or killed run ended.
 
     points, sampling: see Thinning. limit: only the first items. on_error: ``skip`` bad samples or ``stop`` at one.
-    The file's bytes don't depend on jobs. UsageError when ``output`` was made another way and ``force`` is off;
-    DataError when no sample is good; Stopped after a stop signal, with what is done kept beside ``output``.
+    shard: only its items, for ``merge``; it may turn out empty. executor: where items are read, ``jobs`` at a time,
+    instead of processes on this machine. The file's bytes depend on neither. resume: off where nobody could run it
+    again (a pipe); saves the journal's disk space. UsageError when ``output`` was made
+    another way and ``force`` is off; DataError when no sample is good; Stopped after a stop signal, with what is done
+    kept beside ``output``.
     """
     if on_error not in ("skip", "stop"):
         raise UsageError(f"--on-error {on_error}: expected skip or stop")
     thinning = Thinning(points, sampling)
-    if jobs > 1:
+    if jobs > 1 and executor is None:
         start_early(_needed_by_workers(reader, thinning))
     items = reader.items()
     for line in reader.summary(items):
         log.info(line)
     items = items[:limit]
-    provenance = record(configuration(reader, thinning, items, compression), seed)
+    provenance = describe_shard(record(configuration(reader, thinning, items, compression), seed), shard)
     report = Report()
     if not force and already_complete(output, provenance):
+        sweep(output)
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
-        return _count(report, output)
+        return count_samples(report, output)
     work = partial(convert_item, reader, thinning, seed)
     try:
-        with CloudsWriter(
+        with stop_requested() as stop, CloudsWriter(
             output, class_names=reader.class_names, length_unit=reader.length_unit, source=type(reader).__name__,
-            seed=seed, fields=reader.fields, compression=compression, provenance=provenance, force=force, resume=True,
+            seed=seed, fields=reader.fields, compression=compression, provenance=provenance, force=force, resume=resume,
         ) as writer:  # fmt: skip
-            with stop_requested() as stop:
-                _stream(work, items, writer, report, stop, jobs=jobs, on_error=on_error, task=task)
+            run = _Run(writer, report, stop, on_error, items, shard)
+            run.stream(work, jobs, executor, task)
             writer.skipped = report.skipped
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
         raise DpcError(f"{output}: no space left on the device; nothing was left under this name") from None
-    return _count(report, output)
+    return count_samples(report, output)
 
 
 def _needed_by_workers(reader: Reader, thinning: Thinning) -> list[str]:
@@ -136,48 +146,64 @@ def _needed_by_workers(reader: Reader, thinning: Thinning) -> list[str]:
     return [*program, type(reader).__module__, __name__, *video, *sampling]
 
 
-def _stream(
-    work: Any, items: list[Item], writer: CloudsWriter, report: Report, stop: StopRequest, *,
-    jobs: int, on_error: str, task: str,
-) -> None:  # fmt: skip
-    done = set(writer.written_names)
-    if done:
-        log.info(f"continuing: {len(done)} of {len(items)} were converted before")
-    last = max((i for i, item in enumerate(items) if item.name in done), default=-1)
-    todo = [(i, item) for i, item in enumerate(items) if item.name not in done]
-    with Progress(task, total=len(items), unit="video") as bar:
-        bar.skip(len(done))
-        try:
-            for (index, item), result in ordered_map(work, todo, jobs):
-                if isinstance(result, Sample) and index > last:
-                    _write(writer, item, result, report, bar)
-                else:
-                    _skip(item, result, report, bar, on_error)
-                stop.check(f"{len(writer)} of {len(items)} samples are kept")
-        except KeyboardInterrupt:
-            log.warn(f"interrupted; {len(writer)} of {len(items)} samples are kept; run again to continue")
-            raise
-        except DpcError:
-            # a signal to the whole process group takes the workers down as well: that is a stop, not a failure
-            stop.check(f"{len(writer)} of {len(items)} samples are kept")
-            raise
-    if not len(writer):
-        reason = report.skipped[0][1] if report.skipped else "the index is empty"
-        raise DataError(f"none of the {len(items)} samples is good; the first: {reason}")
+class _Run:
+    """One pass over the items that are not written yet, in order, into the writer."""
 
+    def __init__(
+        self, writer: CloudsWriter, report: Report, stop: StopRequest, on_error: str, items: list[Item],
+        shard: Shard | None,
+    ) -> None:  # fmt: skip
+        self.writer, self.report, self.stop, self.on_error = writer, report, stop, on_error
+        self.items = [(place, items[place]) for place in (shard or WHOLE).places(len(items))]
+        done = set(writer.written_names)
+        if done:
+            log.info(f"continuing: {len(done)} of {len(self.items)} were converted before")
+        written = [place for place, item in self.items if item.name in done]
+        self.last = written[-1] if written else -1
+        self.todo = [(place, item) for place, item in self.items if item.name not in done]
+        self.places: tuple[list[int], list[int]] = (written, [])  # of the samples written, of those skipped
+        writer.positions = self.places if shard else None
 
-def _write(writer: CloudsWriter, item: Item, sample: Sample, report: Report, bar: Progress) -> None:
-    with _whole():
-        writer.write(sample.sequence)
-    report.notes.update(sample.notes)
-    for what, count in sample.notes.items():
-        log.detail(f"{item.name}: {what}: {count}")
-    bar.advance(1, frames=sample.sequence.num_frames)
+    def stream(self, work: Any, jobs: int, executor: Executor | None, task: str) -> None:
+        with Progress(task, total=len(self.items), unit="video") as bar:
+            bar.skip(len(self.items) - len(self.todo))
+            try:
+                for indexed, result in ordered_map(work, self.todo, jobs, executor):
+                    self.take(indexed, result, bar)
+                    self.stop.check(self.kept())
+            except KeyboardInterrupt:
+                log.warn(f"interrupted; {self.kept()}; run again to continue")
+                raise
+            except DpcError as error:
+                # a signal to the whole process group takes the workers down as well: that is a stop, not a failure
+                self.stop.check(self.kept())
+                self.writer.keep = not isinstance(error, DataError)  # a lost worker says nothing about the samples
+                raise
+        if not len(self.writer) and self.writer.positions is None:
+            reason = self.report.skipped[0][1] if self.report.skipped else "the index is empty"
+            raise DataError(f"none of the {len(self.items)} samples is good; the first: {reason}")
+
+    def kept(self) -> str:
+        return f"{len(self.writer)} of {len(self.items)} samples are kept"
+
+    def take(self, indexed: tuple[int, Item], result: Any, bar: Progress) -> None:
+        (place, item) = indexed
+        if isinstance(result, Sample) and place > self.last:
+            with _whole():
+                self.writer.write(result.sequence)
+            self.places[0].append(place)
+            self.report.notes.update(result.notes)
+            for what, count in result.notes.items():
+                log.detail(f"{item.name}: {what}: {count}")
+            bar.advance(1, frames=result.sequence.num_frames)
+        else:
+            _skip(item, result, self.report, bar, self.on_error)
+            self.places[1].append(place)
 
 
 @contextmanager
 def _whole() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block: a half-appended sample would make the part file useless."""
+    """Ctrl-C waits for the end of the block: a half-appended sample is not appended."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -222,7 +248,7 @@ def already_complete(output: Path, provenance: dict[str, Any]) -> bool:
     raise UsageError(f"{output}: exists, made with {different}; write to another file, or --force to replace it")
 
 
-def _count(report: Report, output: Path) -> Report:
+def count_samples(report: Report, output: Path) -> Report:
     """What the finished file holds, whether this run wrote all of it or continued another."""
     with CloudsReader(output) as reader:
         report.written = len(reader)

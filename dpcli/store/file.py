@@ -135,6 +135,23 @@ def read_skipped(file: h5py.File) -> list[tuple[str, str]]:
     return [(str(name), str(reason)) for name, reason in file["skipped"].asstr()[:]]
 
 
+def write_positions(file: h5py.File, positions: tuple[Sequence[int], Sequence[int]] | None) -> None:
+    """Where a shard's samples belong: places in the list of all, of those written and of those skipped, i64 each.
+
+    `dpc prepare merge` needs them to restore the order. Nothing is written for None, a file that is no shard.
+    """
+    if positions is not None:
+        for name, values in zip(("position", "skipped_position"), positions):
+            file.create_dataset(name, data=np.array(values, np.int64))
+
+
+def read_positions(file: h5py.File) -> tuple[list[int], list[int]] | None:
+    """What `write_positions` wrote; None when the file is no shard."""
+    if "position" not in file or "skipped_position" not in file:
+        return None
+    return file["position"][:].tolist(), file["skipped_position"][:].tolist()
+
+
 def read_strings(file: h5py.File, name: str) -> list[str]:
     """A string data set as a list; DataError when it is absent."""
     if name not in file:
@@ -143,15 +160,15 @@ def read_strings(file: h5py.File, name: str) -> list[str]:
 
 
 class AtomicFile:
-    """An HDF5 file written beside its target (`.NAME.part`) and renamed when whole.
+    """An HDF5 file written beside its target (`.NAME.part`, or another suffix) and renamed when whole.
 
-    A file under the final name is therefore always complete. `commit` closes, syncs and renames; `discard` removes;
-    `suspend` closes and keeps the part for a later run. Write errors become DpcError with the reason in words.
+    A file under the final name is therefore always complete. `commit` closes, syncs and renames; `discard` removes.
+    Write errors become DpcError with the reason in words.
     """
 
-    def __init__(self, target: str | Path, mode: str = "w") -> None:
+    def __init__(self, target: str | Path, mode: str = "w", suffix: str = ".part") -> None:
         self.target = Path(target)
-        self.part = self.target.with_name(f".{self.target.name}.part")
+        self.part = self.target.with_name(f".{self.target.name}{suffix}")
         if not self.target.parent.is_dir():
             raise DataError(f"{self.target}: the folder {self.target.parent} does not exist; create it first")
         if self.target.is_dir():
@@ -186,9 +203,6 @@ class AtomicFile:
                 self._let_go()
             self.discard()
             raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
-
-    def suspend(self) -> None:
-        self.file.close()
 
     def discard(self) -> None:
         try:

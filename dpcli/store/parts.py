@@ -101,8 +101,8 @@ class PartsWriter(CloudsWriter):
         self.num_parts = num_parts
         super().__init__(path, fields=fields if "part" in fields else (*fields, "part"), **options)
 
-    def _same_configuration(self, file: h5py.File) -> bool:
-        return super()._same_configuration(file) and file["part_probability"].shape[1] == self.num_parts
+    def _about(self) -> dict[str, Any]:
+        return super()._about() | {"num_parts": self.num_parts}
 
     def _create(self) -> None:
         super()._create()
@@ -133,7 +133,7 @@ class PartsWriter(CloudsWriter):
         said.validate(sequence, self.num_parts)
         self._append_said(said)
         self._append_sequence(sequence)
-        self._names.add(sequence.name)
+        self._note(sequence, said.probability, said.pairs, said.motion, said.flow)
 
     def _append_said(self, said: PartsSample) -> None:
         pairs, rows = len(self._file["pair"]), len(self._file["flow"])
@@ -143,22 +143,6 @@ class PartsWriter(CloudsWriter):
         self._append("part_motion", said.motion)
         self._append("flow", np.concatenate([np.zeros((0, 3), np.float32), *said.flow]))
         self._append("flow_offsets", rows + np.cumsum([len(one) for one in said.flow], dtype=np.int64))
-
-    def _whole_rows(self) -> dict[str, int]:
-        rows, samples = super()._whole_rows(), len(self)
-        pairs = int(self._file["pair_offsets"][samples])
-        flow = int(self._file["flow_offsets"][pairs])
-        return rows | {
-            "part_probability": rows["points"], "pair_offsets": samples + 1, "pair": pairs, "part_motion": pairs,
-            "flow_offsets": pairs + 1, "flow": flow,
-        }  # fmt: skip
-
-    def _reader(self, path: Path) -> PartsReader:
-        return PartsReader(path)
-
-    def _copy(self, reader: PartsReader, index: int) -> None:  # type: ignore[override]
-        said = reader.read_parts(index)
-        self.write(reader.read(index), said.probability, said.pairs, said.motion, said.flow)
 
 
 class PartsReader(CloudsReader):

@@ -5,32 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import Any
 
 import h5py
 import numpy as np
 
 from dpcli.errors import DataError, Stopped, UsageError
-from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, write_root, write_skipped
+from dpcli.store.file import STRING, AtomicFile, write_positions, write_root, write_skipped
+from dpcli.store.journal import Journal
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
-
-if TYPE_CHECKING:
-    from dpcli.store.reader import CloudsReader
 
 COMPRESSIONS = ("none", "lzf", "gzip")
 POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence
 PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _PER_SAMPLE = {"name": STRING, "split": STRING, "label": np.int32, "subject": np.int32, "camera": np.int32}
+_INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
+_FIELDS = ("time", *POINT_FIELDS, "pose")  # the order in which they are made, whoever names them: equal bytes
+_FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
 
 
 class CloudsWriter:
-    """Context manager that writes sequences to `path`, through a part file renamed when whole.
+    """Context manager that writes sequences to `path`, through a file beside it renamed when whole.
 
-    Leaving the block without an exception finishes the file; an exception removes the part, except that with
-    `resume=True` a stop (Stopped, KeyboardInterrupt) keeps it, and the next writer with the same provenance continues:
-    `written_names` lists what is already there. `fields` names the optional ones the samples carry
-    (time, color, part, track, pose). `skipped`, set before the block ends: (name, reason) of samples left out, kept in
-    the file. Raises UsageError when `path` exists and `force` is off.
+    Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
+    written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
+    the next writer with the same provenance continues, `written_names` lists what is already there, and the file gets
+    the bytes it would have had. That takes a journal (`.NAME.part`) as large as the samples until the file is whole.
+    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose). Set before the
+    block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
+    kept in the file; a shard may be empty. Raises UsageError when `path` exists and `force` is off.
     """
 
     kind = "clouds"
@@ -54,31 +57,52 @@ class CloudsWriter:
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
         self.path, self.class_names, self.resume = Path(path), list(class_names), resume
-        self.fields, self.compression = tuple(fields), compression
+        unknown = set(fields) - set(_FIELDS)
+        if unknown:
+            raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
+        self.fields, self.compression = tuple(name for name in _FIELDS if name in fields), compression
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self._root = {"length_unit": length_unit, "source": source, "seed": seed}
         self.skipped: list[tuple[str, str]] = []
-        self.written_names: list[str] = self._resumable() if resume and not force else []
-        self.resumed = bool(self.written_names)
-        self._atomic = AtomicFile(self.path, "r+" if self.resumed else "w")
-        self._file = self._atomic.file
-        if not self.resumed:
-            self._create()
-        self._names = set(self.written_names)
+        self.positions: tuple[list[int], list[int]] | None = None
+        self.keep = False
+        self._names: set[str] = set()
+        self._frames = self._points = self._unflushed = 0
+        self._index: dict[str, list] = {name: [] for name in _INDEX}
+        self._journal: Journal | None = None
+        self.written_names: list[str] = []
+        self._opening = True
+        self._open(force)
+        self._opening = False
 
-    def _resumable(self) -> list[str]:
-        """Names in a part file left by an earlier run of the same configuration; none when it can't be continued."""
-        part = self.path.with_name(f".{self.path.name}.part")
-        if not part.exists():
-            return []
+    def _open(self, force: bool) -> None:
+        folder = self.path.parent
+        if self.resume and folder.is_dir() and not self.path.is_dir():  # AtomicFile explains what is wrong otherwise
+            self._journal = Journal(folder / f".{self.path.name}.part", self._about())
         try:
-            with open_store(part, [self.kind]) as file:
-                return list(file["name"].asstr()[:]) if self._same_configuration(file) else []
-        except (DataError, OSError, KeyError):
-            return []
+            self._atomic = AtomicFile(self.path, suffix=".new" if self._journal else ".part")
+            self._file = self._atomic.file
+            self._create()
+            if self._journal:
+                self._continue(self._journal, force)
+        except BaseException as error:
+            if self._journal and self._journal.was_there:  # nothing of the earlier run may be lost
+                self._journal.keep()
+            self._leave(type(error), error, None)
+            raise
 
-    def _same_configuration(self, file: h5py.File) -> bool:
-        return read_provenance(file) == self.provenance
+    def _about(self) -> dict[str, Any]:
+        """What decides whether a journal is of this very work."""
+        return {"kind": self.kind, "provenance": self.provenance}
+
+    def _continue(self, journal: Journal, force: bool) -> None:
+        """Write what an earlier run had written, if it was the same work."""
+        if force:
+            journal.begin_again()
+            return
+        for given in journal.samples():
+            self.write(*given)
+            self.written_names.append(given[0].name)
 
     def _create(self) -> None:
         file = self._file
@@ -106,13 +130,18 @@ class CloudsWriter:
             dtype, shape = POINT_FIELDS[name]
             chunks = (POINTS_PER_CHUNK, *shape)
             file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunks, **PACKED)
-        elif name != "pose":  # created with the first sample, which tells the number of parts
-            raise UsageError(f"unknown field {name!r}; expected time, pose, {', '.join(POINT_FIELDS)}")
+        # pose is created with the first sample, which tells the number of parts
 
     def write(self, sequence: CloudSequence) -> None:
         """Append one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
         self._check(sequence)
         self._append_sequence(sequence)
+        self._note(sequence)
+
+    def _note(self, sequence: CloudSequence, *said: Any) -> None:
+        """From here on the sample counts as written; `said`: what else `write` was given."""
+        if self._journal and not self._opening:  # what comes from it need not go to it again
+            self._journal.append([sequence, *said])
         self._names.add(sequence.name)
 
     def _check(self, sequence: CloudSequence) -> None:
@@ -129,26 +158,36 @@ class CloudsWriter:
                                 "pad to the largest")  # fmt: skip
 
     def _append_sequence(self, sequence: CloudSequence) -> None:
-        points, frames = len(self._file["points"]), len(self._file["frame_offsets"]) - 1
         self._append("points", sequence.points)
         for name in self.fields:
             self._append(name, getattr(sequence, name))
-        self._append("frame_offsets", sequence.frame_offsets[1:] + points)
-        self._append("sequence_offsets", np.array([frames + sequence.num_frames]))
+        self._append("frame_offsets", sequence.frame_offsets[1:] + self._points)
+        self._append("sequence_offsets", [self._frames + sequence.num_frames])
         for name in _PER_SAMPLE:
             self._append(name, [getattr(sequence, name)])
+        self._points += len(sequence.points)
+        self._frames += sequence.num_frames
 
     def _append(self, name: str, values: np.ndarray | list) -> None:
+        if name in self._index:
+            self._index[name].extend(values)
+            return
         if name == "pose" and name not in self._file:
             shape = values.shape[1:]
             self._file.create_dataset(
                 name, (0, *shape), np.float64, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
             )
+        self._extend(name, values)
+        self._unflushed += getattr(values, "nbytes", 0)
+        if self._unflushed > _FLUSH_BYTES:
+            self._file.flush()
+            self._unflushed = 0
+
+    def _extend(self, name: str, values: np.ndarray | list) -> None:
         data = self._file[name]
         start = len(data)
         data.resize(start + len(values), axis=0)
         data[start:] = values
-        data.flush()  # as its closing would do, which can't say that the disk is full
 
     def __len__(self) -> int:
         return len(self._names)
@@ -161,64 +200,34 @@ class CloudsWriter:
     ) -> None:
         if kind is None:
             self._finish()
-        elif self.resume and issubclass(kind, (Stopped, KeyboardInterrupt)) and len(self):
-            self._drop_half_sample()
-            self._atomic.suspend()
         else:
+            self._leave(kind, error, trace)
+
+    def _leave(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing stays but, after a stop, the journal."""
+        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
+        if self._journal and stopped and len(self):
+            self._journal.keep()
+        elif self._journal:
+            self._journal.discard()
+        if hasattr(self, "_atomic"):
             self._atomic.failed(kind, error, trace)
 
-    def _drop_half_sample(self) -> None:
-        """Ctrl-C may come in the middle of a sample; what was appended of it would shift those that follow."""
-        for name, rows in self._whole_rows().items():
-            if name in self._file and len(self._file[name]) != rows:
-                self._file[name].resize(rows, axis=0)
-
-    def _whole_rows(self) -> dict[str, int]:
-        """Rows of each data set after the samples that are whole."""
-        samples = len(self)
-        frames = int(self._file["sequence_offsets"][samples])
-        points = int(self._file["frame_offsets"][frames])
-        rows = {"sequence_offsets": samples + 1, "frame_offsets": frames + 1, "points": points}
-        rows |= {name: frames if name in ("time", "pose") else points for name in self.fields}
-        return rows | dict.fromkeys(_PER_SAMPLE, samples)
-
     def _finish(self) -> None:
-        if not len(self):
-            self._atomic.discard()
-            raise DataError(f"{self.path}: not one good sample to write; nothing was written")
-        if (
-            self.resumed
-        ):  # a file that was closed and reopened has another layout: copy, so that equal work gives equal bytes
-            self._repack()
         try:
+            if not len(self) and self.positions is None:
+                raise DataError(f"{self.path}: not one good sample to write; nothing was written")
+            for name, values in self._index.items():
+                if values:
+                    self._extend(name, values)
             write_skipped(self._file, self.skipped)
+            write_positions(self._file, self.positions)
+            self._file.flush()
         except BaseException as error:
-            self._atomic.failed(type(error), error, None)
+            self._leave(type(error), error, None)
             raise
         self._atomic.commit()
-
-    def _repack(self) -> None:
-        self._file.close()
-        whole = self._atomic.part.with_name(f".{self.path.name}.resumed.part")
-        self._atomic.part.replace(whole)
-        self._atomic = AtomicFile(self.path, "w")
-        self._file, names = self._atomic.file, self._names
-        self._names = set()
-        try:
-            self._create()
-            with self._reader(whole) as reader:
-                for index in range(len(names)):
-                    self._copy(reader, index)
-        except BaseException as error:
-            self._atomic.failed(type(error), error, None)
-            raise
-        finally:
-            whole.unlink(missing_ok=True)
-
-    def _reader(self, path: Path) -> CloudsReader:
-        from dpcli.store.reader import CloudsReader
-
-        return CloudsReader(path)
-
-    def _copy(self, reader: CloudsReader, index: int) -> None:
-        self.write(reader.read(index))
+        if self._journal:
+            self._journal.discard()
