@@ -24,7 +24,7 @@ ROWS = {
     "(e) + dense to sparse": (),
 }
 THESIS = {"(a)": (22.3, 0.795), "(b)": (25.3, 0.841), "(c)": (28.5, 0.875), "(d)": (29.7, 0.894), "(e)": (30.2, 0.908)}
-CLIPS = "Cow:Gallop,Fox:Walk,Trex:Run,Spider:Walk"
+CLIPS = "Cow:Gallop,Fox:Walk,Trex:TRex_Run,Spider:Spider_Walk"
 
 
 def dpc(*words: object) -> str:
