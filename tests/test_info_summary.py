@@ -9,9 +9,12 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store import info as info_module
+from dpcli.store.gaussians import write_scene
 from dpcli.store.info import point_ranges, summary
+from tests.scenes import toy_scene
 
 
 def write_clouds(path: Path, seed: int = 0) -> np.ndarray:
@@ -108,11 +111,15 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
     assert peaks[1] < 40e6 and peaks[1] < 1.2 * peaks[0]
 
 
-def test_other_kinds_are_listed_by_their_data_sets(tmp_path: Path) -> None:
+def test_a_scene_is_summarised_and_a_broken_one_is_named(tmp_path: Path) -> None:
+    scene = toy_scene()
+    write_scene(tmp_path / "scene.h5", scene)
+    found = summary(tmp_path / "scene.h5")
+    assert found["counts"]["gaussians"] == len(scene.mean) and found["counts"]["frames"] == len(scene.time)
+    assert sum(found["gaussians_per_part"].values()) == len(scene.mean)
     path = tmp_path / "v.h5"
     with h5py.File(path, "w") as file:
         file.attrs.update({"dpc_kind": "gaussians", "dpc_schema": 1, "dpc_version": "9"})
         file.create_dataset("mean", data=np.zeros((5, 3), np.float32))
-    found = summary(path)
-    assert found["kind"] == "gaussians"
-    assert found["datasets"] == [{"name": "mean", "shape": [5, 3], "type": "float32", "compression": None}]
+    with pytest.raises(DataError, match="log_scale.* missing"):
+        summary(path)

@@ -109,8 +109,8 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     lines += _skipped_lines(found.get("skipped", []))
     if found["kind"] == "views":
         lines += _view_lines(found)
-    elif found["kind"] not in ("clouds", "parts", "scores"):
-        lines += [(item["name"], f"{item['type']} {tuple(item['shape'])}") for item in found["datasets"]]
+    elif found["kind"] == "gaussians":
+        lines += _scene_lines(found)
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
 
@@ -131,6 +131,13 @@ def _view_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         rest = f"radius {camera['radius']:.4g}, fovy {camera['fovy']:.4g} degrees"
         lines.append((f"view {camera['view']}", f"{camera['role']:<9} {angles}, {rest}"))
     return lines
+
+
+def _scene_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
+    parts = ", ".join(f"{part}: {count:,}" for part, count in found["gaussians_per_part"].items())
+    lines = [("size", f"{found['size'][0]}x{found['size'][1]} pixels"), ("duration", f"{found['duration']:.4g} s"),
+             ("Gaussians by part", parts)]  # fmt: skip
+    return lines + [(name, str(value)) for name, value in found["metrics"].items() if isinstance(value, (int, float, str))]
 
 
 def _class_table(found: dict[str, Any]) -> Any:

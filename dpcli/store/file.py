@@ -223,7 +223,7 @@ class AtomicFile:
             raise worded from None
 
     def _let_go(self) -> None:
-        """After a failed write: what HDF5 still holds goes into memory nobody reads, instead of to the full disk.
+        """After a failed write: what HDF5 still holds goes to the null device instead of to the full disk.
 
         It would try again on every close, complain each time, and crash as the process ends.
         """

@@ -34,8 +34,8 @@ def summary(path: str | Path) -> dict[str, Any]:
             "provenance": read_provenance(file),
             "datasets": _datasets(file),
         }
-    own = {"clouds": _clouds, "parts": _parts, "scores": _scores, "views": _views, "gaussians": _gaussians}.get(kind)
-    return {**common, **(own(path) if own else {})}
+    own = {"clouds": _clouds, "parts": _parts, "scores": _scores, "views": _views, "gaussians": _gaussians}[kind]
+    return {**common, **own(path)}
 
 
 def _datasets(file: h5py.File) -> list[dict[str, Any]]:
