@@ -96,13 +96,13 @@ class Fit:
         if kind == "sphere":
             points = in_sphere(config.gaussians, config.start_radius, rng)
             return torch.from_numpy(points), torch.full((len(points), 3), 0.5)
-        view = targets.reference
+        view, frame = targets.reference, targets.widest_frame()
         if kind == "inflate":
             points, colours = inflated(
-                targets.picture(view, 0), targets.intrinsics[view], targets.world_to_camera[view], config.gaussians, rng
+                targets.picture(view, frame), targets.intrinsics[view], targets.world_to_camera[view], config.gaussians, rng
             )
         else:
-            pictures = [targets.picture(index, 0) for index in range(targets.num_views)]
+            pictures = [targets.picture(index, frame) for index in range(targets.num_views)]
             points, colours = hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
         return torch.from_numpy(points), torch.from_numpy(colours)
 

@@ -29,7 +29,7 @@ def inflated(
     """
     mask = rgba[..., 3] > 0.5
     if not mask.any():
-        raise DataError("the reference view's first frame shows nothing (alpha is zero); prepare the clip again")
+        raise DataError("the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again")
     half = ball_thickness(mask)
     rows, columns = np.nonzero(mask)
     share = half[rows, columns] / half[rows, columns].sum()
@@ -94,7 +94,7 @@ def hull(
         if total >= count:
             break
     if not total:
-        raise DataError("the silhouettes of the views have no point in common at the first frame; are the cameras right?")
+        raise DataError("the silhouettes of the views have no point in common; are the cameras right?")
     points = np.concatenate(kept)[:count]
     colours = np.zeros_like(points)
     weights = np.zeros((len(points), 1), np.float32)

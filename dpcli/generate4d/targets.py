@@ -46,6 +46,11 @@ class Targets:
         """Frame times in 0..1, what the networks are asked."""
         return torch.linspace(0, 1, self.num_frames) if self.num_frames > 1 else torch.zeros(1)
 
+    def widest_frame(self) -> int:
+        """The frame in which most of the object is seen, over all views: limbs hide each other least, so that parts which
+        only touch in passing don't start as one."""
+        return int(self.pictures[..., 3].float().sum((0, 2, 3)).argmax())
+
     def at(self, views: list[int], frames: list[int], shrink: int = 1) -> tuple[Tensor, Tensor, Tensor]:
         """Pictures f32 (C,H,W,4), intrinsics (C,3,3) and world_to_camera (C,4,4) of (view, frame) pairs, 1/shrink the size."""
         chosen = self.pictures[views, frames].float()

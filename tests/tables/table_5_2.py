@@ -82,8 +82,8 @@ def table(scores: dict[str, list[dict]], clips: int) -> str:
         psnr, ssim = THESIS[row[:3]]
         lines.append(
             f"| {row} | {mean('per_role', 'test', 'psnr'):.2f} | {mean('per_role', 'test', 'ssim'):.4f} |"
-            f" {mean('per_role', 'reference', 'psnr'):.2f} | {mean('parts', 'ari'):.3f} |"
-            f" {mean('tracks', 'epe_relative'):.4f} | {psnr} | {ssim} |"
+            f" {mean('per_role', 'reference', 'psnr'):.2f} | {mean('parts', 'adjusted_rand_index'):.3f} |"
+            f" {mean('tracks', 'epe_of_diameter'):.4f} | {psnr} | {ssim} |"
         )
     return "\n".join(lines)
 
