@@ -20,13 +20,14 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench lint clean table-4.2 table-5.2
+.PHONY: help venv demo test bench lint clean table-4.1 table-4.2 table-5.2
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
 	@echo "make test                     the whole test suite"
 	@echo "make lint                     ruff over everything"
 	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
+	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make clean                    remove .venv, demo/ and caches"
@@ -88,6 +89,15 @@ table-4.2: $(READY)
 	    echo "## $$name, protocol $$protocol"; \
 	    $(DPC) evaluate segmentation $(T42)/$$name.h5 --truth $(T42)/test.h5 --split test --protocol $$protocol --markdown || exit 1; \
 	done; done | tee $(T42)/table.md
+
+# Table 4.1: the switches of training, one after the other, with the same budget. Stopped, it goes on where it was.
+T41 := table/4.1
+table-4.1: $(READY)
+	$(if $(SAPIEN),,$(error make table-4.1 needs SAPIEN=folder, a folder of CATEGORY/ID/mobility.urdf))
+	mkdir -p $(T41)
+	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
+	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
+	$(BIN)/python -m tests.tables.table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
 
 # Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files. Stopped, it goes on where it was.
 MESHES ?=

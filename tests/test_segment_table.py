@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dpcli.store import CloudsReader
-from tests.bench.table_4_1 import METRICS, ROWS, table
+from tests.tables.table_4_1 import METRICS, ROWS, table
 from tests.prepare_helpers import ROOT
 
 
@@ -36,7 +36,7 @@ def objects(dpc, tmp_path_factory) -> Path:
 
 
 def test_a_toy_table_is_made_and_running_again_trains_nothing(objects, tmp_path) -> None:
-    words = [sys.executable, "-m", "tests.bench.table_4_1", objects, objects, tmp_path / "t", "--rows", "past,full", "--",
+    words = [sys.executable, "-m", "tests.tables.table_4_1", objects, objects, tmp_path / "t", "--rows", "past,full", "--",
              "--epochs", "1", "--pairs-per-epoch", "4", "--batch", "2", "--points", "64"]  # fmt: skip
     first = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert first.returncode == 0, first.stderr

@@ -1,6 +1,6 @@
 """Table 4.1 of the thesis: every switch of the part network trained with the same budget, the thesis's numbers beside ours.
 
-    python -m tests.bench.table_4_1 TRAIN.h5 TEST.h5 FOLDER [--protocol dpc] [--rows ...] [-- words of `dpc segment train`]
+    python -m tests.tables.table_4_1 TRAIN.h5 TEST.h5 FOLDER [--protocol dpc] [--rows ...] [-- words of `dpc segment train`]
 
 TRAIN and TEST are clouds files with parts (`dpc prepare sapien`, or `synthetic articulated` for a trial). Each row is
 a folder under FOLDER: a stopped run continues, a finished one is passed over, and what is there so far makes the table
