@@ -174,10 +174,11 @@ class _Run:
             except KeyboardInterrupt:
                 log.warn(f"interrupted; {self.kept()}; run again to continue")
                 raise
-            except DpcError as error:
-                # a signal to the whole process group takes the workers down as well: that is a stop, not a failure
-                self.stop.check(self.kept())
-                self.writer.keep = not isinstance(error, DataError)  # a lost worker says nothing about the samples
+            except Exception as error:
+                lost = isinstance(error, DpcError) or executor is not None
+                if lost:  # a signal to the whole process group takes the workers down as well: a stop, not a failure
+                    self.stop.check(self.kept())
+                self.writer.keep = lost and not isinstance(error, DataError)  # it says nothing about the samples
                 raise
         if not len(self.writer) and self.writer.positions is None:
             reason = self.report.skipped[0][1] if self.report.skipped else "the index is empty"

@@ -1,0 +1,184 @@
+"""A conversion killed at any moment: nothing but the sample in hand is lost, and the end is the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DpcError, Stopped
+from dpcli.prepare import pipeline
+from dpcli.prepare.pipeline import convert, convert_item
+from dpcli.runtime import pool
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.journal import Journal
+from tests.prepare_helpers import DPC, ROOT, ToyReader, dpc
+
+SYNTHETIC = ("prepare", "synthetic", "gestures", "--frames", "8", "--size", "64", "--videos-per-class", "6")
+ABOUT = {"kind": "clouds", "provenance": [{"config": 1}]}
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def sequence(number: int) -> CloudSequence:
+    rng = np.random.default_rng(number)
+    frames = [rng.normal(size=(int(n), 3)).astype(np.float32) for n in rng.integers(0, 9, 3) + [1, 0, 0]]
+    track = [np.arange(len(frame)) for frame in frames]
+    return CloudSequence.from_frames(f"s{number} é", frames, label=number % 2, time=np.arange(3.0), track=track)
+
+
+def options(config: int = 1) -> dict:
+    return {"class_names": ["a", "b"], "fields": ["track", "time"], "resume": True, "provenance": {"config": config}}
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory) -> tuple[bytes, list[int], str]:
+    """The journal of five samples, where each of them ends in it, and the digest of the file they make."""
+    folder = tmp_path_factory.mktemp("kill")
+    ends, journal = [], folder / ".a.h5.part"
+    with pytest.raises(Stopped), CloudsWriter(folder / "a.h5", **options()) as writer:
+        for number in range(5):
+            ends.append(journal.stat().st_size)
+            writer.write(sequence(number))
+        ends.append(journal.stat().st_size)
+        raise Stopped("now")
+    content = journal.read_bytes()
+    with CloudsWriter(folder / "whole.h5", **options()) as writer:
+        for number in range(5):
+            writer.write(sequence(number))
+    return content, ends, digest(folder / "whole.h5")
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_journal_cut_anywhere_or_damaged_gives_the_samples_before(killed, tmp_path_factory, data):
+    """Every state that a kill or a lost block can leave; the HDF5 file beside it may be anything."""
+    content, ends, whole = killed
+    folder = tmp_path_factory.mktemp("cut")
+    cut = data.draw(st.one_of(st.sampled_from(ends), st.integers(0, len(content))))
+    left = bytearray(content[:cut])
+    sound = cut
+    if data.draw(st.booleans()) and cut:
+        sound = data.draw(st.integers(0, cut - 1))
+        left[sound] ^= data.draw(st.integers(1, 255))
+    (folder / ".a.h5.part").write_bytes(left)
+    (folder / ".a.h5.new").write_bytes(data.draw(st.sampled_from([b"", b"\x89HDF\r\n\x1a\n", b"x" * 5000])))
+    expected = max([0, *(k for k, end in enumerate(ends) if end <= sound)])
+    with CloudsWriter(folder / "a.h5", **options()) as writer:
+        assert writer.written_names == [sequence(k).name for k in range(expected)]
+        for number in range(expected, 5):
+            writer.write(sequence(number))
+    assert digest(folder / "a.h5") == whole
+    assert [path.name for path in folder.iterdir()] == ["a.h5"]
+
+
+def test_a_journal_gives_back_what_went_in(tmp_path):
+    given_values = [sequence(3), np.arange(6.0).reshape(2, 3)[:, ::2], [np.zeros((0, 3), np.float32)], "x", 4, None]
+    journal = Journal(tmp_path / "j", ABOUT)
+    assert list(journal.samples()) == []
+    journal.append(given_values)
+    journal.keep()
+    journal = Journal(tmp_path / "j", ABOUT)
+    (back,) = journal.samples()
+    for key, value in vars(given_values[0]).items():
+        np.testing.assert_array_equal(getattr(back[0], key), value)
+    np.testing.assert_array_equal(back[1], given_values[1])
+    assert back[2][0].shape == (0, 3) and back[2][0].dtype == np.float32 and back[3:] == given_values[3:]
+    journal.discard()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_of_two_writers_of_one_file_the_second_is_refused(tmp_path):
+    with CloudsWriter(tmp_path / "a.h5", **options()) as writer:
+        writer.write(sequence(0))
+        with pytest.raises(DpcError, match="another dpc is writing it"):
+            CloudsWriter(tmp_path / "a.h5", **options())
+        writer.write(sequence(1))
+    with CloudsReader(tmp_path / "a.h5") as reader:
+        assert len(reader) == 2
+
+
+def test_a_journal_of_other_work_is_not_continued_and_force_starts_over(killed, tmp_path):
+    for more in ({"provenance": {"config": 2}}, {"force": True}):
+        (tmp_path / ".a.h5.part").write_bytes(killed[0])
+        with CloudsWriter(tmp_path / "a.h5", **{**options(), **more}) as writer:
+            assert writer.written_names == []
+            writer.write(sequence(0))
+        (tmp_path / "a.h5").unlink()
+
+
+def test_what_a_kill_after_the_renaming_left_is_swept(tmp_path):
+    convert(ToyReader(), tmp_path / "a.h5")
+    (tmp_path / ".a.h5.part").write_bytes(b"rest")
+    assert convert(ToyReader(), tmp_path / "a.h5").was_complete
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_a_lost_worker_keeps_what_is_done(tmp_path, monkeypatch):
+    whole = convert(ToyReader(), tmp_path / "whole.h5")
+
+    def dies(work, items, jobs, executor):
+        for number, result in enumerate(pool.ordered_map(work, items, jobs, executor)):
+            if number == 3:
+                raise DpcError("a worker process died")
+            yield result
+
+    with monkeypatch.context() as patch, pytest.raises(DpcError, match="died"):
+        patch.setattr(pipeline, "ordered_map", dies)
+        convert(ToyReader(), tmp_path / "a.h5")
+    read = []
+    monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
+    assert convert(ToyReader(), tmp_path / "a.h5").written == whole.written
+    assert read == [3, 4] and digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
+
+
+def survivors(session: int) -> list[str]:
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            fields = (folder / "stat").read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == session and fields[0] not in "ZX":
+            found.append(folder.name)
+    return found
+
+
+def test_kill_minus_nine_at_random_moments(tmp_path):
+    """The same command again and again, killed each time a little later, ends with the bytes of one whole run."""
+    out, rng = tmp_path / "out.h5", np.random.default_rng(5)
+    assert dpc(*SYNTHETIC, "-o", tmp_path / "whole.h5", "--jobs", "2").returncode == 0
+    journal, kept = tmp_path / ".out.h5.part", 0
+    for _ in range(4):
+        process = subprocess.Popen(
+            [*DPC, *SYNTHETIC, "-o", str(out), "--jobs", "2"],
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT, start_new_session=True,
+        )  # fmt: skip
+        deadline = time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < deadline:
+            if journal.exists() and journal.stat().st_size > kept:
+                break
+            time.sleep(0.002)
+        time.sleep(rng.uniform(0, 0.15))
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait(30)
+        size = journal.stat().st_size if journal.exists() else 0
+        assert out.exists() or size >= kept  # what an earlier run had is still there
+        kept = size
+        while survivors(process.pid) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert survivors(process.pid) == []
+    last = dpc(*SYNTHETIC, "-o", out, "--jobs", "2")
+    assert last.returncode == 0 and ("continuing: " in last.stderr or "already complete" in last.stderr), last.stderr
+    assert digest(out) == digest(tmp_path / "whole.h5")
+    assert {path.name for path in tmp_path.iterdir()} == {"out.h5", "whole.h5"}

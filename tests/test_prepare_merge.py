@@ -1,0 +1,142 @@
+"""Joining unlike files: label maps, names, units, fields; nothing is mixed up silently."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare import merge as module
+from dpcli.prepare.label_map import LabelMap
+from dpcli.prepare.merge import merge
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from tests.prepare_helpers import dpc
+
+
+def write(path: Path, names: list[str], classes: list[str], **options) -> Path:
+    fields = options.get("fields", ())
+    with CloudsWriter(path, class_names=classes, provenance={"config": {"of": path.name}}, **options) as writer:
+        for number, name in enumerate(names):
+            points = np.full((2 + number, 3), len(name) + number, np.float32)
+            more = {"time": np.array([number / 2])} if "time" in fields else {}
+            more |= {"track": [np.arange(len(points))]} if "track" in fields else {}
+            label = number % len(classes) if classes else -1
+            writer.write(CloudSequence.from_frames(name, [points], label=label, **more))
+        writer.skipped = [(f"bad of {path.stem}", "why")]
+    return path
+
+
+@pytest.fixture
+def two(tmp_path) -> list[Path]:
+    a = write(tmp_path / "a.h5", ["a0", "a1", "a2"], ["hand wave", "push", "bend"])
+    return [a, write(tmp_path / "b.h5", ["b0", "b1"], ["g1", "g2"])]
+
+
+def joined(path: Path) -> dict[str, str]:
+    with CloudsReader(path) as reader:
+        return {name: reader.class_names[label] for name, label in zip(reader.names, reader.labels)}
+
+
+def test_files_of_equal_classes_follow_one_another(tmp_path):
+    paths = [write(tmp_path / f"{k}.h5", [f"{k}x", f"{k}y"], ["p", "q"]) for k in range(3)]
+    report = merge(paths[::-1], tmp_path / "all.h5")
+    assert report.written == 6 and report.skipped == [(f"bad of {k}", "why") for k in (2, 1, 0)]
+    with CloudsReader(tmp_path / "all.h5") as whole, CloudsReader(paths[0]) as first:
+        assert list(whole.names) == ["2x", "2y", "1x", "1y", "0x", "0y"] and whole.class_names == ["p", "q"]
+        np.testing.assert_array_equal(whole.read(5).points, first.read(1).points)
+        entry = whole.provenance[-1]
+        assert entry["config"]["sources"][2] == [{"config": {"of": "0.h5"}}] and len(entry["inputs"]) == 3
+    assert merge(paths[::-1], tmp_path / "all.h5").was_complete
+    with pytest.raises(UsageError, match="made with merge"):
+        merge(paths, tmp_path / "all.h5")
+
+
+def test_many_files_are_not_all_open_at_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_OPEN", 2)
+    paths = [write(tmp_path / f"{k}.h5", [f"{k}x"], ["p"]) for k in range(5)]
+    files = module.OpenFiles()
+    for path in [*paths, *paths]:
+        assert files.read(path, 0).name == f"{path.stem}x"
+        assert len(files._readers) <= 2
+    files.close()
+
+
+def test_a_label_map_joins_unlike_classes(two, tmp_path):
+    text = '[labels]\n"push" = "shove"\n"bend" = ""\n[files."b.h5"]\n"g1" = "shove"\n"g2" = "hand wave"\n'
+    (tmp_path / "map.toml").write_text(text)
+    content = {"labels": {"push": "shove", "bend": ""}, "files": {"b.h5": {"g1": "shove", "g2": "hand wave"}}}
+    (tmp_path / "map.json").write_text(json.dumps(content))
+    assert LabelMap.read(tmp_path / "map.toml") == LabelMap.read(tmp_path / "map.json")
+    report = merge(two, tmp_path / "all.h5", labels=LabelMap.read(tmp_path / "map.toml"))
+    assert joined(tmp_path / "all.h5") == {"a0": "hand wave", "a1": "shove", "b0": "shove", "b1": "hand wave"}
+    assert ("a2", "class 'bend' is left out by the label map") in report.skipped
+    (tmp_path / "order.toml").write_text('classes = ["shove", "hand wave"]\n' + text)
+    merge(two, tmp_path / "ordered.h5", labels=LabelMap.read(tmp_path / "order.toml"))
+    with CloudsReader(tmp_path / "ordered.h5") as reader:
+        assert reader.class_names == ["shove", "hand wave"]
+    assert joined(tmp_path / "ordered.h5") == joined(tmp_path / "all.h5")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('[labels]\n"jump" = "leap"', "no file has a class 'jump'"),
+        ('[files."c.h5"]\n"g1" = "push"', "no file 'c.h5' among a.h5, b.h5"),
+        ('[files."b.h5"]\n"push" = "g1"', "b.h5 has no class 'push'"),
+        ('classes = ["g1"]\n', "class 'hand wave' becomes 'hand wave', which classes"),
+        ("[labels]\npush = 3\n", "something that is no name"),
+        ("labels = 3\n", "labels is 3, expected a table"),
+        ("[label]\nx = 'y'\n", "holds label; expected classes"),
+        ("[labels\n", "not TOML"),
+        ("", "holds nothing"),
+    ],
+)
+def test_maps_that_fit_nothing_are_refused(two, tmp_path, text, message):
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(DataError, match=message):
+        merge(two, tmp_path / "all.h5", labels=LabelMap.read(tmp_path / "map.toml"))
+    assert not (tmp_path / "all.h5").exists()
+
+
+def test_what_does_not_fit_is_refused(two, tmp_path):
+    with pytest.raises(DataError, match="its 2 classes .*are not the 3 of .*--labels"):
+        merge(two, tmp_path / "all.h5")
+    again = write(tmp_path / "c.h5", ["c0", "a1"], ["hand wave", "push", "bend"])
+    with pytest.raises(DataError, match="sample 'a1' is in .*a.h5 as well.*--prefix"):
+        merge([two[0], again], tmp_path / "all.h5")
+    assert merge([two[0], again], tmp_path / "all.h5", prefix=True).written == 5
+    assert {"a/a1", "c/a1"} < joined(tmp_path / "all.h5").keys()
+    metres = write(tmp_path / "mm.h5", ["m"], ["hand wave", "push", "bend"], length_unit="mm")
+    with pytest.raises(DataError, match="its length unit is 'mm', of .*a.h5 it is 'm'"):
+        merge([two[0], metres], tmp_path / "all.h5", force=True)
+    with pytest.raises(UsageError, match="named twice"):
+        merge([two[0], two[0]], tmp_path / "x.h5")
+    with pytest.raises(UsageError, match="named twice"):
+        merge(two, two[0], force=True)
+    (tmp_path / "text.h5").write_text("no")
+    with pytest.raises(DataError, match="not an HDF5 file"):
+        merge([two[0], tmp_path / "text.h5"], tmp_path / "x.h5")
+
+
+def test_fields_that_not_all_have_are_left_out(tmp_path):
+    paths = [
+        write(tmp_path / "a.h5", ["a"], [], fields=["time", "track"]),
+        write(tmp_path / "b.h5", ["b"], [], fields=["time"]),
+    ]
+    for order in (paths, paths[::-1]):
+        merge(order, tmp_path / "all.h5", force=True)
+        with CloudsReader(tmp_path / "all.h5") as reader:
+            assert reader.fields == ("time",) and list(reader.labels) == [-1, -1]
+
+
+def test_the_command(two, tmp_path):
+    (tmp_path / "map.json").write_text(json.dumps({"labels": {"g1": "push"}}))
+    done = dpc("prepare", "merge", *two, "-o", tmp_path / "all.h5", "--labels", tmp_path / "map.json", "-q")
+    assert (
+        done.returncode == 0 and done.stdout == f"{tmp_path / 'all.h5'}: 5 sequences, 5 frames, 14 points, 2 skipped\n"
+    )
+    refused = dpc("prepare", "merge", *two, "-o", tmp_path / "no.h5")
+    assert refused.returncode == 3 and "--labels map.toml" in refused.stderr and not (tmp_path / "no.h5").exists()
