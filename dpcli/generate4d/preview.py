@@ -9,15 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dpcli.generate4d.colours import part_colours, weight_colours
 from dpcli.generate4d.model import Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting import rasterization
-
-_COLOURS = torch.tensor(
-    [[230, 75, 53], [77, 187, 213], [0, 160, 135], [60, 84, 136], [243, 155, 127], [145, 209, 194], [126, 97, 72],
-     [220, 180, 20], [132, 145, 180], [176, 156, 133]]
-) / 255  # fmt: skip
 
 
 @torch.no_grad()
@@ -34,8 +30,8 @@ def write_preview(model: Model4D, targets: Targets, path: Path, columns: int = 5
     times = targets.times()[frames].to(device)
     instant = model.at(times)
     field = model.field(model.gaussians.mean, times)
-    parts = _COLOURS.to(device)[field.part.argmax(-1) % len(_COLOURS)]
-    rigid = torch.cat([1 - field.weight, torch.full_like(field.weight, 0.3), field.weight], -1)
+    parts = torch.from_numpy(part_colours(field.part.argmax(-1).cpu().numpy()) / 255).float().to(device)
+    rigid = torch.from_numpy(weight_colours(field.weight[..., 0].cpu().numpy()) / 255).float().to(device)
     azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
     aside = torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius)).float().expand(len(frames), 4, 4).to(device)
 
