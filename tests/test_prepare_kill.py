@@ -59,7 +59,7 @@ def killed(tmp_path_factory) -> tuple[bytes, list[int], str]:
     return content, ends, digest(folder / "whole.h5")
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(data=st.data())
 def test_a_journal_cut_anywhere_or_damaged_gives_the_samples_before(killed, tmp_path_factory, data):
     """Every state that a kill or a lost block can leave; the HDF5 file beside it may be anything."""

@@ -25,7 +25,7 @@ from dpcli.errors import DpcError
 from dpcli.store.sequence import CloudSequence
 
 _MAGIC = b"dpc journal 1\n"
-_HEAD = struct.Struct("<QII")  # bytes of content, bytes of its JSON, CRC-32 of both
+_LENGTHS, _CHECK = struct.Struct("<QI"), struct.Struct("<I")  # bytes of content, of its JSON; CRC-32 of these and it
 _SYNC_SECONDS = 10.0  # a kill loses nothing that was written; only a power cut could, and then this much
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)
 
@@ -72,11 +72,11 @@ class Journal:
         arrays: list[np.ndarray] = []
         text = json.dumps([_packed(value, arrays) for value in values]).encode()
         parts = [text, *(memoryview(array).cast("B") for array in arrays if array.size)]
-        check = 0
+        lengths = _LENGTHS.pack(sum(len(part) for part in parts), len(text))
+        check = zlib.crc32(lengths)
         for part in parts:
             check = zlib.crc32(part, check)
-        head = _HEAD.pack(sum(len(part) for part in parts), len(text), check)
-        for part in (head, *parts):
+        for part in (lengths + _CHECK.pack(check), *parts):
             _write_all(self._file, part)
         if time.monotonic() - self._synced > _SYNC_SECONDS:
             os.fdatasync(self._file)
@@ -123,10 +123,11 @@ def _write_all(number: int, data: bytes | memoryview) -> None:
 
 def _read_record(number: int, size: int) -> list[Any] | None:
     """The next record; None at the end, and where what follows is cut short or is not what was written."""
-    head = os.read(number, _HEAD.size)
-    if len(head) < _HEAD.size:
+    head = os.read(number, _LENGTHS.size + _CHECK.size)
+    if len(head) < _LENGTHS.size + _CHECK.size:
         return None
-    length, text_length, check = _HEAD.unpack(head)
+    length, text_length = _LENGTHS.unpack_from(head)
+    (check,) = _CHECK.unpack_from(head, _LENGTHS.size)
     if text_length > length or length > size - os.lseek(number, 0, os.SEEK_CUR):
         return None
     content = bytearray(length)
@@ -136,7 +137,7 @@ def _read_record(number: int, size: int) -> list[Any] | None:
         if not got:
             return None
         filled += got
-    if zlib.crc32(content) != check:
+    if zlib.crc32(content, zlib.crc32(head[: _LENGTHS.size])) != check:
         return None
     arrays = view[text_length:]
     taken = [0]

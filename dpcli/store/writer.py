@@ -69,6 +69,7 @@ class CloudsWriter:
         self._names: set[str] = set()
         self._frames = self._points = self._unflushed = 0
         self._index: dict[str, list] = {name: [] for name in _INDEX}
+        self._data: dict[str, h5py.Dataset] = {}
         self._journal: Journal | None = None
         self.written_names: list[str] = []
         self._opening = True
@@ -184,7 +185,9 @@ class CloudsWriter:
             self._unflushed = 0
 
     def _extend(self, name: str, values: np.ndarray | list) -> None:
-        data = self._file[name]
+        if name not in self._data:  # kept open: closing would write its unfinished chunk, each time
+            self._data[name] = self._file[name]
+        data = self._data[name]
         start = len(data)
         data.resize(start + len(values), axis=0)
         data[start:] = values
