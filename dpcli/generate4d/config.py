@@ -97,7 +97,7 @@ class FitConfig:
 PRESETS = {
     "thesis": FitConfig(size=512, start="sphere", seeds=False),
     "quick": FitConfig(
-        dense_steps=400, sparse_steps=1100, batch=2, gaussians=6000, most_gaussians=12_000, width=96, depth=4,
+        dense_steps=600, sparse_steps=2000, batch=2, gaussians=6000, most_gaussians=12_000, width=96, depth=4,
         rate_mean=(2e-3, 2e-4), rate_network=(2e-3, 2e-4), rate_rigid=2e-3, rate_scale=0.01, grow_share=0.15,
     ),
     "tiny": FitConfig(
