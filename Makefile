@@ -63,7 +63,7 @@ demo: $(READY)
 	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png, demo/parts.gif and demo/scene.png."
 
 test: $(READY)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 # Table 4.2 of the thesis on three categories that training never sees; SAPIEN names a folder of PartNet-Mobility objects.
 SAPIEN  ?=

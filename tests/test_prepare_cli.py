@@ -103,7 +103,7 @@ def test_options_reach_the_readers(tmp_path):
         assert reader.length_unit == "mm" and reader.read(0).points.tolist() == [[2, 2, 2]] * 2
 
 
-VIDEOS = 15  # per class
+VIDEOS = 40  # per class
 
 
 def start(out: Path, videos: int = VIDEOS) -> subprocess.Popen:
