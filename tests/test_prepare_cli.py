@@ -103,7 +103,7 @@ def test_options_reach_the_readers(tmp_path):
         assert reader.length_unit == "mm" and reader.read(0).points.tolist() == [[2, 2, 2]] * 2
 
 
-VIDEOS = 40  # per class
+VIDEOS = 25  # per class
 
 
 def start(out: Path, videos: int = VIDEOS) -> subprocess.Popen:
@@ -113,6 +113,7 @@ def start(out: Path, videos: int = VIDEOS) -> subprocess.Popen:
     process = subprocess.Popen(
         [*DPC, *SYNTHETIC, str(videos), "-o", str(out), "--jobs", "2"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where a shell put us in the background
     )  # fmt: skip
     while not (part.exists() and part.stat().st_size > before + 100_000):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
