@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from dpcli.store import CloudsReader
-from tests.tables.table_4_1 import METRICS, ROWS, table
 from tests.prepare_helpers import ROOT
+from tests.tables.table_4_1 import METRICS, ROWS, table
 
 
 def test_rows_have_the_thesis_numbers_and_grow_by_one_switch() -> None:

@@ -62,6 +62,16 @@ def score(views: Path, row: str, out: Path, steps: tuple[int, int], seed: int) -
     return json.loads(result.read_text())["metrics"]
 
 
+def _mean(values: list[dict], *keys: str) -> float:
+    """Mean over clips of the number that the keys lead to."""
+    total = 0.0
+    for value in values:
+        for key in keys:
+            value = value[key]
+        total += value
+    return total / len(values)
+
+
 def table(scores: dict[str, list[dict]], clips: int) -> str:
     """Markdown, one line per row, means over clips; the thesis's values beside, on its own data and protocol."""
     lines = [
@@ -71,19 +81,11 @@ def table(scores: dict[str, list[dict]], clips: int) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for row, values in scores.items():
-        def mean(*keys: str) -> float:
-            picked = []
-            for value in values:
-                for key in keys:
-                    value = value[key]
-                picked.append(value)
-            return sum(picked) / len(picked)
-
         psnr, ssim = THESIS[row[:3]]
         lines.append(
-            f"| {row} | {mean('per_role', 'test', 'psnr'):.2f} | {mean('per_role', 'test', 'ssim'):.4f} |"
-            f" {mean('per_role', 'reference', 'psnr'):.2f} | {mean('parts', 'adjusted_rand_index'):.3f} |"
-            f" {mean('tracks', 'epe_of_diameter'):.4f} | {psnr} | {ssim} |"
+            f"| {row} | {_mean(values, 'per_role', 'test', 'psnr'):.2f} | {_mean(values, 'per_role', 'test', 'ssim'):.4f} |"
+            f" {_mean(values, 'per_role', 'reference', 'psnr'):.2f} | {_mean(values, 'parts', 'adjusted_rand_index'):.3f} |"
+            f" {_mean(values, 'tracks', 'epe_of_diameter'):.4f} | {psnr} | {ssim} |"
         )
     return "\n".join(lines)
 
