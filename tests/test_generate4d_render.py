@@ -13,11 +13,12 @@ from scenes import toy_scene
 
 from dpcli.cli.generate4d_output import render
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.generate4d.colours import PALETTE, WEIGHTS, parse_background, part_colours, weight_colours
+from dpcli.generate4d.colours import WEIGHTS, parse_background, weight_colours
 from dpcli.generate4d.paths import Lens, clip_rate, default_rate, instants, plan
 from dpcli.generate4d.render import Look, Renderer, render_views, sheet
 from dpcli.generate4d.video_out import output_kind, write_pictures
 from dpcli.ops.cameras import orbit_of, orbit_pose
+from dpcli.runtime.palette import PALETTE, part_colours
 from dpcli.store import ViewsHeader, ViewsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
 

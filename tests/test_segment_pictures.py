@@ -12,13 +12,11 @@ from PIL import Image
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.open3d_import import load_open3d
+from dpcli.runtime.palette import PALETTE, UNKNOWN, part_colours
 from dpcli.segment.balls import FINE, _ball, draw_balls, view_matrix
 from dpcli.segment.pictures import (
-    PALETTE,
-    UNKNOWN,
     Look,
     matched_ids,
-    part_colours,
     parts_picture,
     there_and_back,
     turntable,

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from dpcli.cli.options import Force, Jobs, Json, Seed
+from dpcli.cli.prepare_views import write_views
 from dpcli.errors import UsageError
 
 _Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
@@ -91,7 +92,7 @@ def animation(
         return
     camera = _options(filming, output, yaw=0.0)
     config = animation_config(model, clip, frames, camera)
-    _write(
+    write_views(
         lambda: animation_clip(model, clip, frames, camera, _processes(jobs)), output, config=config, source="animation",
         seed=camera.seed, force=force,
     )  # fmt: skip
@@ -113,7 +114,7 @@ def animal(
 
     camera = _options(filming, output, yaw=55.0)
     config = animal_config(motion, frames, cycles, camera)
-    _write(
+    write_views(
         lambda: animal_clip(motion, frames, cycles, camera, _processes(jobs)), output, config=config,
         source="synthetic animal", seed=camera.seed, force=force,
     )  # fmt: skip
@@ -141,17 +142,6 @@ def _processes(jobs: int | None) -> int:
     from dpcli.runtime.device import cpu_count
 
     return jobs or cpu_count()
-
-
-def _write(make_clip: Any, output: str, *, source: str, **options: Any) -> None:
-    from dpcli.prepare.views_pipeline import convert_clip
-    from dpcli.store.pipes import output_file
-
-    with output_file(output) as path:
-        header = convert_clip(make_clip, path, source=source, task=f"prepare {source}", **options)
-    if output != "-":
-        size = f"{header.size[0]}x{header.size[1]}"
-        typer.echo(f"{output}: {header.name}, {header.num_views} views, {header.num_frames} frames, {size}")
 
 
 def _print_clips(clips: list[tuple[str, float]], as_json: bool) -> None:

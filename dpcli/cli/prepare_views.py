@@ -72,7 +72,7 @@ def video(
     options.check()
     read, describe = (transforms_clip, transforms_config) if is_transforms(clip) else (video_clip, video_config)
     config = describe(clip, options)
-    _write(lambda: read(clip, options), output, config=config, source="video", seed=seed, force=force)
+    write_views(lambda: read(clip, options), output, config=config, source="video", seed=seed, force=force)
 
 
 def artemis(
@@ -105,10 +105,11 @@ def artemis(
         _numbers(train_cameras, "--train-cameras"), tracks, fps, on_error, seed,
     )  # fmt: skip
     config = artemis_config(animal, options)
-    _write(lambda: artemis_clip(animal, options), output, config=config, source="artemis", seed=seed, force=force)
+    write_views(lambda: artemis_clip(animal, options), output, config=config, source="artemis", seed=seed, force=force)
 
 
-def _write(make_clip: Any, output: str, *, source: str, **options: Any) -> None:
+def write_views(make_clip: Any, output: str, *, source: str, **options: Any) -> None:
+    """Convert one clip into `output` (a path, or - for a pipe) and say what it holds."""
     from dpcli.prepare.views_pipeline import convert_clip
     from dpcli.store.pipes import output_file
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,7 +68,7 @@ class Picture:
         return alpha.astype(np.uint8)
 
 
-class Source:
+class Source(ABC):
     """Videos of one object. `pictures` reads the frames of a view in rising order, one in memory at a time.
 
     frames: of each view, None = any (a scene can be seen at any time). has_alpha: whether the object is cut out.
@@ -81,10 +82,11 @@ class Source:
     header: ViewsHeader | None = None
     history: list[dict] = []
 
+    @abstractmethod
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
-        raise NotImplementedError
+        """The frames of a view, in rising order."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027  most sources hold nothing open
         """Let go of open files."""
 
 

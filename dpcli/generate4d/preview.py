@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.generate4d.colours import part_colours, weight_colours
+from dpcli.generate4d.colours import weight_colours
 from dpcli.generate4d.model import Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting import rasterization
+from dpcli.runtime.palette import part_colours
 
 
 @torch.no_grad()

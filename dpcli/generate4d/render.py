@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from dpcli.errors import DataError, UsageError
-from dpcli.generate4d.colours import part_colours, weight_colours
+from dpcli.generate4d.colours import weight_colours
 from dpcli.generate4d.paths import Shot
 from dpcli.ops.splatting import rasterization
+from dpcli.runtime.palette import part_colours
 from dpcli.store.gaussians import GaussianScene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 

@@ -21,7 +21,7 @@ _ALLOWED = {
 _MOST_BYTES = 1 << 28
 
 
-class _ArrayUnpickler(pickle.Unpickler):
+class ArrayUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) in _ALLOWED:
             home = "numpy._core" if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else "numpy.core"
@@ -53,7 +53,7 @@ def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: boo
             raise DataError(f"{path}: {key} is an object array of shape {shape}; expected shape ()")
         if not dtype.hasobject:
             return np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
-        return _ArrayUnpickler(stream, encoding="latin1").load().item()
+        return ArrayUnpickler(stream, encoding="latin1").load().item()
     except pickle.UnpicklingError as error:
         raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None
     except DataError:

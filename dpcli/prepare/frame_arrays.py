@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.array_pickle import _ArrayUnpickler
+from dpcli.prepare.array_pickle import ArrayUnpickler
 
 _MOST_BYTES = 1 << 31  # of a member unpacked; 300 frames of 40,000 points in float64 take 0.3 GB
 
@@ -49,7 +49,7 @@ def _read_array(stream: io.BytesIO) -> np.ndarray:
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = header(stream)
     if dtype.hasobject:
-        return _ArrayUnpickler(stream, encoding="latin1").load()
+        return ArrayUnpickler(stream, encoding="latin1").load()
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
 

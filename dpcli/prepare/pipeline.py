@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -232,12 +232,14 @@ def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str)
     bar.advance(1)
 
 
-def already_complete(output: Path, provenance: dict[str, Any]) -> bool:
+def already_complete(
+    output: Path, provenance: dict[str, Any], open_reader: Callable[[Path], Any] = CloudsReader
+) -> bool:
     """Whether ``output`` exists and was made by this configuration and seed; UsageError when made by another."""
     if not output.exists():
         return False
     try:
-        with CloudsReader(output) as reader:
+        with open_reader(output) as reader:
             before = reader.provenance[-1] if reader.provenance else {}
     except DataError as error:
         raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.prepare.pipeline import already_complete
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import file_digest, record
 from dpcli.runtime.signals import stop_requested
@@ -41,7 +41,7 @@ def convert_clip(
     another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
     """
     provenance = record(json.loads(json.dumps({"reader": source, **config})), seed)
-    if not force and already_complete(output, provenance):
+    if not force and already_complete(output, provenance, ViewsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         with ViewsReader(output) as reader:
             return reader.header
@@ -55,23 +55,6 @@ def convert_clip(
             bar.advance()
             stop.check("the unfinished file was removed")
     return header
-
-
-def already_complete(output: Path, provenance: dict[str, Any]) -> bool:
-    """Whether `output` exists and was made by this configuration and seed; UsageError when made by another."""
-    if not output.exists():
-        return False
-    try:
-        with ViewsReader(output) as reader:
-            before = reader.provenance[-1] if reader.provenance else {}
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    old, new = (({**entry.get("config", {}), "seed": entry.get("seed")}) for entry in (before, provenance))
-    if old == new:
-        return True
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    different = ", ".join(f"{key} {old.get(key)} (now {new.get(key)})" for key in keys[:3])
-    raise UsageError(f"{output}: exists, made with {different}; write to another file, or --force to replace it")
 
 
 def digest_of(paths: Iterable[Path]) -> str:

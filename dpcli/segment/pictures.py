@@ -10,18 +10,10 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.palette import part_colours
 from dpcli.segment.balls import draw_balls, view_matrix
 from dpcli.store import CloudSequence
 
-# Okabe & Ito's colours without black (Color Universal Design, 2008), then Tol's muted ones that differ from them
-PALETTE = np.array(
-    [
-        [0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66],
-        [136, 34, 85], [51, 34, 136], [153, 153, 51], [68, 170, 153], [170, 68, 153], [17, 119, 51], [221, 204, 119],
-    ],
-    np.uint8,
-)  # fmt: skip
-UNKNOWN = (128, 128, 128)  # of part -1
 _WHITE, _DARK = (255, 255, 255), (17, 20, 26)
 _GAP, _TITLE = 8, 22
 _AZIMUTH, _ELEVATION = np.deg2rad(-60.0), np.deg2rad(22.0)
@@ -51,13 +43,6 @@ class Look:
     @property
     def ink(self) -> tuple[int, int, int]:
         return (226, 230, 236) if self.dark else (40, 44, 52)
-
-
-def part_colours(part: np.ndarray) -> np.ndarray:
-    """Colour u8 (N,3) of part ids (N): the same id has the same colour everywhere; -1 is grey, others repeat after 14."""
-    colours = PALETTE[np.maximum(part, 0) % len(PALETTE)]
-    colours[np.asarray(part) < 0] = UNKNOWN
-    return colours
 
 
 def matched_ids(found: np.ndarray, truth: np.ndarray) -> np.ndarray:

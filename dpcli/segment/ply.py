@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.segment.pictures import part_colours
+from dpcli.runtime.palette import part_colours
 from dpcli.store import CloudSequence
 
 _VERTEX = np.dtype(

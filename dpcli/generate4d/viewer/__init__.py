@@ -16,9 +16,10 @@ import numpy as np
 
 from dpcli import __version__
 from dpcli.errors import DataError
-from dpcli.generate4d.colours import WEIGHTS, part_colours
+from dpcli.generate4d.colours import WEIGHTS
 from dpcli.generate4d.paths import clip_rate
 from dpcli.ops.cameras import orbit_of
+from dpcli.runtime.palette import part_colours
 from dpcli.store.gaussians import GaussianScene
 
 SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")
