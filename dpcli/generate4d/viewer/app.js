@@ -165,7 +165,7 @@ class App {
     const camera = cameraOf(state, this.header.camera.fovy, this.canvas);
     scene.moveTo(state.time);
     this.painter.draw(scene, scene.sorted(camera.forward, this.hidden), scene.colours(state.colour), camera, GROUNDS[state.background]);
-    root.dataset.state = "ready";
+    if (root.dataset.state !== "ready") requestAnimationFrame(() => { root.dataset.state = "ready"; });  // once it is on the screen
   }
 
   // Drag with one pointer turns; with shift, another button or two pointers it moves; two pointers also zoom.
