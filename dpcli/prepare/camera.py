@@ -64,23 +64,37 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
     return rays.reshape(-1, 3)
 
 
-def back_project(depth: np.ndarray, intrinsics: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
-    """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0.
+def back_project(
+    depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in near..far.
 
-    depth: (T,H,W), any real dtype, 0 or less = nothing seen -> points f32 (P,3) in raster order within
-    each frame, frames one after the other, in depth's unit; counts i64 (T) of points per frame.
+    depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
+    order within each frame, frames one after the other; counts i64 (T) of points per frame.
     """
     frames, height, width = depth.shape
     rays = pixel_rays(height, width, intrinsics)
-    flat = depth.reshape(frames, height * width)
-    pixels = [np.flatnonzero(frame > 0) for frame in flat]
-    counts = np.array([len(p) for p in pixels], np.int64)
+    # what is not seen is dropped before anything is computed: most pixels of a cut-out person or hand
+    seen = [_seen(frame, np.float32(unit), near, far) for frame in depth.reshape(frames, height * width)]
+    counts = np.array([len(pixels) for pixels, _ in seen], np.int64)
     points = np.empty((int(counts.sum()), 3), np.float32)
     start = 0
-    for frame, index in zip(flat, pixels, strict=True):
-        block = points[start : start + len(index)]
-        # float64 z would double the traffic for nothing: raw depths are integers below 2**24 or metres
-        rays.take(index, axis=0, out=block, mode="clip")
-        block *= frame[index].astype(np.float32)[:, None]
-        start += len(index)
+    for pixels, z in seen:
+        block = points[start : start + len(pixels)]
+        rays.take(pixels, axis=0, out=block, mode="clip")
+        block *= z[:, None]
+        start += len(pixels)
     return points, counts
+
+
+def _seen(frame: np.ndarray, unit: np.float32, near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
+    pixels = np.flatnonzero(frame > 0)
+    # float64 z would double the traffic for nothing: raw depths are integers below 2**24 or metres
+    z = frame.take(pixels).astype(np.float32)
+    if unit != 1:
+        z *= unit
+    if near > 0 or far < np.inf:
+        inside = (z >= near) & (z <= far)
+        pixels, z = pixels[inside], z[inside]
+    return pixels, z

@@ -100,20 +100,22 @@ class DepthVideos:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         video = read_depth_video(item.path, self.stride)
-        depth = self._metric(video.frames, item.path)
+        depth, unit = self._raw(video.frames, item.path)
         if self.background != "none":
+            depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
-        depth[(depth < self.near) | (depth > self.far)] = 0
-        points, counts = back_project(depth, self._camera(*depth.shape[1:]))
+        points, counts = back_project(
+            depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far
+        )
         kept, notes = drop_empty_frames(str(item.path), counts)
         rate = (self.fps or video.fps or DEFAULT_FPS) / self.stride
         return Sample(
             CloudSequence(item.name, points, offsets(counts[kept]), time=kept / rate, **describe(item)), notes
         )
 
-    def _metric(self, frames: np.ndarray, path: Path) -> np.ndarray:
-        """Raw frames -> depth f32 (T,H,W) in metres, 0 = nothing seen."""
+    def _raw(self, frames: np.ndarray, path: Path) -> tuple[np.ndarray, float]:
+        """Depth (T,H,W) as the sensor counts it, 0 = nothing seen, and how many metres one count is."""
         kind = frames.dtype
         if kind.kind == "f" and not np.isfinite(frames).all():
             frames = np.nan_to_num(frames, nan=0, posinf=0, neginf=0)  # the usual marks for "no return"
@@ -124,7 +126,7 @@ class DepthVideos:
                     f"{path}: depths of type {kind}; --invert needs unsigned integers, whose range is known"
                 )
             frames = np.where(frames > 0, np.iinfo(kind).max - frames, 0)
-        return frames.astype(np.float32) * np.float32(1 / scale)
+        return frames, 1 / scale
 
     def _camera(self, height: int, width: int) -> Intrinsics:
         if self.intrinsics:
