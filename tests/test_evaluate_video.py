@@ -168,7 +168,7 @@ def test_protocols_differ_where_they_say(said: Path, truth: Path) -> None:
     assert len({json.dumps(one["protocol"]) for one in found.values()}) == len(PROTOCOLS)
     assert found["dpc"]["metrics"]["psnr"] == found["torchmetrics"]["metrics"]["psnr"]
     assert found["dpc"]["metrics"]["ssim"] != found["torchmetrics"]["metrics"]["ssim"]
-    with pytest.raises(UsageError, match="--protocol svd: expected dpc, thesis, consistent4d, torchmetrics"):
+    with pytest.raises(UsageError, match="--protocol svd: expected dpc, thesis, consistent4d, disco, torchmetrics"):
         evaluate_video(said, truth, protocol="svd")
     with pytest.raises(UsageError, match="--background red"):
         evaluate_video(said, truth, background="red")
@@ -289,18 +289,20 @@ def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> N
     values[2, 1, 3, 4:6] = np.nan
     values[3, 0, 3, 4, 1] = np.inf
     np.save(tmp_path / "nan.npy", values)
-    result = run(tmp_path / "nan.npy", "--truth", truth, "--json")
+    with pytest.raises(DataError, match=r"2 frames with NaN or infinite pixels, the first view 2 frame 1 \(2 pixels\)"):
+        evaluate_video(tmp_path / "nan.npy", truth)
+    result = run(tmp_path / "nan.npy", "--truth", truth, "--json", "--intersect")
     found = json.loads(result.stdout)  # NaN would be refused
     assert found["left_out"] == [{"reason": "frames in which the prediction has NaN or infinite pixels", "count": 2,
                                   "names": ["view 2 frame 1 (2 pixels)", "view 3 frame 0 (1 pixels)"]}]  # fmt: skip
     assert found["denominators"]["frames"] == 10
     assert (
-        numbers(evaluate_video(tmp_path / "nan.npy", truth), "psnr")[:2]
+        numbers(evaluate_video(tmp_path / "nan.npy", truth, intersect=True), "psnr")[:2]
         == numbers(evaluate_video(whole, truth), "psnr")[:2]
     )
     np.save(tmp_path / "all.npy", np.full_like(values, np.nan))
     with pytest.raises(DataError, match="every frame has NaN"):
-        evaluate_video(tmp_path / "all.npy", truth)
+        evaluate_video(tmp_path / "all.npy", truth, intersect=True)
     with pytest.raises(DataError, match="nan.npy: view '2', frame 1: 2 pixels are NaN"):
         evaluate_video(whole, tmp_path / "nan.npy")
 
@@ -323,11 +325,26 @@ def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> N
     with pytest.raises(DataError, match="32x24; ms_ssim needs at least 176 pixels"):
         evaluate_video(said, truth, metrics=("ms_ssim",))
     assert parse_metrics("ssim, psnr") == ("psnr", "ssim") and parse_metrics(None) is None
-    for wrong in ("psnr,lpips", "", ","):
-        with pytest.raises(UsageError, match="expected some of psnr,psnr_foreground,ssim,ms_ssim,parts,tracks"):
+    for wrong in ("psnr,lpip", "", ","):
+        with pytest.raises(
+            UsageError, match="expected some of psnr,psnr_foreground,ssim,ms_ssim,lpips,.*,parts,tracks"
+        ):
             parse_metrics(wrong)
     with pytest.raises(DataError, match="--metrics parts needs a gaussians file and a views file, not a views file"):
         evaluate_video(said, truth, metrics=("parts",))
+
+
+def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path: Path) -> None:
+    worse = write(tmp_path / "worse.h5", clip(2, noise=12))
+    command = ["compare", str(said), str(worse), "--truth", str(truth), "--metrics", "psnr,ssim", "--json"]
+    found = json.loads(CliRunner().invoke(evaluate.app, command).stdout)
+    expected = [np.mean(numbers(evaluate_video(path, truth), "psnr")) for path in (said, worse)]
+    change = found["metrics"]["psnr"]
+    assert [change["a"], change["b"]] == pytest.approx(expected) and change["a_better"] == 4
+    with pytest.raises(UsageError, match="a video holds no truth"):
+        raise CliRunner().invoke(evaluate.app, ["compare", str(said), str(worse)]).exception
+    runs = CliRunner().invoke(evaluate.app, ["runs", str(said), str(worse), "--truth", str(truth), "--json"])
+    assert json.loads(runs.stdout)["metrics"]["psnr"]["mean"] == pytest.approx(np.mean(expected))
 
 
 def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:
@@ -355,9 +372,11 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
     result = run(said, "--truth", truth, "--markdown", "--picture", strip)
     assert result.exit_code == 0
     rows = [line for line in result.stdout.splitlines() if line.startswith("|")]
-    assert len({row.count("|") for row in rows}) == 1 and any(
-        row.startswith("| mean of 2 | test | 6 |") for row in rows
-    )
+    assert any(row.startswith("| mean of 2 | test | 6 |") for row in rows)
+    intervals = [row for row in rows if row.startswith("| PSNR (dB) |")]
+    low, high = (float(end) for end in intervals[0].split("|")[3].split(" - "))
+    each = numbers(evaluate_video(said, truth), "psnr")
+    assert min(each) <= low < np.mean(each) < high <= max(each)  # four views, resampled
     assert "over white" in result.stdout and "data range 1.0" in result.stdout
     with Image.open(strip) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)

@@ -71,7 +71,12 @@ def classification_update(scores: np.ndarray, labels: np.ndarray, top_k: int = T
     classes = scores.shape[1]
     cells = labels.astype(np.int64) * classes + predicted_labels(scores)
     confusion = np.bincount(cells, minlength=classes * classes).reshape(classes, classes)
-    return ClassificationStatistics(confusion.astype(np.int64), int((_ranks(scores, labels) < top_k).sum()), top_k)
+    return ClassificationStatistics(confusion.astype(np.int64), int(top_hits(scores, labels, top_k).sum()), top_k)
+
+
+def top_hits(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> np.ndarray:
+    """Whether the true class is among the `top_k` best scores of each row, bool (S); ties go to the lower label."""
+    return _ranks(scores, labels) < top_k
 
 
 def _ranks(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.motion import (
     RELEASE_BATCH,
     TAUS,
@@ -23,7 +24,8 @@ from dpcli.evaluate.motion import (
     true_motion,
 )
 from dpcli.evaluate.pairing import Compared, Comparison
-from dpcli.evaluate.protocol import LeftOut
+from dpcli.evaluate.protocol import LeftOut, intervals_json, samples_json
+from dpcli.evaluate.resampled import motion_weighted
 from dpcli.evaluate.segmentation import PROTOCOLS
 
 MAIN_TAU = {"dpc": 0.05, "release": 0.01}  # the thesis's text; what its code takes on SAPIEN and OGC-DR
@@ -31,7 +33,11 @@ MAIN_TAU = {"dpc": 0.05, "release": 0.01}  # the thesis's text; what its code ta
 
 @dataclass
 class MotionReport:
-    """Metrics of all sequences, and of those of each label that occurs."""
+    """Metrics of all sequences, and of those of each label that occurs.
+
+    names, statistics, pairs: each sequence that counts, its statistics and frame pairs i (Q,2). intervals: by metric
+    (part_rotation in degrees; see `motion_weighted`), empty without `resampling`.
+    """
 
     protocol: str
     split: str
@@ -42,25 +48,39 @@ class MotionReport:
     class_names: list[str]
     left_out: list[LeftOut]
     sequences: int
+    names: list[str] = field(default_factory=list)
+    statistics: list[MotionStatistics] = field(default_factory=list)
+    pairs: list[np.ndarray] = field(default_factory=list)
+    resampling: Resampling = field(default_factory=lambda: Resampling(0))
+    intervals: dict[str, Interval] = field(default_factory=dict)
 
 
 def evaluate_motion(
-    path: str | Path, truth: str | Path, *, protocol: str = "dpc", split: str | None = None, intersect: bool = False
+    path: str | Path,
+    truth: str | Path,
+    *,
+    protocol: str = "dpc",
+    split: str | None = None,
+    intersect: bool = False,
+    resampling: Resampling | None = None,
 ) -> MotionReport:
     """Metrics of all frame pairs of a parts file against the `part` and `pose` of a clouds file.
 
     `protocol`: "dpc", every point counts the same; "release", as the published code: means over the points of each 6
     successive pairs, then over these batches. Points without a true part don't count. `split`, `intersect` and
-    DataErrors as `Comparison`.
+    DataErrors as `Comparison`. `resampling`: how to find the intervals; without it there are none.
     """
     if protocol not in PROTOCOLS:
         raise UsageError(f"--protocol {protocol}: expected {' or '.join(PROTOCOLS)}")
-    labels, found, without = [], [], []
+    names, labels, found, pairs, without = [], [], [], [], []
+    resampling = resampling or Resampling(0)
     with Comparison(path, truth, split=split, intersect=intersect, fields=("part", "pose")) as comparison:
         for compared in comparison:
             if len(compared.said.pairs) == 0:
                 without.append(compared.truth.name)
                 continue
+            names.append(compared.truth.name)
+            pairs.append(compared.said.pairs)
             labels.append(compared.truth.label)
             found.append(_object(compared, Path(truth)))
         left_out = [*comparison.left_out, *([LeftOut("no frame pair predicted", without)] if without else [])]
@@ -74,7 +94,9 @@ def evaluate_motion(
         for label in sorted({label for label in labels if label >= 0})
     }
     main = motion_compute(motion_merge(found), batch)
-    return MotionReport(protocol, split, str(truth), unit, main, classes, class_names, left_out, len(found))
+    return MotionReport(protocol, split, str(truth), unit, main, classes, class_names, left_out, len(found),
+                        names, found, pairs, resampling,
+                        resampling.intervals(motion_weighted(found, MAIN_TAU[protocol], batch), len(found)))  # fmt: skip
 
 
 def _object(compared: Compared, path: Path) -> MotionStatistics:
@@ -125,6 +147,8 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
                 for label, own in report.classes.items()
             ],
         },
+        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
+        "samples": samples_json("sequences", report.names),
         "units": {"epe3d": unit, "epe3d_no_motion": unit, "accs": "fraction", "accr": "fraction", "outlier": "fraction",
                   "tau": unit, "part_rotation": "degree", "part_displacement": unit},
         "denominators": {"sequences": report.sequences, **_counts(report.main)},

@@ -40,9 +40,17 @@ class Comparison:
         if missing:
             raise DataError(f"{truth}: no {' and no '.join(missing)} in it, so it can't be the truth; "
                             "`dpc prepare` writes them for data sets that have them")  # fmt: skip
+        self._same_unit()
         self.split = split or ("test" if "test" in self.truth.splits else "all")
         self.left_out: list[LeftOut] = []
         self.rows = self._match(intersect)
+
+    def _same_unit(self) -> None:
+        """A unit that a file doesn't name may be any."""
+        unit, other = self.predicted.length_unit, self.truth.length_unit
+        if unit and other and unit != other:
+            raise DataError(f"{self.predicted.path}: length_unit {unit!r}, but {other!r} in {self.truth.path}; "
+                            "predict again from that file")  # fmt: skip
 
     def _match(self, intersect: bool) -> list[tuple[int, int]]:
         """(index in the parts file, index in the truth) of what counts."""

@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.evaluate.bootstrap import Interval
 from dpcli.evaluate.motion import TAUS, MotionMetrics
-from dpcli.evaluate.motion_protocol import MotionReport
+from dpcli.evaluate.motion_protocol import MAIN_TAU, MotionReport
 from dpcli.evaluate.protocol import LeftOut
+from dpcli.evaluate.resampled import flow_keys
 from dpcli.evaluate.segmentation import SegmentationMetrics
 from dpcli.evaluate.segmentation_protocol import FIXES, SegmentationReport, shares
-from dpcli.evaluate.tables import TextTable, percent
+from dpcli.evaluate.tables import TextTable, percent, percent_ends, resampling_note
 
 TITLES = {"ap": "AP", "pq": "PQ", "f1": "F1", "pre": "Pre", "rec": "Rec", "miou": "mIoU", "ri": "RI"}
 _NAMES_SHOWN = 10
@@ -28,7 +30,16 @@ def segmentation_tables(report: SegmentationReport) -> list[TextTable]:
     """One row for each class and for all; percentages."""
     header = ["sequences of", "number", "frames", "true parts", "predicted", "found", *TITLES.values()]
     rows = [_segmentation_row(*row) for row in class_rows(report.main, report.classes, report.class_names)]
-    return [TextTable("Parts (AP, PQ, F1, Pre, Rec at IoU 0.5)", header, rows)]
+    main = TextTable("Parts (AP, PQ, F1, Pre, Rec at IoU 0.5)", header, rows)
+    values = shares(report.main)
+    return [main, *_intervals(report, [[title, percent(values[key]), percent_ends(report.intervals.get(key))]
+                                       for key, title in TITLES.items()])]  # fmt: skip
+
+
+def _intervals(report: SegmentationReport | MotionReport, rows: list[list[str]]) -> list[TextTable]:
+    """A table of (metric, value, interval) over all sequences; none without intervals."""
+    title = f"{100 * report.resampling.confidence:.4g} % interval"
+    return [TextTable("All sequences", ["metric", "value", title], rows)] if report.intervals else []
 
 
 def _segmentation_row(title: str, own: SegmentationMetrics) -> list[str]:
@@ -43,6 +54,7 @@ def segmentation_notes(report: SegmentationReport) -> list[str]:
         f"Split {report.split!r}, truth: {report.truth}. AP, PQ, F1, Pre, Rec: {main.true_positives} found of "
         f"{main.truth_parts} true parts, {main.predictions} predictions, pooled over {main.frames} frames; "
         f"mIoU, RI: mean over the frames of each of {main.objects} sequences, then over these.",
+        *resampling_note(report.resampling, "sequences", len(report.names)),
         *_protocol_lines(report.protocol),
     ]
     if report.ignore_below:
@@ -81,7 +93,24 @@ def motion_tables(report: MotionReport) -> list[TextTable]:
     return [
         TextTable("Flow", header, [_flow_row(*row) for row in rows]),
         TextTable("Motions of matched parts", parts, [_part_row(*row) for row in rows]),
+        *_intervals(report, _motion_interval_rows(report, unit)),
     ]
+
+
+def _motion_interval_rows(report: MotionReport, unit: str) -> list[list[str]]:
+    main, found = report.main, report.intervals
+    lengths = (("epe3d", f"EPE3D{unit}", main.epe3d), ("part_rotation", "rotation (deg)", np.degrees(main.rotation)),
+               ("part_displacement", f"displacement{unit}", main.displacement))  # fmt: skip
+    rows = [[title, _number(value), _ends(found.get(key))] for key, title, value in lengths]
+    names = ("AccS", "AccR", "Outlier")
+    for key, row, column in flow_keys(MAIN_TAU[report.protocol]):
+        share = getattr(main.shares[TAUS[row]], names[column].lower())
+        rows.append([f"{names[column]} {TAUS[row]:g}", percent(share), percent_ends(found.get(key))])
+    return rows
+
+
+def _ends(own: Interval | None) -> str:
+    return f"{own.low:.4g} - {own.high:.4g}" if own is not None and own.defined else "-"
 
 
 def _flow_row(title: str, own: MotionMetrics) -> list[str]:
@@ -109,6 +138,7 @@ def motion_notes(report: MotionReport) -> list[str]:
         f"means {how}. no motion: EPE3D of predicting none.",
         "At tau: AccS error < tau or 5 %, AccR < 2 tau or 10 %, Outlier > 6 tau or 10 % of the true flow. The published "
         "tables of SAPIEN and OGC-DR take tau 0.01; the thesis's text, KITTI and Waymo 0.05.",
+        *resampling_note(report.resampling, "sequences", len(report.names)),
         "Displacement: how far apart true and predicted motion put a true part's centroid.",
     ]
     if main.unknown:

@@ -12,8 +12,8 @@ from dpcli.evaluate.part_matching import FrameMatch, match_parts, mean_iou, rand
 from dpcli.evaluate.ratio import divide, mean_defined
 
 PROTOCOLS = ("dpc", "release")
-_RECALLS = np.linspace(0, 1, 101)
-_FLOOR = 1e-10  # of the published denominators
+RECALLS = np.linspace(0, 1, 101)
+FLOOR = 1e-10  # of the published denominators
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
     matched, truth = statistics.matched, statistics.truth_parts
     hits, count = int(matched.sum()), len(matched)
     ap = average_precision(statistics.confidence, matched, truth, keep_order=release)
-    ratio = (lambda top, bottom: top / max(bottom, _FLOOR)) if release else (lambda a, b: float(divide(a, b)))
+    ratio = (lambda top, bottom: top / max(bottom, FLOOR)) if release else (lambda a, b: float(divide(a, b)))
     precision, recall = ratio(hits, count), ratio(hits, truth)
     return SegmentationMetrics(
         ap=ap, pq=ratio(float(statistics.iou[matched].sum()), (count + truth) / 2),
@@ -162,4 +162,4 @@ def average_precision(
         ends = np.append(np.diff(confidence[order]) != 0, True)[: len(hits)]
         recall, precision = recall[ends], precision[ends]
     envelope = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)
-    return float(envelope[np.searchsorted(recall, _RECALLS, side="left")].mean())
+    return float(envelope[np.searchsorted(recall, RECALLS, side="left")].mean())

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.pairing import Compared, Comparison
-from dpcli.evaluate.protocol import LeftOut
+from dpcli.evaluate.protocol import LeftOut, intervals_json, samples_json
+from dpcli.evaluate.resampled import segmentation_weighted
 from dpcli.evaluate.segmentation import (
     PROTOCOLS,
     Frame,
@@ -34,7 +36,10 @@ FIXES = (
 
 @dataclass
 class SegmentationReport:
-    """Metrics of all sequences, and of those of each label that occurs; `objects` has what pictures need."""
+    """Metrics of all sequences, and of those of each label that occurs; `objects` has what pictures need.
+
+    names, sequences: each sequence that counts and its statistics; intervals: by metric, empty without `resampling`.
+    """
 
     protocol: str
     ignore_below: int
@@ -45,6 +50,10 @@ class SegmentationReport:
     classes: dict[int, SegmentationMetrics]
     class_names: list[str]
     left_out: list[LeftOut]
+    names: list[str] = field(default_factory=list)
+    sequences: list[SegmentationStatistics] = field(default_factory=list)
+    resampling: Resampling = field(default_factory=lambda: Resampling(0))
+    intervals: dict[str, Interval] = field(default_factory=dict)
 
 
 def evaluate_segmentation(
@@ -55,17 +64,21 @@ def evaluate_segmentation(
     ignore_below: int = 0,
     split: str | None = None,
     intersect: bool = False,
+    resampling: Resampling | None = None,
 ) -> SegmentationReport:
     """Metrics of a parts file against the `part` of a clouds file; all frames of all sequences that count.
 
     `protocol`: "dpc", or "release" with the quirks of the published code (FIXES lists the differences). `ignore_below`:
-    true parts of fewer points are ignored. `split`, `intersect` and DataErrors as `Comparison`.
+    true parts of fewer points are ignored. `split`, `intersect` and DataErrors as `Comparison`. `resampling`: how to find
+    the intervals; without it there are none.
     """
     if protocol not in PROTOCOLS:
         raise UsageError(f"--protocol {protocol}: expected {' or '.join(PROTOCOLS)}")
-    labels, found = [], []
+    names, labels, found = [], [], []
+    resampling = resampling or Resampling(0)
     with Comparison(path, truth, split=split, intersect=intersect) as comparison:
         for compared in comparison:
+            names.append(compared.truth.name)
             labels.append(compared.truth.label)
             found.append(_object(compared, protocol, ignore_below))
         left_out, split = comparison.left_out, comparison.split
@@ -75,7 +88,8 @@ def evaluate_segmentation(
         raise DataError(f"{truth}: not one frame has a true part"
                         + (f" of at least {ignore_below} points" if ignore_below else ""))  # fmt: skip
     return SegmentationReport(protocol, ignore_below, split, str(truth), segmentation_compute(main, protocol), main,
-                              _by_class(labels, found, protocol), class_names, left_out)  # fmt: skip
+                              _by_class(labels, found, protocol), class_names, left_out, names, found, resampling,
+                              resampling.intervals(segmentation_weighted(found, protocol), len(found)))  # fmt: skip
 
 
 def _object(compared: Compared, protocol: str, ignore_below: int) -> SegmentationStatistics:
@@ -138,6 +152,8 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
                 for label, own in report.classes.items()
             ],
         },
+        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
+        "samples": samples_json("sequences", report.names),
         "units": dict.fromkeys(SHARES, "fraction"),
         "denominators": _counts(report.main),
         "left_out": [{"reason": e.reason, "count": len(e.names), "names": e.names} for e in report.left_out],

@@ -7,6 +7,7 @@ from typing import TextIO
 
 import numpy as np
 
+from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.classification import ClassificationMetrics
 from dpcli.evaluate.protocol import ClassificationReport
 
@@ -36,9 +37,24 @@ def percent(share: float | None) -> str:
     return _UNDEFINED if share is None or np.isnan(share) else f"{100 * share:.1f} %"
 
 
+def percent_ends(own: Interval | None) -> str:
+    """`83.1 - 87.0 %`; `-` where there is no interval or an undefined one."""
+    return f"{100 * own.low:.1f} - {percent(own.high)}" if own is not None and own.defined else _UNDEFINED
+
+
+def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
+    """How the intervals were found, as a list of one line, or of none where there are none."""
+    if not resampling.resamples:
+        return []
+    if number < 2:
+        return [f"Intervals: undefined; there is one of these {of} only, and nothing says how another would differ."]
+    return [f"Intervals: {100 * resampling.confidence:.4g} %, bootstrap (BCa, {resampling.resamples} resamples of the "
+            f"{number} {of}, seed {resampling.seed}): what other {of} of this kind would give, not another training."]  # fmt: skip
+
+
 def tables(report: ClassificationReport) -> list[TextTable]:
     """Streams, classes and, up to 30 classes, the confusion matrix of the main scores."""
-    made = [_streams(report), _classes(report)]
+    made = [_streams(report), *_intervals(report), _classes(report)]
     if len(report.class_names) <= MOST_CLASSES:
         made.append(_confusion(report))
     return made
@@ -48,6 +64,7 @@ def notes(report: ClassificationReport) -> list[str]:
     """What was counted, and what was left out."""
     occur = f"{int((report.main.support > 0).sum())} of {len(report.class_names)} classes occur"
     lines = [f"{report.main.samples} samples of split {report.split!r}, {occur}; truth: {report.truth}."]
+    lines += resampling_note(report.resampling, "samples", report.main.samples)
     for entry in report.left_out:
         shown = ", ".join(entry.names[:_NAMES_SHOWN]) + (", ..." if len(entry.names) > _NAMES_SHOWN else "")
         named = f" ({shown})" if "label" in entry.reason else ""
@@ -57,7 +74,8 @@ def notes(report: ClassificationReport) -> list[str]:
 
 def _streams(report: ClassificationReport) -> TextTable:
     top = report.main.top_accuracy is not None
-    header = ["stream", "accuracy", "correct", "95 % interval", *([f"top-{report.main.top_k}"] if top else []),
+    interval = f"{100 * report.resampling.confidence:.4g} % interval"
+    header = ["stream", "accuracy", "correct", interval, *([f"top-{report.main.top_k}"] if top else []),
               "balanced accuracy", "macro F1"]  # fmt: skip
     return TextTable("Accuracy", header, [_stream_row(name, values) for name, values in report.streams.items()])
 
@@ -67,6 +85,20 @@ def _stream_row(name: str, values: ClassificationMetrics) -> list[str]:
     top = [] if values.top_accuracy is None else [percent(values.top_accuracy)]
     return [name, percent(values.accuracy), f"{values.correct}/{values.samples}", f"{100 * low:.1f} - {percent(high)}",
             *top, percent(values.balanced_accuracy), percent(values.macro_f1)]  # fmt: skip
+
+
+def _intervals(report: ClassificationReport) -> list[TextTable]:
+    """Bootstrap intervals of what isn't a share of the samples, and of top-k accuracy; none without resamples."""
+    if not report.resampling.resamples:
+        return []
+    top = f"top{report.main.top_k}_accuracy"
+    titles = {top: f"top-{report.main.top_k}", "balanced_accuracy": "balanced accuracy", "macro_f1": "macro F1"}
+    if report.main.top_accuracy is None:
+        titles.pop(top)
+    rows = [
+        [title, *(percent_ends(own.get(key)) for own in report.intervals.values())] for key, title in titles.items()
+    ]
+    return [TextTable(f"{100 * report.resampling.confidence:.4g} % intervals", ["metric", *report.intervals], rows)]
 
 
 def _classes(report: ClassificationReport) -> TextTable:

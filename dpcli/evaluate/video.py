@@ -7,28 +7,34 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.image_metrics import PictureMetrics, PictureStatistics, picture_compute, picture_merge
+from dpcli.evaluate.learned import LEARNED, LearnedMetric, LearnedScore, load_metrics
 from dpcli.evaluate.protocol import LeftOut
 from dpcli.evaluate.ratio import mean_defined
+from dpcli.evaluate.resampled import means
 from dpcli.evaluate.video_pairing import match_views
 from dpcli.evaluate.video_protocol import (
     PICTURE_METRICS,
     SCENE_METRICS,
     VideoProtocol,
     check_size,
+    scaled,
     score_frame,
     video_protocol,
 )
 from dpcli.evaluate.video_sources import Picture, SceneSource, Source, View, ViewsSource, open_source
+from dpcli.evaluate.weights import weights_folder
 from dpcli.runtime.progress import Progress
 
+NO_INTERVALS = Resampling(0)
 ROLES = ("reference", "test", "train")
 
 
@@ -52,9 +58,13 @@ class VideoReport:
     views: list[ViewScore]
     left_out: list[LeftOut]
     notes: list[str]
+    learned: dict[str, LearnedScore] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)  # metrics that were asked for and not computed, and why
     scene: dict[str, Any] = field(default_factory=dict)  # "parts", "tracks": scores of discovery.py
     length_unit: str = ""
     history: list[dict] = field(default_factory=list)
+    resampling: Resampling = NO_INTERVALS
+    intervals: dict[str, Interval] = field(default_factory=dict)  # of the means over all views
 
     @property
     def roles(self) -> dict[str, dict[str, float]]:
@@ -69,19 +79,22 @@ class VideoReport:
 
 
 def evaluate_video(
-    path: str | Path, truth: str | Path, *, metrics: Sequence[str] | None = None, protocol: str = "dpc",
-    background: str | None = None, intersect: bool = False, seed: int = 0,
+    path: str | Path, truth: str | Path, *, metrics: Sequence[str] | None = None,
+    protocol: str | VideoProtocol = "dpc", background: str | None = None, intersect: bool = False, seed: int = 0,
     watch: Callable[[View, int, int, Picture, Picture], None] | None = None,
+    weights: Path | None = None, device: str = "cpu", resampling: Resampling = NO_INTERVALS,
 ) -> VideoReport:  # fmt: skip
     """Metrics of a predicted video against the true one; each of the kinds `video_sources.open_source` knows.
 
-    metrics: names of PICTURE_METRICS and SCENE_METRICS; None = all that these files allow, but MS-SSIM. intersect:
-    compare the views and first frames that both have, list the rest. seed: of the k-means baseline of `parts`.
-    watch(view, frame, frames, predicted, truth): sees every pair of pictures. Frames in which the prediction has NaN
-    are left out and listed. DataError, naming the first difference, when views, frames or sizes differ; UsageError for
-    protocols, metrics and backgrounds there aren't.
+    metrics: names of PICTURE_METRICS, LEARNED and SCENE_METRICS; None = all that these files allow, but MS-SSIM and the
+    learned ones. intersect: compare the views and first frames that both have and that are finite, list the rest.
+    seed: of the k-means baseline of `parts`. watch(view, frame, frames, predicted, truth): sees every pair of pictures.
+    weights: folder of the learned metrics' networks; a metric whose network is absent is listed in `missing`.
+    resampling: how to find intervals of the means over views.
+    DataError, naming the first difference, when views, frames or sizes differ, and for NaN or infinite pixels;
+    UsageError for protocols, metrics and backgrounds there aren't.
     """
-    chosen = video_protocol(protocol, background)
+    chosen = protocol if isinstance(protocol, VideoProtocol) else video_protocol(protocol, background)
     with closing(open_source(Path(truth))) as real, closing(open_source(Path(path), truth=real)) as said:
         names = _metrics(metrics, said, real)
         pictured = [name for name in names if name in PICTURE_METRICS]
@@ -89,10 +102,57 @@ def evaluate_video(
         pairs = match_views(said, real, chosen, intersect, left_out) if pictured else []
         run = _Run(said, real, chosen, pictured, intersect, watch or (lambda *_: None), left_out)
         views = run.views(pairs)
+        learned, missing = _learned_scores(run, [name for name in names if name in LEARNED], weights, device)
         scene = _scene_scores(said, real, names, seed)
         unit = real.header.length_unit if real.header else ""
-        return VideoReport(chosen, tuple(names), str(truth), run.size, views, left_out, run.notes(), scene, unit,
-                           list(said.history))  # fmt: skip
+        report = VideoReport(chosen, tuple(names), str(truth), run.size, views, left_out, run.notes(), learned, missing,
+                             scene, unit, list(said.history), resampling)  # fmt: skip
+        report.intervals = _intervals(report)
+        return report
+
+
+def _intervals(report: VideoReport) -> dict[str, Interval]:
+    """Of the means over views, views being resampled; none of a lone view."""
+    values, units = view_values(report)
+    if len(values) < 2:
+        return {}
+    columns = {key: np.array([own.get(key, np.nan) for own in values.values()]) for key in units}
+    return report.resampling.intervals(means(columns), len(values))
+
+
+def _learned_scores(
+    run: _Run, names: Sequence[str], weights: Path | None, device: str
+) -> tuple[dict[str, LearnedScore], dict[str, str]]:
+    """Scores of the learned metrics, and why others have none: a pass of its own, frames in order."""
+    if not names:
+        return {}, {}
+    made, missing = load_metrics(names, run.protocol.networks, weights_folder(weights), device)
+    others = replace(run.protocol, views=run.protocol.learned_views or run.protocol.views)
+    second = replace(run, left_out=[])
+    if made:
+        second.feed(match_views(run.said, run.real, others, run.intersect, second.left_out), made, missing)
+    run.size = second.size
+    run.left_out.extend(entry for entry in second.left_out if entry not in run.left_out)  # each is said once
+    scores = {}
+    for name, metric in made.items():
+        if name not in missing:
+            try:
+                scores[name] = metric.score()
+            except DataError as error:
+                missing[name] = str(error)
+    return scores, missing
+
+
+def view_values(report: VideoReport) -> tuple[dict[str, dict[str, float]], dict[str, str]]:
+    """{view: {metric: value}} of metrics whose value is the mean over views, and each one's unit."""
+    pictured = [name for name in report.names if name in PICTURE_METRICS]
+    values = {view.title: {name: getattr(view.metrics, name) for name in pictured} for view in report.views}
+    units = {name: "dB" if name.startswith("psnr") else "1" for name in pictured}
+    for name, score in report.learned.items():
+        for view, value in score.per_view.items():
+            values.setdefault(view, {})[name] = value
+            units[name] = "1"
+    return values, units
 
 
 def _metrics(asked: Sequence[str] | None, said: Source, real: Source) -> list[str]:
@@ -142,6 +202,7 @@ class _Run:
     size: tuple[int, int] = (0, 0)
     brightest: tuple[int, int] = (0, 0)  # 8-bit colour of the prediction, of the truth, until one is plausible
     hollow: int = 0  # predicted pictures without an object
+    swapped: str = ""  # the first picture that seems to have red and blue swapped
 
     def views(self, pairs: Iterable[tuple[int, int]]) -> list[ViewScore]:
         counts = [(ours, theirs, self._frames(ours, theirs)) for ours, theirs in pairs]
@@ -152,10 +213,38 @@ class _Run:
                 if found:
                     view = self.real.views[theirs]
                     scores.append(ViewScore(view.title, view.role, picture_compute(picture_merge(found))))
-        if damaged:
-            self.left_out.append(LeftOut("frames in which the prediction has NaN or infinite pixels", damaged))
+        self._say_damaged(damaged)
         self._plausible(scores, counts)
         return scores
+
+    def feed(self, pairs: list[tuple[int, int]], metrics: dict[str, LearnedMetric], missing: dict[str, str]) -> None:
+        """Show every frame of every pair of views to the metrics; one that can't go on leaves its reason in `missing`."""
+        counts = [(ours, theirs, self._frames(ours, theirs)) for ours, theirs in pairs]
+        damaged: list[str] = []
+        with Progress("learned metrics", sum(count for *_, count in counts), "frame") as progress:
+            for ours, theirs, count in counts:
+                self._each(metrics, missing, "start", self.real.views[theirs].title)
+                for _, predicted, truth in self._checked(ours, theirs, count, damaged):
+                    self._each(metrics, missing, "add", scaled(predicted, self.protocol), scaled(truth, self.protocol))
+                    progress.advance()
+                self._each(metrics, missing, "end")
+        self._say_damaged(damaged)
+
+    @staticmethod
+    def _each(metrics: dict[str, LearnedMetric], missing: dict[str, str], verb: str, *given: Any) -> None:
+        for name, metric in metrics.items():
+            if name not in missing:
+                try:
+                    getattr(metric, verb)(*given)
+                except DataError as error:
+                    missing[name] = str(error)
+
+    def _say_damaged(self, damaged: list[str]) -> None:
+        if damaged and not self.intersect:
+            raise DataError(f"{self.said.path}: {len(damaged)} frames with NaN or infinite pixels, the first "
+                            f"{damaged[0]}; make them again, or leave them out with --intersect")  # fmt: skip
+        if damaged:
+            self.left_out.append(LeftOut("frames in which the prediction has NaN or infinite pixels", damaged))
 
     def _frames(self, ours: int, theirs: int) -> int:
         """How many frames of a pair of views are compared."""
@@ -174,6 +263,16 @@ class _Run:
         self, ours: int, theirs: int, count: int, damaged: list[str]
     ) -> Iterator[Callable[[], PictureStatistics]]:
         """A scoring to do for each frame, pictures read as they are needed."""
+        view = self.real.views[theirs]
+        for frame, predicted, truth in self._checked(ours, theirs, count, damaged, self.watch):
+            self._look(predicted, truth, f"view {view.title!r}, frame {frame}")
+            yield lambda f=frame, p=predicted, t=truth: score_frame(f, p, t, self.protocol, self.metrics)
+
+    def _checked(
+        self, ours: int, theirs: int, count: int, damaged: list[str],
+        watch: Callable[[View, int, int, Picture, Picture], None] = lambda *_: None,
+    ) -> Iterator[tuple[int, Picture, Picture]]:  # fmt: skip
+        """Frame, predicted, true picture of a pair of views; frames whose prediction isn't finite go to `damaged`."""
         frames, view = range(count), self.real.views[theirs]
         pairs = zip(frames, self.said.pictures(ours, frames), self.real.pictures(theirs, frames), strict=True)
         for frame, predicted, truth in pairs:
@@ -181,12 +280,11 @@ class _Run:
             if truth.unusable:
                 raise DataError(f"{self.real.path}: view {view.title!r}, frame {frame}: {truth.unusable} pixels are NaN "
                                 "or infinite; make the truth again")  # fmt: skip
-            self.watch(view, frame, count, predicted, truth)
+            watch(view, frame, count, predicted, truth)
             if predicted.unusable:
                 damaged.append(f"view {view.title} frame {frame} ({predicted.unusable} pixels)")
-                continue
-            self._look(predicted, truth)
-            yield lambda f=frame, p=predicted, t=truth: score_frame(f, p, t, self.protocol, self.metrics)
+            else:
+                yield frame, predicted, truth
 
     def _same_size(self, predicted: Picture, truth: Picture, where: str) -> None:
         if self.protocol.size is None and predicted.size != truth.size:
@@ -197,13 +295,15 @@ class _Run:
             check_size(truth.size, self.protocol, self.metrics, str(self.real.path))
         self.size = truth.size
 
-    def _look(self, predicted: Picture, truth: Picture) -> None:
-        """Note what tells a broken prediction: 0..1 saved as 8 bits, or pictures without an object."""
+    def _look(self, predicted: Picture, truth: Picture, where: str) -> None:
+        """Note what tells a broken prediction: 0..1 saved as 8 bits, no object, red and blue swapped."""
         if self.brightest[0] <= 1 and predicted.rgba is not None and truth.rgba is not None:
             pair = (int(p.rgba[..., :3].max()) for p in (predicted, truth))
             self.brightest = tuple(max(*both) for both in zip(self.brightest, pair, strict=True))  # type: ignore
         if self.said.has_alpha:
             self.hollow += not (predicted.rgba if predicted.values is None else predicted.values)[..., 3].any()
+        if not self.swapped and where.endswith("frame 0"):
+            self.swapped = where if _swapped(scaled(predicted, self.protocol), scaled(truth, self.protocol)) else ""
 
     def _plausible(self, scores: list[ViewScore], counts: list) -> None:
         if not scores and counts:
@@ -223,9 +323,18 @@ class _Run:
             lines.append(f"The prediction ({self.said.kind}) has no alpha: its colours are compared as they are.")
         if not self.real.has_alpha:
             lines.append(f"The truth ({self.real.kind}) has no alpha: background and object are compared alike.")
+        if self.swapped:
+            lines.append(f"Red and blue look swapped in the prediction ({self.swapped}): with them exchanged it is much "
+                         "closer to the truth; was it saved as BGR?")  # fmt: skip
         if self.hollow:
             lines.append(f"Predicted pictures without an object (alpha 0 everywhere): {self.hollow}.")
         return lines
+
+
+def _swapped(predicted: np.ndarray, truth: np.ndarray) -> bool:
+    """Whether exchanging red and blue takes away nearly all of the error, of pictures f32 (3,H,W) in 0..1."""
+    error, other = (float(np.square(p - truth).mean()) for p in (predicted, predicted[::-1]))
+    return error > 1e-3 and other < 0.1 * error
 
 
 def _in_threads(work: Iterator[Callable[[], PictureStatistics]], progress: Progress) -> Iterator[PictureStatistics]:

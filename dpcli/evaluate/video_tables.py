@@ -10,9 +10,12 @@ import numpy as np
 
 from dpcli.evaluate.discovery import PART_NEIGHBOURS, SOLID, TRACK_NEIGHBOURS, PartScore, TrackScore
 from dpcli.evaluate.image_metrics import PSNR_CAP
+from dpcli.evaluate.learned import TITLES as LEARNED_TITLES
+from dpcli.evaluate.learned import LearnedScore
+from dpcli.evaluate.protocol import intervals_json, samples_json
 from dpcli.evaluate.ratio import divide
-from dpcli.evaluate.tables import TextTable
-from dpcli.evaluate.video import VideoReport, ViewScore
+from dpcli.evaluate.tables import TextTable, resampling_note
+from dpcli.evaluate.video import VideoReport, ViewScore, view_values
 from dpcli.evaluate.video_protocol import PICTURE_METRICS, choices
 
 TITLES = {"psnr": "PSNR (dB)", "psnr_foreground": "PSNR on object (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM"}
@@ -23,6 +26,10 @@ _NAMES_SHOWN = 10
 def video_tables(report: VideoReport) -> list[TextTable]:
     """One row for each view, each role with more than one view, and all; then parts and tracks where they were asked."""
     made = [_pictures(report)] if report.views else []
+    if report.learned or report.missing:
+        made.append(_learned(report))
+    if report.intervals:
+        made.append(_intervals(report))
     if "parts" in report.scene:
         made.append(_parts(report.scene["parts"]))
     if "tracks" in report.scene:
@@ -42,6 +49,30 @@ def _pictures(report: VideoReport) -> TextTable:
     if len(report.views) > 1:
         rows.append([f"mean of {len(report.views)}", "all", _frames(report.views), *_cells(report.mean(), names), ""])
     return TextTable(f"Pictures, protocol {report.protocol.name}", header, rows)
+
+
+def _learned(report: VideoReport) -> TextTable:
+    header, rows = ["metric", "value", "the truth's own", "of"], []
+    for name in (name for name in report.names if name in LEARNED_TITLES):
+        if name in report.missing:
+            rows.append([LEARNED_TITLES[name], "-", "", "not computed"])
+            continue
+        score = report.learned[name]
+        own = "" if score.truth is None else _number(score.truth)
+        rows.append([LEARNED_TITLES[name], _number(score.value), own, _counts(score)])
+    return TextTable(f"Learned and temporal metrics, protocol {report.protocol.name}", header, rows)
+
+
+def _intervals(report: VideoReport) -> TextTable:
+    means = report.mean() | {name: score.value for name, score in report.learned.items()}
+    titles = TITLES | LEARNED_TITLES
+    rows = [[titles[name], _number(means[name]), f"{own.low:.4g} - {own.high:.4g}" if own.defined else "-"]
+            for name, own in report.intervals.items()]  # fmt: skip
+    return TextTable("All views", ["metric", "mean", f"{100 * report.resampling.confidence:.4g} % interval"], rows)
+
+
+def _counts(score: LearnedScore) -> str:
+    return ", ".join(f"{count} {name}" for name, count in score.counts.items())
 
 
 def _frames(views: list[ViewScore]) -> str:
@@ -84,6 +115,10 @@ def video_notes(report: VideoReport) -> list[str]:
     lines = [f"Truth: {report.truth}.", *report.notes]
     if report.views:
         lines += _picture_notes(report)
+    for name, score in report.learned.items():
+        said = "; ".join(f"{key} {value}" for key, value in score.choices.items())
+        lines.append(f"{LEARNED_TITLES[name]}: {said}.")
+    lines += [f"{LEARNED_TITLES[name]} not computed: {reason}" for name, reason in report.missing.items()]
     if "parts" in report.scene:
         lines.append(
             f"Parts: each true surface point takes the part of its {PART_NEIGHBOURS} nearest Gaussians (opacity >= {SOLID:g}, "
@@ -96,6 +131,8 @@ def video_notes(report: VideoReport) -> list[str]:
             f"later frames; diameter {_number(report.scene['tracks'].diameter)} {report.length_unit}".rstrip()
             + " (diagonal of the bounding box in the first frame)."
         )
+    if report.intervals:
+        lines += resampling_note(report.resampling, "views", len(view_values(report)[0]))
     for entry in report.left_out:
         shown = ", ".join(entry.names[:_NAMES_SHOWN]) + (", ..." if len(entry.names) > _NAMES_SHOWN else "")
         lines.append(f"Left out, {entry.reason}: {len(entry.names)} ({shown}).")
@@ -128,24 +165,37 @@ def video_json(report: VideoReport, source: str) -> dict[str, Any]:
             "per_role": {role: _defined(means) for role, means in report.roles.items()},
             "per_view": [_view(view, report.names) for view in report.views],
         }
-    units = {name: _UNITS[name] for name in report.names if name in _UNITS}
+    metrics |= _defined({name: score.value for name, score in report.learned.items()})
+    metrics |= {name: None for name in report.missing}
+    units = {name: _UNITS.get(name, "1") for name in report.names if name in (*_UNITS, *LEARNED_TITLES)}
     pixels = report.size[0] * report.size[1] if not report.protocol.size else report.protocol.size**2
     denominators = {"views": len(report.views), "frames": sum(view.metrics.frames for view in report.views),
                     "pixels": pixels if report.views else 0}  # fmt: skip
+    if report.learned:
+        metrics["per_view_learned"] = {name: _defined(s.per_view) for name, s in report.learned.items() if s.per_view}
+        metrics["of_the_truth"] = _defined({n: s.truth for n, s in report.learned.items() if s.truth is not None})
+        denominators |= {name: score.counts for name, score in report.learned.items()}
     for name, score in report.scene.items():
         metrics[name] = _parts_json(score) if isinstance(score, PartScore) else _tracks_json(score)
         denominators[name] = {key: value for key, value in asdict(score).items() if isinstance(value, int)}
     if "tracks" in report.scene:
         units |= {"epe": report.length_unit, "epe_no_motion": report.length_unit, "epe_of_diameter": "fraction",
                   "epe_no_motion_of_diameter": "fraction", "diameter": report.length_unit}  # fmt: skip
+    names = list(view_values(report)[0])
     return {
         "task": "video",
         "input": source,
-        "protocol": choices(report.protocol) | {"truth": report.truth} | _scene_choices(report),
+        "protocol": choices(report.protocol)
+        | {"truth": report.truth}
+        | _scene_choices(report)
+        | {name: score.choices for name, score in report.learned.items()},
         "metrics": metrics,
         "units": units | ({"adjusted_rand_index": "1"} if "parts" in report.scene else {}),
         "denominators": denominators,
+        "samples": samples_json("views", names),
+        "intervals": intervals_json(report.resampling, "views", len(names), report.intervals),
         "left_out": [{"reason": e.reason, "count": len(e.names), "names": e.names} for e in report.left_out],
+        "not_computed": report.missing,
         "notes": report.notes,
         "provenance": report.history,
     }

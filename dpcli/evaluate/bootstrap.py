@@ -1,0 +1,186 @@
+"""Bootstrap intervals: how far a metric would move with other samples of the same kind (Efron & Tibshirani 1993).
+
+What is resampled is a whole sample: a video of a scores file, a sequence of a parts file with all its frames and frame
+pairs, which are not independent of one another. A metric is a function of how often each sample counts (`Weighted`), so
+a resample is a row of counts and a thousand of them are a few sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.errors import UsageError
+from dpcli.runtime.seed import generator
+
+Weighted = Callable[[np.ndarray], dict[str, np.ndarray]]
+"""Counts f64 (R,n), how often each of n samples counts in each of R resamples -> value f64 (R) by metric, NaN = 0/0."""
+
+METHODS = ("bca", "percentile")
+_BLOCK = 1 << 21  # counts in memory at once
+_MOST_LEFT_OUT = 2000  # samples up to which each is left out once, for BCa's acceleration
+_EQUAL = 1e-12  # relative: sums in another order
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """How to resample: `resamples` times (0 = no intervals), for intervals of `confidence`, from `seed`."""
+
+    resamples: int = 2000
+    confidence: float = 0.95
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.confidence < 1:
+            raise UsageError(f"--confidence {self.confidence:g}: expected a share between 0 and 1, such as 0.95")
+        if self.resamples < 0 or 0 < self.resamples < 100:
+            raise UsageError(f"--resamples {self.resamples}: expected 100 or more, or 0 for no intervals")
+
+    def intervals(self, metric: Weighted, samples: int, method: str = "bca") -> dict[str, Interval]:
+        """Interval of each metric over `samples` samples; empty when `resamples` is 0."""
+        if self.resamples == 0:
+            return {}
+        return bootstrap(metric, samples, generator(self.seed), resamples=self.resamples,
+                         confidence=self.confidence, method=method)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Ends of an interval in the metric's own unit; NaN = undefined (fewer than two samples, or a metric of 0/0)."""
+
+    low: float
+    high: float
+
+    @property
+    def defined(self) -> bool:
+        return not np.isnan(self.low)
+
+
+def drawn_counts(
+    samples: int, resamples: int, rng: np.random.Generator, groups: np.ndarray | None = None
+) -> Iterator[np.ndarray]:  # f64 (R,samples), blocks of rows
+    """Counts of `samples` samples drawn with replacement, `resamples` times.
+
+    `groups` i (samples), 0..G-1: samples of one group are drawn together, G groups each time.
+    """
+    units = samples if groups is None else int(groups.max()) + 1
+    rows = max(1, _BLOCK // max(samples, 1))
+    for start in range(0, resamples, rows):
+        count = min(rows, resamples - start)
+        drawn = rng.integers(0, units, (count, units)) + units * np.arange(count)[:, None]
+        counts = np.bincount(drawn.ravel(), minlength=count * units).reshape(count, units).astype(np.float64)
+        yield counts if groups is None else counts[:, groups]
+
+
+def replicates(
+    metric: Weighted, samples: int, rng: np.random.Generator, resamples: int, groups: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
+    """Value of each metric in each resample, f64 (resamples)."""
+    return _joined(metric(counts) for counts in drawn_counts(samples, resamples, rng, groups))
+
+
+def left_out_once(metric: Weighted, samples: int, groups: np.ndarray | None = None) -> dict[str, np.ndarray] | None:
+    """Value of each metric without each sample (or group), f64 (samples); None for more than 2,000 of them.
+
+    The acceleration they serve falls with the root of their number: it no longer moves an interval there.
+    """
+    groups = np.arange(samples) if groups is None else groups
+    units = int(groups.max()) + 1
+    if units > _MOST_LEFT_OUT:
+        return None
+    rows = max(1, _BLOCK // samples)
+    return _joined(metric((groups != np.arange(start, min(start + rows, units))[:, None]).astype(np.float64))
+                   for start in range(0, units, rows))  # fmt: skip
+
+
+def _joined(parts: Iterator[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    parts = list(parts)
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def bootstrap(
+    metric: Weighted,
+    samples: int,
+    rng: np.random.Generator,
+    *,
+    resamples: int = 2000,
+    confidence: float = 0.95,
+    method: str = "bca",
+    groups: np.ndarray | None = None,
+) -> dict[str, Interval]:
+    """Interval of each metric from resamples of `samples` samples (of whole `groups`, see `drawn_counts`).
+
+    `method`: "bca", bias-corrected and accelerated (Efron 1987), or "percentile". A resample in which a metric is 0/0
+    doesn't count for it; when most are, or there is one sample only, the interval is undefined.
+    """
+    if method not in METHODS:
+        raise ValueError(f"method {method!r}: expected one of {', '.join(METHODS)}")
+    estimate = {key: float(value[0]) for key, value in metric(np.ones((1, samples))).items()}
+    if samples < 2 or (groups is not None and groups.max() == 0):
+        return {key: Interval(np.nan, np.nan) for key in estimate}
+    found = replicates(metric, samples, rng, resamples, groups)
+    jackknife = left_out_once(metric, samples, groups) if method == "bca" else None
+    return {
+        key: interval(estimate[key], found[key], confidence, bca=method == "bca",
+                      jackknife=None if jackknife is None else jackknife[key])
+        for key in estimate
+    }  # fmt: skip
+
+
+def interval(
+    estimate: float,
+    replicate: np.ndarray,  # f64 (R), NaN = undefined
+    confidence: float = 0.95,
+    *,
+    bca: bool = False,
+    jackknife: np.ndarray | None = None,  # f64 (n)
+) -> Interval:
+    """Interval of an estimate from its replicates: percentiles of them, with `bca` moved by bias and acceleration."""
+    defined = replicate[~np.isnan(replicate)]
+    if np.isnan(estimate) or 2 * len(defined) < len(replicate) or len(defined) == 0:
+        return Interval(np.nan, np.nan)
+    defined = snapped(defined, estimate)
+    shares = np.array([(1 - confidence) / 2, (1 + confidence) / 2])
+    if bca:
+        shares = _bca_shares(estimate, defined, shares, jackknife)
+    low, high = np.quantile(defined, shares)
+    return Interval(float(low), float(high))
+
+
+def snapped(replicate: np.ndarray, estimate: float) -> np.ndarray:
+    """Replicates that equal the estimate but for rounding, made equal to it."""
+    return np.where(np.abs(replicate - estimate) <= _EQUAL * max(1.0, abs(estimate)), estimate, replicate)
+
+
+def _bca_shares(estimate: float, replicate: np.ndarray, shares: np.ndarray, jackknife: np.ndarray | None) -> np.ndarray:
+    """Percentiles to take instead of `shares`; the same ones where all replicates lie on one side of the estimate."""
+    from scipy.special import ndtr, ndtri
+
+    below = float(((replicate < estimate).mean() + (replicate <= estimate).mean()) / 2)
+    if not 0 < below < 1:
+        return shares
+    bias, quantiles = ndtri(below), ndtri(shares)
+    return ndtr(bias + (bias + quantiles) / (1 - _acceleration(jackknife) * (bias + quantiles)))
+
+
+def _acceleration(jackknife: np.ndarray | None) -> float:
+    if jackknife is None or np.isnan(jackknife).any():
+        return 0.0
+    away = jackknife.mean() - jackknife
+    spread = float((away**2).sum())
+    return float((away**3).sum() / (6 * spread**1.5)) if spread > 1e-24 else 0.0
+
+
+def two_sided_p(replicate: np.ndarray) -> float:
+    """p value of "no difference" from replicates of a difference, f64 (R): twice the smaller share on one side of 0.
+
+    It counts the observed data as one more resample (so it is never 0), falls below 1 - confidence where the percentile
+    interval leaves out 0, and is 1 where nothing differs. NaN without defined replicates.
+    """
+    defined = replicate[~np.isnan(replicate)]
+    if len(defined) == 0:
+        return float("nan")
+    sides = [(1 + int((sign * defined <= _EQUAL).sum())) / (1 + len(defined)) for sign in (1, -1)]
+    return min(1.0, 2 * min(sides))

@@ -1,0 +1,79 @@
+"""Results as sections: what is shown of each, in which order, and the thesis's tables beside them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import PurePath
+
+from dpcli import __version__
+from dpcli.errors import DataError
+from dpcli.evaluate.report.blocks import Cell, Report, Section, Table, table
+from dpcli.evaluate.report.classification_section import SHOWN_HERE, classification_blocks
+from dpcli.evaluate.report.collect import Collected, Result
+from dpcli.evaluate.report.general import denominator, detail_lists, headline, metric_blocks
+from dpcli.evaluate.report.thesis import beside_table, chosen_tables
+
+
+def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[str] = ()) -> Report:
+    """The report of all results. beside: ids of the thesis's tables, none = those that know the data.
+
+    DataError when a result's numbers have no shape that can be shown; UsageError for a table there isn't.
+    """
+    objects = [result.found for result in collected.results]
+    tables = chosen_tables(beside, objects)
+    titles = _titles(collected.results)
+    sections = [_section(number, own, title) for number, (own, title) in enumerate(zip(collected.results, titles), 1)]
+    named = list(zip(titles, objects, strict=True))
+    return Report(title, _summary(sections), sections, [beside_table(own, named, bool(beside)) for own in tables],
+                  collected.duplicates, __version__)  # fmt: skip
+
+
+def _titles(results: Sequence[Result]) -> list[str]:
+    """The input's file name, or the whole path where names repeat within a task, or a number after it."""
+    full = [_input(result) for result in results]
+    short = [PurePath(text).name or text for text in full]
+    seen = Counter((own.found["task"], name) for own, name in zip(results, short))
+    made = [name if seen[result.found["task"], name] == 1 else text for result, name, text in zip(results, short, full)]
+    taken: Counter = Counter()
+    out = []
+    for result, name in zip(results, made):
+        taken[result.found["task"], name] += 1
+        count = taken[result.found["task"], name]
+        out.append(name if count == 1 else f"{name} ({count})")
+    return out
+
+
+def _input(result: Result) -> str:
+    said = result.found.get("input", "")
+    if isinstance(said, (list, tuple)):
+        said = ", ".join(PurePath(str(own)).name for own in said)
+    return result.source if said in ("", "-", None) else str(said)
+
+
+def _section(number: int, result: Result, title: str) -> Section:
+    found = result.found
+    classified = found["task"] == "classification"
+    try:
+        special = classification_blocks(found) if classified else []
+        blocks, notes = metric_blocks(found, SHOWN_HERE if classified else ())
+    except (DataError, AttributeError, TypeError, KeyError, ValueError, IndexError) as error:
+        raise DataError(f"{result.source}: the {found['task']} object can't be shown: {error}") from None
+    protocol, data = found.get("protocol", {}), denominator(found)
+    truth = PurePath(str(protocol.get("truth", "")))
+    if truth.suffix or len(truth.parts) > 1:  # a path, not words
+        data = f"{data} of {truth.name}" if data else truth.name
+    said = [str(note) for note in found.get("notes", []) if isinstance(note, str)]
+    left = [
+        f"Left out, {own.get('reason', 'unknown')}: {own.get('count', len(own.get('names', [])))}."
+        for own in found.get("left_out", [])
+    ]
+    commands = [str(own["command"]) for own in found.get("provenance", []) if own.get("command")]
+    return Section(f"result-{number}", title, found["task"], data, headline(found), [*special, *blocks, *result.extras],
+                   [*said, *left, *result.notes, *notes], detail_lists(found), commands)  # fmt: skip
+
+
+def _summary(sections: Sequence[Section]) -> Table:
+    rows = [[Cell(own.title, link=own.anchor), own.task, own.headline.metric, own.headline.value, own.headline.interval or "-",
+             Cell(own.data or "-")] for own in sections]  # fmt: skip
+    return table("Summary", ("result", "task", "metric", "value", "interval", "over"), rows, key="summary")

@@ -1,0 +1,99 @@
+"""What only a classification result has: streams, classes with bars, the confusion matrix, and what is confused most."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, table, title_of
+from dpcli.evaluate.report.charts import confusion_grid
+
+SHOWN_HERE = ("streams", "per_class", "confusion")
+_MOST_CLASSES = 128
+_MOST_PAIRS = 12
+
+
+def classification_blocks(found: Mapping[str, Any]) -> list[Table | Figure]:
+    """Tables and the matrix of a classification object; those whose numbers it lacks are left out. DataError: `_matrix`."""
+    metrics = found.get("metrics", {})
+    classes = [row for row in metrics.get("per_class", []) if isinstance(row, Mapping)]
+    blocks: list[Table | Figure] = []
+    if isinstance(metrics.get("streams"), Mapping):
+        blocks.append(_streams(metrics["streams"], found.get("denominators", {})))
+    if classes:
+        blocks.append(_classes(classes))
+    confusion = _matrix(metrics.get("confusion"), len(classes))
+    if confusion is not None:
+        names = [str(row.get("name", "")) for row in classes] or [""] * len(confusion)
+        blocks += _confusions(confusion, names)
+    return blocks
+
+
+def _streams(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Table:
+    names = list(dict.fromkeys(key for own in streams.values() for key in own if not key.endswith("_interval")))
+    samples, correct = counts.get("samples"), counts.get("correct", {})
+    rows = []
+    for stream, own in streams.items():
+        hits = f"{correct.get(stream)}/{samples}" if samples and correct.get(stream) is not None else "-"
+        interval = interval_text(own.get("accuracy_interval"), "fraction") or "-"
+        rows.append(
+            [stream, hits, interval, *(cell(own.get(name), "fraction", bar=name == "accuracy") for name in names)]
+        )
+    return table(
+        "By stream", ("stream", "correct", "95 % interval of accuracy", *map(title_of, names)), rows, key="streams"
+    )
+
+
+def _classes(classes: list[Mapping[str, Any]]) -> Table:
+    rows = [[Cell(f"{row.get('label', number)} {row.get('name', '')}".strip(), float(number)),
+             cell(row.get("recall"), "fraction", bar=True), cell(row.get("support")), cell(row.get("hits")),
+             cell(row.get("precision"), "fraction"), cell(row.get("f1"), "fraction")]
+            for number, row in enumerate(classes)]  # fmt: skip
+    return table(
+        "By class", ("class", "accuracy (recall)", "samples", "correct", "precision", "F1"), rows, key="per_class"
+    )
+
+
+def _matrix(found: Any, classes: int) -> np.ndarray | None:
+    """The confusion matrix, i64 (C,C); None without one. DataError unless it is square, of counts, of all classes."""
+    if found is None:
+        return None
+    try:
+        matrix = np.array(found, np.int64)
+    except (ValueError, TypeError, OverflowError):
+        matrix = np.zeros(0)
+    if (
+        matrix.ndim != 2
+        or matrix.shape[0] != matrix.shape[1]
+        or (classes and len(matrix) != classes)
+        or (matrix < 0).any()
+    ):
+        raise DataError(f"metrics.confusion has shape {matrix.shape}; expected counts, one row and column for each of "
+                        f"{classes or 'the'} classes")  # fmt: skip
+    return matrix
+
+
+def _confusions(confusion: np.ndarray, names: list[str]) -> list[Table | Figure]:
+    note = "Rows: truth, columns: prediction; colour: share of the row's truth, number: samples."
+    if len(confusion) > _MOST_CLASSES:
+        grid = []
+    else:
+        grid = [Figure("Confusion matrix", confusion_grid(confusion, names), note)]
+    return [*grid, *_confused(confusion, names)]
+
+
+def _confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
+    """The pairs that are mixed up most often, most samples first, then by label."""
+    wrong = confusion * (1 - np.eye(len(confusion), dtype=np.int64))
+    cells = [tuple(own) for own in np.argwhere(wrong > 0).tolist()]
+    cells.sort(key=lambda own: (-wrong[own], own))
+    support = confusion.sum(axis=1)
+    rows = [[f"{names[a] or a}", f"{names[b] or b}", cell(int(wrong[a, b])), cell(float(wrong[a, b] / support[a]), "fraction", bar=True)]
+            for a, b in cells[:_MOST_PAIRS]]  # fmt: skip
+    if not rows:
+        return []
+    return [table(f"Confused most ({len(rows)} of {len(cells)} pairs)", ("truth", "predicted as", "samples", "of the truth"), rows,
+                  key="confused")]  # fmt: skip

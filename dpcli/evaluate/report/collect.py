@@ -1,0 +1,246 @@
+"""What the arguments of a report hold: result objects, or scores, parts and videos that are evaluated here."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.report.blocks import Figure, Table
+from dpcli.evaluate.report.clouds import part_blocks
+from dpcli.evaluate.report.strips import strip_figure
+from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_EXPECTED = ("expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
+             "or a video as PRED=TRUTH")  # fmt: skip
+_MAPPINGS, _LISTS = ("metrics", "protocol", "units", "denominators", "intervals"), ("left_out", "provenance")
+_VIDEO = ("views", "gaussians")
+
+
+@dataclass
+class Result:
+    """A result object and where it is from; `extras`: figures that only the files behind it could give."""
+
+    found: dict[str, Any]
+    source: str
+    extras: list[Table | Figure] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Collected:
+    """All results in the order given, and what was given twice."""
+
+    results: list[Result]
+    duplicates: list[str]
+
+
+def collect(
+    arguments: Sequence[str], truth: Path | None = None, *, split: str | None = None, pictures: bool = True,
+    stdin: BinaryIO | None = None,
+) -> Collected:  # fmt: skip
+    """The results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
+
+    truth: of the parts files, and of scores files if given with them only. pictures: also what needs the files behind a
+    result (clouds, strips). Equal objects count once. DataError for a file that holds no result, UsageError for no
+    arguments or a pipe named twice.
+    """
+    if not arguments:
+        raise UsageError("no results to report; " + _EXPECTED)
+    if list(arguments).count("-") > 1:
+        raise UsageError("- names the pipe, which can be read only once")
+    results = [result for argument in arguments for result in _results(argument, truth, split, pictures, stdin)]
+    return _once(results)
+
+
+def _results(
+    argument: str, truth: Path | None, split: str | None, pictures: bool, stdin: BinaryIO | None
+) -> list[Result]:  # fmt: skip
+    if argument == "-":
+        return _objects((stdin or sys.stdin.buffer).read(), "stdin", pictures)
+    path, own = _named(argument)
+    if path.is_file() and not _is_store(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
+        return _objects(path.read_bytes(), str(path), pictures)
+    kind = file_kind(path) if path.is_file() and _is_store(path) else "video"
+    if kind == "scores":
+        return [_scores(path, own, split)]
+    if kind == "parts":
+        return _parts(path, own or truth, split, pictures)
+    if kind in _VIDEO or (own and kind == "video"):
+        return [_video(path, own, pictures)]
+    if kind == "video" and not path.exists():
+        raise DataError(f"{path}: no such file; {_EXPECTED}")
+    raise DataError(f"{path}: holds {kind!r}, which has no result in it; {_EXPECTED}")
+
+
+def _named(argument: str) -> tuple[Path, Path | None]:
+    """`PRED=TRUTH` -> both; a file that has an equals sign in its name stays one."""
+    if "=" not in argument or Path(argument).exists():
+        return Path(argument), None
+    cuts = [i for i, letter in enumerate(argument) if letter == "="]
+    cut = next((i for i in cuts if Path(argument[:i]).exists() and Path(argument[i + 1 :]).exists()), cuts[0])
+    return Path(argument[:cut]), Path(argument[cut + 1 :])
+
+
+def _is_store(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return file.read(len(_HDF5)) == _HDF5
+
+
+def _objects(data: bytes, source: str, pictures: bool) -> list[Result]:
+    """Result objects from text: one object, a list of them, or one on each line."""
+    if data.startswith(_HDF5):
+        raise DataError(f"{source}: an HDF5 file; save it and name it (the report reads it more than once)")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{source}: neither text nor HDF5 (it begins with {data[:8]!r}); {_EXPECTED}") from None
+    if not text.strip():
+        raise DataError(f"{source}: empty; {_EXPECTED}")
+    results = [Result(_checked(own, where), source) for own, where in _parsed(text, source)]
+    for result in results:
+        if pictures and result.found.get("task") == "video":
+            _add_strips(result)
+    return results
+
+
+def _parsed(text: str, source: str) -> list[tuple[Any, str]]:
+    try:
+        whole = _json(text)
+        found = whole if isinstance(whole, list) else [whole]
+        return [(own, f"{source}: object {i}" if len(found) > 1 else source) for i, own in enumerate(found, 1)]
+    except ValueError:
+        pass
+    made = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            made.append((_json(line), f"{source}: line {number}"))
+        except ValueError as error:
+            shown = line.strip()[:40]
+            raise DataError(
+                f"{source}: line {number} is not JSON ({error}), it begins with {shown!r}; {_EXPECTED}"
+            ) from None
+    return made
+
+
+def _json(text: str) -> Any:
+    """JSON without NaN and Infinity, which no result has. ValueError."""
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no number")
+
+    try:
+        return json.loads(text, parse_constant=refuse)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _checked(found: Any, where: str) -> dict[str, Any]:
+    """The object, if it has the shape of a result; a task that nobody knows is fine. DataError."""
+    if not isinstance(found, dict) or not isinstance(found.get("task"), str):
+        shown = (
+            f"an object with {', '.join(list(found)[:5]) or 'nothing'}"
+            if isinstance(found, dict)
+            else f"a {type(found).__name__}"
+        )
+        raise DataError(f"{where}: {shown}, no result (it has no text `task`); {_EXPECTED}")
+    for key in _MAPPINGS:
+        if not isinstance(found.get(key, {}), dict):
+            raise DataError(f"{where}: {key} is a {type(found[key]).__name__}; expected an object of names and values")
+    said = found.get("provenance", [])
+    if isinstance(said, list):  # of a comparison: one list for each side
+        flat = [entry for own in said for entry in (own if isinstance(own, list) else [own])]
+        found = found | {"provenance": [entry for row, entry in enumerate(flat) if entry not in flat[:row]]}
+    for key in _LISTS:
+        entries = found.get(key, [])
+        if not isinstance(entries, list) or not all(isinstance(own, dict) for own in entries):
+            raise DataError(f"{where}: {key} is not a list of objects; print the result again")
+    return found
+
+
+def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
+    from dpcli.evaluate.bootstrap import Resampling
+    from dpcli.evaluate.protocol import as_json, evaluate_classification
+
+    report = evaluate_classification(path, truth, split, resampling=Resampling())
+    return Result(_plain(as_json(report, str(path), ScoresReader(path).provenance)), str(path))
+
+
+def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[Result]:
+    """Segmentation, and motion where the truth has poses and the prediction frame pairs."""
+    from dpcli.evaluate.bootstrap import Resampling
+    from dpcli.evaluate.motion_protocol import evaluate_motion, motion_json
+    from dpcli.evaluate.segmentation_protocol import evaluate_segmentation, segmentation_json
+
+    if truth is None:
+        raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
+    with CloudsReader(truth) as clouds, PartsReader(path) as said:
+        motion, provenance = "pose" in clouds.fields and bool((said.pair_counts > 0).any()), said.provenance
+    options = {"split": split, "resampling": Resampling()}
+    made = [
+        Result(
+            _plain(segmentation_json(evaluate_segmentation(path, truth, **options), str(path), provenance)), str(path)
+        )
+    ]
+    if motion:
+        made.append(
+            Result(_plain(motion_json(evaluate_motion(path, truth, **options), str(path), provenance)), str(path))
+        )
+    if pictures:
+        made[0].extras = part_blocks(path, truth, split=split, motion=motion)
+    return made
+
+
+def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
+    from dpcli.evaluate.video import evaluate_video
+    from dpcli.evaluate.video_tables import video_json
+
+    if truth is None:
+        raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")
+    result = Result(_plain(video_json(evaluate_video(path, truth), str(path))), str(path))
+    if pictures:
+        _add_strips(result)
+    return result
+
+
+def _add_strips(result: Result) -> None:
+    """Pictures of the files that the object names, if they are still there; else a note that says why not."""
+    protocol = result.found.get("protocol", {})
+    said, real = result.found.get("input"), protocol.get("truth")
+    if not (isinstance(said, str) and isinstance(real, str) and Path(said).exists() and Path(real).exists()):
+        result.notes.append("No pictures: the files that were compared are not where the object says.")
+        return
+    try:
+        background = protocol.get("background")
+        result.extras.append(
+            strip_figure(Path(said), Path(real), protocol=str(protocol.get("name", "dpc")), background=background)
+        )
+        result.notes.append("The pictures are of the files as they are now.")
+    except (DataError, UsageError) as error:
+        result.notes.append(f"No pictures: {error}.")
+
+
+def _plain(found: dict[str, Any]) -> dict[str, Any]:
+    """The object as its JSON text would be read, so that files and objects make the same page."""
+    return json.loads(json.dumps(found, allow_nan=False))
+
+
+def _once(results: list[Result]) -> Collected:
+    kept: dict[str, Result] = {}
+    duplicates = []
+    for result in results:
+        key = json.dumps(result.found, sort_keys=True)
+        if key in kept:
+            duplicates.append(
+                f"{result.source}: the same {result.found['task']} result as in {kept[key].source}, shown once"
+            )
+        else:
+            kept[key] = result
+    return Collected(list(kept.values()), duplicates)

@@ -1,0 +1,174 @@
+"""Learned metrics in `dpc evaluate video`: fed the right pictures in the right order, whatever network; absent weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+from typer.testing import CliRunner
+
+from dpcli.cli import evaluate
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.image_metrics import ssim_reference
+from dpcli.evaluate.networks.clip import Clip, clip_across_views, clip_similarity, clip_spherical, clip_temporal
+from dpcli.evaluate.networks.lpips import Lpips
+from dpcli.evaluate.video import evaluate_video
+from dpcli.evaluate.video_features import FeatureNetwork, feature_variant
+from dpcli.evaluate.video_protocol import PROTOCOLS, video_protocol
+from dpcli.evaluate.warping import Warping, warping_compute, warping_merge
+from tests.test_evaluate_video import FRAMES, clip, header, white, write
+
+ROLES = ("reference", "test", "test")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory) -> tuple[Path, Path]:
+    folder = tmp_path_factory.mktemp("learned")
+    made = [write(folder / f"{name}.h5", clip(seed, noise=noise, views=3), header(ROLES))
+            for name, seed, noise in (("said", 1, 9), ("truth", 0, 0))]  # fmt: skip
+    return made[0], made[1]
+
+
+def pictures(which: int) -> np.ndarray:
+    """f32 (V,T,3,H,W) in 0..1 over white, as the protocol dpc sees them."""
+    rgba = clip(1, noise=9, views=3) if which == 0 else clip(views=3)
+    return np.moveaxis(white(rgba), -1, 2).astype(np.float32)
+
+
+class FakeClip:
+    """Embeds a picture as its mean colours in four quarters; keeps the real class's interface."""
+
+    def embed(self, batch: np.ndarray, *, bgr: bool = False) -> np.ndarray:
+        batch = batch[..., ::-1] if bgr else batch
+        height, width = batch.shape[1] // 2, batch.shape[2] // 2
+        quarters = [batch[:, y : y + height, x : x + width].mean((1, 2)) for y in (0, height) for x in (0, width)]
+        found = np.concatenate(quarters, -1) - 0.5
+        return (found / np.linalg.norm(found, axis=-1, keepdims=True)).astype(np.float32)
+
+
+@pytest.fixture
+def no_weights(monkeypatch, tmp_path: Path) -> Path:
+    monkeypatch.setenv("DPC_WEIGHTS", str(tmp_path / "none"))
+    return tmp_path / "none"
+
+
+@pytest.fixture
+def fake_networks(monkeypatch, no_weights: Path) -> None:
+    torch.manual_seed(0)
+    lpips = Lpips("squeeze")
+    monkeypatch.setattr(Lpips, "load", classmethod(lambda cls, net, folder: lpips))
+    monkeypatch.setattr(Clip, "load", classmethod(lambda cls, folder, variant, device: FakeClip()))
+    pooled = nn.Sequential(nn.Flatten(), nn.AdaptiveAvgPool1d(20))
+
+    def load(cls, name, folder, device="cpu"):
+        return FeatureNetwork(feature_variant(name), pooled, device)
+
+    monkeypatch.setattr(FeatureNetwork, "load", classmethod(load))
+
+
+def test_each_metric_is_that_of_its_own_function(files, fake_networks) -> None:
+    report = evaluate_video(
+        *files, metrics=("lpips", "clip", "clip_spherical", "clip_views", "clip_temporal", "warping")
+    )
+    assert report.missing == {} and report.views == []
+    ours, theirs = pictures(0), pictures(1)
+    value = {name: score.value for name, score in report.learned.items()}
+
+    network = Lpips.load("alex", Path())
+    each = [network.distance(torch.from_numpy(o), torch.from_numpy(t)).mean().item() for o, t in zip(ours, theirs)]
+    assert value["lpips"] == pytest.approx(np.mean(each), rel=1e-4)
+    assert list(report.learned["lpips"].per_view.values()) == pytest.approx(each, rel=1e-4)
+
+    rows = [np.stack([FakeClip().embed(np.moveaxis(view, 1, -1)) for view in video]) for video in (ours, theirs)]
+    swapped = [np.stack([FakeClip().embed(np.moveaxis(v, 1, -1), bgr=True) for v in video]) for video in (ours, theirs)]
+    assert value["clip"] == pytest.approx(np.mean([clip_similarity(p, t) for p, t in zip(*rows)]), abs=1e-6)
+    assert value["clip_spherical"] == pytest.approx(np.mean([clip_spherical(p, t) for p, t in zip(*swapped)]), abs=1e-6)
+    assert value["clip_views"] == pytest.approx(clip_across_views(rows[0]), abs=1e-6)
+    assert report.learned["clip_views"].truth == pytest.approx(clip_across_views(rows[1]), abs=1e-6)
+    assert value["clip_temporal"] == pytest.approx(np.mean([clip_temporal(view) for view in rows[0]]), abs=1e-6)
+    assert report.learned["clip_temporal"].truth == pytest.approx(
+        np.mean([clip_temporal(v) for v in rows[1]]), abs=1e-6
+    )
+
+    parts = []
+    for video, truth in zip(ours, theirs):
+        warping = Warping()
+        for pair in zip(video, truth):
+            warping.add(*pair)
+        parts.append(warping.result())
+    assert value["warping"] == pytest.approx(warping_compute(warping_merge(parts)).squared, rel=1e-5)
+
+
+def test_frechet_distances_by_hand(files, fake_networks) -> None:
+    """The closed form of one video against one, a view being a video: computed here from the network's own features."""
+    report = evaluate_video(*files, metrics=("fvd", "fid_vid_inception", "fid_vid_r3d50"))
+    network = FeatureNetwork.load("consistent4d", Path())
+    from dpcli.evaluate.video_features import prepare
+
+    each = []
+    for video, truth in zip(pictures(0), pictures(1)):
+        f, g = (network.features([prepare(network.variant, frame) for frame in v]) for v in (video, truth))
+        each.append(((f - g) ** 2).sum() + (f.std(ddof=1) - g.std(ddof=1)) ** 2)
+    assert report.learned["fvd"].value == pytest.approx(np.mean(each), rel=1e-4)
+    assert report.learned["fid_vid_inception"].counts == {"videos": 3, "clips": 3 * FRAMES, "frames": 3 * FRAMES}
+    assert "needs at least 16" in report.missing["fid_vid_r3d50"]  # three frames: said, the others are there
+
+
+def test_equal_videos_score_perfectly(files, fake_networks) -> None:
+    found = evaluate_video(files[1], files[1], metrics=("lpips", "clip", "fvd", "fid_vid_inception", "warping")).learned
+    assert [found[name].value for name in ("lpips", "fvd")] == [0, 0] and found["clip"].value == pytest.approx(1)
+    assert found["fid_vid_inception"].value == pytest.approx(0, abs=1e-6)
+    assert found["warping"].value == found["warping"].truth
+
+
+def test_absent_weights_cost_only_their_own_metric(files, no_weights: Path) -> None:
+    said, truth = map(str, files)
+    command = ["video", said, "--truth", truth, "--metrics", "psnr,lpips,fvd,warping", "--protocol", "thesis", "--json"]
+    result = CliRunner().invoke(evaluate.app, command)
+    assert isinstance(result.exception, DataError)
+    message = str(result.exception)
+    assert message.startswith("lpips not computed (fvd neither): ") and "\n" not in message
+    assert (
+        "vgg16-397923af.pth" in message and str(no_weights) in message and "dpc evaluate weights fetch vgg16" in message
+    )
+    found = json.loads(result.stdout)
+    assert found["metrics"]["psnr"] > 20 and found["metrics"]["warping"] > 0
+    assert found["metrics"]["lpips"] is None and set(found["not_computed"]) == {"lpips", "fvd"}
+
+
+def test_the_thesis_compares_pixels_of_the_reference_and_features_of_all_views(files, fake_networks) -> None:
+    report = evaluate_video(*files, metrics=("psnr", "lpips"), protocol="thesis")
+    assert [view.title for view in report.views] == ["0"]
+    assert list(report.learned["lpips"].per_view) == ["0", "1", "2"]
+
+
+def test_options_replace_a_protocols_networks() -> None:
+    chosen = video_protocol("consistent4d", lpips="squeeze", fvd="videogpt", every=4)
+    assert (chosen.networks.lpips, chosen.networks.fvd, chosen.networks.every) == ("squeeze", "videogpt", 4)
+    assert chosen.size == 512 and PROTOCOLS["disco"].networks.lpips_range01
+    for wrong in ({"lpips": "resnet"}, {"fvd": "i3d"}):
+        with pytest.raises(UsageError, match="expected"):
+            video_protocol("dpc", **wrong)
+
+
+def test_disco_takes_ssim_of_luminance(files) -> None:
+    protocol = replace(PROTOCOLS["disco"], size=None)
+    found = evaluate_video(*files, metrics=("psnr", "ssim"), protocol=protocol)
+    grey = [np.tensordot(np.rint(pictures(which) * 255), [0.2125, 0.7154, 0.0721], (2, 0)) for which in (0, 1)]
+    each = [np.mean([ssim_reference(o, t, data_range=255) for o, t in zip(*view)]) for view in zip(*grey)]
+    assert [view.metrics.ssim for view in found.views] == pytest.approx(each, abs=1e-4)
+    colour = evaluate_video(*files, metrics=("psnr", "ssim"), protocol=replace(protocol, grey=False))
+    assert colour.mean()["psnr"] == found.mean()["psnr"] and colour.mean()["ssim"] != found.mean()["ssim"]
+
+
+def test_red_and_blue_swapped_are_noticed(tmp_path: Path, files) -> None:
+    wrong = clip(views=3)
+    wrong[..., :3] = wrong[..., 2::-1]
+    swapped = evaluate_video(write(tmp_path / "bgr.h5", wrong, header(ROLES)), files[1])
+    assert any("Red and blue look swapped" in note for note in swapped.notes)
+    assert not any("swapped" in note for note in evaluate_video(*files).notes)
