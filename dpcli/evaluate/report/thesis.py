@@ -106,11 +106,12 @@ def chosen_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -
 
 
 def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, Any]]], asked: bool = False) -> Table:
-    """(title, object) of ours that are of the table's data (of its task, when the table was asked for), then its rows."""
+    """(title, object) of ours that are of the table's data (of its task, when the table was asked for), then its rows:
+    the thesis's own methods before those it cites."""
     ours = [(title, found) for title, found in objects
             if thesis.knows(found) or asked and found.get("task") == thesis.task]  # fmt: skip
     rows = [row for title, found in ours for row in _own_rows(thesis, title, found)]
-    rows += [_thesis_row(thesis, own) for own in thesis.rows]
+    rows += [_thesis_row(thesis, own) for own in sorted(thesis.rows, key=lambda row: not row.get("own"))]
     header = (
         "method",
         "source",
