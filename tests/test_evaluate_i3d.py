@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -31,33 +32,21 @@ from dpcli.evaluate.video_features import (
 )
 from dpcli.evaluate.weights import find, weights_folder
 from dpcli.runtime.seed import generator
+from tests import network_helpers
 
 # on `seeded_state` and the clips below: the I3D of cd-fvd 0.1.1, the 3D ResNet-50 of monai 1.6.1
 CD_FVD = [5.0683, -1.0638, -5.09506, 2.50488, -2.62659, -2.9186]
 MONAI = [11678.1, 10520.7, 4324.28, 5793.8, 1718.51, 0.0]
 
 
-def seeded_state(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Weights from NumPy's generators, one for each tensor; activations keep their size."""
-    state = {}
-    for index, (name, value) in enumerate(module.state_dict().items()):
-        rng, shape = generator(0, 50, index), tuple(value.shape)
-        if value.dim() > 1:
-            found = rng.standard_normal(shape, np.float32) * (2 / np.prod(shape[1:])) ** 0.5
-        elif name.endswith("running_var"):
-            found = rng.uniform(0.75, 1.25, shape)
-        else:
-            found = rng.standard_normal(shape) * 0.1 + (name.endswith("weight"))
-        state[name] = torch.tensor(0) if name.endswith("tracked") else torch.from_numpy(np.asarray(found, np.float32))
-    return state
+def _vector(rng: np.random.Generator, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    if name.endswith("running_var"):
+        return rng.uniform(0.75, 1.25, shape)
+    return rng.standard_normal(shape) * 0.1 + (name.endswith("weight"))
 
 
-def seeded(make: Callable[[], torch.nn.Module]) -> torch.nn.Module:
-    """A network with `seeded_state`; PyTorch's own random weights are never drawn, which would take longer."""
-    with torch.device("meta"):
-        module = make()
-    module.load_state_dict(seeded_state(module), assign=True)
-    return module
+seeded_state = functools.partial(network_helpers.seeded_state, stream=50, vector=_vector)
+seeded = functools.partial(network_helpers.seeded, stream=50, vector=_vector)
 
 
 def i3d_clip() -> torch.Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
 
 import numpy as np
 import pytest
@@ -12,32 +12,20 @@ import torch.nn.functional as F
 from dpcli.evaluate.networks.inception import FidInception, inception_input
 from dpcli.evaluate.video_features import VARIANTS, FeatureNetwork, VideoFeatures, prepare, video_distance
 from dpcli.runtime.seed import generator
+from tests import network_helpers
 
 # torch-fidelity 0.4.0's FeatureExtractorInceptionV3 on `seeded_state` and `picture`: the first features
 TORCH_FIDELITY = [1.23219, 0.00268905, 0.690231, 7.18121, 0.0, 0.147934]
 
 
-def seeded_state(module: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Weights from NumPy's generators, one for each tensor; activations keep their size."""
-    state = {}
-    for index, (name, value) in enumerate(module.state_dict().items()):
-        rng, shape = generator(0, 40, index), tuple(value.shape)
-        if value.dim() > 1:
-            found = rng.standard_normal(shape, np.float32) * (2 / np.prod(shape[1:])) ** 0.5
-        elif name.endswith(("running_var", "bn.weight", "bn1.weight")):
-            found = rng.uniform(0.75, 1.25, shape)
-        else:
-            found = rng.standard_normal(shape) * 0.1
-        state[name] = torch.tensor(0) if name.endswith("tracked") else torch.from_numpy(np.asarray(found, np.float32))
-    return state
+def _vector(rng: np.random.Generator, name: str, shape: tuple[int, ...]) -> np.ndarray:
+    if name.endswith(("running_var", "bn.weight", "bn1.weight")):
+        return rng.uniform(0.75, 1.25, shape)
+    return rng.standard_normal(shape) * 0.1
 
 
-def seeded(make: Callable[[], torch.nn.Module]) -> torch.nn.Module:
-    """A network with `seeded_state`; PyTorch's own random weights are never drawn, which would take longer."""
-    with torch.device("meta"):
-        module = make()
-    module.load_state_dict(seeded_state(module), assign=True)
-    return module
+seeded_state = functools.partial(network_helpers.seeded_state, stream=40, vector=_vector)
+seeded = functools.partial(network_helpers.seeded, stream=40, vector=_vector)
 
 
 def picture() -> np.ndarray:

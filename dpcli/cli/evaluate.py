@@ -10,7 +10,15 @@ from typing import Annotated
 import typer
 
 from dpcli.cli import evaluate_compare, evaluate_report, evaluate_video, evaluate_weights
-from dpcli.cli.evaluate_output import Markdown, check_output, print_object, print_tables
+from dpcli.cli.evaluate_output import (
+    Confidence,
+    Intersect,
+    Markdown,
+    Resamples,
+    check_output,
+    print_object,
+    print_tables,
+)
 from dpcli.cli.options import Json, Picture, Seed
 
 app = typer.Typer(no_args_is_help=True, help="Compare what a model says with the truth.")
@@ -20,10 +28,7 @@ Truth = Annotated[Path, typer.Option("--truth", help="Clouds file with the true 
 Split = Annotated[
     str | None, typer.Option("--split", help="Sequences of the truth that count, or all. Default: test if any.")
 ]
-Intersect = Annotated[bool, typer.Option("--intersect", help="Compare what both files have, list the rest.")]
 Protocol = Annotated[str, typer.Option("--protocol", help="dpc, or release: the published code's numbers.")]
-Confidence = Annotated[float, typer.Option("--confidence", help="Of the intervals, between 0 and 1.")]
-Resamples = Annotated[int, typer.Option("--resamples", min=0, help="For bootstrap intervals; 0 for none.")]
 
 
 @app.command()

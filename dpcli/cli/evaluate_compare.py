@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dpcli.cli.evaluate_output import Markdown, check_output, print_object, print_tables
+from dpcli.cli.evaluate_output import (
+    Confidence,
+    Intersect,
+    Markdown,
+    Resamples,
+    check_output,
+    print_object,
+    print_tables,
+)
 from dpcli.cli.options import Json, Picture, Seed
 from dpcli.errors import UsageError
 
@@ -24,8 +32,6 @@ Metrics = Annotated[
 Protocol = Annotated[str, typer.Option("--protocol", help="Of parts: dpc or release; of videos: as evaluate video.")]
 IgnoreBelow = Annotated[int, typer.Option("--ignore-below", min=0, help="True parts of fewer points are ignored.")]
 Split = Annotated[str | None, typer.Option("--split", help="Samples that count, or all. Default: test if any.")]
-Intersect = Annotated[bool, typer.Option("--intersect", help="Evaluate what all have, list the rest.")]
-Confidence = Annotated[float, typer.Option("--confidence", help="Of the intervals, between 0 and 1.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -44,7 +50,7 @@ def compare(
     split: Split = None,
     intersect: Intersect = False,
     confidence: Confidence = 0.95,
-    resamples: Annotated[int, typer.Option("--resamples", min=0, help="Of the paired bootstrap.")] = 2000,
+    resamples: Resamples = 2000,
     seed: Seed = 0,
     as_markdown: Markdown = False,
     as_object: Json = False,

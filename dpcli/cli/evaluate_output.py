@@ -1,4 +1,4 @@
-"""What the commands of `dpc evaluate` share: forms of output."""
+"""What the commands of `dpc evaluate` share: options, and forms of output."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ import typer
 from dpcli.errors import UsageError
 
 Markdown = Annotated[bool, typer.Option("--markdown", help="Print markdown tables.")]
+Intersect = Annotated[bool, typer.Option("--intersect", help="Compare what both sides have, list the rest.")]
+Confidence = Annotated[float, typer.Option("--confidence", help="Of the intervals, between 0 and 1.")]
+Resamples = Annotated[int, typer.Option("--resamples", min=0, help="For bootstrap intervals; 0 for none.")]
 
 
 def check_output(as_object: bool, as_markdown: bool, picture: Path | None) -> None:

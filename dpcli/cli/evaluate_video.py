@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from dpcli.cli.evaluate_output import Markdown, check_output, print_object, print_tables
+from dpcli.cli.evaluate_output import (
+    Confidence,
+    Intersect,
+    Markdown,
+    Resamples,
+    check_output,
+    print_object,
+    print_tables,
+)
 from dpcli.cli.options import Device, Json, Picture, Seed
 from dpcli.errors import DataError
 
@@ -38,7 +46,7 @@ def video(
     background: Annotated[
         str | None, typer.Option("--background", help="white or black behind the object. Default: the protocol's.")
     ] = None,
-    intersect: Annotated[bool, typer.Option("--intersect", help="Compare what both have, list the rest.")] = False,
+    intersect: Intersect = False,
     lpips: Annotated[str | None, typer.Option("--lpips", help="alex, vgg or squeeze. Default: the protocol's.")] = None,
     fvd: Annotated[
         str | None,
@@ -51,8 +59,8 @@ def video(
         Path | None,
         typer.Option("--weights", help="Folder of networks. Default: $DPC_WEIGHTS, else the user's cache."),
     ] = None,
-    confidence: Annotated[float, typer.Option("--confidence", help="Of the intervals, between 0 and 1.")] = 0.95,
-    resamples: Annotated[int, typer.Option("--resamples", min=0, help="For bootstrap intervals; 0 for none.")] = 2000,
+    confidence: Confidence = 0.95,
+    resamples: Resamples = 2000,
     device: Device = "auto",
     seed: Seed = 0,
     as_markdown: Markdown = False,
