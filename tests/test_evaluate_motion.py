@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 from parts_helpers import CHAIN, perfect, rigid, rotation, truth_sequence, write_parts, write_truth
@@ -148,7 +149,7 @@ def test_the_truth_has_no_error_and_a_broken_twin_has(tmp_path, truths) -> None:
     points = sum(len(flow) for *_, flows in samples for flow in flows)
     assert found["denominators"] == {
         "sequences": 3, "pairs": 9, "points": points, "true_part_motions": 27, "unmatched_part_motions": 0,
-        "points_without_truth": 0,
+        "points_without_truth": 0, "pairs_without_truth": 0,
     }  # fmt: skip
     for *_, flows in samples:  # source and target exchanged
         flows[:] = [-flow for flow in flows]
@@ -209,7 +210,7 @@ def test_sequences_without_pairs_are_listed_or_explained(tmp_path, truths) -> No
 def test_a_truth_without_good_poses_is_explained(tmp_path, truths) -> None:
     parts = write_parts(tmp_path / "a.h5", [perfect(one, 4) for one in truths])
     plain = write_truth(tmp_path / "plain.h5", truths, fields=["part"])
-    assert f"{plain}: no pose in it" in str(run(parts, "--truth", plain).exception)
+    assert f"{plain}: no pose in it, nor scene_flow" in str(run(parts, "--truth", plain).exception)
     truths[1].pose[1, 2] = np.nan
     broken = write_truth(tmp_path / "nan.h5", truths)
     result = run(parts, "--truth", broken)
@@ -217,3 +218,85 @@ def test_a_truth_without_good_poses_is_explained(tmp_path, truths) -> None:
     truths[1].part[3] = 9
     few = write_truth(tmp_path / "few.h5", truths)
     assert "part 9, but there are poses of 4 parts" in str(run(parts, "--truth", few).exception)
+
+
+# ---- a truth that knows the flow of points, not the poses of parts ----
+
+
+def scene_flow(truth) -> np.ndarray:
+    """Each frame's displacement to the next, the last one's to the frame before, point by point from the poses."""
+    rows = []
+    for t in range(truth.num_frames):
+        other = t + 1 if t + 1 < truth.num_frames else t - 1
+        for point, part in zip(truth.frame(t), truth.part[truth.frame_offsets[t] : truth.frame_offsets[t + 1]]):
+            moved = truth.pose[other, part] @ np.linalg.inv(truth.pose[t, part]) @ [*point, 1]
+            rows.append(moved[:3] - point)
+    return np.float32(rows)
+
+
+def noisy(truths: list, pairs: np.ndarray = CHAIN) -> list:
+    rng = np.random.default_rng(3)
+    samples = [perfect(one, 4, pairs) for one in truths]
+    for *_, flows in samples:
+        flows[:] = [flow + np.float32(rng.normal(size=flow.shape) * 0.05) for flow in flows]
+    return samples
+
+
+@pytest.mark.parametrize("protocol", ["dpc", "release"])
+def test_scene_flow_as_truth_gives_the_numbers_of_the_poses(tmp_path, truths, protocol) -> None:
+    """On pairs f -> f + 1; the same predictions against poses, with those pairs alone, are the other side."""
+    forward = np.array([[0, 1], [1, 2]], np.int32)
+    known = write_truth(tmp_path / "pose.h5", truths)
+    for one in truths:
+        one.scene_flow = scene_flow(one)
+    flow = write_truth(tmp_path / "flow.h5", truths, fields=["scene_flow"])  # not even parts
+    parts = write_parts(tmp_path / "a.h5", noisy(truths))
+    samples = noisy(truths)
+    kept = [(*own[:2], forward, own[3][:2], own[4][:2]) for own in samples]
+    only = write_parts(tmp_path / "b.h5", kept)
+    options = ("--json", "--protocol", protocol, "--resamples", 200)
+    ours, theirs = (
+        json.loads(run(*pair, *options).stdout) for pair in ((parts, "--truth", flow), (only, "--truth", known))
+    )
+    for key in ("epe3d", "epe3d_no_motion", "accs", "accr", "outlier"):
+        assert ours["metrics"][key] == pytest.approx(theirs["metrics"][key], rel=1e-5), key
+        assert ours["intervals"]["metrics"][key] == pytest.approx(theirs["intervals"]["metrics"][key], rel=1e-5), key
+    assert ours["protocol"]["true_flow"] == "scene_flow, frame f to f + 1" and ours["metrics"]["part_rotation"] is None
+    counts = ours["denominators"]
+    assert counts["points"] == theirs["denominators"]["points"] and counts["true_part_motions"] == 0
+    assert (counts["pairs"], counts["pairs_without_truth"]) == (6, 3)
+    table = run(parts, "--truth", flow, "--protocol", protocol, "--resamples", 200).stdout
+    assert "frame pairs other than f -> f + 1: 3" in table and "matched parts" not in table and "rotation" not in table
+
+
+def test_flow_of_the_wrong_direction_scores_worse(tmp_path, truths) -> None:
+    samples = noisy(truths)
+    for one in truths:
+        one.scene_flow = scene_flow(one)
+    truth = write_truth(tmp_path / "flow.h5", truths, fields=["part", "scene_flow"])
+    good = json.loads(run(write_parts(tmp_path / "a.h5", samples), "--truth", truth, "--json").stdout)["metrics"]
+    for *_, flows in samples:
+        flows[:] = [-flow for flow in flows]
+    bad = json.loads(run(write_parts(tmp_path / "b.h5", samples), "--truth", truth, "--json").stdout)["metrics"]
+    assert good["epe3d"] < 0.1 < good["epe3d_no_motion"] < bad["epe3d"] and bad["accr"] < 0.2 < good["accr"]
+
+
+def test_scene_flow_tells_of_no_other_pairs(tmp_path, truths) -> None:
+    for one in truths:
+        one.scene_flow = scene_flow(one)
+    truth = write_truth(tmp_path / "flow.h5", truths, fields=["scene_flow"])
+    back = np.array([[2, 1], [0, 2]], np.int32)
+    result = run(write_parts(tmp_path / "a.h5", [perfect(one, 4, back) for one in truths]), "--truth", truth)
+    assert "none of its 6 frame pairs is f -> f + 1" in str(result.exception)
+    some = [perfect(one, 4, CHAIN if n else back) for n, one in enumerate(truths)]
+    found = json.loads(run(write_parts(tmp_path / "b.h5", some), "--truth", truth, "--json").stdout)
+    assert found["left_out"] == [{"reason": "no frame pair f -> f + 1 predicted", "count": 1, "names": ["s0"]}]
+    both = write_truth(tmp_path / "both.h5", truths, fields=["part", "pose", "scene_flow"])
+    found = json.loads(run(tmp_path / "b.h5", "--truth", both, "--json").stdout)  # poses tell of all pairs
+    assert found["denominators"]["pairs"] == 8 and found["denominators"]["pairs_without_truth"] == 0
+    with h5py.File(truth, "r+") as file:
+        file["scene_flow"][130:133, 1] = np.nan  # of s1, frame 0: each has 40 + 41 + 42 points
+    result = run(tmp_path / "b.h5", "--truth", truth)
+    assert isinstance(result.exception, DataError) and "of 3 of the 40 points of frame 0 is NaN" in str(
+        result.exception
+    )

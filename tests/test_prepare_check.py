@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
+from PIL import Image
+from typer.testing import CliRunner
 
+from dpcli.cli.app import app
 from dpcli.errors import DataError
 from dpcli.prepare import recipe_check
 from dpcli.prepare.recipe_check import RECIPES, Tree, check_folder, check_rows, expand, read_recipe
@@ -153,3 +157,115 @@ def test_the_command(tmp_path):
     assert nowhere.returncode == 3 and "does not exist" in nowhere.stderr
     without = dpc("prepare", "msraction3d", raw)
     assert without.returncode == 2 and "-o/--output FILE is missing" in without.stderr
+
+
+# ---- clips and animals, which become views ----
+
+
+def check(*arguments: object):
+    return CliRunner().invoke(app, ["prepare", *map(str, arguments), "--check"])
+
+
+@pytest.fixture
+def panda(tmp_path) -> Path:
+    """An animal of three frames, two cameras: pictures are a few bytes, as none is opened."""
+    folder = tmp_path / "panda"
+    (folder / "bones" / "walk").mkdir(parents=True)
+    row = "0 0 1 1 0 0 0 1 0 0 0 0\n"
+    (folder / "CamPose.inf").write_text(2 * row)
+    (folder / "Intrinsic.inf").write_text("".join(f"{k}\n9 0 4\n0 9 4\n0 0 1\n\n" for k in range(2)))
+    (folder / "sequences").write_text("walk 3\n")
+    for frame in range(3):
+        pictures = folder / "img" / "walk" / str(frame)
+        pictures.mkdir(parents=True)
+        for view in range(2):
+            (pictures / f"img_{view:04d}.jpg").write_bytes(b"picture")
+            (pictures / f"img_{view:04d}_alpha.png").write_bytes(b"mask")
+        (folder / "bones" / "walk" / f"Bones_{frame:04d}.inf").write_text(row)
+    return folder
+
+
+def test_a_whole_animal_passes(panda):
+    done = check("artemis", panda)
+    assert done.exit_code == 0, done.stdout
+    assert "index: 1 samples to convert, 0 that cannot be" in done.stdout and "MISSING" not in done.stdout
+    assert "optional voxels and their bones" in done.stdout
+    for folder in (panda / "img/walk").iterdir():  # a copy of one camera only is whole in itself
+        for path in folder.glob("img_0001*"):
+            path.unlink()
+    assert check("artemis", panda).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda raw: (raw / "CamPose.inf").unlink(), "CamPose.inf: missing"),
+        (lambda raw: (raw / "Intrinsic.inf").write_text("0\n9 0 4\n0 9 4\n0 0 1\n"), "2 cameras, Intrinsic.inf 1"),
+        (lambda raw: (raw / "img/walk/1/img_0001.jpg").unlink(), "1 files are missing, the first: img/walk/1/img_0001.jpg"),
+        (lambda raw: (raw / "img/walk/2/img_0000_alpha.png").unlink(), "the first: img/walk/2/img_0000_alpha.png"),
+        (lambda raw: (raw / "img/walk/0/img_0000.jpg").write_bytes(b""), "0 bytes, expected at least 1"),
+        (lambda raw: (raw / "bones/walk/Bones_0001.inf").unlink(), "the first: bones/walk/Bones_0001.inf"),
+        (lambda raw: (raw / "sequences").write_text("walk 5\n"), "walk: 3 of the 5 frames are there"),
+        (lambda raw: (raw / "sequences").write_text("walk 3\nrun 9\n"), "img/run: missing; sequences tells of its 9 frames"),
+        (lambda raw: shutil.rmtree(raw / "img"), "img/*/*/img_????_alpha.png: missing"),
+    ],
+)  # fmt: skip
+def test_what_an_animal_lacks_is_told(panda, change, message):
+    change(panda)
+    done = check("artemis", panda)
+    assert isinstance(done.exception, DataError) and message in done.stdout, done.stdout
+    assert "missing or wrong" in str(done.exception)
+
+
+def test_only_the_motion_that_is_asked_for(panda):
+    (panda / "sequences").write_text("walk 3\nrun 9\n")
+    assert check("artemis", panda, "--motion", "walk").exit_code == 0
+    assert "img/run: missing" in check("artemis", panda, "--motion", "run").stdout
+
+
+@pytest.fixture
+def clip(tmp_path) -> Path:
+    (tmp_path / "clip").mkdir()
+    for number in range(4):
+        Image.new("RGBA", (8, 6)).save(tmp_path / "clip" / f"{number}.png")
+    return tmp_path / "clip"
+
+
+def test_a_whole_clip_passes(clip):
+    done = check("video", clip)
+    assert done.exit_code == 0 and "4 samples to convert, 0 that" in done.stdout, done.stdout
+    Image.new("L", (8, 6)).save(clip.parent / "a.gif", save_all=True, append_images=[Image.new("L", (8, 6), 90)])
+    done = check("video", clip.parent / "a.gif")
+    assert done.exit_code == 0 and "2 samples to convert" in done.stdout, done.stdout
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda raw: (raw / "2.png").write_bytes(b""), "2.png: 0 bytes"),
+        (lambda raw: (raw / "2.png").write_bytes(b"no picture"), "2.png: not a readable image"),
+        (lambda raw: Image.new("L", (9, 6)).save(raw / "3.png"), "3.png: 9x6, 0.png is 8x6; export all frames at one size"),
+        (lambda raw: [path.unlink() for path in raw.iterdir()], "MISSING"),
+        (lambda raw: (raw / "rgba").mkdir() or [p.rename(raw / "rgba" / p.name) for p in raw.glob("*.png")],
+         "it has folders (rgba): name one of them"),
+    ],
+)  # fmt: skip
+def test_what_a_clip_lacks_is_told(clip, change, message):
+    change(clip)
+    done = check("video", clip)
+    assert isinstance(done.exception, DataError) and message in done.stdout, done.stdout
+
+
+def test_masks_and_views_of_a_clip_are_looked_for(clip):
+    masks, views = clip.parent / "masks", clip.parent / "views"
+    masks.mkdir()
+    shutil.copy(clip / "0.png", masks)
+    assert "1 masks for 4 frames" in check("video", clip, "--mask", masks).stdout
+    for frame in range(4):
+        (views / f"{frame}_rgba").mkdir(parents=True)
+        for view in range(6 - (frame == 3)):
+            shutil.copy(clip / "0.png", views / f"{frame}_rgba" / f"{view}.png")
+    assert "4 folders of 5/6 pictures" in check("video", clip, "--views", views).stdout
+    shutil.copy(clip / "0.png", views / "3_rgba" / "5.png")
+    assert check("video", clip, "--views", views).exit_code == 0
+    assert "-o/--output FILE is missing" in str(CliRunner().invoke(app, ["prepare", "video", str(clip)]).exception)

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, Stopped, UsageError
 from dpcli.prepare import merge as module
 from dpcli.prepare.label_map import LabelMap
-from dpcli.prepare.merge import merge
+from dpcli.prepare.merge import merge, read_source
+from dpcli.prepare.pipeline import convert
+from dpcli.prepare.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
-from tests.prepare_helpers import dpc
+from tests.prepare_helpers import ROOT, ToyReader, dpc
 
 
 def write(path: Path, names: list[str], classes: list[str], **options) -> Path:
@@ -140,3 +147,115 @@ def test_the_command(two, tmp_path):
     )
     refused = dpc("prepare", "merge", *two, "-o", tmp_path / "no.h5")
     assert refused.returncode == 3 and "--labels map.toml" in refused.stderr and not (tmp_path / "no.h5").exists()
+
+
+SLOW = """
+import sys, time
+from pathlib import Path
+from dpcli.prepare.merge import OpenFiles, merge
+read = OpenFiles.read
+def slowly(self, path, index):
+    time.sleep(0.05)
+    return read(self, path, index)
+OpenFiles.read = slowly
+sys.argv = ["dpc", "prepare", "merge"]
+merge([Path(word) for word in FILES], Path(OUT), prefix=True)
+"""
+
+
+@pytest.mark.parametrize("shards", [False, True])
+def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkeypatch, shards):
+    """kill -9 three times in the middle: each time what was copied stays, and only the rest is copied."""
+    monkeypatch.setattr(sys, "argv", ["dpc", "prepare", "merge"])
+    if shards:
+        paths = [tmp_path / f"{k}.h5" for k in range(3)]
+        for index, path in enumerate(paths):
+            convert(ToyReader(count=24, bad=(3,)), path, shard=Shard(index, 3))
+        script = SLOW.replace(", prefix=True", "")
+    else:
+        paths = [write(tmp_path / f"{k}.h5", [f"x{n}" for n in range(8)], ["p", "q"]) for k in range(3)]
+        script = SLOW
+    whole, out = tmp_path / "whole.h5", tmp_path / "out.h5"
+    total = merge(paths, whole, prefix=not shards).written
+    script = script.replace("FILES", repr([str(path) for path in paths])).replace("OUT", repr(str(out)))
+    journal, kept = tmp_path / ".out.h5.part", 0
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", script], cwd=ROOT, stderr=subprocess.DEVNULL)
+        deadline = time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < deadline:
+            if journal.exists() and journal.stat().st_size > kept:
+                break
+            time.sleep(0.002)
+        time.sleep(0.05)
+        process.kill()
+        process.wait(30)
+        assert journal.stat().st_size > kept and not out.exists()
+        kept = journal.stat().st_size
+    read = []
+    monkeypatch.setattr(module.OpenFiles, "read", counting(module.OpenFiles.read, read))
+    report = merge(paths, out, prefix=not shards)
+    assert report.written == total == (23 if shards else 24) and 0 < len(read) < total
+    assert out.read_bytes() == whole.read_bytes()
+    assert not journal.exists() and not (tmp_path / ".out.h5.new").exists()
+
+
+def counting(read, calls: list):
+    return lambda self, path, index: calls.append((path, index)) or read(self, path, index)
+
+
+def stopped_after(count: int, monkeypatch, *arguments, **options) -> None:
+    """merge, ended by Ctrl-C before it reads sample `count`."""
+    calls, read = [], module.OpenFiles.read
+
+    def interrupted(self, path, index):
+        if len(calls) == count:
+            raise KeyboardInterrupt
+        return counting(read, calls)(self, path, index)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(module.OpenFiles, "read", interrupted)
+        merge(*arguments, **options)
+
+
+def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
+    """Other inputs or a pipe: nothing is continued; a conversion of the same name is, or stays untouched."""
+    out, journal = tmp_path / "all.h5", tmp_path / ".all.h5.part"
+    again = write(tmp_path / "c.h5", ["c0", "c1"], ["hand wave", "push", "bend"])
+    stopped_after(2, monkeypatch, [two[0], again], out)
+    assert journal.exists()
+    merge([again, two[0]], out)
+    assert list(joined(out)) == ["c0", "c1", "a0", "a1", "a2"] and not journal.exists()
+    stopped_after(2, monkeypatch, [two[0], again], tmp_path / "pipe.h5", resume=False)
+    assert not (tmp_path / ".pipe.h5.part").exists()
+
+    paths = [tmp_path / f"shard{k}.h5" for k in range(2)]
+    for index, path in enumerate(paths):
+        convert(ToyReader(bad=(1,)), path, shard=Shard(index, 2))
+    entry = shard_of(read_source(paths[0]).provenance[-1])[1]
+    for names, fine in ((["toy000"], True), (["toy000", "toy001"], False)):
+        with pytest.raises(Stopped), CloudsWriter(tmp_path / "x.h5", provenance=entry, resume=True) as writer:
+            for name in names:
+                writer.write(CloudSequence.from_frames(name, [np.ones((1, 3), np.float32)]))
+            raise Stopped("now")
+        if fine:
+            assert merge(paths, tmp_path / "x.h5").written == 4
+            (tmp_path / "x.h5").unlink()
+        else:
+            with pytest.raises(UsageError, match="a stopped run left 2 other samples"):
+                merge(paths, tmp_path / "x.h5")
+            assert (tmp_path / ".x.h5.part").exists()
+            assert merge(paths, tmp_path / "x.h5", force=True).written == 4
+
+
+def test_a_signal_stops_it_politely(two, tmp_path, monkeypatch):
+    read = module.OpenFiles.read
+
+    def signalled(self, path, index):
+        if index == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return read(self, path, index)
+
+    with monkeypatch.context() as patch, pytest.raises(Stopped, match="SIGTERM; 2 of 3 samples are kept"):
+        patch.setattr(module.OpenFiles, "read", signalled)
+        merge(two[:1], tmp_path / "all.h5")
+    assert merge(two[:1], tmp_path / "all.h5").written == 3

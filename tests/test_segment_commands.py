@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from dpcli.cli.app import app
 from dpcli.errors import DataError, UsageError
 from dpcli.segment.commands import split_sequences
 from dpcli.segment.flow_store import FlowStore
 from dpcli.segment.objective import Batch, Objective, pair_loss, turn_randomly
-from dpcli.segment.pairs import PairSource, choose_points, sequence_scale
+from dpcli.segment.pairs import PairSource, backward_flow, choose_points, sequence_scale
 from dpcli.segment.predict import Refinement, predict_parts
 from dpcli.segment.train import Schedule, rand_index
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -252,6 +254,66 @@ def test_the_right_masks_cost_less_than_wrong_ones_in_every_form(data):
         assert best < 1e-3
         for name, mask in wrong.items():
             assert float(pair_loss(Fixed(mask), batch, objective, 0.0).loss) > 5 * best + 1e-3, (form, name)
+
+
+def with_scene_flow(sequence: CloudSequence) -> CloudSequence:
+    """The truth told as displacements to the next frame (the last frame's: to the one before) instead of poses."""
+    from dpcli.segment.pairs import frame_parts, true_flow
+
+    rows, last = [], sequence.num_frames - 1
+    for t in range(sequence.num_frames):
+        poses = sequence.pose[t], sequence.pose[t + 1 if t < last else t - 1]
+        rows.append(true_flow(sequence.frame(t), frame_parts(sequence, t), *poses))
+    sequence.scene_flow = np.float32(np.concatenate(rows))
+    return sequence
+
+
+@pytest.fixture(scope="module")
+def flow_data(tmp_path_factory) -> Path:
+    """The sequences of `data`, whose truth is scene flow."""
+    path = tmp_path_factory.mktemp("parts") / "flow.h5"
+    with CloudsWriter(path, class_names=["drawer"], fields=["part", "scene_flow"]) as writer:
+        for i in range(6):
+            writer.write(with_scene_flow(drawer(f"d{i}", i, split="train" if i < 4 else "test", label=0)))
+    return path
+
+
+def test_pairs_with_scene_flow_are_those_with_poses(data, flow_data):
+    """Where the file tells both ways, both are equal; elsewhere the way back is found among the points (below)."""
+    ours, theirs = (PairSource(CloudsReader(path), [0, 1], 48, 3) for path in (flow_data, data))
+    for pair in ours.pairs:
+        one, other = ours.load(pair), theirs.load(pair)
+        np.testing.assert_array_equal(one.points, other.points)
+        np.testing.assert_allclose(one.flow[0], other.flow[0], atol=1e-6)
+        if pair.first == 1:  # of three frames
+            np.testing.assert_allclose(one.flow[1], other.flow[1], atol=1e-6)
+        else:
+            assert np.linalg.norm(one.flow[1] - other.flow[1], axis=1).mean() < 0.1 * np.abs(other.flow[1]).max()
+    still = PairSource(CloudsReader(flow_data), [0], 48, 3)
+    still.fields = ["part"]
+    assert still.load(still.pairs[0]).flow is None
+
+
+def test_the_way_back_ends_where_the_way_there_began():
+    rng = np.random.default_rng(0)
+    points, order = rng.normal(size=(40, 3)), rng.permutation(40)
+    flow = rng.normal(size=(40, 3)) * 0.3
+    np.testing.assert_array_equal(backward_flow(points, flow, (points + flow)[order]), -flow[order])
+
+
+def test_supervised_training_learns_from_scene_flow(flow_data, tmp_path):
+    def train(data: Path, name: str):
+        words = ("-o", tmp_path / name, "--supervised", "--points", 48, "--batch", 2, "--epochs", 1, "--pairs-per-epoch", 2)
+        return CliRunner().invoke(app, ["segment", "train", str(data), *map(str, words)])
+
+    assert train(flow_data, "run").exit_code == 0
+    rows = json.loads((tmp_path / "run" / "log.json").read_text())
+    assert all(np.isfinite(row["loss"]) and row["motion"] > 0 and row["flow_error"] == 0 for row in rows)
+    with CloudsWriter(tmp_path / "bare.h5", fields=["part"]) as writer:
+        writer.write(drawer("d", 0, split="train"))
+    refused = train(tmp_path / "bare.h5", "no").exception
+    assert isinstance(refused, DataError)
+    assert "poses or scene flow, but the file has no pose or scene_flow" in str(refused)
 
 
 def test_true_flow_of_loaded_pairs_maps_parts_onto_parts(data):

@@ -38,7 +38,9 @@ def merge(
 
     chosen = LabelMap.read(labels) if labels else None
     with output_file(output) as path:
-        report = join(inputs, path, labels=chosen, prefix=prefix, compression=compression, force=force)
+        report = join(
+            inputs, path, labels=chosen, prefix=prefix, compression=compression, force=force, resume=output != "-"
+        )
     if output != "-":
         counts = f"{report.written} sequences, {report.frames} frames, {report.points} points"
         typer.echo(f"{output}: {counts}, {len(report.skipped)} skipped")

@@ -7,9 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from dpcli.cli.options import Force, Output, Seed
+from dpcli.cli.options import Force, Seed
 from dpcli.errors import UsageError
 
+_Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
+_Check = Annotated[bool, typer.Option("--check", help="Only look whether all is there; list what is missing.")]
 _BadFrame = Annotated[str, typer.Option("--on-error", help="A bad frame: stop, or skip (leave it out).")]
 _Size = Annotated[int, typer.Option("--size", min=16, max=4096, help="Side of the square pictures, pixels.")]
 _Frames = Annotated[int, typer.Option("--frames", min=0, help="At most this many, evenly sampled; 0 keeps all.")]
@@ -26,7 +28,7 @@ def register(app: typer.Typer) -> None:
 
 def video(
     clip: Annotated[Path, typer.Argument(help="Folder of frames (.png .jpg .webp ...), or .mp4 .mov .avi .webm .gif.")],
-    output: Output,
+    output: _Output = "",
     frames: _Frames = 32,
     size: _Size = 512,
     recentre: Annotated[
@@ -58,6 +60,7 @@ def video(
     ] = None,
     name: Annotated[str, typer.Option("--name", help="Of the object. Default: the input's.")] = "",
     on_error: _BadFrame = "stop",
+    check: _Check = False,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -70,6 +73,11 @@ def video(
         fovy, views, views_cameras,
     )  # fmt: skip
     options.check()
+    if check:
+        from dpcli.prepare.views_check import ClipIndex
+
+        _check("video", clip, lambda: ClipIndex(clip, options), file=True)
+        return
     read, describe = (transforms_clip, transforms_config) if is_transforms(clip) else (video_clip, video_config)
     config = describe(clip, options)
     write_views(lambda: read(clip, options), output, config=config, source="video", seed=seed, force=force)
@@ -77,7 +85,7 @@ def video(
 
 def artemis(
     animal: Annotated[Path, typer.Argument(help="Folder of an animal: img/, bones/, CamPose.inf, Intrinsic.inf, ...")],
-    output: Output,
+    output: _Output = "",
     motion: Annotated[str, typer.Option("--motion", help="Which; without it the motions are listed.")] = "",
     frames: _Frames = 32,
     size: _Size = 512,
@@ -94,10 +102,16 @@ def artemis(
     ] = 4096,
     fps: Annotated[float, typer.Option("--fps", help="Frames per second.")] = 30.0,
     on_error: _BadFrame = "stop",
+    check: _Check = False,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """ARTEMIS (DFA): animals filmed by 36 cameras, with bones and skinned voxels as ground truth."""
+    if check:
+        from dpcli.prepare.views_check import ArtemisIndex
+
+        _check("artemis", animal, lambda: ArtemisIndex(animal, motion))
+        return
     from dpcli.prepare.artemis import ArtemisOptions, artemis_clip, artemis_config
 
     options = ArtemisOptions(
@@ -110,6 +124,8 @@ def artemis(
 
 def write_views(make_clip: Any, output: str, *, source: str, **options: Any) -> None:
     """Convert one clip into `output` (a path, or - for a pipe) and say what it holds."""
+    if not output:
+        raise UsageError("-o/--output FILE is missing: the file to write, or - for a pipe")
     from dpcli.prepare.views_pipeline import convert_clip
     from dpcli.store.pipes import output_file
 
@@ -118,6 +134,13 @@ def write_views(make_clip: Any, output: str, *, source: str, **options: Any) -> 
     if output != "-":
         size = f"{header.size[0]}x{header.size[1]}"
         typer.echo(f"{output}: {header.name}, {header.num_views} views, {header.num_frames} frames, {size}")
+
+
+def _check(name: str, raw: Path, make_index: Any, **options: Any) -> None:
+    from dpcli.prepare.recipe_check import check_folder
+
+    for line in check_folder(name, raw, make_index, **options):
+        typer.echo(line)
 
 
 def _numbers(text: str, option: str) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""The motion protocol: flow and part motions of a parts file against true part poses, and the result as data."""
+"""The motion protocol: flow and part motions of a parts file against true poses or scene flow, and the result as data."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ class MotionReport:
     """Metrics of all sequences, and of those of each label that occurs.
 
     names, statistics, pairs: each sequence that counts, its statistics and frame pairs i (Q,2). intervals: by metric
-    (part_rotation in degrees; see `motion_weighted`), empty without `resampling`.
+    (part_rotation in degrees; see `motion_weighted`), empty without `resampling`. from_poses: false when the true flow
+    is the field `scene_flow`; without_truth then counts the predicted pairs that it doesn't tell of.
     """
 
     protocol: str
@@ -53,6 +54,8 @@ class MotionReport:
     pairs: list[np.ndarray] = field(default_factory=list)
     resampling: Resampling = field(default_factory=lambda: Resampling(0))
     intervals: dict[str, Interval] = field(default_factory=dict)
+    from_poses: bool = True
+    without_truth: int = 0
 
 
 def evaluate_motion(
@@ -66,16 +69,23 @@ def evaluate_motion(
 ) -> MotionReport:
     """Metrics of all frame pairs of a parts file against the `part` and `pose` of a clouds file.
 
-    `protocol`: "dpc", every point counts the same; "release", as the published code: means over the points of each 6
-    successive pairs, then over these batches. Points without a true part don't count. `split`, `intersect` and
-    DataErrors as `Comparison`. `resampling`: how to find the intervals; without it there are none.
+    Where it has no poses but `scene_flow`, the flow of pairs f -> f + 1 is compared with that, at all points; other
+    pairs are left out and counted, motions of parts are not compared. `protocol`: "dpc", every point counts the same;
+    "release", as the published code: means over the points of each 6 successive pairs, then over these batches. Points
+    without a true part don't count. `split`, `intersect` and DataErrors as `Comparison`. `resampling`: how to find the
+    intervals; without it there are none.
     """
     if protocol not in PROTOCOLS:
         raise UsageError(f"--protocol {protocol}: expected {' or '.join(PROTOCOLS)}")
     names, labels, found, pairs, without = [], [], [], [], []
-    resampling = resampling or Resampling(0)
-    with Comparison(path, truth, split=split, intersect=intersect, fields=("part", "pose")) as comparison:
+    resampling, without_truth = resampling or Resampling(0), 0
+    with Comparison(path, truth, split=split, intersect=intersect, fields=("part", "pose"),
+                    instead=("scene_flow",)) as comparison:  # fmt: skip
+        from_poses = "pose" in comparison.fields
         for compared in comparison:
+            predicted = len(compared.said.pairs)
+            compared = compared if from_poses else _to_the_next_frame(compared)
+            without_truth += predicted - len(compared.said.pairs)
             if len(compared.said.pairs) == 0:
                 without.append(compared.truth.name)
                 continue
@@ -83,10 +93,13 @@ def evaluate_motion(
             pairs.append(compared.said.pairs)
             labels.append(compared.truth.label)
             found.append(_object(compared, Path(truth)))
-        left_out = [*comparison.left_out, *([LeftOut("no frame pair predicted", without)] if without else [])]
+        reason = "no frame pair predicted" if from_poses else "no frame pair f -> f + 1 predicted"
+        left_out = [*comparison.left_out, *([LeftOut(reason, without)] if without else [])]
         split, class_names, unit = comparison.split, comparison.truth.class_names, comparison.truth.length_unit
     if not any(one.points.any() for one in found):
-        why = "holds no frame pairs; sequences of one frame have no motion" if not found else "no point has a true part"
+        why = "no point has a true part" if found else "holds no frame pairs; sequences of one frame have no motion"
+        if without_truth and not found:
+            why = f"none of its {without_truth} frame pairs is f -> f + 1, of which alone scene_flow tells"
         raise DataError(f"{path}: nothing to compare: {why}")
     batch = RELEASE_BATCH if protocol == "release" else None
     classes = {
@@ -96,12 +109,21 @@ def evaluate_motion(
     main = motion_compute(motion_merge(found), batch)
     return MotionReport(protocol, split, str(truth), unit, main, classes, class_names, left_out, len(found),
                         names, found, pairs, resampling,
-                        resampling.intervals(motion_weighted(found, MAIN_TAU[protocol], batch), len(found)))  # fmt: skip
+                        resampling.intervals(motion_weighted(found, MAIN_TAU[protocol], batch), len(found)),
+                        from_poses, without_truth)  # fmt: skip
+
+
+def _to_the_next_frame(compared: Compared) -> Compared:
+    """Only what is said of pairs f -> f + 1."""
+    said = compared.said
+    rows = np.flatnonzero(said.pairs[:, 1] == said.pairs[:, 0] + 1)
+    kept = replace(said, pairs=said.pairs[rows], motion=said.motion[rows], flow=[said.flow[row] for row in rows])
+    return replace(compared, said=kept)
 
 
 def _object(compared: Compared, path: Path) -> MotionStatistics:
     try:
-        return motion_merge(_pairs(compared))
+        return motion_merge(_pairs(compared) if compared.truth.pose is not None else _flows(compared))
     except DataError as error:
         raise DataError(f"{path}: {compared.truth.name!r}: {error}; make the file again") from None
 
@@ -120,6 +142,17 @@ def _pairs(compared: Compared) -> Iterator[MotionStatistics]:
         yield part_motion_update(points, part, predicted, real, motions)
 
 
+def _flows(compared: Compared) -> Iterator[MotionStatistics]:
+    """Of pairs f -> f + 1 against scene_flow, which every point has."""
+    truth = compared.truth
+    for (source, _), flow in zip(compared.said.pairs.tolist(), compared.said.flow, strict=True):
+        real = truth.scene_flow[int(truth.frame_offsets[source]) : int(truth.frame_offsets[source + 1])]
+        if not np.isfinite(real).all():
+            wrong = int((~np.isfinite(real)).any(axis=1).sum())
+            raise DataError(f"the true flow of {wrong} of the {len(real)} points of frame {source} is NaN or infinite")
+        yield flow_update(flow, real)
+
+
 def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
     """One object for `--json`: numbers under `metrics`, None where a number is undefined (0/0).
 
@@ -134,6 +167,7 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
             "name": report.protocol,
             "split": report.split,
             "truth": report.truth,
+            "true_flow": "part poses" if report.from_poses else "scene_flow, frame f to f + 1",
             "tau": tau,
             "mean": batches if report.protocol == "release" else "over all points of all pairs",
             "accs": "share of points with error < tau or < 5 % of the true flow",
@@ -151,7 +185,8 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
         "samples": samples_json("sequences", report.names),
         "units": {"epe3d": unit, "epe3d_no_motion": unit, "accs": "fraction", "accr": "fraction", "outlier": "fraction",
                   "tau": unit, "part_rotation": "degree", "part_displacement": unit},
-        "denominators": {"sequences": report.sequences, **_counts(report.main)},
+        "denominators": {"sequences": report.sequences, **_counts(report.main),
+                         "pairs_without_truth": report.without_truth},
         "left_out": [{"reason": e.reason, "count": len(e.names), "names": e.names} for e in report.left_out],
         "provenance": list(provenance),
     }  # fmt: skip

@@ -27,19 +27,23 @@ class Comparison:
     """Sequences of a parts file that count, each beside its truth, in the order of the parts file.
 
     `split`: only sequences of this split of the truth; "all" every one; None = "test" if there are any. Sequences on
-    one side only are an error, with `intersect` they are left out and listed. `fields` names what the truth needs.
+    one side only are an error, with `intersect` they are left out and listed. `fields` names what the truth needs,
+    `instead` what serves as well where it lacks some of them; the attribute `fields` tells which of the two it is.
     DataError when the truth lacks a field or nothing is left to compare.
     """
 
     def __init__(
         self, path: str | Path, truth: str | Path, *, split: str | None = None, intersect: bool = False,
-        fields: Sequence[str] = ("part",),
+        fields: Sequence[str] = ("part",), instead: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        self.predicted, self.truth, self.fields = PartsReader(path), CloudsReader(truth), tuple(fields)
+        self.predicted, self.truth = PartsReader(path), CloudsReader(truth)
         missing = [field for field in fields if field not in self.truth.fields]
-        if missing:
-            raise DataError(f"{truth}: no {' and no '.join(missing)} in it, so it can't be the truth; "
+        serves = bool(instead) and all(field in self.truth.fields for field in instead)
+        if missing and not serves:
+            other = f", nor {' and '.join(instead)}" if instead else ""
+            raise DataError(f"{truth}: no {' and no '.join(missing)} in it{other}, so it can't be the truth; "
                             "`dpc prepare` writes them for data sets that have them")  # fmt: skip
+        self.fields = tuple(instead if missing else fields)
         self._same_unit()
         self.split = split or ("test" if "test" in self.truth.splits else "all")
         self.left_out: list[LeftOut] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,10 @@ from dpcli.evaluate.tables import TextTable, percent, percent_ends, resampling_n
 
 TITLES = {"ap": "AP", "pq": "PQ", "f1": "F1", "pre": "Pre", "rec": "Rec", "miou": "mIoU", "ri": "RI"}
 _NAMES_SHOWN = 10
+_DISPLACEMENT = "Displacement: how far apart true and predicted motion put a true part's centroid."
+_NO_POSES = (
+    "True flow: scene_flow, from each frame to the next. No poses in the truth: motions of parts aren't compared."
+)
 
 
 def class_rows(main: Any, classes: Mapping[int, Any], names: list[str]) -> list[tuple[str, Any]]:
@@ -84,7 +89,7 @@ def _left_out(entries: list[LeftOut]) -> list[str]:
 
 
 def motion_tables(report: MotionReport) -> list[TextTable]:
-    """Flow errors at both thresholds, and errors of part motions; one row for each class and for all."""
+    """Flow errors at both thresholds, and errors of part motions where poses are known; one row for each class and all."""
     rows = class_rows(report.main, report.classes, report.class_names)
     unit = f" ({report.length_unit})" if report.length_unit else ""
     shares = [f"{name} {tau:g}" for tau in TAUS for name in ("AccS", "AccR", "Outlier")]
@@ -92,7 +97,7 @@ def motion_tables(report: MotionReport) -> list[TextTable]:
     parts = ["sequences of", "true parts", "matched", "rotation (deg)", f"displacement{unit}"]
     return [
         TextTable("Flow", header, [_flow_row(*row) for row in rows]),
-        TextTable("Motions of matched parts", parts, [_part_row(*row) for row in rows]),
+        *([TextTable("Motions of matched parts", parts, list(starmap(_part_row, rows)))] if report.from_poses else []),
         *_intervals(report, _motion_interval_rows(report, unit)),
     ]
 
@@ -101,6 +106,7 @@ def _motion_interval_rows(report: MotionReport, unit: str) -> list[list[str]]:
     main, found = report.main, report.intervals
     lengths = (("epe3d", f"EPE3D{unit}", main.epe3d), ("part_rotation", "rotation (deg)", np.degrees(main.rotation)),
                ("part_displacement", f"displacement{unit}", main.displacement))  # fmt: skip
+    lengths = lengths if report.from_poses else lengths[:1]
     rows = [[title, _number(value), _ends(found.get(key))] for key, title, value in lengths]
     names = ("AccS", "AccR", "Outlier")
     for key, row, column in flow_keys(MAIN_TAU[report.protocol]):
@@ -139,8 +145,10 @@ def motion_notes(report: MotionReport) -> list[str]:
         "At tau: AccS error < tau or 5 %, AccR < 2 tau or 10 %, Outlier > 6 tau or 10 % of the true flow. The published "
         "tables of SAPIEN and OGC-DR take tau 0.01; the thesis's text, KITTI and Waymo 0.05.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
-        "Displacement: how far apart true and predicted motion put a true part's centroid.",
+        _DISPLACEMENT if report.from_poses else _NO_POSES,
     ]
+    if report.without_truth:
+        lines.append(f"Left out, frame pairs other than f -> f + 1: {report.without_truth}.")
     if main.unknown:
         lines.append(f"Left out, points without a true part (-1): {main.unknown} over all pairs.")
     return [*lines, *_left_out(report.left_out)]

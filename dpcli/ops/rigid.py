@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from dpcli.ops.backend import chosen_backend, run_in_threads
+
+_SUM_NS, _TURN_NS, _BLEND_NS = 6.0, 2e3, 4.0  # measured: per point and slot, per slot, per point and slot
 _EMPTY = 1e-12  # a slot with less weight in all has no motion to be fitted
 _TOWARDS_IDENTITY = 1e-6  # share of the covariance's norm; decides the turns that the points leave open
 
@@ -21,9 +25,28 @@ def weighted_kabsch(
     A slot of weight below 1e-12 in all, or with NaN or infinite values, gets the identity and zero.
     Differentiable in all three, once; the gradient of the rotation is the polar factor's, finite also where singular
     values coincide (a gradient through the SVD itself is not), and zero along turns that the points leave open.
+    Backends: a numba kernel on CPU in float32 where no gradient is wanted, else torch; equal up to rounding.
     Raises ValueError on shapes that don't fit.
     """
     _check(source, target, weights)
+    if not _by_kernel(source, target, weights):
+        return _kabsch_torch(source, target, weights)
+    from dpcli.ops.kernels_rigid import kabsch_kernel
+
+    (batch, count), slots = source.shape[:2], weights.shape[2]
+    rotation, translation = source.new_empty(batch, slots, 3, 3), source.new_empty(batch, slots, 3)
+    arrays = [_array(tensor) for tensor in (source, target, weights, rotation, translation)]
+    run_in_threads(kabsch_kernel, tuple(arrays), batch * slots, count * _SUM_NS + _TURN_NS)
+    return rotation, translation
+
+
+def weighted_kabsch_reference(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """The torch twin of `weighted_kabsch`: same arguments, same result up to rounding."""
+    _check(source, target, weights)
+    return _kabsch_torch(source, target, weights)
+
+
+def _kabsch_torch(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     total = weights.sum(1)  # [B, S]
     share = (weights / total.clamp(min=_EMPTY)[:, None]).mT  # [B, S, N]
     x_mean, y_mean = share @ source, share @ target
@@ -54,7 +77,25 @@ def rigid_flow(
     rotation: Tensor,  # [B, S, 3, 3]
     translation: Tensor,  # [B, S, 3]
 ) -> Tensor:  # [B, N, 3]
-    """Displacement of each point by its slots' motions, blended by the mask: sum_s m_ns (R_s x_n + t_s) - x_n."""
+    """Displacement of each point by its slots' motions, blended by the mask: sum_s m_ns (R_s x_n + t_s) - x_n.
+
+    Backends as `weighted_kabsch`. ValueError for a mask that doesn't fit.
+    """
+    if mask.shape[:2] != points.shape[:2] or mask.shape[2] != rotation.shape[1]:
+        raise ValueError(f"mask {tuple(mask.shape)} must have a row for each of points {tuple(points.shape)} and a column "
+                         f"for each of rotations {tuple(rotation.shape)}")  # fmt: skip
+    if not _by_kernel(points, mask, rotation, translation):
+        return rigid_flow_reference(points, mask, rotation, translation)
+    from dpcli.ops.kernels_rigid import flow_kernel
+
+    out = points.new_empty(points.shape)
+    arrays = [_array(tensor) for tensor in (points, mask, rotation, translation, out)]
+    run_in_threads(flow_kernel, tuple(arrays), points.shape[0] * points.shape[1], mask.shape[2] * _BLEND_NS)
+    return out
+
+
+def rigid_flow_reference(points: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+    """The torch twin of `rigid_flow`: same arguments, same result up to rounding."""
     return torch.einsum("bns,bsnd->bnd", mask, apply_motions(points, rotation, translation)) - points
 
 
@@ -64,6 +105,16 @@ def to_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
     bottom = torch.zeros_like(top[..., :1, :])
     bottom[..., 3] = 1.0
     return torch.cat([top, bottom], -2)
+
+
+def _by_kernel(*tensors: Tensor) -> bool:
+    plain = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors)
+    wanted = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)
+    return plain and not wanted and chosen_backend() == "numba"
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
 
 
 def _check(source: Tensor, target: Tensor, weights: Tensor) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,10 @@ from dpcli.prepare.pipeline import Report, already_complete, count_samples
 from dpcli.prepare.shards import Shard, shard_of
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
+from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.file import file_kind, read_positions
+from dpcli.store.journal import sweep
 
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
 
@@ -76,25 +78,26 @@ class OpenFiles:
 
 def merge(
     inputs: Sequence[Path], output: Path, *, labels: LabelMap | None = None, prefix: bool = False,
-    compression: str = "none", force: bool = False,
+    compression: str = "none", force: bool = False, resume: bool = True,
 ) -> Report:  # fmt: skip
-    """Join clouds files, one sample in memory at a time.
+    """Join clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
 
     All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
     whole's. Other files follow one another as given; their class lists must agree unless `labels` maps them.
-    prefix: names become FILE/NAME. UsageError: missing, repeated or mixed shards, or `output` is there and another;
-    DataError: classes, units or fields that disagree, a name twice.
+    prefix: names become FILE/NAME. resume: off where nobody could run it again (a pipe); saves the journal's disk
+    space. UsageError: missing, repeated or mixed shards, `output` or what a stopped run left of it is there and
+    another; DataError: classes, units or fields that disagree, a name twice; Stopped after a stop signal.
     """
     _refuse_repeats([*inputs, output])
     sources = [read_source(path) for path in inputs]
     if all(source.shard for source in sources) and labels is None and not prefix:
-        return _merge_shards(sources, output, force)
+        return _merge_shards(sources, output, force, resume)
     for source in sources:
         if source.shard:
             log.warn(
                 f"{source.path}: is shard {source.shard} of a conversion; joined as any other file, in its own order"
             )
-    return _merge_unlike(sources, output, labels or LabelMap(), prefix, compression, force)
+    return _merge_unlike(sources, output, labels or LabelMap(), prefix, compression, force, resume)
 
 
 def _refuse_repeats(paths: Sequence[Path]) -> None:
@@ -103,7 +106,7 @@ def _refuse_repeats(paths: Sequence[Path]) -> None:
             raise UsageError(f"{path}: is named twice; every file once, and the output is another one")
 
 
-def _merge_shards(sources: list[Source], output: Path, force: bool) -> Report:
+def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool) -> Report:
     entry = _whole_entry(sources)
     places: dict[int, tuple[Source, int]] = {}
     lost: dict[int, tuple[str, str]] = {}
@@ -119,11 +122,9 @@ def _merge_shards(sources: list[Source], output: Path, force: bool) -> Report:
     if not places:
         raise DataError(f"{output}: all {len(sources)} shards are empty; their samples were all skipped")
     first = next(source for source in sources if source.names)
-    samples = (places[place] for place in sorted(places))
-    return _write(
-        output, entry, first, ((source, index, None) for source, index in samples), len(places), force,
-        [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none")),
-    )  # fmt: skip
+    samples = [(*places[place], None) for place in sorted(places)]
+    skipped, compression = [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none"))
+    return _write(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
 
 
 def _whole_entry(sources: list[Source]) -> dict[str, Any]:
@@ -160,7 +161,7 @@ def _difference(one: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _merge_unlike(
-    sources: list[Source], output: Path, labels: LabelMap, prefix: bool, compression: str, force: bool
+    sources: list[Source], output: Path, labels: LabelMap, prefix: bool, compression: str, force: bool, resume: bool
 ) -> Report:
     units = {source.length_unit: source.path for source in sources}
     if len(units) > 1:
@@ -185,7 +186,8 @@ def _merge_unlike(
               "compression": compression, "sources": [source.provenance for source in sources]}  # fmt: skip
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
     pattern = Source(output, class_names, sources[0].length_unit, 0, "merge", [], [], fields, [], [], None)
-    return _write(output, entry, pattern, iter(chosen), len(chosen), force, skipped, compression, prefix)
+    return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume,
+                  prefix=prefix)  # fmt: skip
 
 
 def _refuse_equal_names(sources: list[Source], prefix: bool) -> None:
@@ -206,31 +208,54 @@ def _name(source: Source, name: str, prefix: bool) -> str:
 
 
 def _write(
-    output: Path, entry: dict[str, Any], pattern: Source, samples: Iterator[tuple[Source, int, int | None]], total: int,
-    force: bool, skipped: list[tuple[str, str]], compression: str, prefix: bool = False,
+    output: Path, entry: dict[str, Any], pattern: Source, samples: list[tuple[Source, int, int | None]],
+    skipped: list[tuple[str, str]], *, compression: str, force: bool, resume: bool, prefix: bool = False,
 ) -> Report:  # fmt: skip
     """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
     report = Report(skipped=skipped)
     if not force and already_complete(output, entry):
+        sweep(output)
         log.info(f"{output}: already complete, made of the same files (--force makes it again)")
         report.was_complete = True
         return count_samples(report, output)
     files = OpenFiles()
     try:
-        with CloudsWriter(
+        with stop_requested() as stop, CloudsWriter(
             output, class_names=pattern.class_names, length_unit=pattern.length_unit, source=pattern.made_by,
-            seed=pattern.seed, fields=pattern.fields, compression=compression, provenance=entry, force=force,
-        ) as writer, Progress("prepare merge", total=total, unit="video") as bar:  # fmt: skip
-            for source, index, label in samples:
-                sequence = files.read(source.path, index)
-                if label is not None:
-                    sequence.label = label
-                sequence.name = _name(source, sequence.name, prefix)
-                for name in set(source.fields) - set(pattern.fields):
-                    setattr(sequence, name, None)
+            seed=pattern.seed, fields=pattern.fields, compression=compression, provenance=entry, force=force, resume=resume,
+        ) as writer, Progress("prepare merge", total=len(samples), unit="video") as bar:  # fmt: skip
+            done = _copied_before(writer, [_name(source, source.names[index], prefix) for source, index, _ in samples])
+            bar.skip(done)
+            for source, index, label in samples[done:]:
+                sequence = _relabelled(files.read(source.path, index), source, pattern, label, prefix)
                 writer.write(sequence)
                 bar.advance(1, frames=sequence.num_frames)
+                stop.check(f"{len(writer)} of {len(samples)} samples are kept")
             writer.skipped = skipped
     finally:
         files.close()
     return count_samples(report, output)
+
+
+def _copied_before(writer: CloudsWriter, names: list[str]) -> int:
+    """How many of the samples, from the first on, a stopped run left; UsageError when it left others, which stay."""
+    done = len(writer.written_names)
+    if writer.written_names != names[:done]:
+        writer.keep = True
+        raise UsageError(f"{writer.path}: a stopped run left {done} other samples for it; go on with that run, write to "
+                         "another file, or --force to start over")  # fmt: skip
+    if done:
+        log.info(f"continuing: {done} of {len(names)} were copied before")
+    return done
+
+
+def _relabelled(
+    sequence: CloudSequence, source: Source, pattern: Source, label: int | None, prefix: bool
+) -> CloudSequence:
+    """The sample as the joined file has it: its label, its name, and no field that others lack."""
+    if label is not None:
+        sequence.label = label
+    sequence.name = _name(source, sequence.name, prefix)
+    for name in set(source.fields) - set(pattern.fields):
+        setattr(sequence, name, None)
+    return sequence

@@ -96,13 +96,15 @@ def expand(pattern: str) -> list[str]:
 
 
 class Tree:
-    """The files below a folder, listed once: path -> size, -1 for links to nowhere."""
+    """The files below a folder (or one file), listed once: path -> size, -1 for links to nowhere."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     @cached_property
     def files(self) -> dict[str, int]:
+        if self.folder.is_file():
+            return {self.folder.name: self.folder.stat().st_size}
         return dict(_walk(self.folder, ""))
 
     def find(self, pattern: str) -> list[str]:
@@ -198,8 +200,10 @@ def _worse(one: tuple[Row, list[str], str, int], other: tuple[Row, list[str], st
     return max(other, one, key=lambda it: (bool(it[1]), it[3] == 0, len(it[1])))[0].what
 
 
-def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any]) -> Iterator[str]:
+def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *, file: bool = False) -> Iterator[str]:
     """Lines that say what of recipe `name` is in `raw` and what is not, then what the reader's own index finds.
+
+    make_reader: anything with the `items` and `summary` of a Reader. file: `raw` may be a single file.
 
     DataError, after the last line, when something is missing; DataError at once when there is no recipe or no folder.
     """
@@ -208,7 +212,9 @@ def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any]) ->
         raise DataError(
             f"--check: name the folder of {recipe.get('title', name)}, as dpc prepare {name} FOLDER --check"
         )
-    yield f"{recipe.get('title', name)}, {require_folder(raw, 'what data_recipes/' + name + '.toml shows')}"
+    if not (file and raw.is_file()):
+        require_folder(raw, f"what data_recipes/{name}.toml shows")
+    yield f"{recipe.get('title', name)}, {raw}"
     lines, errors = check_rows(rows, Tree(raw))
     yield from lines
     try:

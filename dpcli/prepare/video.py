@@ -78,7 +78,7 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     options.check()
     frames = open_frames(path)
     cutter, wanted, crop, size = _survey(frames, options)
-    given, cameras = _given_views(frames, wanted, options)
+    given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
     header = ViewsHeader(
         options.name or clip_name(path),
@@ -151,7 +151,7 @@ class Cutter:
 def _survey(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
     """How to cut, which frames, the one crop of them all, and the (width, height) of the source."""
     wanted = _readable(frames, spread(len(frames), options.frames), options.on_error)
-    _warn_gaps(frames, wanted)
+    warn_gaps(frames, wanted)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
     boxes, cut_off, good, empty = [], [], [], []
     for index, rgba in zip(wanted, cutter.cut(wanted)):
@@ -210,7 +210,8 @@ def _readable(frames: Frames, wanted: list[int], on_error: str) -> list[int]:
     return good
 
 
-def _warn_gaps(frames: Frames, wanted: list[int]) -> None:
+def warn_gaps(frames: Frames, wanted: list[int]) -> None:
+    """Say in the log where the numbers of frames jump."""
     steps = np.diff(frames.numbers)
     if len(steps) > 1 and (steps != np.median(steps)).any():
         at = int(np.argmax(steps != np.median(steps)))
@@ -235,7 +236,7 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
         borders.append(matting.border_pixels(frame[..., :3]))
     size = (shape[1], shape[0])
     if options.mask:
-        return Cutter(frames, options, "mask", masks=_masks(frames, options.mask)), size
+        return Cutter(frames, options, "mask", masks=find_masks(frames, options.mask)), size
     if options.background == "keep":
         return Cutter(frames, options, "keep"), size
     if any(clear):
@@ -251,7 +252,7 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
     ), size
 
 
-def _masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
+def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
     """A mask for every frame of the clip: by number where all numbers agree, else in order."""
     masks = open_frames(require_folder(folder, "a mask per frame, as images"))
     if set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
@@ -290,9 +291,10 @@ def _times(frames: Frames, wanted: list[int], fps: float | None) -> np.ndarray:
     return times - times[0]
 
 
-def _given_views(
+def find_given_views(
     frames: Frames, wanted: list[int], options: VideoOptions
 ) -> tuple[list[list[Path]], list[OrbitCamera]]:
+    """Pictures [view][frame] of --views for the frames `wanted`, and their cameras; DataError when some are missing."""
     if not options.views:
         return [], []
     reference = options.camera()

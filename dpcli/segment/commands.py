@@ -26,7 +26,7 @@ from dpcli.segment.model_file import SHIPPED, load_model
 from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Objective
 from dpcli.segment.pair_flow import pair_flow
-from dpcli.segment.pairs import PairSource
+from dpcli.segment.pairs import MOTION_FIELDS, PairSource
 from dpcli.segment.precision import wanted
 from dpcli.segment.predict import Estimate, Refinement, Segmenter, network_segmenter, predict_parts
 from dpcli.segment.train import Schedule, Trainer
@@ -106,11 +106,12 @@ def _new_model(shape: PartConfig, start_from: str | None) -> PartNetwork:
 
 
 def _check_supervision(reader: CloudsReader, aims: Objective) -> None:
-    missing = [name for name in ("part", "pose") if name not in reader.fields]
+    missing = [] if "part" in reader.fields else ["part"]
+    if not any(name in reader.fields for name in MOTION_FIELDS):
+        missing.append(" or ".join(MOTION_FIELDS))
     if aims.supervised and missing:
-        raise DataError(
-            f"{reader.path}: --supervised needs part ids and poses, but the file has no {' and no '.join(missing)}"
-        )
+        raise DataError(f"{reader.path}: --supervised needs part ids and poses or scene flow, but the file has no "
+                        f"{' and no '.join(missing)}")  # fmt: skip
 
 
 def split_sequences(reader: CloudsReader, validation: str | None, seed: int) -> tuple[list[int], list[int]]:

@@ -58,7 +58,8 @@ def soft_match(moved: Tensor, points: Tensor, bias: Tensor, temperature: float) 
     from dpcli.segment.kernels_match import soft_match_kernel
 
     out = torch.empty_like(moved, memory_format=torch.contiguous_format)
-    arrays = [x.detach().contiguous().numpy() for x in (moved, points.mT, bias)]
+    columns = torch.nn.functional.pad(points.mT, (0, -points.shape[1] % 8))  # the kernel takes eight at a time
+    arrays = [x.detach().contiguous().numpy() for x in (moved, columns, bias)]
     rows = moved.shape[0] * moved.shape[1]
     run_in_threads(soft_match_kernel, (*arrays, temperature, out.numpy()), rows, _ROW_NS * points.shape[1])
     return out

@@ -10,6 +10,7 @@ from dpcli.errors import DataError
 from dpcli.runtime.seed import generator
 from dpcli.store import CloudSequence, CloudsReader
 
+MOTION_FIELDS = ("pose", "scene_flow")  # what may tell the true motion, the better one first
 _FRAME_KEY = 7001  # keeps these generators apart from those of epochs
 
 
@@ -25,7 +26,7 @@ class Pair:
 @dataclass
 class LoadedPair:
     """points f32 (2,N,3) in units of the sequence's diameter, centred; part i64 (2,N) (-1 unknown); flow f32 (2,N,3), the
-    true one each way, None without poses."""
+    true one each way, None without poses and scene_flow."""
 
     points: np.ndarray
     part: np.ndarray
@@ -54,7 +55,8 @@ class PairSource:
         self.pairs = [Pair(n, s, f) for n, (s, f) in enumerate(spots)]
         if not self.pairs:
             raise DataError(f"{reader.path}: no sequence of two frames or more to train on")
-        self.fields = [name for name in ("part", "pose") if name in reader.fields]
+        truth = next((name for name in MOTION_FIELDS if name in reader.fields), None)
+        self.fields = [name for name in ("part", truth) if name in reader.fields]
 
     def load(self, pair: Pair) -> LoadedPair:
         """One pair. DataError when a frame is empty."""
@@ -69,14 +71,32 @@ class PairSource:
         ]
         parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
         points = np.stack([cloud[pick] for cloud, pick in zip(clouds, picks)])
-        flow = None
-        if sample.pose is not None:
-            flow = np.stack([true_flow(points[t], parts[t], sample.pose[t], sample.pose[1 - t]) for t in range(2)])
+        flow = self._flow(pair, sample, points, parts, picks)
         scale = sequence_scale(clouds)
         centre = np.float32(points.mean((0, 1)))
         return LoadedPair(
             np.float32((points - centre) * scale), parts, None if flow is None else np.float32(flow * scale)
         )
+
+    def _flow(
+        self, pair: Pair, sample: CloudSequence, points: np.ndarray, parts: np.ndarray, picks: list[np.ndarray]
+    ) -> np.ndarray | None:
+        """The true flow (2,N,3) of the chosen points, each way."""
+        if sample.pose is not None:
+            return np.stack([true_flow(points[t], parts[t], sample.pose[t], sample.pose[1 - t]) for t in range(2)])
+        if sample.scene_flow is None:
+            return None
+        forth, back = np.split(sample.scene_flow, [sample.frame_offsets[1]])
+        if pair.first + 2 < self.reader.frame_counts[pair.sequence]:  # scene_flow leads on, to a third frame
+            back = backward_flow(sample.frame(0), forth, sample.frame(1))
+        return np.stack([forth[picks[0]], back[picks[1]]])
+
+
+def backward_flow(points: np.ndarray, flow: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Flow (M,3) of `others`, the next frame's points, back: minus that of the point (N,3) which its flow leads nearest."""
+    from scipy.spatial import cKDTree
+
+    return -flow[cKDTree(points + flow).query(others)[1]]
 
 
 def frame_parts(sample: CloudSequence, t: int) -> np.ndarray:

@@ -28,7 +28,8 @@ _TOGETHER = 8  # pairs of frames whose motions are refined at once
 _SPREAD = 8  # farthest points are searched among this many times the wanted number, drawn at random
 
 Estimate = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (N,3), (M,3) -> flow forth (N,3) and back (M,3)
-Segmenter = Callable[[list[Tensor], dict[tuple[int, int], Tensor]], list[Tensor]]  # frames, flows -> masks (N,S)
+Flows = dict[tuple[int, int], Tensor]  # from one frame to another, by their numbers
+Segmenter = Callable[[list[Tensor], Flows], list[Tensor]]  # frames, flows -> masks (N,S)
 
 
 @dataclass(frozen=True)
@@ -48,15 +49,22 @@ class Refinement:
 
 def network_segmenter(model: PartNetwork, device: torch.device) -> Segmenter:
     """Masks of the part network, frame by frame or together where frames have equally many points."""
+    return _NetworkSegmenter(model, device)
+
+
+@dataclass(frozen=True)
+class _NetworkSegmenter:
+    """Looks at no flow, so `predict_parts` may call it while the flows are still being found."""
+
+    model: PartNetwork
+    device: torch.device
 
     @torch.inference_mode()
-    def segment(frames: list[Tensor], flows: dict[tuple[int, int], Tensor]) -> list[Tensor]:
+    def __call__(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
         if len({len(frame) for frame in frames}) == 1:
             chunks = torch.stack(frames).split(8)
-            return [mask.cpu() for chunk in chunks for mask in model(chunk.to(device)).mask]
-        return [model(frame[None].to(device)).mask[0].cpu() for frame in frames]
-
-    return segment
+            return [mask.cpu() for chunk in chunks for mask in self.model(chunk.to(self.device)).mask]
+        return [self.model(frame[None].to(self.device)).mask[0].cpu() for frame in frames]
 
 
 def needs_flows(frames: int, pairs: str) -> list[tuple[int, int]]:
@@ -81,8 +89,7 @@ def predict_parts(
     thin = [_thinned(cloud, options.points, generator(seed, index, t)) for t, cloud in enumerate(whole)]
     pairs = needs_flows(len(thin), options.pairs)
     chain = [(t, t + 1) for t in range(len(thin) - 1)]
-    flows = _flows(thin, [*pairs, *chain], estimate)
-    masks = segmenter(thin, flows)
+    flows, masks = _flows_and_masks(thin, [*pairs, *chain], estimate, segmenter)
     if options.split and len(thin) > 1:
         with _threads_for(thin):
             masks = [
@@ -107,17 +114,24 @@ def _thinned(cloud: Tensor, wanted: int, rng: np.random.Generator) -> Tensor:
     return some[fps(some[None], wanted)[0]]
 
 
-def _flows(frames: list[Tensor], pairs: list[tuple[int, int]], estimate: Estimate) -> dict[tuple[int, int], Tensor]:
-    """All flows wanted: of every two frames both ways at once, two pairs of frames at a time."""
+def _flows_and_masks(
+    frames: list[Tensor], pairs: list[tuple[int, int]], estimate: Estimate, segmenter: Segmenter
+) -> tuple[Flows, list[Tensor]]:
+    """All flows wanted, of every two frames both ways at once, and the masks.
+
+    Two threads: beside the pairs of frames, which come one after the other, the network if that is what says the masks.
+    """
     both = sorted({(min(pair), max(pair)) for pair in pairs})
-    with ThreadPoolExecutor(min(2, torch.get_num_threads())) as pool:
+    workers = min(2, torch.get_num_threads())  # one of torch's threads in each: what is set now holds for new ones
+    with _threads_for(frames), ThreadPoolExecutor(workers) as pool:
+        early = pool.submit(segmenter, frames, {}) if isinstance(segmenter, _NetworkSegmenter) else None
         found = list(pool.map(lambda pair: estimate(frames[pair[0]], frames[pair[1]]), both))
-    return {key: flow for (i, j), (forth, back) in zip(both, found) for key, flow in (((i, j), forth), ((j, i), back))}
+        flows = dict(zip(both, (forth for forth, _ in found)))
+        flows |= {(j, i): back for (i, j), (_, back) in zip(both, found)}
+        return flows, early.result() if early else segmenter(frames, flows)
 
 
-def _consistent(
-    frames: list[Tensor], flows: dict[tuple[int, int], Tensor], masks: list[Tensor], vote: bool
-) -> list[Tensor]:
+def _consistent(frames: list[Tensor], flows: Flows, masks: list[Tensor], vote: bool) -> list[Tensor]:
     """Slots in frame 0's order in every frame, and each mask averaged with its neighbours' as the flow brings them."""
     if len(frames) == 1:
         return masks
@@ -158,7 +172,7 @@ def _carried_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
 
 def _motions(
     thin: list[Tensor], whole: list[Tensor], masks: list[Tensor], full: list[Tensor],
-    flows: dict[tuple[int, int], Tensor], pairs: list[tuple[int, int]], options: Refinement, scale: float, centre: np.ndarray,
+    flows: Flows, pairs: list[tuple[int, int]], options: Refinement, scale: float, centre: np.ndarray,
 ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
     """Motion f32 (Q,S,4,4) in the input's own coordinates and flow of all points, pair by pair."""
     slots = masks[0].shape[1]
@@ -186,7 +200,7 @@ def _threads_for(frames: list[Tensor]) -> Iterator[None]:
 
 
 def _fitted(
-    thin: list[Tensor], masks: list[Tensor], flows: dict[tuple[int, int], Tensor], pairs: list[tuple[int, int]], steps: int
+    thin: list[Tensor], masks: list[Tensor], flows: Flows, pairs: list[tuple[int, int]], steps: int
 ) -> list[tuple[Tensor, Tensor]]:  # fmt: skip
     """Motions (S,3,3), (S,3) of every pair of frames; pairs of equally many points together, `_TOGETHER` at a time."""
     found: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}

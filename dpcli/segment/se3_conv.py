@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from dpcli.ops.backend import chosen_backend, run_in_threads
 from dpcli.ops.kernel_conv import kernel_convolution
 from dpcli.segment.config import Layer, PartConfig
 from dpcli.segment.icosahedron import GROUPS
@@ -79,7 +80,9 @@ class GroupConv(nn.Module):
         return _GroupConv.apply(features, self.weight, self.table, self.back)
 
 
-_POINTS = 32  # whose turned features are held at a time: a MiB or two, which stay in the cache until they are multiplied
+_POINTS = (
+    32  # whose turned features are held at a time: a MiB or two, which stay in the cache until they are multiplied
+)
 
 
 class _GroupConv(torch.autograd.Function):
@@ -138,6 +141,10 @@ def instance_norm(features: Tensor) -> Tensor:
     return (features - mean) * torch.rsqrt(variance + 1e-5)
 
 
+_LEAK = 0.01  # slope of the activation below zero
+_NORM_NS = 0.3  # measured: the kernel's, per number
+
+
 class SeparableConv(nn.Module):
     """Spatial then group convolution, each with norm and leaky ReLU, plus a 1x1 shortcut (facts 1.5)."""
 
@@ -156,4 +163,23 @@ class SeparableConv(nn.Module):
 
 
 def _activate(features: Tensor) -> Tensor:
-    return nn.functional.leaky_relu(instance_norm(features), 0.01)
+    """Instance norm and leaky ReLU of features (B,P,G,C) that nobody needs afterwards: without gradient, they are overwritten.
+
+    Backends: a numba kernel on CPU in float32 for channels in sixteens where no gradient is wanted, else torch; equal
+    up to rounding.
+    """
+    if not _by_kernel(features):
+        return nn.functional.leaky_relu(instance_norm(features), _LEAK)
+    from dpcli.segment.kernels_norm import norm_kernel
+
+    batch, channels = len(features), features.shape[-1]
+    rows = features[0].numel() // channels
+    flat = features.detach().view(-1).numpy()
+    run_in_threads(norm_kernel, (flat, rows, channels, _LEAK), batch, rows * channels * _NORM_NS)
+    return features
+
+
+def _by_kernel(features: Tensor) -> bool:
+    wanted = torch.is_grad_enabled() and features.requires_grad
+    fits = features.dtype == torch.float32 and features.numel() and features.shape[-1] % 16 == 0
+    return bool(fits and not wanted and features.is_contiguous() and chosen_backend(features.device) == "numba")

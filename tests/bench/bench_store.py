@@ -90,12 +90,15 @@ def conversion(source: Path, output: Path, jobs: int, *extra: str) -> float:
 
 def bench_conversion(folder: Path, videos: int, jobs: int) -> None:
     print(f"conversion against decoding alone, {videos} videos of {FRAMES} frames {WIDTH}x{HEIGHT}, --jobs {jobs}")
-    for name, source in write_sources(folder, videos).items():
-        started = min(conversion(source, folder / "one.h5", jobs, "--limit", "1") for _ in range(3))
-        alone, whole = decoding_alone(source, jobs), conversion(source, folder / "all.h5", jobs)
-        steady = (whole - started) * videos / max(videos - 1, 1)
-        print(f"  {name}: decoding {alone:5.2f} s, conversion {whole:5.2f} s of which {started:4.2f} s to start and end: "
-              f"{steady / alone:4.2f}x decoding without those, {whole / alone:4.2f}x with (target 1.1-1.3)")  # fmt: skip
+    sources = write_sources(folder, videos)
+    for name, source in sources.items():
+        alone = decoding_alone(source, jobs)
+        for kept, words in (("all points", ()), ("2,048 a frame", ("--points", "2048", "--sampling", "random"))):
+            started = min(conversion(source, folder / "one.h5", jobs, "--limit", "1", *words) for _ in range(3))
+            whole = conversion(source, folder / "all.h5", jobs, *words)
+            steady = (whole - started) * videos / max(videos - 1, 1)
+            print(f"  {name}, {kept}: decoding {alone:5.2f} s, conversion {whole:5.2f} s of which {started:4.2f} s to start "
+                  f"and end: {steady / alone:4.2f}x decoding without those, {whole / alone:4.2f}x with (target 1.1-1.3)")  # fmt: skip
 
 
 def _clips(path: Path, seed: int, seconds: float) -> tuple[int, float]:

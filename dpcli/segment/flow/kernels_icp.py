@@ -341,3 +341,54 @@ def assign_kernel(cost, neighbours, label, extra, border, rounds):
         label[:] = new
         if not changed:
             break
+
+
+@kernel
+def lloyd_kernel(points, centre, rounds, patch):
+    """k-means in place: centre f64 (K,D), patch i64 (N) of points f32 (N,D); a centre without points stays.
+
+    Distances in float64, ties to the lowest patch; means in float32 in the points' order, as numpy takes them.
+    """
+    total, own = np.empty(centre.shape, np.float32), np.empty(len(centre), np.int64)
+    for _ in range(rounds):
+        total[:] = 0
+        own[:] = 0
+        for i in range(len(points)):
+            best, at = math.inf, 0
+            for k in range(len(centre)):
+                apart = 0.0
+                for c in range(points.shape[1]):
+                    apart += (points[i, c] - centre[k, c]) ** 2
+                if apart < best:
+                    best, at = apart, k
+            patch[i] = at
+            own[at] += 1
+            for c in range(points.shape[1]):
+                total[at, c] += points[i, c]
+        for k in range(len(centre)):
+            if own[k]:
+                for c in range(points.shape[1]):
+                    centre[k, c] = total[k, c] / np.float32(own[k])
+
+
+@kernel
+def distinct_kernel(moved, order, apart, chosen):
+    """Of places f64 (H,n,3), taken in the given order, those no two of which are within `apart` at every point.
+
+    Fills chosen i64 from its start; returns how many there are, its length at most.
+    """
+    found = 0
+    for h in order:
+        if found == len(chosen):
+            break
+        new = True
+        for c in chosen[:found]:
+            far = False
+            for n in range(moved.shape[1]):
+                for k in range(3):
+                    far = far or abs(moved[h, n, k] - moved[c, n, k]) > apart
+            new = new and far
+        if new:
+            chosen[found] = h
+            found += 1
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.ops import fps_numpy
+from dpcli.segment.flow.kernels_icp import distinct_kernel, lloyd_kernel
 
 ANGLES = (-0.6, -0.3, 0.3, 0.6)  # radians
 SHIFTS = (-0.18, -0.08, 0.08, 0.18)  # diameters
@@ -56,25 +57,18 @@ def articulated(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
 
 def distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: float, most: int) -> list[int]:
     """Indices of the best (lowest) scored motions, no two of which move every point to within `apart` of each other."""
-    chosen: list[int] = []
+    chosen = np.empty(most, np.int64)
     corners = points[:: max(1, len(points) // 12)]
     moved = np.einsum("hij,nj->hni", motions[:, :, :3], corners) + motions[:, None, :, 3]
-    for h in np.argsort(score, kind="stable"):
-        if all(np.abs(moved[h] - moved[c]).max() > apart for c in chosen):
-            chosen.append(int(h))
-        if len(chosen) == most:
-            break
-    return chosen
+    found = distinct_kernel(moved, np.argsort(score, kind="stable"), apart, chosen)
+    return chosen[:found].tolist()
 
 
 def voronoi(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
     """Patch i64 (N) of each point (N,3 or more): k-means (Lloyd) from farthest points; the same every time."""
     centre = points[fps_numpy(points[:, :3], min(count, len(points)))].astype(np.float64)
-    for _ in range(rounds):
-        patch = ((points[:, None] - centre) ** 2).sum(2).argmin(1)
-        for k in range(len(centre)):
-            if (patch == k).any():
-                centre[k] = points[patch == k].mean(0)
+    patch = np.zeros(len(points), np.int64)
+    lloyd_kernel(np.ascontiguousarray(points, np.float32), centre, rounds, patch)
     return patch
 
 
