@@ -430,13 +430,13 @@ def emptied(file) -> None:
 
 
 @pytest.mark.parametrize(("what", "change", "words"), [
-    ("scores", put("scores", 3, math.nan), "scores of .*'v3'"),
-    ("scores", put("scores", (slice(5, 9), 0), math.inf), "scores of .*'v5'"),
-    ("scores", put("scores", 3, -math.inf), "scores of .*'v3'"),
+    ("scores", put("scores", 3, math.nan), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
+    ("scores", put("scores", (slice(5, 9), 0), math.inf), "4 of .* samples with NaN or infinite scores, the first 'v5'"),
+    ("scores", put("scores", 3, -math.inf), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
     ("scores", emptied, "no samples"),
-    ("parts", put("flow", 0, math.nan), "'s0'.*flow 0 -> 1 .* NaN or infinite"),
-    ("parts", put("flow", 0, math.inf), "'s0'.*flow 0 -> 1 .* NaN or infinite"),
-    ("parts", put("part_probability", 0, math.nan), "'s0': probability holds nan"),
+    ("parts", put("flow", 0, math.nan), "'s0': 1 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1"),
+    ("parts", put("flow", slice(0, 2), math.inf), "'s0': 2 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1"),
+    ("parts", put("part_probability", 0, math.nan), "'s0': 1 of .* NaN or infinite probability, the first is point 0"),
     ("parts", put("part_motion", 0, math.nan), "'s0': motion of part 0"),
     ("truth", put("pose", 0, math.nan), "pose"),
     ("truth", put("points", 0, math.nan), "'s0' holds NaN or infinite coordinates"),

@@ -13,6 +13,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.merge import merge
 from dpcli.prepare.pipeline import convert
 from dpcli.prepare.shards import Shard, describe_shard, shard_of
+from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudsReader
 from dpcli.store.file import read_positions
 from tests.prepare_helpers import ToyReader, dpc
@@ -78,9 +79,24 @@ def test_shards_divide_the_places(count, total):
 
 
 def test_the_command_of_a_shard_is_that_of_the_whole():
-    entry = {"command": "dpc prepare x 'a b' --shard 1/3 --points 5 --dask=local", "config": {"points": 5}}
+    words = [
+        "prepare",
+        "x",
+        "a b",
+        "--shard",
+        "1/3",
+        "--points",
+        "5",
+        "--dask=local",
+        "--dask",
+        "tcp://a:1",
+        "--shard=2/3",
+    ]
+    command = command_line(words)
+    assert command == "dpc prepare x 'a b' --points 5"
+    entry = {"command": command, "config": {"points": 5}}
     made = describe_shard(entry, Shard(1, 3))
-    assert made["command"] == "dpc prepare x 'a b' --points 5"
+    assert made["command"] == command and made["config"] == {"points": 5, "shard": "1/3"}
     assert shard_of(made) == (Shard(1, 3), describe_shard(entry, None))
 
 

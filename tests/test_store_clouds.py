@@ -6,6 +6,7 @@ import hashlib
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -159,6 +160,48 @@ def test_reader_crosses_process_borders(tmp_path, three):
     reader.read(0)
     copy = pickle.loads(pickle.dumps(reader))
     assert copy._file is None and np.array_equal(copy.read(2).points, three[2].points)
+
+
+def test_handles_are_kept_closed_and_opened_again(tmp_path, three):
+    """Each data set is looked up once; a closed reader opens itself again, at whatever file has that name by then."""
+    path = write(tmp_path / "a.h5", three)
+    with CloudsReader(path) as reader:
+        reader.read(0)
+        kept = reader._set("points")
+        reader.read(1)
+        assert reader._set("points") is kept and kept.id.valid
+        assert pickle.loads(pickle.dumps(reader))._sets == {}
+        reader.close()
+        assert not kept.id.valid and np.array_equal(reader.read(2).points, three[2].points)
+        moved = [replace(sequence, points=sequence.points + 1) for sequence in three]
+        write(tmp_path / "b.h5", moved).replace(path)
+        assert np.array_equal(reader.read(1).points, three[1].points)  # what was opened
+        reader.close()
+        assert np.array_equal(reader.read(1).points, moved[1].points)
+        reader.file.close()  # by someone else
+        assert np.array_equal(reader.read(0).points, moved[0].points)
+
+
+def test_a_forked_process_opens_its_own(tmp_path, three):
+    import multiprocessing
+
+    reader = CloudsReader(write(tmp_path / "a.h5", three))
+    reader.read(0)
+    handle = reader.file
+
+    def child(pipe) -> None:
+        sums = [float(reader.read(index).points.sum()) for index in range(3)]
+        pipe.send((sums, reader.file is handle))
+        reader.close()
+
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=child, args=(theirs,))
+    process.start()
+    assert ours.poll(60) and ours.recv() == ([float(s.points.sum()) for s in three], False)
+    process.join(60)
+    assert process.exitcode == 0 and reader.file is handle
+    assert np.array_equal(reader.read(2).points, three[2].points)
 
 
 def test_several_loader_workers_read_what_one_reads(tmp_path, three):

@@ -164,7 +164,12 @@ def _with(array: np.ndarray, place: object, value: float) -> np.ndarray:
 BAD = {
     "probability has shape": lambda s: changed(s, 1, s[1][:, :3]),
     "probability holds 1.5, expected 0..1": lambda s: changed(s, 1, _with(s[1], (3, 1), 1.5)),
-    "probability holds nan": lambda s: changed(s, 1, _with(s[1], (3, 1), np.nan)),
+    "1 of 123 points with NaN or infinite probability, the first is point 3": lambda s: changed(
+        s, 1, _with(s[1], (3, 1), np.nan)
+    ),
+    "2 of 123 points with NaN or infinite probability, the first is point 7": lambda s: changed(
+        s, 1, _with(s[1], ([9, 7], 1), np.inf)
+    ),
     "pairs holds 3, expected 0..2": lambda s: changed(s, 2, _with(s[2], (1, 0), 3)),
     "motion has shape": lambda s: changed(s, 3, s[3][:2]),
     "motion of part 2 in pair 1 is not a rigid one": lambda s: changed(s, 3, _with(s[3], (1, 2, 0, 0), 2)),
@@ -173,7 +178,12 @@ BAD = {
     "motion of part 1 in pair 2 is not": lambda s: changed(s, 3, _with(s[3], (2, 1, 0, 3), np.inf)),
     "flow of 2 pairs, expected 3": lambda s: changed(s, 4, s[4][:2]),
     "flow 1 -> 2 has shape": lambda s: changed(s, 4, [s[4][0], s[4][0], s[4][2]]),
-    "flow 2 -> 1 is NaN": lambda s: changed(s, 4, [*s[4][:2], s[4][2] * np.nan]),
+    "42 of 123 points with NaN or infinite flow, the first is point 0 of flow 2 -> 1": lambda s: changed(
+        s, 4, [*s[4][:2], s[4][2] * np.nan]
+    ),
+    "3 of 123 points with NaN or infinite flow, the first is point 5 of flow 1 -> 2": lambda s: changed(
+        s, 4, [s[4][0], _with(s[4][1], ([5, 8], 2), np.inf), _with(s[4][2], 0, np.nan)]
+    ),
     "no part, though": lambda s: changed(s, 0, CloudSequence("s0", s[0].points, s[0].frame_offsets)),
 }
 
@@ -237,7 +247,7 @@ def test_damaged_values_are_said_when_read(tmp_path, samples):
     path = write_parts(tmp_path / "a.h5", samples)
     _edit(path, lambda file: file["flow"].__setitem__(0, np.nan))
     reader = PartsReader(path)
-    with pytest.raises(DataError, match=r"a\.h5: sample 's0': flow 0 -> 1 is NaN"):
+    with pytest.raises(DataError, match=r"a\.h5: sample 's0': 1 of 123 points with NaN or infinite flow, the first"):
         reader.read_parts(0)
     reader.read_parts(2)
 

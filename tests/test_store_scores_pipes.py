@@ -50,7 +50,12 @@ def test_bad_rows_are_refused(tmp_path):
     ("name", "value", "message"),
     [
         ("scores", np.ones((4, 3), np.float32), "samples, classes"),
-        ("scores", np.full((4, 2), np.nan, np.float32), "'v0' are NaN"),
+        ("scores", np.full((4, 2), np.nan, np.float32), "4 of 4 samples with NaN or infinite scores, the first 'v0'"),
+        (
+            "scores",
+            np.float32([[0, 1], [0, np.inf], [0, 0], [np.nan, 1]]),
+            "2 of 4 samples .*, the first 'v1'; predict",
+        ),
         ("label", np.array([0, 1, 2, 0], np.int32), "label 2 of 'v2'"),
         ("name", ["v0", "v0", "v2", "v3"], "names repeat"),
     ],

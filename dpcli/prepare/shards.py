@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
-import shlex
 from dataclasses import dataclass
 from typing import Any
 
 from dpcli.errors import UsageError
-
-_NOT_OF_THE_RESULT = ("--shard", "--dask")  # words of a command line that decide where work is done, not what
 
 
 @dataclass(frozen=True)
@@ -43,13 +40,6 @@ WHOLE = Shard(0, 1)
 
 def describe_shard(entry: dict[str, Any], shard: Shard | None) -> dict[str, Any]:
     """A provenance entry of a shard: the whole's, and under `config` which piece of it this is."""
-    words, kept = iter(shlex.split(entry["command"])), []
-    for word in words:
-        if word in _NOT_OF_THE_RESULT:
-            next(words, None)
-        elif word.split("=")[0] not in _NOT_OF_THE_RESULT:
-            kept.append(word)
-    entry = {**entry, "command": shlex.join(kept)}
     return entry if shard is None else {**entry, "config": {**entry["config"], "shard": str(shard)}}
 
 

@@ -64,12 +64,21 @@ class PartsSample:
             if flow.shape != (sizes[source], 3):
                 raise DataError(f"{where}: flow {source} -> {target} has shape {flow.shape}, expected one row for each "
                                 f"of the {sizes[source]} points of frame {source}")  # fmt: skip
-            if not np.isfinite(flow).all():
-                raise DataError(f"{where}: flow {source} -> {target} is NaN or infinite")
+        bad = [np.flatnonzero(~np.isfinite(flow).all(axis=1)) for flow in self.flow]
+        count, total = sum(map(len, bad)), sum(map(len, self.flow))
+        if count:
+            row = next(row for row, own in enumerate(bad) if len(own))
+            source, target = self.pairs[row].tolist()
+            raise DataError(f"{where}: {count} of {total} points with NaN or infinite flow, the first is point "
+                            f"{bad[row][0]} of flow {source} -> {target}")  # fmt: skip
 
 
 def _check_probability(probability: np.ndarray, where: str) -> None:
-    wrong = ~((probability >= -_TOLERANCE) & (probability <= 1 + _TOLERANCE))  # NaN is wrong, too
+    bad = np.flatnonzero(~np.isfinite(probability).all(axis=1))
+    if len(bad):
+        raise DataError(f"{where}: {len(bad)} of {len(probability)} points with NaN or infinite probability, "
+                        f"the first is point {bad[0]}")  # fmt: skip
+    wrong = (probability < -_TOLERANCE) | (probability > 1 + _TOLERANCE)
     if wrong.any():
         raise DataError(f"{where}: probability holds {probability[wrong][0]}, expected 0..1")
 
@@ -187,15 +196,15 @@ class PartsReader(CloudsReader):
         points = slice(int(frames[0]), int(frames[-1]))
         pairs = slice(*map(int, self._pair_offsets[index : index + 2]))
         offsets = self._flow_offsets[pairs.start : pairs.stop + 1]
-        flow = self.file["flow"][int(offsets[0]) : int(offsets[-1])]
+        flow = self._set("flow")[int(offsets[0]) : int(offsets[-1])]
         said = PartsSample(
-            self.file["part_probability"][points],
-            self.file["pair"][pairs],
-            self.file["part_motion"][pairs],
+            self._set("part_probability")[points],
+            self._set("pair")[pairs],
+            self._set("part_motion")[pairs],
             np.split(flow, offsets[1:-1] - offsets[0]) if pairs.stop > pairs.start else [],
         )
         sequence = CloudSequence(self.names[index], np.empty((points.stop - points.start, 3), np.float32),
-                                 frames - frames[0], part=self.file["part"][points])  # fmt: skip
+                                 frames - frames[0], part=self._set("part")[points])  # fmt: skip
         try:
             said.validate(sequence, self.num_parts)
         except DataError as error:

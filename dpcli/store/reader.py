@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,8 +19,9 @@ OPTIONAL = ("time", "color", "part", "track", "scene_flow", "pose")
 class CloudsReader:
     """Lazy access to the sequences of a `clouds` (or `parts`) file.
 
-    The index (names, labels, offsets) is read and checked on opening: a few dozen bytes a sample. The HDF5 handle is
-    opened on first use in each process and never pickled, so a DataLoader may hand the reader to its workers.
+    The index (names, labels, offsets) is read and checked on opening: a few dozen bytes a sample. The HDF5 handles are
+    opened on first use in each process and never pickled, so a DataLoader may hand the reader to its workers. Those of
+    data sets are kept: finding one again for each sequence takes longer than reading it.
     Raises DataError when the file is not what the contract says.
     """
 
@@ -28,6 +30,8 @@ class CloudsReader:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._file: h5py.File | None = None
+        self._process = 0  # that opened the handles; after a fork the child opens its own
+        self._sets: dict[str, h5py.Dataset] = {}
         with open_store(self.path, self.kinds) as file:
             self._load_index(file)
 
@@ -104,9 +108,17 @@ class CloudsReader:
     @property
     def file(self) -> h5py.File:
         """The open handle of this process."""
-        if self._file is None or not self._file.id.valid:
-            self._file = open_store(self.path, self.kinds)
+        if self._file is None or self._process != os.getpid() or not self._file.id.valid:
+            self._sets = {}
+            self._file, self._process = open_store(self.path, self.kinds), os.getpid()
         return self._file
+
+    def _set(self, name: str) -> h5py.Dataset:
+        """A data set of the file, found once in each process."""
+        file = self.file
+        if name not in self._sets:
+            self._sets[name] = file[name]
+        return self._sets[name]
 
     def read(
         self, index: int, frames: slice | Sequence[int] | None = None, fields: Sequence[str] | None = None
@@ -133,9 +145,9 @@ class CloudsReader:
         values = {}
         for key in ("points", *(self.fields if fields is None else fields)):
             if key in ("time", "pose"):
-                values[key] = self.file[key][first + low : first + high][wanted - low]
+                values[key] = self._set(key)[first + low : first + high][wanted - low]
             else:
-                values[key] = _pick(self.file[key][span], offsets - offsets[0], picks)
+                values[key] = _pick(self._set(key)[span], offsets - offsets[0], picks)
         if not np.isfinite(values["points"]).all():
             raise DataError(
                 f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
@@ -146,9 +158,9 @@ class CloudsReader:
         )  # fmt: skip
 
     def close(self) -> None:
-        if self._file is not None:
+        if self._file is not None and self._process == os.getpid():
             self._file.close()
-            self._file = None
+        self._file, self._sets = None, {}
 
     def __enter__(self) -> CloudsReader:
         return self
@@ -157,7 +169,7 @@ class CloudsReader:
         self.close()
 
     def __getstate__(self) -> dict:
-        return {**self.__dict__, "_file": None}
+        return {**self.__dict__, "_file": None, "_sets": {}}
 
 
 def _pick(values: np.ndarray, offsets: np.ndarray, picks: np.ndarray | None) -> np.ndarray:

@@ -110,9 +110,10 @@ class ScoresReader:
         for key, value in {"scores": self.scores, **self.streams}.items():
             if value.shape != shape:
                 raise DataError(f"{self.path}: {key} has shape {value.shape}, expected (samples, classes) = {shape}")
-            if not np.isfinite(value).all():
-                row = int(np.argmax(~np.isfinite(value).all(1)))
-                raise DataError(f"{self.path}: {key} of {self.names[row]!r} are NaN or infinite; predict again")
+            bad = np.flatnonzero(~np.isfinite(value).all(1))
+            if len(bad):
+                raise DataError(f"{self.path}: {len(bad)} of {len(value)} samples with NaN or infinite {key}, the first "
+                                f"{self.names[bad[0]]!r}; predict again")  # fmt: skip
         if self.labels.shape != shape[:1] or len(self.splits) != shape[0]:
             raise DataError(f"{self.path}: {len(self.labels)} labels for {shape[0]} names")
         if len(set(self.names)) != len(self.names):
