@@ -24,7 +24,7 @@ from dpcli.cli.options import Json, Picture, Seed
 app = typer.Typer(no_args_is_help=True, help="Compare what a model says with the truth.")
 
 Parts = Annotated[str, typer.Argument(help="Parts file, or - for a pipe.")]
-Truth = Annotated[Path, typer.Option("--truth", help="Clouds file with the true parts, and poses for motion.")]
+Truth = Annotated[Path, typer.Option("--truth", help="Clouds file with the true parts; poses or scene_flow for motion.")]
 Split = Annotated[
     str | None, typer.Option("--split", help="Sequences of the truth that count, or all. Default: test if any.")
 ]

@@ -26,7 +26,7 @@ def train(
     config: Annotated[
         str, typer.Option(help="compact (under 0.25 M parameters) or release (1.43 M, as published).")
     ] = "compact",
-    supervised: Annotated[bool, typer.Option("--supervised", help="Learn from part ids and poses instead.")] = False,
+    supervised: Annotated[bool, typer.Option("--supervised", help="Learn from part ids and poses (or scene flow) instead.")] = False,
     flow: Annotated[str, typer.Option(help=_FLOW)] = "icp",
     flow_decay: Annotated[
         float, typer.Option(help="alpha of eq. 4.6: 1 keeps the first flow (past), 0 takes the newest (current).")

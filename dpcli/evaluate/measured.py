@@ -116,7 +116,7 @@ def measured_kind(path: Path, source: str) -> str:
 def measure(path: Path, source: str, question: Question) -> list[Measured]:
     """A scores file or a video (one entry), or a parts file: what is asked of its segmentation and of its motion.
 
-    Without `metrics`, motion is measured where the truth has poses and the file has frame pairs. UsageError for metrics
+    Without `metrics`, motion is measured where the truth has poses or scene flow and the file has frame pairs. UsageError for metrics
     that the file can't have, or a parts file without a truth; DataErrors as `evaluate_*`.
     """
     kind = measured_kind(path, source)
@@ -140,7 +140,7 @@ def measure(path: Path, source: str, question: Question) -> list[Measured]:
 
 def _has_motion(path: Path, truth: Path) -> bool:
     with PartsReader(path) as parts, CloudsReader(truth) as clouds:
-        return "pose" in clouds.fields and bool(parts.pair_counts.any())
+        return bool({"pose", "scene_flow"} & set(clouds.fields)) and bool(parts.pair_counts.any())
 
 
 def _classification(path: Path, source: str, question: Question) -> Measured:
