@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.segment.flow import kernels_icp
+from dpcli.segment.flow import kernels_icp, starts
 from dpcli.segment.flow.bodies import BodySearch, _Search
 from dpcli.segment.flow.surface import Surface
 from dpcli.segment.object_icp import soft_match, soft_match_reference
+from dpcli.segment.se3_conv import _activate, instance_norm
+from tests.ops_helpers import backend
 
 
 def sphere(count: int, seed: int) -> np.ndarray:
@@ -37,6 +39,58 @@ def test_soft_match_far_away_and_in_float64() -> None:
     found = soft_match(far, points, torch.zeros(1, 1, 64), 1e-3)
     assert found.isfinite().all() and found.abs().max() <= 0.5
     assert soft_match(far.double(), points.double(), torch.zeros(1, 1, 64).double(), 1e-3).dtype == torch.float64
+
+
+@pytest.mark.parametrize("count", [1, 3, 7, 8, 9, 16, 21])
+def test_soft_match_of_any_number_of_points(count: int) -> None:
+    """What fills the kernel's last eight counts for nothing, though it lies nearest."""
+    points = torch.from_numpy(sphere(count, 6))[None]
+    moved = torch.cat([points * 1.1, torch.zeros(1, 1, 3)], 1)
+    bias = torch.full((1, count + 1, count), -0.5)
+    exact = soft_match_reference(moved.double(), points.double(), bias.double(), 0.3)
+    torch.testing.assert_close(soft_match(moved, points, bias, 0.3).double(), exact, atol=1e-6, rtol=0)
+    padded = torch.cat([points, torch.zeros(1, 1, 3)], 1)  # the broken twin: one zero point counts
+    wrong = soft_match_reference(moved, padded, torch.full((1, count + 1, count + 1), -0.5), 0.3)
+    assert (wrong - exact).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 5, 16), (1, 40, 60, 32), (3, 1, 1, 16), (2, 7, 12, 24)])
+def test_norm_and_activation_are_the_formulas(shape: tuple[int, ...]) -> None:
+    """Also far from zero, for a constant, and for channels that the kernel doesn't take (24)."""
+    features = torch.randn(shape, generator=torch.Generator().manual_seed(0)) * 2 + 50
+    features[..., 3] = 7.0
+    exact = torch.nn.functional.leaky_relu(instance_norm(features.double()), 0.01)
+    with backend("numba"):
+        found = _activate(features.clone())
+    torch.testing.assert_close(found.double(), exact, atol=3e-5, rtol=1e-5)
+    assert not found[..., 3].any()
+    leaf = features.clone().requires_grad_()
+    assert _activate(leaf).requires_grad and torch.equal(leaf, features)
+
+
+def test_lloyd_is_k_means_written_out() -> None:
+    points, centre = sphere(90, 7), sphere(5, 8).astype(np.float64)
+    centre[4] = 100.0  # owns no point and stays
+    ours, patch = centre.copy(), np.empty(90, np.int64)
+    kernels_icp.lloyd_kernel(points, ours, 4, patch)
+    for _ in range(4):
+        own = ((points[:, None] - centre) ** 2).sum(2).argmin(1)
+        for k in np.unique(own):
+            centre[k] = points[own == k].mean(0)
+    assert np.array_equal(patch, own) and np.allclose(ours, centre, atol=1e-7, rtol=0) and (ours[4] == 100).all()
+
+
+@pytest.mark.parametrize("most", [1, 3, 50])
+def test_distinct_motions_are_apart_and_the_best(most: int) -> None:
+    rng = np.random.default_rng(9)
+    motions = starts.shift(rng.integers(0, 3, (40, 3)) * 0.1)
+    score, points = rng.permutation(40).astype(float), sphere(30, 1).astype(np.float64)
+    chosen: list[int] = []
+    for h in np.argsort(score):  # shifts move all points alike
+        if all(np.abs(motions[h, :, 3] - motions[c, :, 3]).max() > 0.05 for c in chosen):
+            chosen.append(int(h))
+    assert 3 < len(chosen) < 40
+    assert starts.distinct(motions, score, points, 0.05, most) == chosen[:most]
 
 
 @pytest.mark.parametrize("count", [1, 9, 127, 128, 129, 256, 512, 700])

@@ -79,18 +79,20 @@ def rigid_flow(
 ) -> Tensor:  # [B, N, 3]
     """Displacement of each point by its slots' motions, blended by the mask: sum_s m_ns (R_s x_n + t_s) - x_n.
 
-    Backends as `weighted_kabsch`. ValueError for a mask that doesn't fit.
+    Backends as `weighted_kabsch`. Raises ValueError on shapes that don't fit.
     """
-    if mask.shape[:2] != points.shape[:2] or mask.shape[2] != rotation.shape[1]:
-        raise ValueError(f"mask {tuple(mask.shape)} must have a row for each of points {tuple(points.shape)} and a column "
-                         f"for each of rotations {tuple(rotation.shape)}")  # fmt: skip
+    (batch, count), slots = points.shape[:2], mask.shape[-1]
+    wanted = ((batch, count, 3), (batch, count, slots), (batch, slots, 3, 3), (batch, slots, 3))
+    given = tuple(tuple(x.shape) for x in (points, mask, rotation, translation))
+    if given != wanted:
+        raise ValueError(f"points (B,N,3), mask (B,N,S), rotation (B,S,3,3), translation (B,S,3) do not fit: {given}")
     if not _by_kernel(points, mask, rotation, translation):
         return rigid_flow_reference(points, mask, rotation, translation)
     from dpcli.ops.kernels_rigid import flow_kernel
 
     out = points.new_empty(points.shape)
     arrays = [_array(tensor) for tensor in (points, mask, rotation, translation, out)]
-    run_in_threads(flow_kernel, tuple(arrays), points.shape[0] * points.shape[1], mask.shape[2] * _BLEND_NS)
+    run_in_threads(flow_kernel, tuple(arrays), batch * count, slots * _BLEND_NS)
     return out
 
 
