@@ -23,6 +23,7 @@ _PIECE = 1 << 22  # bytes of activations between two matrix products, which then
 _BLOCKS = 32  # pieces of work of a sum: more than threads, for balance; fixed, so that sums repeat exactly
 _HELD = 8  # pieces summed in float32
 _SPLITS = 4  # the same where each needs a copy of a large target
+_LANES = 8  # channels in a vector of the kernels
 
 
 @dataclass
@@ -49,9 +50,11 @@ def grouped_mlp(
     """max over K of relu(bn2(W2 relu(bn1(W1 [x_j - x_i, f_j])))) (PointNet++'s set abstraction with two layers).
 
     Returns (pooled (B,M,C2), [mean1, var1, mean2, var2]): the biased batch statistics, or the given ones.
-    Differentiable in features, weights, biases and norms; not in positions. float32 on the fast path.
+    Differentiable in features, weights, biases and norms; not in positions. The fast path takes float32, C1 in eights and
+    C2 of 8 or more.
     """
     fast = chosen_backend(points.device) == "numba" and norm1.mean is None and points.dtype == torch.float32
+    fast = fast and len(norm1.weight) % _LANES == 0 and len(norm2.weight) >= _LANES
     if fast:
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
     taps, statistics = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
@@ -122,30 +125,31 @@ class _GroupedMLP(torch.autograd.Function):
             first = _FromTable(points, centers, idx, table.detach(), offset.detach(), weight1)
         mean1, var1 = first.statistics()
         first.fold(g1.detach() * torch.rsqrt(var1 + eps1), torch.rsqrt(var1 + eps1), b1.detach())
-        best, where, gram, total = _pool_linear(first, weight2.detach(), bias2.detach(), g2.detach())
+        signs = torch.where(g2 < 0, -1.0, 1.0)  # of the largest or smallest values, whichever the norm makes largest
+        best, where, gram, total = _pool_linear(first, weight2.detach() * signs[:, None])
         mean2, var2 = _linear_statistics(gram, total, idx.numel(), weight2.detach(), bias2.detach())
-        inverse2 = torch.rsqrt(var2 + eps2)
-        normal = (best - mean2) * inverse2
-        out = torch.relu_(normal * g2 + b2)
+        inverse2 = signs * torch.rsqrt(var2 + eps2)
+        away = signs * (mean2 - bias2)  # mean of what `best` is the largest of
+        out = torch.addcmul(b2 - away * inverse2 * g2, best, inverse2 * g2).relu_()
         ctx.first = first
-        ctx.save_for_backward(g2, weight2, bias2, where, normal, out, mean2, inverse2, gram, total)
+        ctx.save_for_backward(g2, weight2, bias2, where, best, away, out, mean2, signs, inverse2, gram, total)
         ctx.mark_non_differentiable(mean1, var1, mean2, var2)
         return out.view(*idx.shape[:2], -1), mean1, var1, mean2, var2
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad, *unused):
-        g2, weight2, bias2, where, normal, out, mean2, inverse2, gram, total = ctx.saved_tensors
-        rows, c2 = ctx.first.rows, len(g2)
-        grad = grad.reshape(-1, c2) * (out > 0)
-        grad_b2, grad_g2 = grad.sum(0), (grad * normal).sum(0)
+        g2, weight2, bias2, where, best, away, out, mean2, signs, inverse2, gram, total = ctx.saved_tensors
+        rows = ctx.first.rows
+        pooled, sums = _sort_pooled(ctx.first, grad.reshape(out.shape).contiguous(), out, best, where, away)
+        grad_b2, grad_g2 = sums[0], sums[1] * inverse2
         # d(linear output) = sparse - u - v * output, the last two from the batch statistics
-        scale2 = g2 * inverse2
+        scale2, inverse2 = g2 * inverse2 * signs, inverse2 * signs
         v = scale2 * grad_g2 * inverse2 / rows
         u = scale2 * grad_b2 / rows - v * mean2
         shift = u + v * bias2
         mixed, constant = (weight2 * -v[:, None]).t() @ weight2, -(shift @ weight2)
-        parts = _back_pool(ctx.first, (grad * scale2).contiguous(), where, weight2, mixed, constant)
+        parts = scale2[:, None] * _back_pool(ctx.first, pooled, weight2 * scale2[:, None], mixed, constant)
         grad_w2 = parts - torch.outer(shift, total.float()) - v[:, None] * (weight2 @ gram.float())
         table, offset, weight1, bias1, grad_g1, grad_b1 = ctx.first.gradients()
         return (None, None, None, table, offset, weight1, bias1, grad_g1, grad_b1, grad_g2, grad_b2,
@@ -184,13 +188,14 @@ class _FromPositions:
         """The layer's activations of a piece (rows,C) from centroid `first` on."""
         self.kernels.hidden_xyz(*self.arrays, *self.folded, first, out)
 
-    def begin_backward(self) -> None:
+    def begin_backward(self) -> int:
+        """Returns how many copies of the weight's gradient `back` fills."""
         self.sums = torch.zeros(_SPLITS, 4, self.channels, dtype=torch.float64)
+        return _SPLITS
 
-    def back(self, grad: np.ndarray, hidden: np.ndarray, constant: np.ndarray, first: int) -> None:
-        """Take in a piece's gradient, constant to be added, that arrives at the activations `hidden`."""
-        self.kernels.back_xyz(grad, hidden, constant, *self.arrays, first, self.sums.numpy(),
-                              _width(self.channels, _SPLITS))  # fmt: skip
+    def back(self, first: int, *arrays: np.ndarray) -> None:
+        """Take in a piece's gradient: arrays as the kernel's hidden .. grad_weight."""
+        self.kernels.back_xyz(*arrays, *self.arrays, first, self.sums.numpy(), _width(self.channels, _SPLITS))
 
     def gradients(self) -> tuple[Tensor | None, ...]:
         """Of (table, offset, weight, bias, norm weight, norm bias); table and offset are not inputs here."""
@@ -231,13 +236,17 @@ class _FromTable:
         """The layer's activations of a piece (rows,C) from centroid `first` on."""
         self.kernels.hidden_table(*self.folded, self.idx.numpy(), first, out)
 
-    def begin_backward(self) -> None:
-        self.to_table, self.to_offset = torch.zeros_like(self.table), torch.zeros_like(self.sums)
+    def begin_backward(self) -> int:
+        """Returns how many copies of the weight's gradient `back` fills."""
+        batch, nodes, channels = self.table.shape
+        self.packed = torch.zeros(-(-channels // (2 * _LANES)), batch, nodes, 2 * _LANES)
+        self.to_offset = torch.empty_like(self.sums)
+        self.targets = (self.packed.view(-1).numpy(), self.to_offset.view(-1).numpy(), nodes)
+        return 1
 
-    def back(self, grad: np.ndarray, hidden: np.ndarray, constant: np.ndarray, first: int) -> None:
-        """Take in a piece's gradient, constant to be added, that arrives at the activations `hidden`."""
-        self.kernels.back_table(grad, hidden, constant, self.idx.numpy(), first,
-                                self.to_table.numpy(), self.to_offset.numpy(), _width(self.channels))  # fmt: skip
+    def back(self, first: int, *arrays: np.ndarray) -> None:
+        """Take in a piece's gradient: arrays as the kernel's hidden .. grad_weight."""
+        self.kernels.back_table(*arrays, self.idx.numpy(), first, *self.targets, _width(self.channels))
 
     def gradients(self) -> tuple[Tensor | None, ...]:
         """Of (table, offset, weight, bias, norm weight, norm bias); weight and bias are reached through the table."""
@@ -245,15 +254,14 @@ class _FromTable:
         reach = torch.zeros(*self.table.shape[:2], 4, dtype=torch.float64)
         self.kernels.reach(self.idx.numpy(), self.centers.numpy(), reach.numpy())
         total = self.to_offset.sum(0)
-        products = self._products(self.to_table, self.table, self.mean)
+        to_table = self.packed.movedim(0, 2).reshape(*self.table.shape[:2], -1)[..., : self.channels].contiguous()
+        products = self._products(to_table, self.table, self.mean)
         grad_norm = self.inverse * (products - self._products(self.to_offset, self.offset, torch.zeros_like(self.mean)))
         t0, t1 = total / self.rows, self.inverse * grad_norm / self.rows
         vectors = (self.mean.numpy(), self.scale.numpy(), t0.numpy(), t1.numpy())
-        self.kernels.back_norm(
-            self.to_table.numpy(), self.table.numpy(), reach.numpy(), self.weight_x.numpy(), *vectors
-        )
+        self.kernels.back_norm(to_table.numpy(), self.table.numpy(), reach.numpy(), self.weight_x.numpy(), *vectors)
         offset = self.scale * (neighbors * t0 + (self.sums - neighbors * self.mean) * t1 - self.to_offset)
-        return self.to_table, offset.view_as(self.offset), None, None, grad_norm, total
+        return to_table, offset.view_as(self.offset), None, None, grad_norm, total
 
     def _products(self, first: Tensor, second: Tensor, shift: Tensor) -> Tensor:
         """Per channel the sum over all rows of first * (second - shift)."""
@@ -263,9 +271,9 @@ class _FromTable:
 
 
 def _width(channels: int, splits: int = 1) -> int:
-    """Channels per task, whole cache lines: every thread has a task, the rows being cut into `splits`. No sum depends on it."""
-    tasks = -(-torch.get_num_threads() // splits)
-    return max(16, -(-channels // tasks // 16) * 16)
+    """Blocks of channels per task: every thread has a task, the rows being cut into `splits`. No sum depends on it."""
+    tasks, blocks = -(-torch.get_num_threads() // splits), -(-channels // (2 * _LANES))
+    return -(-blocks // tasks)
 
 
 @dataclass
@@ -277,10 +285,7 @@ class _Room:
 
     def __post_init__(self) -> None:
         self.arrays = (self.hidden.numpy(), self.wide.numpy())
-
-    def groups(self, neighbors: int) -> tuple[np.ndarray, np.ndarray]:
-        """The arrays as (centroids,K,C)."""
-        return tuple(array.reshape(-1, neighbors, array.shape[1]) for array in self.arrays)
+        self.flat = tuple(array.reshape(-1) for array in self.arrays)
 
 
 def _pieces(first: _FromPositions | _FromTable, widest: int) -> Iterator[tuple[slice, _Room]]:
@@ -322,48 +327,56 @@ class _Moments:
         self.held = 0
 
 
-def _pool_linear(
-    first: _FromPositions | _FromTable, weight: Tensor, bias: Tensor, sign: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Second linear layer and its pooling, piece by piece: neither layer's activations are ever stored.
+def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Second linear layer (no bias) and its pooling, piece by piece: neither layer's activations are ever stored.
 
-    Returns the extremes (M,C2), largest where sign >= 0 and else smallest, and their rows i32, and of the hidden layer h
-    the Gram matrix h'h and the sum, in float64.
+    Returns the largest values (M,C2) and their rows i32, and of the hidden layer h the Gram matrix h'h and the sum, in
+    float64.
     """
-    neighbors, c2 = first.idx.shape[2], len(bias)
+    neighbors, c2 = first.idx.shape[2], len(weight)
     count = first.rows // neighbors
     best, where = torch.empty(count, c2), torch.empty(count, c2, dtype=torch.int32)
     targets = (best.numpy(), where.numpy())
-    moments, signs = _Moments(first.channels), torch.where(sign < 0, -1.0, 1.0)
-    signed, width = (weight * signs[:, None]).t(), _width(c2)
+    moments, weight = _Moments(first.channels), weight.t()
     for piece, room in _pieces(first, c2):
         first.hidden(piece.start, room.arrays[0])
-        torch.mm(room.hidden, signed, out=room.wide)
+        torch.mm(room.hidden, weight, out=room.wide)
         moments.add(room.hidden)
-        first.kernels.largest(room.groups(neighbors)[1], *(array[piece] for array in targets), width)
+        first.kernels.largest(room.flat[1], neighbors, *(array[piece] for array in targets))
     moments.flush()
-    return best.mul_(signs).add_(bias), where, moments.gram, moments.total
+    return best, where, moments.gram, moments.total
+
+
+def _sort_pooled(
+    first: _FromPositions | _FromTable, grad: Tensor, out: Tensor, best: Tensor, where: Tensor, mean: Tensor
+) -> tuple[tuple[np.ndarray, ...], Tensor]:
+    """The kernel `sort_pooled`: (order, values, starts), and the sums (2,C2)."""
+    count, c2 = grad.shape
+    order, values = torch.empty(count, c2, dtype=torch.int32), torch.empty(count, c2)
+    starts = torch.empty(count, first.idx.shape[2] + 1, dtype=torch.int32)
+    found, sums = tuple(tensor.numpy() for tensor in (order, values, starts)), torch.zeros(2, _BLOCKS, c2).double()
+    first.kernels.sort_pooled(*(tensor.numpy() for tensor in (grad, out, best, where, mean)), *found, sums.numpy())
+    return found, sums.sum(1).float()
 
 
 def _back_pool(
-    first: _FromPositions | _FromTable, sparse: Tensor, where: Tensor, weight: Tensor, mixed: Tensor, constant: Tensor
+    first: _FromPositions | _FromTable, pooled: tuple[np.ndarray, ...], weight: Tensor, mixed: Tensor, constant: Tensor
 ) -> Tensor:
-    """Send d(linear output) = sparse (M,C2, at row `where`) and its affine part h -> h @ mixed + constant into `first`.
+    """Send d(linear output), the sparse `pooled` times weight and its affine part h -> h @ mixed + constant, into `first`.
 
-    Returns the sparse part's share of the gradient of the weight, (C2,C1).
+    Returns the sum of pooled times h, (C2,C1).
     """
-    neighbors, c1 = first.idx.shape[2], first.channels
-    first.begin_backward()
-    splits = _SPLITS if neighbors <= 256 else 1  # few and large groups: each weight matrix is worth more than a copy
-    parts, width = torch.zeros(splits, *weight.shape), _width(c1, splits)
-    arrays, weight = (sparse.numpy(), where.numpy()), weight.detach().contiguous().numpy()
+    splits, c1 = first.begin_backward(), first.channels
+    columns = torch.arange(-(-c1 // (2 * _LANES)) * 2 * _LANES)
+    columns = torch.where(columns < c1, columns, columns - _LANES)  # half a block left: twice the same
+    packed = weight[:, columns].view(len(weight), -1, 2 * _LANES).transpose(0, 1).contiguous()
+    parts = torch.zeros(splits, *packed.shape)
+    arrays = (constant.numpy(), *pooled, packed.view(-1).numpy(), parts.view(splits, -1).numpy())
     for piece, room in _pieces(first, c1):
         first.hidden(piece.start, room.arrays[0])
         torch.mm(room.hidden, mixed, out=room.wide)
-        grad = (array[piece] for array in arrays)
-        first.kernels.back_pooled(*grad, weight, *room.groups(neighbors), parts.numpy(), width)
-        first.back(*room.arrays[::-1], constant.numpy(), piece.start)
-    return parts.sum(0)
+        first.back(piece.start, *room.flat, *arrays)
+    return parts.sum(0).transpose(0, 1).reshape(len(weight), -1)[:, :c1]
 
 
 def _linear_statistics(gram: Tensor, total: Tensor, rows: int, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,6 +13,10 @@ import numpy as np
 from numba import prange
 
 from dpcli.ops.jit import parallel_kernel
+from dpcli.ops.kernels_simd import WIDTH, higher, lanes, load, store, where_lower
+
+PAIR = 2 * WIDTH  # channels that go through a backward kernel together, and the width of a block of its weights
+CHUNK = 4  # centroids whose rows stay in the cache while the blocks of weights go by
 
 
 @parallel_kernel
@@ -90,126 +94,190 @@ def hidden_table(table, offset, idx, first, out):
 
 
 @parallel_kernel
-def largest(rows, best, where, width):
-    """Per centroid and channel the largest value over its K rows, and which row; ties: the first.
+def largest(rows, neighbors, best, where):
+    """Per centroid and channel the largest value over its rows, and which row; ties: the first.
 
-    rows (M,K,C), best (M,C), where (M,C) i32; width: channels per task.
+    rows (M*K*C), best (M,C), where (M,C) i32, at least WIDTH channels. Four vectors of running maxima stay in registers
+    while the rows go by; where fewer channels are left, vectors overlap.
     """
-    count, neighbors, channels = rows.shape
-    tasks = (channels + width - 1) // width
-    for task in prange(count * tasks):
-        i, low = np.uintp(task // tasks), np.uintp(task % tasks * width)
-        high = min(low + np.uintp(width), np.uintp(channels))
-        for c in range(low, high):
-            best[i, c] = rows[i, 0, c]
-            where[i, c] = 0
-        for k in range(0, neighbors, 4):  # four rows at a time: the running maximum is read and written once for them
-            k0, k1 = np.uintp(k), np.uintp(min(k + 1, neighbors - 1))
-            k2, k3 = np.uintp(min(k + 2, neighbors - 1)), np.uintp(min(k + 3, neighbors - 1))
-            for c in range(low, high):  # selects, not branches: the loop then vectorises
-                at = np.int32(k + 1) if rows[i, k1, c] > rows[i, k0, c] else np.int32(k)
-                top = max(rows[i, k0, c], rows[i, k1, c])
-                other_at = np.int32(k + 3) if rows[i, k3, c] > rows[i, k2, c] else np.int32(k + 2)
-                other = max(rows[i, k2, c], rows[i, k3, c])
-                at = other_at if other > top else at
-                top = max(top, other)
-                where[i, c] = at if top > best[i, c] else where[i, c]
-                best[i, c] = max(best[i, c], top)
+    count, channels = best.shape
+    tasks = (channels + 4 * WIDTH - 1) // (4 * WIDTH)
+    for i in prange(count):
+        at = np.empty(channels, np.float32)  # row numbers: exact below 2^24
+        top = np.empty(channels, np.float32)
+        for task in range(tasks):
+            last = channels - WIDTH
+            c0 = task * 4 * WIDTH
+            c1, c2, c3 = min(c0 + WIDTH, last), min(c0 + 2 * WIDTH, last), min(c0 + 3 * WIDTH, last)
+            c0 = min(c0, last)
+            row = i * neighbors * channels
+            m0, m1, m2, m3 = load(rows, row + c0), load(rows, row + c1), load(rows, row + c2), load(rows, row + c3)
+            k0 = k1 = k2 = k3 = lanes(np.float32(0))
+            for k in range(1, neighbors):
+                row += channels
+                number = lanes(np.float32(k))
+                v0, v1, v2, v3 = load(rows, row + c0), load(rows, row + c1), load(rows, row + c2), load(rows, row + c3)
+                k0, k1 = where_lower(m0, v0, number, k0), where_lower(m1, v1, number, k1)
+                k2, k3 = where_lower(m2, v2, number, k2), where_lower(m3, v3, number, k3)
+                m0, m1, m2, m3 = higher(m0, v0), higher(m1, v1), higher(m2, v2), higher(m3, v3)
+            store(top, c0, m0)
+            store(top, c1, m1)
+            store(top, c2, m2)
+            store(top, c3, m3)
+            store(at, c0, k0)
+            store(at, c1, k1)
+            store(at, c2, k2)
+            store(at, c3, k3)
+        for c in range(np.uintp(channels)):
+            best[i, c] = top[c]
+            where[i, c] = np.int32(at[c])
 
 
 @parallel_kernel
-def back_pooled(grad, where, weight, hidden, dense, grad_weight, width):
-    """Add the gradient that came through the pooling: it reaches one row per centroid and channel.
+def sort_pooled(grad, out, best, where, mean, order, values, starts, sums):
+    """The gradient at a ReLU's pooled output `out`, sorted by the rows it goes to, and its sums.
 
-    grad (M,C2) of the linear output at row where (M,C2) i32; weight (C2,C1); hidden and dense (M,K,C1):
-    dense[i, where[i,o]] += grad[i,o] * weight[o] and grad_weight[split, o] += grad[i,o] * hidden[i, where[i,o]], the
-    centroids cut into splits; width: channels of C1 per task.
+    grad, out, best (M,C), where (M,C) i32 in 0..K-1, mean (C). g is grad where out > 0. Centroid i's channels with
+    out > 0 that reach row k, ascending, are order[i, starts[i,k] : starts[i,k+1]], i32, and values (M,C) f32 their g;
+    starts (M,K+1) i32. sums (2,blocks,C) f64: sums over centroids of g and of g * (best - mean).
     """
-    count, outputs = grad.shape
-    splits, channels = grad_weight.shape[0], weight.shape[1]
-    tasks = (channels + width - 1) // width
-    for task in prange(splits * tasks):
-        split, low = np.uintp(task // tasks), np.uintp(task % tasks * width)
-        high = min(low + np.uintp(width), np.uintp(channels))
-        for i in range(
-            split * np.uintp(count) // np.uintp(splits), (split + np.uintp(1)) * np.uintp(count) // np.uintp(splits)
-        ):
-            for o in range(np.uintp(outputs)):
-                g = grad[i, o]
-                if g != 0:
-                    k = np.uintp(where[i, o])
-                    for c in range(low, high):
-                        dense[i, k, c] += g * weight[o, c]
-                    for c in range(low, high):
-                        grad_weight[split, o, c] += g * hidden[i, k, c]
+    count, channels = grad.shape
+    neighbors, blocks = starts.shape[1] - 1, sums.shape[1]
+    zero = np.float32(0)
+    for block in prange(blocks):
+        slots = np.empty(neighbors + 2, np.int32)
+        for i in range(block * count // blocks, (block + 1) * count // blocks):
+            for c in range(np.uintp(channels)):
+                g = grad[i, c] if out[i, c] > zero else zero
+                sums[0, block, c] += g
+                sums[1, block, c] += g * (best[i, c] - mean[c])
+            slots[:] = 0
+            for c in range(np.uintp(channels)):
+                slots[(where[i, c] if out[i, c] > zero else neighbors) + 1] += 1
+            for k in range(neighbors):
+                slots[k + 1] += slots[k]
+                starts[i, k] = slots[k]
+            starts[i, neighbors] = slots[neighbors]
+            for c in range(np.uintp(channels)):
+                k = where[i, c] if out[i, c] > zero else neighbors  # the last: nowhere
+                slot = slots[k]
+                order[i, slot] = c
+                values[i, slot] = grad[i, c]
+                slots[k] = slot + 1
 
 
 @parallel_kernel
-def back_xyz(grad, hidden, constant, points, centers, idx, first, sums, width):
-    """Through the ReLU of `hidden_xyz`: with g = grad + constant where hidden > 0, else 0, and x as in `moments_xyz`,
+def back_xyz(
+    hidden, dense, constant, order, values, starts, weight, grad_weights, points, centers, idx, first, sums, width
+):
+    """Back through a piece's pooling, second linear layer and the ReLU of `hidden_xyz`.
 
-    sums (splits,4,C) f64 += sums over the piece's rows of g, g x, g y, g z. grad and hidden (rows,C), constant (C).
+    With g[r] = dense[r] + constant + sum over the row's pooled values of value * weight[o], where hidden[r] > 0, else 0,
+    and x as in `moments_xyz`: sums (splits,4,C1) f64 += sums over rows of g, g x, g y, g z, and
+    grad_weights[split,o] += value * hidden[r]. hidden and dense (rows*C1), constant (C1), order, values, starts: of
+    `sort_pooled`, for all centroids; weight (blocks*C2*2*WIDTH) and grad_weights (splits, the same): in blocks of channels as
+    `grouped_mlp` packs them; width: blocks per task.
     """
     count, neighbors = idx.shape[1], idx.shape[2]
     splits, _, channels = sums.shape
-    tasks = (channels + width - 1) // width
-    piece = grad.shape[0] // neighbors
-    zero = np.float32(0)
+    outputs = order.shape[1]
+    blocks = (channels + PAIR - 1) // PAIR
+    tasks = (blocks + width - 1) // width
+    piece = hidden.size // channels // neighbors
+    zero = lanes(np.float32(0))
     for task in prange(splits * tasks):
-        split, low = task // tasks, np.uintp(task % tasks * width)
-        high = min(low + np.uintp(width), np.uintp(channels))
-        parts = np.zeros((4, channels), np.float32)
-        for p in range(split * piece // splits, (split + 1) * piece // splits):
-            b, m = (first + p) // count, (first + p) % count
-            cx, cy, cz = centers[b, m, 0], centers[b, m, 1], centers[b, m, 2]
-            parts[:] = zero
-            for k in range(0, neighbors - 1, 2):
-                r = np.uintp(p * neighbors + k)
-                s = r + np.uintp(1)
-                i, j = np.uintp(idx[b, m, k]), np.uintp(idx[b, m, k + 1])
-                x0, y0, z0 = points[b, i, 0] - cx, points[b, i, 1] - cy, points[b, i, 2] - cz
-                x1, y1, z1 = points[b, j, 0] - cx, points[b, j, 1] - cy, points[b, j, 2] - cz
-                for c in range(low, high):
-                    g = grad[r, c] + constant[c] if hidden[r, c] > zero else zero
-                    h = grad[s, c] + constant[c] if hidden[s, c] > zero else zero
-                    parts[0, c] += g + h
-                    parts[1, c] += g * x0 + h * x1
-                    parts[2, c] += g * y0 + h * y1
-                    parts[3, c] += g * z0 + h * z1
-            if neighbors % 2:
-                r, j = np.uintp((p + 1) * neighbors - 1), np.uintp(idx[b, m, neighbors - 1])
-                x, y, z = points[b, j, 0] - cx, points[b, j, 1] - cy, points[b, j, 2] - cz
-                for c in range(low, high):
-                    g = grad[r, c] + constant[c] if hidden[r, c] > zero else zero
-                    parts[0, c] += g
-                    parts[1, c] += g * x
-                    parts[2, c] += g * y
-                    parts[3, c] += g * z
-            for a in range(4):
-                for c in range(low, high):
-                    sums[split, a, c] += parts[a, c]
+        split, low = task // tasks, task % tasks * width
+        high = min(low + width, blocks)
+        parts, to_weight = np.empty(8 * WIDTH, np.float32), grad_weights[split]
+        start, stop = split * piece // splits, (split + 1) * piece // splits
+        for chunk in range(start, stop, CHUNK):
+            for block in range(low, high):
+                c0 = block * PAIR
+                c1 = min(c0 + WIDTH, channels - WIDTH)
+                base = block * outputs * PAIR
+                add0, add1 = load(constant, c0), load(constant, c1)
+                for p in range(chunk, min(chunk + CHUNK, stop)):
+                    i = first + p
+                    b, m = i // count, i % count
+                    cx, cy, cz = centers[b, m, 0], centers[b, m, 1], centers[b, m, 2]
+                    t0 = t1 = x0 = x1 = y0 = y1 = z0 = z1 = zero
+                    for k in range(neighbors):
+                        row = (p * neighbors + k) * channels
+                        h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
+                        g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
+                        for slot in range(starts[i, k], starts[i, k + 1]):
+                            w = base + order[i, slot] * PAIR
+                            value = lanes(values[i, slot])
+                            g0 = g0 + value * load(weight, w)
+                            g1 = g1 + value * load(weight, w + WIDTH)
+                            store(to_weight, w, load(to_weight, w) + value * h0)
+                            store(to_weight, w + WIDTH, load(to_weight, w + WIDTH) + value * h1)
+                        g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+                        j = idx[b, m, k]
+                        x, y, z = lanes(points[b, j, 0] - cx), lanes(points[b, j, 1] - cy), lanes(points[b, j, 2] - cz)
+                        t0, x0, y0, z0 = t0 + g0, x0 + g0 * x, y0 + g0 * y, z0 + g0 * z
+                        t1, x1, y1, z1 = t1 + g1, x1 + g1 * x, y1 + g1 * y, z1 + g1 * z
+                    store(parts, 0 * WIDTH, t0)
+                    store(parts, 1 * WIDTH, x0)
+                    store(parts, 2 * WIDTH, y0)
+                    store(parts, 3 * WIDTH, z0)
+                    store(parts, 4 * WIDTH, t1)
+                    store(parts, 5 * WIDTH, x1)
+                    store(parts, 6 * WIDTH, y1)
+                    store(parts, 7 * WIDTH, z1)
+                    for a in range(4):
+                        for c in range(WIDTH):
+                            sums[split, a, c0 + c] += parts[a * WIDTH + c]
+                            if c1 > c0:
+                                sums[split, a, c1 + c] += parts[(4 + a) * WIDTH + c]
 
 
 @parallel_kernel
-def back_table(grad, hidden, constant, idx, first, to_table, to_offset, width):
-    """Through the ReLU of `hidden_table`: g as in `back_xyz`; to_table[idx[r]] += g and to_offset[i] += g.
+def back_table(
+    hidden, dense, constant, order, values, starts, weight, grad_weights, idx, first, to_table, to_offset, nodes, width
+):
+    """As `back_xyz`, through the ReLU of `hidden_table`: to_table[idx[r]] += g and to_offset[i] = sum of g.
 
-    grad and hidden (rows,C), constant (C), to_table (B,N,C), to_offset (B*M,C).
+    to_table (blocks*B*N*2*WIDTH), in blocks of channels (rows of all channels would fall on few sets of the cache),
+    to_offset (B*M*C1), nodes = N; grad_weights has one split.
     """
-    count, neighbors = idx.shape[1], idx.shape[2]
-    channels = grad.shape[1]
-    zero = np.float32(0)
-    for task in prange((channels + width - 1) // width):
-        low = np.uintp(task * width)
-        high = min(low + np.uintp(width), np.uintp(channels))
-        for r in range(np.uintp(grad.shape[0])):
-            i = np.uintp(first) + r // np.uintp(neighbors)
-            b, m = i // np.uintp(count), i % np.uintp(count)
-            j = np.uintp(idx[b, m, r % np.uintp(neighbors)])
-            for c in range(low, high):
-                g = grad[r, c] + constant[c] if hidden[r, c] > zero else zero
-                to_table[b, j, c] += g
-                to_offset[i, c] += g
+    grad_weight = grad_weights[0]
+    batch, count, neighbors = idx.shape
+    channels, outputs = constant.size, order.shape[1]
+    blocks = (channels + PAIR - 1) // PAIR
+    piece = hidden.size // channels // neighbors
+    zero = lanes(np.float32(0))
+    for task in prange((blocks + width - 1) // width):
+        low = task * width
+        high = min(low + width, blocks)
+        for chunk in range(0, piece, CHUNK):
+            for block in range(low, high):
+                c0 = block * PAIR
+                c1 = min(c0 + WIDTH, channels - WIDTH)
+                base = block * outputs * PAIR
+                add0, add1 = load(constant, c0), load(constant, c1)
+                for p in range(chunk, min(chunk + CHUNK, piece)):
+                    i = first + p
+                    b, m = i // count, i % count
+                    t0 = t1 = zero
+                    for k in range(neighbors):
+                        row = (p * neighbors + k) * channels
+                        h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
+                        g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
+                        for slot in range(starts[i, k], starts[i, k + 1]):
+                            w = base + order[i, slot] * PAIR
+                            value = lanes(values[i, slot])
+                            g0 = g0 + value * load(weight, w)
+                            g1 = g1 + value * load(weight, w + WIDTH)
+                            store(grad_weight, w, load(grad_weight, w) + value * h0)
+                            store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
+                        g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+                        t0, t1 = t0 + g0, t1 + g1
+                        at = ((block * batch + b) * nodes + idx[b, m, k]) * PAIR
+                        store(to_table, at, load(to_table, at) + g0)
+                        store(to_table, at + WIDTH, load(to_table, at + WIDTH) + g1)
+                    store(to_offset, i * channels + c0, t0)
+                    store(to_offset, i * channels + c1, t1)
 
 
 @parallel_kernel
