@@ -104,8 +104,19 @@ def test_foreground_against_its_description(seed):
         return  # which of two equal components is taken is nobody's business
     largest = labels == 1 + sizes.argmax()
     np.testing.assert_array_equal(foreground(frame, 0).astype(bool), largest)
-    eroded = ndimage.binary_erosion(largest, np.ones((3, 3)), border_value=1)
-    np.testing.assert_array_equal(foreground(frame, 1).astype(bool), eroded)
+    for passes in (1, 3):
+        eroded = ndimage.binary_erosion(largest, np.ones((3, 3)), passes, border_value=1)
+        np.testing.assert_array_equal(foreground(frame, passes).astype(bool), eroded)
+
+
+@pytest.mark.parametrize("row", [0, 1, 9, 17, 18])
+@pytest.mark.parametrize("column", [0, 1, 25, 26])
+def test_the_rim_comes_off_inside_the_image_but_not_at_its_border(row, column):
+    frame = np.zeros((24, 32), np.uint8)
+    frame[row : row + 6, column : column + 6] = 200
+    expected = ndimage.binary_erosion(frame > 0, np.ones((3, 3)), 2, border_value=1)
+    np.testing.assert_array_equal(foreground(frame, 2).astype(bool), expected)
+    assert foreground(np.zeros_like(frame)).sum() == 0
 
 
 def test_the_default_keeps_the_eroded_hand_without_the_speck(tmp_path):

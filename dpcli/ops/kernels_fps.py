@@ -15,7 +15,8 @@ from dpcli.ops.jit import kernel
 
 BUCKET = 32  # points per bucket: 16 and 64 measured slower or equal on 2 k - 32 k points
 GROUP = 8  # buckets in a group, with a box of its own: 16 is a tenth faster on 32 k points, a quarter slower on 4 k
-_CELLS = 1023.0  # Morton cells per axis minus one: 10 bits each, three radix passes
+_SMALL = 8192  # points up to which 7 bits per axis and two radix passes do; more get 10 and three
+_DIGIT = 11  # bits sorted per radix pass: 2,048 counters stay in the nearest cache
 
 
 @kernel
@@ -28,18 +29,17 @@ def _spread_bits(v):
 
 
 @kernel
-def _morton_keys(points, n):
-    low = np.empty(3, np.float64)
-    extent = 0.0
-    for axis in range(3):
-        least = points[0, axis]
-        most = least
-        for i in range(n):
-            least = min(least, points[i, axis])
-            most = max(most, points[i, axis])
-        low[axis] = least
-        extent = max(extent, np.float64(most) - np.float64(least))
-    scale = _CELLS / extent if extent > 0.0 else 0.0
+def _morton_keys(points, n, bits):
+    """Morton keys i32 (n) with `bits` bits per axis."""
+    lx, ly, lz = points[0, 0], points[0, 1], points[0, 2]
+    mx, my, mz = lx, ly, lz
+    for i in range(n):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        lx, ly, lz = min(lx, x), min(ly, y), min(lz, z)
+        mx, my, mz = max(mx, x), max(my, y), max(mz, z)
+    low = (np.float64(lx), np.float64(ly), np.float64(lz))
+    extent = max(max(mx - low[0], my - low[1]), mz - low[2])
+    scale = ((1 << bits) - 1.0) / extent if extent > 0.0 else 0.0
     keys = np.empty(n, np.int32)
     for i in range(n):
         keys[i] = (
@@ -52,19 +52,21 @@ def _morton_keys(points, n):
 
 @kernel
 def _morton_order(points, n):
-    """Indices of the first `n` points along the Morton curve: a stable radix sort of 30-bit keys."""
-    keys = _morton_keys(points, n)
+    """Indices of the first `n` points along the Morton curve: a stable radix sort of their keys."""
+    bits = 7 if n <= _SMALL else 10
+    keys = _morton_keys(points, n, bits)
     order = np.arange(n).astype(np.int32)
     other = np.empty(n, np.int32)
-    start = np.empty(1025, np.int32)
-    for shift in (0, 10, 20):
+    start = np.empty((1 << _DIGIT) + 1, np.int32)
+    mask = (1 << _DIGIT) - 1
+    for shift in range(0, 3 * bits, _DIGIT):
         start[:] = 0
         for i in range(n):
-            start[((keys[i] >> shift) & 1023) + 1] += 1
-        for digit in range(1024):
+            start[((keys[i] >> shift) & mask) + 1] += 1
+        for digit in range(mask + 1):
             start[digit + 1] += start[digit]
         for i in range(n):
-            digit = (keys[order[i]] >> shift) & 1023
+            digit = (keys[order[i]] >> shift) & mask
             other[start[digit]] = order[i]
             start[digit] += 1
         order, other = other, order
@@ -78,14 +80,13 @@ def _fill_buckets(points, n, order, xyz, box):
     for b in range((n + BUCKET - 1) // BUCKET):
         first = b * BUCKET
         for axis in range(3):
-            box[2 * axis, b] = points[order[first], axis]
-            box[2 * axis + 1, b] = points[order[first], axis]
-        for i in range(first, min(first + BUCKET, n)):
-            for axis in range(3):
+            least = points[order[first], axis]
+            most = least
+            for i in range(first, min(first + BUCKET, n)):
                 value = points[order[i], axis]
                 xyz[axis, i] = value
-                box[2 * axis, b] = min(box[2 * axis, b], value)
-                box[2 * axis + 1, b] = max(box[2 * axis + 1, b], value)
+                least, most = min(least, value), max(most, value)
+            box[2 * axis, b], box[2 * axis + 1, b] = least, most
 
 
 @kernel
@@ -168,7 +169,8 @@ def _farthest(data, top, group_top, order, n):
     most = np.float32(0)
     for group in range(group_top.size):
         most = max(most, group_top[group])
-    found = n
+    none = np.int32(n)
+    found = none
     for group in range(group_top.size):
         if group_top[group] == most:
             for b in range(group * GROUP, group * GROUP + GROUP):
@@ -183,7 +185,7 @@ def _farthest(data, top, group_top, order, n):
 def _sample(points, n, start, out):
     buckets = (n + BUCKET - 1) // BUCKET
     groups = (buckets + GROUP - 1) // GROUP
-    order = np.empty(n, np.int32)
+    order = np.full(groups * GROUP * BUCKET, n, np.int32)
     xyz = np.zeros((3, groups * GROUP * BUCKET), np.float32)
     box, group_box = np.zeros((6, groups * GROUP), np.float32), np.empty((6, groups), np.float32)
     _fill_buckets(points, n, order, xyz, box)

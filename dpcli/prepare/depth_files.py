@@ -58,26 +58,35 @@ def video_frames(path: Path, start: int = 0, stop: int | None = None, stride: in
     """
     capture = open_video(path)
     try:
-        index = 0
-        while (stop is None or index < stop) and capture.grab():
-            if index >= start and (index - start) % stride == 0:
-                ok, frame = capture.retrieve()
-                if not ok:
-                    raise DataError(f"{path}: frame {index} cannot be decoded")
-                yield np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
-            index += 1
+        yield from _decoded(capture, path, start, stop, stride)
     finally:
         capture.release()
 
 
-def frame_rate(path: Path) -> float | None:
-    """Frames per second that a video file declares, or None."""
+def read_video(
+    path: Path, start: int = 0, stop: int | None = None, stride: int = 1
+) -> tuple[list[np.ndarray], float | None]:
+    """What `video_frames` yields, and the frames per second that the file declares (None = says nothing)."""
     import cv2
 
     capture = open_video(path)
-    rate = float(capture.get(cv2.CAP_PROP_FPS))
-    capture.release()
-    return rate if np.isfinite(rate) and 0 < rate < 10_000 else None
+    try:
+        rate = float(capture.get(cv2.CAP_PROP_FPS))
+        frames = list(_decoded(capture, path, start, stop, stride))
+    finally:
+        capture.release()
+    return frames, rate if np.isfinite(rate) and 0 < rate < 10_000 else None
+
+
+def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> Iterator[np.ndarray]:
+    index = 0
+    while (stop is None or index < stop) and capture.grab():
+        if index >= start and (index - start) % stride == 0:
+            ok, frame = capture.retrieve()
+            if not ok:
+                raise DataError(f"{path}: frame {index} cannot be decoded")
+            yield np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
+        index += 1
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -134,10 +143,10 @@ def read_depth_video(path: Path, stride: int = 1) -> DepthVideo:
     elif suffix == ".npy":
         video = DepthVideo(read_array(path, stride))
     elif suffix in VIDEO_SUFFIXES:
-        frames = list(video_frames(path, stride=stride))
+        frames, rate = read_video(path, stride=stride)
         if not frames:
             raise DataError(f"{path}: an empty video: no frame can be decoded")
-        video = DepthVideo(np.stack(frames), frame_rate(path))
+        video = DepthVideo(np.stack(frames), rate)
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:

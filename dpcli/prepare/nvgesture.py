@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics, pixel_rays
-from dpcli.prepare.depth_files import frame_rate, video_frames
+from dpcli.prepare.depth_files import read_video
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
 
@@ -60,11 +61,26 @@ def foreground(frame: np.ndarray, erode: int = 1) -> np.ndarray:
     x, y, width, height = cv2.boundingRect(mask)
     window = mask[y : y + height, x : x + width]
     if window.size:
-        # areas from the labels of the foreground alone: four times faster than OpenCV's statistics
-        _, labels = cv2.connectedComponents(window, connectivity=4)
-        areas = np.bincount(labels.reshape(-1)[np.flatnonzero(window.view(bool))])
-        window[...] = labels == areas.argmax()
-    return cv2.erode(mask, np.ones((3, 3), np.uint8), iterations=erode) if erode else mask
+        count, labels = cv2.connectedComponents(window, connectivity=4)
+        if count > 2:
+            # areas from the labels of the foreground alone: four times faster than OpenCV's statistics
+            areas = np.bincount(labels.reshape(-1).take(np.flatnonzero(window.view(bool))))
+            np.equal(labels, areas.argmax(), out=window.view(bool))
+    if erode and window.size:
+        # one pixel around it is empty, or is the image's border, beyond which OpenCV takes the pixels for set
+        window = mask[max(y - 1, 0) : y + height + 1, max(x - 1, 0) : x + width + 1]
+        cv2.erode(window, np.ones((3, 3), np.uint8), dst=window, iterations=erode)
+    return mask
+
+
+@lru_cache(maxsize=2)
+def pixel_places(height: int, width: int) -> np.ndarray:
+    """Row, column and 0 of every pixel in raster order, f32 (H*W, 3)."""
+    places = np.zeros((height, width, 3), np.float32)
+    places[..., 0] = np.arange(height)[:, None]
+    places[..., 1] = np.arange(width)
+    places.setflags(write=False)
+    return places.reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -142,7 +158,7 @@ class NvGesture:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         start, stop = item.extra["start"], item.extra["stop"]
-        frames = list(video_frames(item.path, start, stop))
+        frames, rate = read_video(item.path, start, stop)
         if not frames:
             raise DataError(f"{item.path}: ends before frame {start}; the list asks for frames {start} to {stop - 1}")
         clouds = [self._points(frame) for frame in frames]
@@ -154,7 +170,7 @@ class NvGesture:
             item.name,
             np.concatenate(clouds),
             offsets(counts[kept]),
-            time=kept / (frame_rate(item.path) or 30.0),
+            time=kept / (rate or 30.0),
             **describe(item),
         )
         return Sample(sequence, notes)
@@ -162,16 +178,16 @@ class NvGesture:
     def _points(self, frame: np.ndarray) -> np.ndarray:
         if frame.dtype != np.uint8:
             raise DataError(f"frames of {frame.dtype}; expected 8-bit depth")
-        seen = frame > 0
-        if self.foreground == "otsu":
-            seen &= foreground(frame, self.erode).view(bool)
+        # the foreground is brighter than a threshold of 0 or more: nothing unseen is in it
+        seen = foreground(frame, self.erode).view(bool) if self.foreground == "otsu" else frame > 0
         pixels = np.flatnonzero(seen)
-        depth = frame.reshape(-1)[pixels].astype(np.float32)
+        depth = frame.reshape(-1).take(pixels).astype(np.float32)
         if self.coordinates == "camera":
             z = 255 - depth  # a grey level of 255 would be the camera itself
             return (pixel_rays(*frame.shape, INTRINSICS)[pixels] * z[:, None])[z > 0]
-        row, column = np.divmod(pixels, frame.shape[1])
-        return np.stack([row, column, depth], axis=1).astype(np.float32)
+        points = pixel_places(*frame.shape).take(pixels, axis=0)
+        points[:, 2] = depth
+        return points
 
     def summary(self, items: list[Item]) -> list[str]:
         found = Counter(item.split for item in items if not item.problem)

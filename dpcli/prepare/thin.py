@@ -57,7 +57,7 @@ class Thinning:
         for name in ("points", *POINT_FIELDS):
             values = getattr(sequence, name)
             if values is not None:
-                setattr(sequence, name, values[index])
+                setattr(sequence, name, values.take(index, axis=0))
         return sequence
 
 

@@ -15,6 +15,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DpcError
+from dpcli.runtime.memory import keep_freed_memory
 
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
 _SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -29,6 +30,7 @@ def _start_worker() -> None:
         signal.signal(number, signal.SIG_IGN)
     os.environ.update({name: "1" for name in _SINGLE_THREAD})
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    keep_freed_memory()  # one item takes what the one before gave back
 
 
 def _end_with_parent() -> None:
