@@ -31,8 +31,10 @@ def step(function: Callable, tensors: list[torch.Tensor], views: list[torch.Tens
     start = time.perf_counter()
     colors, alphas, notes = function(*leaves, *views, size, size)
     middle = time.perf_counter()
-    torch.autograd.backward([colors, alphas], [torch.ones_like(colors), torch.ones_like(alphas)])
-    times = middle - start, time.perf_counter() - middle
+    incoming = [torch.ones_like(colors), torch.ones_like(alphas)]  # what a loss would hand over: not timed
+    again = time.perf_counter()
+    torch.autograd.backward([colors, alphas], incoming)
+    times = middle - start, time.perf_counter() - again
     return [colors.detach(), *(leaf.grad for leaf in leaves)], notes, times
 
 
