@@ -111,6 +111,7 @@ bench: $(READY)
 	$(BIN)/python -m tests.bench.bench_splatting
 	$(BIN)/python -m tests.bench.bench_video_metrics
 	$(BIN)/python -m tests.bench.bench_part_metrics
+	$(BIN)/python -m tests.bench.bench_segment
 	$(DPC) classify profile --preset thesis --steps
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_store $(BENCH_DATA))
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
