@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.toml_file import read_toml
 
 if TYPE_CHECKING:
     import torch
@@ -64,21 +65,13 @@ class Checked:
 @cache
 def known() -> dict[str, Weights]:
     """The weights that learned metrics can use, by name, from weights.toml."""
-    return {name: _entry(name, dict(fields)) for name, fields in _read_list(LIST).items()}
+    return {name: _entry(name, dict(fields)) for name, fields in read_toml(LIST).items()}
 
 
 def _entry(name: str, fields: dict[str, Any]) -> Weights:
     shared = {key: fields[key] for key in ("licence", "used_by")}
     beside = tuple(Weights(name=name, **shared, **more) for more in fields.pop("beside", []))
     return Weights(name=name, beside=beside, **fields)
-
-
-def _read_list(path: Path) -> dict[str, dict[str, Any]]:
-    try:
-        import tomllib
-    except ImportError:  # before Python 3.11
-        import tomli as tomllib
-    return tomllib.loads(path.read_text("utf-8"))
 
 
 def named(name: str) -> Weights:

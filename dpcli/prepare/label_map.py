@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
-from dpcli.prepare.toml_file import read_toml
+from dpcli.runtime.toml_file import read_toml
 
 
 @dataclass(frozen=True)

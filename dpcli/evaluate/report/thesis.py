@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.resources import files
+from importlib.resources import as_file, files
 from typing import Any
 
-from dpcli.errors import DpcError, UsageError
+from dpcli.errors import UsageError
 from dpcli.evaluate.report.blocks import Cell, Table, is_number, table, title_of
+from dpcli.runtime.toml_file import read_toml
 
 _FACTOR = {("fraction", "percent"): 100.0, ("", "1/100 length unit"): 100.0}
 _WORDS = {"percent": "%", "1": "", "1/100 length unit": "\u00d7100"}
@@ -72,16 +72,10 @@ class ThesisTable:
 @lru_cache(maxsize=1)
 def thesis_tables() -> tuple[ThesisTable, ...]:
     """All tables, in the thesis's order."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:
-        try:
-            import tomli as tomllib
-        except ImportError:
-            raise DpcError("reading TOML on Python 3.10 needs a package: pip install tomli") from None
-    text = files(__package__).joinpath("thesis_tables.toml").read_text("utf-8")
+    with as_file(files(__package__).joinpath("thesis_tables.toml")) as path:
+        tables = read_toml(path)["table"]
     made = []
-    for own in tomllib.loads(text)["table"]:
+    for own in tables:
         known = own.pop("recognise", {})
         own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
         made.append(
