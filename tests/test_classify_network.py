@@ -10,7 +10,7 @@ import torch
 
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinet import Kinet, fuse
-from dpcli.classify.pointnet2 import GlobalHead, he_init
+from dpcli.classify.layers import GlobalHead, he_init
 from dpcli.classify.profile import body_like_clip, count_parameters, macs, measure, paper_parameters, render
 from dpcli.errors import DataError, UsageError
 from dpcli.ops import fps
@@ -94,8 +94,8 @@ def test_a_shift_of_the_body_only_reaches_the_absolute_inputs(config):
     features = []
     for points in (clip, clip + shift):
         groups = model.group(points)
-        taps, _ = model.static.taps(groups)
-        features.append((taps[1][1], model.dynamic.features(groups, taps)))
+        stages, _ = model.static.taps(groups)
+        features.append((stages[1].activations[1], model.dynamic.features(stages)))
     assert torch.allclose(features[0][0], features[1][0], atol=1e-4)
 
 

@@ -24,6 +24,7 @@ class KinetConfig:
         "none"  # none | center (subtract the clip's mean) | unit (and divide by the largest radius) | image
     )
     variant: str = "thesis"
+    backbone: str = "pointnet2"  # pointnet2 | dgcnn | spidercnn | module:Class of the user's
     centroids: tuple[int, int] = (1024, 512)
     neighbors: int = 64
     radii: tuple[float, float] = (0.5, 1.0)  # at time distance 0
@@ -31,8 +32,9 @@ class KinetConfig:
     grouping: str = (
         "balanced"  # which neighbours within the radius: first | nearest | balanced (equal shares of each frame)
     )
-    widths: tuple[tuple[int, int], ...] = ((64, 128), (128, 256), (512, 1024))
+    widths: tuple[tuple[int, ...], ...] = ((64, 128), (128, 256), (512, 1024))  # the backbone's own, a tuple a stage
     # dynamic branch
+    head: tuple[int, int] | None = None  # widths of its head; None: the last of `widths`
     group_size: int = 4  # d of eq. 3.5
     reduction: float = 0.5  # c relative to the static width
     xyz_group: bool = False  # one more group: the neighbour's relative coordinates
@@ -65,6 +67,15 @@ class KinetConfig:
             raise UsageError(f"--radius {self.radii[0]}: expected a number above 0")
 
     def _check_sizes(self) -> None:
+        if self.backbone == "pointnet2":
+            self._check_centroids()
+        reach = 2 * self.temporal_radius + 1
+        if self.grouping == "balanced" and self.neighbors < reach:
+            raise UsageError(
+                f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
+            )
+
+    def _check_centroids(self) -> None:
         first, second = self.centroids
         if not 1 <= second <= first:
             raise UsageError(f"centroids = {self.centroids}: expected two counts, the second not above the first")
@@ -73,11 +84,11 @@ class KinetConfig:
             raise UsageError(
                 f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {first} centroids"
             )
-        reach = 2 * self.temporal_radius + 1
-        if self.grouping == "balanced" and self.neighbors < reach:
-            raise UsageError(
-                f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
-            )
+
+    @property
+    def dynamic_head(self) -> tuple[int, int]:
+        """Widths of the dynamic branch's head."""
+        return self.head or self.widths[-1]
 
     @classmethod
     def release(cls, **changes: object) -> KinetConfig:
@@ -115,6 +126,8 @@ class KinetConfig:
             raise DataError(f"the model's configuration has unknown keys {', '.join(unknown)}; a newer dpc wrote it")
         for key in ("centroids", "radii"):
             values[key] = tuple(values[key])
+        if values.get("head"):
+            values["head"] = tuple(values["head"])
         values["widths"] = tuple(tuple(pair) for pair in values["widths"])
         return cls(**values)
 

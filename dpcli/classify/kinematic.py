@@ -1,20 +1,22 @@
 """The dynamic stream: kinematic learning units that fit space-time surfaces to a frozen static network's activations.
 
 A unit (thesis figure 3.4) reduces the features of a neighbourhood, splits them into groups, fits one surface a group with
-weights from the previous unit's deviations, and hands on the normals. `Kinematics` runs the four units; how their normals
+weights from the previous unit's deviations, and hands on the normals. `Kinematics` runs the units; how their normals
 become one feature per centroid is the business of `merge`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from dpcli.classify.backbone import Grouping, Stage
 from dpcli.classify.config import KinetConfig
+from dpcli.classify.layers import GlobalHead, he_init
 from dpcli.classify.merge import build_merge
-from dpcli.classify.pointnet2 import GlobalHead, Grouping, he_init
 from dpcli.classify.st_surface import deviations, fit_surface, projected_deviations, surface_normal
 from dpcli.ops import gather_points
 
@@ -103,37 +105,39 @@ class KinematicUnit(nn.Module):
 
 
 class Kinematics(nn.Module):
-    """The dynamic branch over a frozen backbone's four taps: units, merge, head."""
+    """The dynamic branch over a frozen backbone's stages: a unit for each tapped layer, merge, head."""
 
-    def __init__(self, config: KinetConfig) -> None:
+    def __init__(self, config: KinetConfig, tap_widths: Sequence[Sequence[int]]) -> None:
         super().__init__()
         self.config = config
         self.units = nn.ModuleList()
         previous = 0
-        for width in (*config.widths[0], *config.widths[1]):
+        for width in (width for stage in tap_widths for width in stage):
             self.units.append(KinematicUnit(config, width, previous))
             previous = self.units[-1].groups
-        self.merge = build_merge(config, [unit.channels for unit in self.units])
-        self.head = GlobalHead(self.merge.channels, config.widths[2], config.num_classes, config.dropout)
+        self.merge = build_merge(config, tap_widths, [unit.channels for unit in self.units])
+        self.head = GlobalHead(self.merge.channels, config.dynamic_head, config.num_classes, config.dropout)
         he_init(self)
 
-    def forward(self, groups: list[Grouping], taps: list[list[Tensor]]) -> Tensor:
-        """Class logits (B,C) from the backbone's groups and activations."""
-        return self.head(groups[1].centers, self.features(groups, taps))
+    def forward(self, stages: list[Stage]) -> Tensor:
+        """Class logits (B,C) from the backbone's neighbourhoods and activations."""
+        return self.head(stages[-1].grouping.centers, self.features(stages))
 
-    def features(self, groups: list[Grouping], taps: list[list[Tensor]]) -> Tensor:
-        """The merged dynamic feature of every stage-2 centroid, (B,M2,C)."""
+    def features(self, stages: list[Stage]) -> Tensor:
+        """The merged dynamic feature of every centroid of the last stage, (B,M,C)."""
         surfaces: list[Surface] = []
-        previous, units = None, iter(self.units)
-        for stage, (group, activations) in enumerate(zip(groups, taps)):
+        previous, units, before = None, iter(self.units), None
+        for stage in stages:
+            group = stage.grouping
             relative, times = group.relative(), group.neighbor_times()
-            if stage and previous is not None:
-                previous = self._to_next_stage(previous, groups[stage - 1], group)
-            for activation in activations:
+            if before is not None and previous is not None:
+                previous = self._to_next_stage(previous, before, group)
+            for activation in stage.activations:
                 surface = next(units)(activation, relative, times, group.center_times, previous)
                 surfaces.append(surface)
                 previous = surface.deviations
-        return self.merge(groups, [surface.normals for surface in surfaces])
+            before = group
+        return self.merge([stage.grouping for stage in stages], [surface.normals for surface in surfaces])
 
     def _to_next_stage(self, deviations: Tensor, before: Grouping, group: Grouping) -> Tensor:
         """Deviations of the next stage's neighbours: those are centroids here, each with a deviation of its own.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dpcli.classify.backbone import Grouping, Stage, build_backbone, clip_points
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinematic import Kinematics
-from dpcli.classify.pointnet2 import Grouping, PointNet2
 
 STREAMS = ("static", "dynamic")
 
@@ -18,29 +18,28 @@ class Kinet(nn.Module):
     def __init__(self, config: KinetConfig) -> None:
         super().__init__()
         self.config = config
-        self.static = PointNet2(config)
-        self.dynamic = Kinematics(config)
+        self.static = build_backbone(config)
+        self.dynamic = Kinematics(config, self.static.tap_widths)
 
     def group(self, points: Tensor) -> list[Grouping]:
         """Neighbourhoods of a batch of clips: points (B,T,P,3), frame after frame."""
-        batch, frames, count = points.shape[:3]
-        times = torch.arange(frames, device=points.device, dtype=points.dtype).repeat_interleave(count)
-        return self.static.group(points.reshape(batch, frames * count, 3), times.expand(batch, -1).contiguous())
+        return self.static.group(*clip_points(points))
 
     def static_logits(self, points: Tensor) -> Tensor:
         return self.static(self.group(points))
 
     def dynamic_logits(self, points: Tensor) -> Tensor:
         """Gradients reach the dynamic branch only; the static network must be in eval mode."""
-        groups = self.group(points)
-        taps, _ = self.static.taps(groups)
-        return self.dynamic(groups, taps)
+        return self.dynamic(self._stages(points)[0])
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
-        groups = self.group(points)
-        taps, static = self.static.taps(groups)
-        return static, self.dynamic(groups, taps)
+        stages, static = self._stages(points)
+        return static, self.dynamic(stages)
+
+    @torch.no_grad()
+    def _stages(self, points: Tensor) -> tuple[list[Stage], Tensor]:
+        return self.static.taps(self.group(points))
 
     def freeze_static(self) -> None:
         """Stop the static stream's gradients and keep its batch norms at their running statistics."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
+from dpcli.classify.backbone import Grouping
 from dpcli.classify.config import KinetConfig
-from dpcli.classify.pointnet2 import Grouping
+from dpcli.errors import UsageError
 from dpcli.ops import gather_points, three_nn_interpolate
 
 
@@ -17,8 +20,10 @@ class ResidualMerge(nn.Module):
     is noisy, and a maximum would pick the noise. With `norm` the sum is batch-normalised before the ReLU.
     """
 
-    def __init__(self, channels: list[int], widths: list[int], norm: bool) -> None:
+    def __init__(self, channels: list[int], tap_widths: Sequence[Sequence[int]], norm: bool) -> None:
         super().__init__()
+        widths = [width for stage in tap_widths for width in stage]
+        self.stage_of = [number for number, stage in enumerate(tap_widths) for _ in stage]
         self.norms = nn.ModuleList(nn.BatchNorm1d(width, eps=1e-3) if norm else nn.Identity() for width in widths)
         self.abstract = nn.ModuleList(nn.Linear(c, w) for c, w in zip(channels, widths))
         self.align = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
@@ -26,10 +31,10 @@ class ResidualMerge(nn.Module):
 
     def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
         state = self._activate(0, self.abstract[0](normals[0]))
-        per_stage = len(normals) // len(groups)
         for level in range(1, len(normals)):
-            if level % per_stage == 0:
-                state = gather_points(state, groups[level // per_stage].idx).mean(2)
+            stage = self.stage_of[level]
+            if stage != self.stage_of[level - 1]:
+                state = gather_points(state, groups[stage].idx).mean(2)
             state = self._activate(level, self.abstract[level](normals[level]) + self.align[level - 1](state))
         return state
 
@@ -71,8 +76,14 @@ class CrossMerge(nn.Module):
         return states[1]
 
 
-def build_merge(config: KinetConfig, channels: list[int]) -> ResidualMerge | CrossMerge:
+def build_merge(
+    config: KinetConfig, tap_widths: Sequence[Sequence[int]], channels: list[int]
+) -> ResidualMerge | CrossMerge:
     """The merge that `config.merge` names, for units with these normal widths."""
-    if config.merge == "cross":
-        return CrossMerge(channels)
-    return ResidualMerge(channels, [*config.widths[0], *config.widths[1]], config.merge_norm)
+    if config.merge == "residual":
+        return ResidualMerge(channels, tap_widths, config.merge_norm)
+    if [len(stage) for stage in tap_widths] != [2, 2]:
+        raise UsageError(
+            f"--variant release with --backbone {config.backbone}: its merge pairs two stages of two layers; use --variant thesis"
+        )
+    return CrossMerge(channels)

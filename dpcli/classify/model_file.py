@@ -8,8 +8,10 @@ from pathlib import Path
 
 from torch import nn
 
+from dpcli.classify.backbone import BACKBONES
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinet import Kinet
+from dpcli.errors import UsageError
 from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 
 
@@ -41,11 +43,19 @@ def find_model(name: str) -> Path:
     return find_weights(name, SHIPPED, _MAKER)
 
 
-def load_model(name: str) -> tuple[Kinet, ModelInfo]:
-    """A Kinet in eval mode. DataError when the file is not one of ours or its weights don't fit its configuration."""
+def load_model(name: str, backbone: str | None = None) -> tuple[Kinet, ModelInfo]:
+    """A Kinet in eval mode. DataError when the file is not one of ours or its weights don't fit its configuration.
+
+    A model on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
+    """
     path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
-    model = Kinet(KinetConfig.from_json(header["config"]))
+    config = KinetConfig.from_json(header["config"])
+    if config.backbone not in BACKBONES and config.backbone != backbone:
+        raise UsageError(
+            f"{path}: made on the backbone {config.backbone}, which is code of yours; if you trust it, add --backbone {config.backbone}"
+        )
+    model = Kinet(config)
     load_state(model, tensors, path)
     names, notes = json.loads(header["class_names"]), json.loads(header["notes"])
     return model.eval(), ModelInfo(model.config, names, header["timing"], notes)

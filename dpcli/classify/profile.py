@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from dpcli.classify.backbone import Stage
 from dpcli.classify.kinet import Kinet, fuse
 from dpcli.runtime.memory import peak_memory
 
@@ -34,35 +35,22 @@ def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
 
     groups = model.group(points)
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        taps, _ = model.static.taps(groups)
+        stages, _ = model.static.taps(groups)
     static = counter.get_total_flops() // 2
-    # The count of the network as it is written in papers: each layer on every gathered neighbour.
-    dense = _dense_static_macs(model)
+    written = getattr(model.static, "macs_as_written", lambda: static)()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        model.dynamic(groups, taps)
-    dynamic = counter.get_total_flops() // 2 + _fit_macs(model)
-    return {"static": static, "static_as_written": dense, "dynamic": dynamic, "total": static + dynamic}
+        model.dynamic(stages)
+    dynamic = counter.get_total_flops() // 2 + _fit_macs(model, stages)
+    return {"static": static, "static_as_written": written, "dynamic": dynamic, "total": static + dynamic}
 
 
-def _dense_static_macs(model: Kinet) -> int:
-    config, static = model.config, model.static
-    total = 0
-    for count, stage in zip(config.centroids, (static.stage1, static.stage2)):
-        total += count * config.neighbors * (stage.linear1.weight.numel() + stage.linear2.weight.numel())
-    head = static.head
-    return (
-        total
-        + config.centroids[1] * (head.linear1.weight.numel() + head.linear2.weight.numel())
-        + head.classify.weight.numel()
-    )
-
-
-def _fit_macs(model: Kinet) -> int:
+def _fit_macs(model: Kinet, stages: list[Stage]) -> int:
     """Normal matrix, right side, solution and deviations of every fit: those kernels are invisible to torch's counter."""
     config, size, total = model.config, model.config.group_size + 1, 0
-    for unit, count in zip(model.dynamic.units, (config.centroids[0],) * 2 + (config.centroids[1],) * 2):
+    shapes = [activation.shape[1:3] for stage in stages for activation in stage.activations]
+    for unit, (centroids, neighbors) in zip(model.dynamic.units, shapes):
         per_neighbor = size * (size + 1) // 2 + size + (0 if config.weighting == "none" else size)
-        total += count * unit.groups * (config.neighbors * per_neighbor + size * size)
+        total += centroids * unit.groups * (neighbors * per_neighbor + size * size)
     return total if config.normals else 0
 
 
@@ -74,9 +62,9 @@ def latency(model: Kinet, points: torch.Tensor, device: torch.device, repeats: i
             marks = [_now(device)]
             groups = model.group(points)
             marks.append(_now(device))
-            taps, static = model.static.taps(groups)
+            stages, static = model.static.taps(groups)
             marks.append(_now(device))
-            fuse(static, model.dynamic(groups, taps), model.config.fusion)
+            fuse(static, model.dynamic(stages), model.config.fusion)
             marks.append(_now(device))
             rows.append([1000 * (b - a) for a, b in zip(marks, marks[1:])] + [1000 * (marks[-1] - marks[0])])
     medians = torch.tensor(rows[1:]).median(0).values.tolist()
@@ -99,10 +87,11 @@ def measure(model: Kinet, device: torch.device, steps: bool = False) -> dict[str
     before = peak_memory()
     counts = macs(model, points)
     result = {
-        "variant": config.variant, "classes": config.num_classes, "clip": [config.num_frames, config.points_per_frame],
+        "variant": config.variant, "backbone": config.backbone, "classes": config.num_classes,
+        "clip": [config.num_frames, config.points_per_frame],
         "parameters": {"total": count_parameters(model), "static": count_parameters(model.static),
                        "dynamic": count_parameters(model.dynamic),
-                       **{f"static_{k}": count_parameters(getattr(model.static, k)) for k in ("stage1", "stage2", "head")},
+                       **{f"static_{name}": count_parameters(part) for name, part in model.static.named_children()},
                        **{f"dynamic_{k}": count_parameters(getattr(model.dynamic, k)) for k in ("units", "merge", "head")}},
         "paper_style_parameters": {"total": round(paper_parameters(model), 3), "static": round(paper_parameters(model.static), 3),
                                    "rule": "weights + Adam moments + moving statistics, / 2^20 (thesis table A.1)"},
@@ -182,7 +171,8 @@ def _profiled(step: Callable[[], tuple[float, float]]) -> tuple[tuple[float, flo
 def render(result: dict[str, Any]) -> str:
     """The object of `measure` as lines for a person."""
     lines = [
-        f"Kinet, {result['variant']} variant, {result['classes']} classes, clip {result['clip'][0]} x {result['clip'][1]} points"
+        f"Kinet on {result['backbone']}, {result['variant']} variant, {result['classes']} classes,"
+        f" clip {result['clip'][0]} x {result['clip'][1]} points"
     ]
     parameters = result["parameters"]
     lines.append(
