@@ -157,7 +157,7 @@ def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, d
 
 
 def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
-    from dpcli.classify.train import Schedule
+    from dpcli.classify.schedule import Schedule
     from dpcli.errors import DataError, UsageError
     from dpcli.runtime.run_folder import RunFolder
 
@@ -235,6 +235,18 @@ def test_help_is_quick_and_imports_nothing_heavy():
     assert run.stdout.strip() == "[]", run.stdout + run.stderr
 
 
+def test_only_the_room_that_is_asked_for_is_loaded():
+    code = (
+        "import sys\nfrom dpcli.cli.app import main\ntry: main({words})\n"
+        "finally: print(sorted(m for m in sys.modules if m.startswith('dpcli.cli.')))"
+    )
+    for words, loaded in ((["--help"], []), (["evaluate", "--help"], ["evaluate"]), (["-q", "info"], ["info"])):
+        run = subprocess.run([sys.executable, "-c", code.format(words=words)], capture_output=True, text=True, cwd=ROOT)
+        rooms = {"prepare", "classify", "segment", "generate4d", "evaluate", "info"}
+        found = json.loads(run.stdout.strip().splitlines()[-1].replace("'", '"'))
+        assert sorted(rooms & {name.split(".")[-1] for name in found}) == loaded, run.stdout + run.stderr
+
+
 def test_every_start_is_scored(data, run_folder, dpc, tmp_path):
     """6 frames, clips of 4: three clips a video; their mean is the video's score."""
     import torch
@@ -250,4 +262,4 @@ def test_every_start_is_scored(data, run_folder, dpc, tmp_path):
     assert video.clips == 3
     with torch.inference_mode():
         rows = [model(points)[0].softmax(-1) for _, points in batches(source, source.clips(None), 1)]
-    np.testing.assert_allclose(video.static, torch.cat(rows).mean(0), atol=1e-5)
+    np.testing.assert_allclose(video.streams["static"], torch.cat(rows).mean(0), atol=1e-5)

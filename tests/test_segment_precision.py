@@ -14,7 +14,7 @@ from dpcli.segment.losses import supervised_loss
 from dpcli.segment.model_file import load_model
 from dpcli.segment.neighbourhood import kernel_weights
 from dpcli.segment.network import PartNetwork
-from dpcli.segment.precision import full_precision, is_reduced, reduced_products, wanted
+from dpcli.runtime.precision import full_precision, is_reduced, reduced_products, wanted
 
 CPU = torch.device("cpu")
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dpcli.classify.sync_norm import SyncNorm
+from dpcli.ops import gather_points
 from dpcli.ops.grouped_mlp import Norm, grouped_mlp
 
 
@@ -26,17 +28,27 @@ class SharedLayers(nn.Module):
 
     def pool(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
         """Maximum over the neighbours, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
+        if self.training and isinstance(self.norm1, SyncNorm):
+            return self._pool_together(points, centers, idx, features)
         pooled, statistics = grouped_mlp(points, centers, idx, features, *self._arguments())
         if self.training:
             self._update(statistics, idx.numel())
         return pooled
 
+    def _pool_together(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
+        """`pool` layer by layer: between layers the processes of a shared run exchange their statistics."""
+        values = gather_points(points, idx) - centers[:, :, None]
+        if features is not None:
+            values = torch.cat([values, gather_points(features, idx)], -1)
+        hidden = torch.relu(self.norm1(self.linear1(values.flatten(0, 2))))
+        return torch.relu(self.norm2(self.linear2(hidden))).view(*idx.shape, -1).amax(2)
+
     def _update(self, statistics: list[Tensor], rows: int) -> None:
         with torch.no_grad():
             for norm, mean, var in zip((self.norm1, self.norm2), statistics[::2], statistics[1::2]):
                 norm.num_batches_tracked += 1
-                norm.running_mean.lerp_(mean, norm.momentum)
-                norm.running_var.lerp_(var * (rows / max(rows - 1, 1)), norm.momentum)
+                norm.running_mean.lerp_(mean.float(), norm.momentum)
+                norm.running_var.lerp_(var.float() * (rows / max(rows - 1, 1)), norm.momentum)
 
 
 class GlobalHead(SharedLayers):

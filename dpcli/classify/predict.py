@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from dpcli.classify.clips import Clip, ClipSource
-from dpcli.classify.kinet import Kinet, fuse
+from dpcli.classify.kinet import STREAMS, Kinet, fuse
 
 
 @dataclass
 class VideoScores:
-    """Mean probabilities (C) of one video, by stream, and how many clips they come from."""
+    """Mean probabilities (C) of one video, fused and by stream, and how many clips they come from."""
 
     sequence: int
-    static: np.ndarray
-    dynamic: np.ndarray
     fused: np.ndarray
+    streams: dict[str, np.ndarray]
     clips: int
 
 
@@ -33,29 +32,35 @@ def batches(source: ClipSource, clips: list[Clip], size: int) -> Iterator[tuple[
 
 @torch.inference_mode()
 def predict_videos(
-    model: Kinet, source: ClipSource, clips_per_video: int | None, batch: int, device: torch.device
-) -> Iterator[VideoScores]:
-    """Scores of every video of `source`, in order, one video in memory at a time."""
-    rows: Iterable[tuple[Clip, list[torch.Tensor]]] = _clip_scores(model, source, clips_per_video, batch, device)
+    model: Kinet, source: ClipSource, clips_per_video: int | None, batch: int, device: torch.device,
+    streams: Sequence[str] = STREAMS,
+) -> Iterator[VideoScores]:  # fmt: skip
+    """Scores of every video of `source`, in order, one video in memory at a time.
+
+    streams: those that were trained; with the static one alone, its scores are the fused ones.
+    """
     current, kept = -1, []
-    for clip, probabilities in rows:
-        if clip.sequence != current and kept:
-            yield _mean(current, kept)
-            kept = []
-        current = clip.sequence
-        kept.append(probabilities)
+    for clips, points in batches(source, source.clips(clips_per_video), batch):
+        rows = clip_scores(model, points.to(device), streams).cpu().unbind(1)
+        for clip, probabilities in zip(clips, rows):
+            if clip.sequence != current and kept:
+                yield _mean(current, kept, streams)
+                kept = []
+            current = clip.sequence
+            kept.append(probabilities)
     if kept:
-        yield _mean(current, kept)
+        yield _mean(current, kept, streams)
 
 
-def _clip_scores(model: Kinet, source: ClipSource, count: int | None, batch: int, device: torch.device) -> Iterator:
-    for clips, points in batches(source, source.clips(count), batch):
-        static, dynamic = model(points.to(device))
-        fused = fuse(static, dynamic, model.config.fusion)
-        table = torch.stack([torch.softmax(static, -1), torch.softmax(dynamic, -1), fused]).cpu()
-        yield from zip(clips, table.unbind(1))
+def clip_scores(model: Kinet, points: torch.Tensor, streams: Sequence[str]) -> torch.Tensor:
+    """Probabilities of clips (B,T,P,3): fused, then by stream, (1 + streams, B, C)."""
+    if tuple(streams) != STREAMS:
+        return torch.stack([torch.softmax(model.static_logits(points), -1)] * 2)
+    static, dynamic = model(points)
+    fused = fuse(static, dynamic, model.config.fusion)
+    return torch.stack([fused, torch.softmax(static, -1), torch.softmax(dynamic, -1)])
 
 
-def _mean(sequence: int, kept: list[torch.Tensor]) -> VideoScores:
-    static, dynamic, fused = torch.stack(kept).mean(0).numpy()
-    return VideoScores(sequence, static, dynamic, fused, len(kept))
+def _mean(sequence: int, kept: list[torch.Tensor], streams: Sequence[str]) -> VideoScores:
+    fused, *single = torch.stack(kept).mean(0).numpy()
+    return VideoScores(sequence, fused, dict(zip(streams, single)), len(kept))

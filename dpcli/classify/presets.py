@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from dpcli.classify.augment import PRESETS as AUGMENTATIONS
 from dpcli.classify.augment import Augmentation
 from dpcli.classify.config import KinetConfig
-from dpcli.classify.train import Schedule
+from dpcli.classify.schedule import Schedule
 from dpcli.errors import UsageError
 
 
@@ -45,3 +46,36 @@ def find_preset(name: str) -> Preset:
     if name not in PRESETS:
         raise UsageError(f"--preset {name}: expected one of {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+_GRAPH = {
+    "neighbors": 20,
+    "grouping": "balanced",
+    "merge": "residual",
+}  # the release's merge pairs PointNet++'s two stages
+_FULL = {**_GRAPH, "head": (512, 1024), "points_per_frame": 128}
+_DGCNN = {**_FULL, "widths": ((64, 64, 64, 128), (1024,), (64, 128, 1024, 512, 256), (512, 256)), "dropout": 0.5}
+_SPIDER = {**_FULL, "widths": ((32, 64, 128, 256), (5,), (1024, 512)), "dropout": 0.7}
+_QUICK = {**_GRAPH, "head": (64, 128), "points_per_frame": 64}
+_TINIER = {**_QUICK, "neighbors": 12, "points_per_frame": 32}
+
+# What a preset's configuration changes for a backbone whose vertices are all points of a clip: published sizes and as many
+# points as the multiply-adds of table A.1 imply, or narrower and fewer where a CPU trains.
+BACKBONE_CHANGES: dict[str, dict[str, dict[str, Any]]] = {
+    "dgcnn": {
+        "thesis": _DGCNN, "release": _DGCNN,
+        "quick": {**_QUICK, "widths": ((32, 32, 64), (256,), (16, 32, 64, 32, 16), (128, 64))},
+        "tiny": {**_TINIER, "widths": ((16, 32), (128,), (16, 32, 64, 32, 16), (64, 32))},
+    },
+    "spidercnn": {
+        "thesis": _SPIDER, "release": _SPIDER,
+        "quick": {**_QUICK, "widths": ((16, 32, 64), (3,), (128, 64))},
+        "tiny": {**_TINIER, "widths": ((16, 32), (3,), (64, 32))},
+    },
+}  # fmt: skip
+
+
+def with_backbone(config: KinetConfig, preset: str, backbone: str) -> KinetConfig:
+    """A preset's configuration on another backbone, with `BACKBONE_CHANGES`; a user's own (`module:Class`) changes nothing
+    else and reads from the configuration what it wants."""
+    return config.changed(backbone=backbone, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {}))

@@ -10,10 +10,12 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import normal_equations, plane_deviations, small_inverse
+from dpcli.runtime.precision import full_precision
 
 _RIDGE = 1e-3  # of the mean diagonal; large enough for float32 at rank-deficient neighbourhoods, small beside the data
 
 
+@full_precision
 def fit_surface(
     features: Tensor,  # (...,n,K,d)
     times: Tensor,  # (...,n)
@@ -41,11 +43,13 @@ def surface_normal(coefficients: Tensor) -> Tensor:
     return torch.nn.functional.normalize(torch.cat([slopes, -torch.ones_like(slopes[..., :1])], -1), dim=-1, eps=1e-6)
 
 
+@full_precision
 def deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
     """Fitting deviation A f_j + b - t_j of each neighbour: (...,K,d+1), (...,n,K,d), (...,n) -> (...,n,K)."""
     return plane_deviations(features, times, coefficients)
 
 
+@full_precision
 def projected_deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
     """The deviation as a vector along the normal, (A,-1) e / ||(A,-1)||^2, as the released code uses it: (...,n,K,d+1)."""
     slopes = coefficients[..., :-1]

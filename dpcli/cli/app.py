@@ -5,32 +5,26 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Sequence
+from importlib import import_module
 
 import typer
 
 from dpcli import __version__
-from dpcli.cli import classify, evaluate, generate4d, info, prepare, segment
 from dpcli.errors import DpcError
 
 # Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-app = typer.Typer(
-    name="dpc",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-    help="Dynamic point clouds: recognise actions, find rigid parts and their motions, rebuild a scene in 4D.",
-    epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
-)
-app.add_typer(prepare.app, name="prepare")
-app.add_typer(classify.app, name="classify")
-app.add_typer(segment.app, name="segment")
-app.add_typer(generate4d.app, name="generate4d")
-app.add_typer(evaluate.app, name="evaluate")
-app.command("info")(info.info)
+# A room's options are many and take long to set up: only the room that is asked for is loaded, `dpc --help` loads none.
+ROOMS = {
+    "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
+    "classify": "Recognise actions and gestures (Kinet).",
+    "segment": "Find rigid parts and their motions in a few frames, without labels.",
+    "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
+    "evaluate": "Compare what a model says with the truth.",
+    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.",
+}
 
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 
@@ -41,11 +35,44 @@ def _version(wanted: bool) -> None:
         raise typer.Exit()
 
 
-@app.callback()
 def _root(
     version: bool = typer.Option(False, "--version", callback=_version, is_eager=True, help="Print the version."),
 ) -> None:
     pass
+
+
+def application(words: Sequence[str] | None = None) -> typer.Typer:
+    """`dpc` with the one room that the words name loaded and the others by name only; with all of them for None."""
+    dpc = typer.Typer(
+        name="dpc",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+        help="Dynamic point clouds: recognise actions, find rigid parts and their motions, rebuild a scene in 4D.",
+        epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
+    )
+    dpc.callback()(_root)
+    asked = None if words is None else next((word for word in words if not word.startswith("-")), "")
+    for name, about in ROOMS.items():
+        if asked not in (None, name):
+            dpc.command(name, help=about)(_not_loaded)
+        elif name == "info":
+            dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
+        else:
+            dpc.add_typer(import_module(f"dpcli.cli.{name}").app, name=name, help=about)
+    return dpc
+
+
+def _not_loaded() -> None:
+    raise AssertionError("only the room that the first word names is ever run")
+
+
+def __getattr__(name: str) -> typer.Typer:
+    if name == "app":  # the whole of it, for those who import it
+        return application()
+    raise AttributeError(name)
 
 
 def _global_flags(argv: list[str]) -> list[str]:
@@ -96,7 +123,7 @@ def main(argv: list[str] | None = None) -> None:
     # torch's and numba's threads take turns: spinning while they wait, each pool would hold the cores the other needs
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = typer.main.get_command(app)
+    command = typer.main.get_command(application(arguments))
     from dpcli.runtime.progress import log
 
     try:

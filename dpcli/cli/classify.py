@@ -6,10 +6,19 @@ from typing import Annotated
 
 import typer
 
-from dpcli.cli.options import Device, Force, Json, Output, Seed
+from dpcli.cli import classify_stream
+from dpcli.cli.classify_explain import app as explain_app
+from dpcli.cli.options import Device, Force, Json, Seed
 from dpcli.errors import UsageError
 
-app = typer.Typer(no_args_is_help=True, help="Recognise actions and gestures (Kinet).")
+app = typer.Typer(no_args_is_help=True)
+app.add_typer(explain_app, name="explain")
+TrustedBackbone = Annotated[
+    str | None,
+    typer.Option(
+        "--backbone", help="module:Class of a model made on a backbone of your own: your leave to run that code."
+    ),
+]
 
 
 @app.command()
@@ -19,6 +28,16 @@ def train(
     preset: Annotated[
         str, typer.Option(help="thesis, release, quick (half the centroids and neighbours, fits a CPU) or tiny (demo).")
     ] = "quick",
+    backbone: Annotated[
+        str | None,
+        typer.Option(
+            help="Static network: pointnet2 (default), dgcnn, spidercnn, or your own as module:Class (docs/backbones.md)."
+        ),
+    ] = None,
+    pretrain: Annotated[
+        bool,
+        typer.Option("--pretrain", help="The static stream alone on single clouds (ModelNet40); for --static-from."),
+    ] = False,
     frames: Annotated[int | None, typer.Option(help="Frames per clip. Default: the preset's (16; release 32).")] = None,
     points: Annotated[int | None, typer.Option(help="Points drawn per frame. Default: the preset's.")] = None,
     timing: Annotated[
@@ -39,7 +58,16 @@ def train(
             help="Carved from the training videos: subject, subjects:3,5, a fraction, or none. Default: subject, or 0.15 without subjects."
         ),
     ] = None,
-    batch: Annotated[int | None, typer.Option(help="Clips per step. Default: the preset's.")] = None,
+    batch: Annotated[
+        int | None, typer.Option(help="Clips per step, of all processes together. Default: the preset's.")
+    ] = None,
+    accumulate: Annotated[
+        int | None, typer.Option(help="Compute a batch in so many parts, one after the other: less memory. Default: 1.")
+    ] = None,
+    amp: Annotated[
+        bool | None,
+        typer.Option("--amp/--no-amp", help="Matrix products in bfloat16. Default: on a GPU yes, on a CPU no."),
+    ] = None,
     lr: Annotated[float | None, typer.Option(help="Adam's learning rate. Default: the preset's.")] = None,
     lr_dynamic: Annotated[
         float | None, typer.Option(help="The same for the dynamic stage. Default: the preset's.")
@@ -58,6 +86,9 @@ def train(
         str | None, typer.Option(help="Neighbours in the radius: first, nearest or balanced over frames.")
     ] = None,
     solver: Annotated[str | None, typer.Option(help="Surface fit: inverse (thesis A.1.1) or ridge.")] = None,
+    reduction: Annotated[
+        float | None, typer.Option(help="Width of the fitted features as a share of the static layer's. Default: 0.5.")
+    ] = None,
     group_size: Annotated[int | None, typer.Option(help="Features per fitted surface (d).")] = None,
     temporal_radius: Annotated[
         int | None, typer.Option(help="Frames before and after that count as neighbours.")
@@ -73,6 +104,9 @@ def train(
     static_from: Annotated[
         str | None, typer.Option(help="A trained model whose static stream to start from (ablations ii, iv).")
     ] = None,
+    init: Annotated[
+        str | None, typer.Option(help="A trained model whose both streams to start from, e.g. of another --frames.")
+    ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU, 4 on a GPU.")
     ] = None,
@@ -80,21 +114,25 @@ def train(
     device: Device = "auto",
     force: Force = False,
 ) -> None:
-    """Train both streams: static, then dynamic on the frozen static weights. Running again continues a stopped run."""
+    """Train both streams: static, then dynamic on the frozen static weights. Running again continues a stopped run.
+
+    Several GPUs or machines: torchrun --nproc-per-node N -m dpcli classify train ...; the batch is shared among them.
+    """
     network = {
         "num_frames": frames, "points_per_frame": points, "normalize": normalize, "grouping": grouping, "solver": solver,
-        "group_size": group_size, "temporal_radius": temporal_radius, "dropout": dropout,
+        "group_size": group_size, "reduction": reduction, "temporal_radius": temporal_radius, "dropout": dropout,
         "radii": None if radius is None else (radius, 2 * radius), "normals": False if no_normals else None,
         "weighting": "none" if no_weights or no_normals else None,
     }  # fmt: skip
     schedule = {
         "batch": batch, "learning_rate": lr, "learning_rate_dynamic": lr_dynamic, "decay": decay, "workers": workers,
-        "clips_per_video": clips_per_video, "epochs": (epochs, epochs_dynamic),
+        "clips_per_video": clips_per_video, "epochs": (epochs, epochs_dynamic), "accumulate": accumulate, "amp": amp,
     }  # fmt: skip
-    from dpcli.classify.commands import run_training
+    from dpcli.classify.train_command import run_training
 
-    run_training(data, output, preset=preset, variant=variant, network=network, schedule=schedule, augment=augment, timing=timing,
-                 drop_short=drop_short, validation=validation, static_from=static_from, seed=seed, device=device, force=force)  # fmt: skip
+    run_training(data, output, preset=preset, backbone=backbone, variant=variant, network=network, schedule=schedule,
+                 augment=augment, timing=timing, drop_short=drop_short, validation=validation, static_from=static_from, init=init,
+                 pretrain=pretrain, seed=seed, device=device, force=force)  # fmt: skip
 
 
 @app.command()
@@ -103,7 +141,11 @@ def predict(
     model: Annotated[
         str, typer.Option("--model", help="A .safetensors file, a folder made by train, or a shipped model's name.")
     ],
-    output: Output,
+    output: Annotated[
+        str | None,
+        typer.Option("-o", "--output", help="File to write, or - for a pipe. With --stream: may be left out."),
+    ] = None,
+    backbone: TrustedBackbone = None,
     split: Annotated[
         str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")
     ] = "auto",
@@ -112,17 +154,35 @@ def predict(
         bool, typer.Option("--drop-short", help="Leave out videos shorter than a clip instead of padding.")
     ] = False,
     batch: Annotated[int, typer.Option(help="Clips at a time.")] = 8,
+    stream: classify_stream.Stream = False,
+    hop: classify_stream.Hop = None,
+    window: classify_stream.Window = None,
+    follow: classify_stream.Follow = None,
     seed: Seed = 0,
     device: Device = "auto",
+    json_output: classify_stream.JsonLines = False,
     force: Force = False,
 ) -> None:
     """Class scores of every video: softmax averaged over its clips, for each stream and fused."""
+    if stream:
+        refused = {
+            "split": split != "auto",
+            "clips-per-video": clips_per_video != 0,
+            "drop-short": drop_short,
+            "batch": batch != 8,
+        }
+        classify_stream.predict_stream(data, model, output, refused=refused, hop=hop, window=window, follow=follow, seed=seed,
+                                       device=device, force=force, json_output=json_output, backbone=backbone)  # fmt: skip
+        return
+    classify_stream.require_stream(hop=hop, window=window, follow=follow, json=json_output)
+    if output is None:
+        raise UsageError("Missing option '-o' / '--output'.")
     if batch < 1 or clips_per_video < 0:
         raise UsageError("--batch must be at least 1 and --clips-per-video at least 0")
     from dpcli.classify.commands import run_prediction
 
     run_prediction(data, model, output, split=split, clips_per_video=clips_per_video or None, drop_short=drop_short, batch=batch,
-                   seed=seed, device=device, force=force)  # fmt: skip
+                   seed=seed, device=device, force=force, backbone=backbone)  # fmt: skip
 
 
 @app.command()
@@ -131,6 +191,9 @@ def profile(
         str | None, typer.Option("--model", help="A trained model; else an untrained one of --preset.")
     ] = None,
     preset: Annotated[str, typer.Option(help="thesis, release, quick or tiny.")] = "thesis",
+    backbone: Annotated[
+        str | None, typer.Option(help="pointnet2 (default), dgcnn, spidercnn or your own as module:Class.")
+    ] = None,
     variant: Annotated[str | None, typer.Option(help="thesis or release.")] = None,
     classes: Annotated[int, typer.Option("--classes", help="Number of classes.")] = 20,
     frames: Annotated[int | None, typer.Option(help="Frames per clip. Default: the preset's.")] = None,
@@ -143,4 +206,4 @@ def profile(
     from dpcli.classify.commands import run_profile
 
     run_profile(model, preset=preset, variant=variant, classes=classes, frames=frames, points=points, steps=steps, device=device,
-                json_output=json_output)  # fmt: skip
+                json_output=json_output, backbone=backbone)  # fmt: skip

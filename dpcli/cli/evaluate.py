@@ -21,7 +21,7 @@ from dpcli.cli.evaluate_output import (
 )
 from dpcli.cli.options import Json, Picture, Seed
 
-app = typer.Typer(no_args_is_help=True, help="Compare what a model says with the truth.")
+app = typer.Typer(no_args_is_help=True)
 
 Parts = Annotated[str, typer.Argument(help="Parts file, or - for a pipe.")]
 Truth = Annotated[Path, typer.Option("--truth", help="Clouds file with the true parts; poses or scene_flow for motion.")]

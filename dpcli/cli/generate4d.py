@@ -9,7 +9,7 @@ import typer
 from dpcli.cli import generate4d_output
 from dpcli.cli.options import Device, Force, Output, Picture, Seed
 
-app = typer.Typer(no_args_is_help=True, help="A 4D Gaussian scene with rigid parts, from one video.")
+app = typer.Typer(no_args_is_help=True)
 
 
 @app.command()

@@ -111,6 +111,8 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         lines += _view_lines(found)
     elif found["kind"] == "gaussians":
         lines += _scene_lines(found)
+    elif found["kind"] == "embedding":
+        lines += [(name.replace("_", " "), f"{value:.4g}") for name, value in found["metrics"].items()]
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
 

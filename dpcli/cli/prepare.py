@@ -14,7 +14,7 @@ from dpcli.cli import prepare_animation, prepare_files, prepare_gestures, prepar
 from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.errors import UsageError
 
-app = typer.Typer(no_args_is_help=True, help="Turn raw data into a file of point cloud sequences, or of views.")
+app = typer.Typer(no_args_is_help=True)
 synthetic = typer.Typer(no_args_is_help=True, help="Make data out of nothing, with ground truth.")
 app.add_typer(synthetic, name="synthetic")
 

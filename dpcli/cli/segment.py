@@ -10,7 +10,7 @@ import typer
 from dpcli.cli.options import Device, Force, Json, Output, Picture, Seed
 from dpcli.errors import UsageError
 
-app = typer.Typer(no_args_is_help=True, help="Find rigid parts and their motions in a few frames, without labels.")
+app = typer.Typer(no_args_is_help=True)
 
 Amp = Annotated[
     bool | None,

@@ -10,7 +10,7 @@ from pathlib import Path
 from dpcli import __version__
 
 # Options that change how the work runs but not its result: left out, so that equal work gives equal bytes.
-_VALUED = {"-o", "--output", "--jobs", "--shard", "--dask", "--picture", "--device", "--log", "--report"}
+_VALUED = {"-o", "--output", "--jobs", "--shard", "--dask", "--picture", "--animation", "--device", "--log", "--report"}
 _FLAGS = {"-q", "--quiet", "-v", "--verbose", "--debug", "--force", "--json"}
 
 

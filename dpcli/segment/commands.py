@@ -27,7 +27,7 @@ from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Objective
 from dpcli.segment.pair_flow import pair_flow
 from dpcli.segment.pairs import MOTION_FIELDS, PairSource
-from dpcli.segment.precision import wanted
+from dpcli.runtime.precision import wanted
 from dpcli.segment.predict import Estimate, Refinement, Segmenter, network_segmenter, predict_parts
 from dpcli.segment.train import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file

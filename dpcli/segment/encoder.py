@@ -12,7 +12,7 @@ from dpcli.ops.gather import gather_points
 from dpcli.segment.config import PartConfig
 from dpcli.segment.icosahedron import GROUPS
 from dpcli.segment.neighbourhood import RULES, Neighbourhood
-from dpcli.segment.precision import full_precision
+from dpcli.runtime.precision import full_precision
 from dpcli.segment.se3_conv import SeparableConv
 
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from dpcli.ops import three_nn_interpolate
 from dpcli.segment.config import PartConfig
 from dpcli.segment.encoder import CanonicalFrames, Level
-from dpcli.segment.precision import full_precision
+from dpcli.runtime.precision import full_precision
 
 
 class PointMLP(nn.Module):

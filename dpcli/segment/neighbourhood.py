@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dpcli.ops import knn
 from dpcli.ops.gather import gather_points
-from dpcli.segment.precision import full_precision
+from dpcli.runtime.precision import full_precision
 
 
 @dataclass

@@ -12,7 +12,7 @@ from dpcli.segment.config import PartConfig
 from dpcli.segment.encoder import Encoder, Level
 from dpcli.segment.heads import SegmentationHead
 from dpcli.segment.motion_head import MotionHead, choose_motion
-from dpcli.segment.precision import reduced_products
+from dpcli.runtime.precision import reduced_products
 
 
 @dataclass

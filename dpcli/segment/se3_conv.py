@@ -14,7 +14,7 @@ from dpcli.segment.config import Layer, PartConfig
 from dpcli.segment.icosahedron import GROUPS
 from dpcli.segment.kernel_points import kernel_points
 from dpcli.segment.neighbourhood import Neighbourhood, kernel_weights
-from dpcli.segment.precision import REDUCED, is_reduced
+from dpcli.runtime.precision import REDUCED, is_reduced
 
 
 class SpatialConv(nn.Module):

@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from dpcli.store.embedding import EmbeddingReader
 from dpcli.store.file import file_kind, open_store, read_provenance, root_attributes
 from dpcli.store.gaussians import read_scene
 from dpcli.store.parts import PartsReader
@@ -34,7 +35,8 @@ def summary(path: str | Path) -> dict[str, Any]:
             "provenance": read_provenance(file),
             "datasets": _datasets(file),
         }
-    own = {"clouds": _clouds, "parts": _parts, "scores": _scores, "views": _views, "gaussians": _gaussians}[kind]
+    own = {"clouds": _clouds, "parts": _parts, "scores": _scores, "views": _views, "gaussians": _gaussians,
+           "embedding": _embedding}[kind]  # fmt: skip
     return {**common, **own(path)}
 
 
@@ -97,6 +99,16 @@ def _scores(path: Path) -> dict[str, Any]:
         "counts": {"samples": len(reader.names), "classes": len(reader.class_names)},
         "streams": sorted(reader.streams),
         "range": {"scores": _ends(reader.scores)},
+        **_who(reader.class_names, reader.labels, reader.splits),
+    }
+
+
+def _embedding(path: Path) -> dict[str, Any]:
+    reader = EmbeddingReader(path)
+    return {
+        "counts": {"samples": len(reader.names), "classes": len(reader.class_names)},
+        "streams": sorted(reader.streams),
+        "metrics": {f"{stream}_{key}": value for stream, said in reader.streams.items() for key, value in said.values.items()},
         **_who(reader.class_names, reader.labels, reader.splits),
     }
 

@@ -26,18 +26,22 @@ def is_reduced(tensor: Tensor) -> bool:
 def full_precision(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function in float32, whatever block it is called in: positions in bfloat16 are off by half a hundredth.
 
-    Looks at positional arguments only: the first tensor among them says the device.
+    The first tensor among the positional arguments says the device.
     """
 
     @functools.wraps(function)
-    def run(*arguments: Any) -> Any:
+    def run(*arguments: Any, **named: Any) -> Any:
         device = next(a.device.type for a in arguments if isinstance(a, Tensor))
         if not torch.is_autocast_enabled(device):
-            return function(*arguments)
+            return function(*arguments, **named)
         with torch.autocast(device, enabled=False):
-            return function(*(a.float() if isinstance(a, Tensor) and a.is_floating_point() else a for a in arguments))
+            return function(*map(_widened, arguments), **{key: _widened(value) for key, value in named.items()})
 
     return run
+
+
+def _widened(value: Any) -> Any:
+    return value.float() if isinstance(value, Tensor) and value.is_floating_point() else value
 
 
 def wanted(amp: bool | None, device: torch.device) -> bool:

@@ -1,0 +1,59 @@
+"""Frames read ahead in a thread of their own, so that arrival is timed and a signal is heard while the pipe is silent."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from dpcli.runtime.signals import StopRequest
+
+
+class Feed:
+    """Reads frames in a thread of its own, at most `room` ahead; then the writer is held back. Nothing is dropped."""
+
+    def __init__(self, frames: Iterator[np.ndarray], room: int) -> None:
+        self._queue: queue.Queue = queue.Queue(room)
+        self._closed = threading.Event()
+        threading.Thread(target=self._run, args=(frames,), daemon=True, name="frames").start()
+
+    def _run(self, frames: Iterator[np.ndarray]) -> None:
+        try:
+            for points in frames:
+                self._put((points, time.monotonic()))
+                if self._closed.is_set():
+                    return
+            self._put(None)
+        except Exception as error:  # raised again where the frames are taken, after those before it
+            self._put(error)
+
+    def _put(self, item: object) -> None:
+        while not self._closed.is_set():
+            try:
+                return self._queue.put(item, timeout=0.2)
+            except queue.Full:
+                continue
+
+    @property
+    def waiting(self) -> int:
+        """Frames that have arrived and were not taken yet."""
+        return self._queue.qsize()
+
+    def frames(self, stop: StopRequest) -> Iterator[tuple[np.ndarray, float]]:
+        """(points, time.monotonic() at arrival) until the stream ends or a stop is asked for."""
+        while not stop.requested:
+            try:
+                item = self._queue.get(timeout=0.1)
+            except queue.Empty:
+                continue
+            if item is None:
+                return
+            if isinstance(item, Exception):
+                raise item
+            yield item
+
+    def close(self) -> None:
+        self._closed.set()

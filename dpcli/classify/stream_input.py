@@ -1,0 +1,166 @@
+"""Frames as they arrive: `.npy` arrays one after another in a pipe or a growing file, or files dropped into a folder."""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime.progress import log
+
+_POLL = 0.02  # seconds between looks at a file or folder that may grow
+_SETTLED = 0.1  # seconds a folder's newest file must stay unchanged to count as whole
+_PIECE = 1 << 20
+_MOST_POINTS = 10_000_000  # in one frame: a damaged header must not ask for all memory
+_MAGIC, _HDF5 = b"\x93NUMPY", b"\x89HDF"
+_RECIPE = "expected frames written one after another by numpy.save(pipe, points)"
+
+
+@dataclass(frozen=True)
+class CloudFiles:
+    """How to read the files of a folder: which suffixes, in which order, and the points (N,3) of one."""
+
+    suffixes: tuple[str, ...]
+    order: Callable[[Path], list]
+    read: Callable[[Path], np.ndarray]
+
+
+def open_frames(argument: str, follow: float, files: CloudFiles) -> Iterator[np.ndarray]:
+    """Frames f32 (P,3) of `-` (stdin), a file or a folder, each as soon as it is whole.
+
+    `follow`: seconds to wait for more at the end of a file or folder; a pipe ends when its writer closes it. Raises
+    UsageError or DataError at once for what can't be read, DataError from the iterator for a bad frame.
+    """
+    if argument == "-":
+        if sys.stdin.isatty():
+            raise UsageError("- reads frames from a pipe, but stdin is a terminal; pipe a program into this one")
+        if follow:
+            raise UsageError("--follow is for files and folders; a pipe ends when its writer closes it")
+        return read_arrays(sys.stdin.fileno(), "stdin")
+    path = Path(argument)
+    if not path.exists():
+        raise DataError(f"{path}: no such file or folder")
+    return _folder_frames(path, follow, files) if path.is_dir() else _file_frames(path, follow)
+
+
+def _file_frames(path: Path, follow: float) -> Iterator[np.ndarray]:
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+    try:
+        yield from read_arrays(descriptor, str(path), follow)
+    finally:
+        os.close(descriptor)
+
+
+class _Bytes:
+    """A descriptor as the `read(count)` numpy's header parser wants. Unbuffered: a buffer's lock would be held while
+    waiting, and the interpreter can't end while another thread holds stdin's."""
+
+    def __init__(self, descriptor: int, follow: float) -> None:
+        self.descriptor, self.ended, self.position = descriptor, False, 0
+        self.follow = follow if stat.S_ISREG(os.fstat(descriptor).st_mode) else 0.0
+
+    def read(self, count: int) -> bytes:
+        """`count` bytes; fewer, with `ended` set, when no more came for `follow` seconds."""
+        pieces, missing, last = [], count, time.monotonic()
+        while missing and not self.ended:
+            piece = os.read(self.descriptor, min(missing, _PIECE))
+            if piece:
+                pieces.append(piece)
+                missing -= len(piece)
+                last = time.monotonic()
+            elif time.monotonic() - last >= self.follow:
+                self.ended = True
+            else:
+                time.sleep(_POLL)
+        self.position += count - missing
+        return b"".join(pieces)
+
+
+def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.ndarray]:
+    """The arrays of a concatenation of `.npy` files as frames f32 (P,3); DataError names the frame and what is wrong."""
+    source, number = _Bytes(descriptor, follow), 0
+    while True:
+        where, start = f"{name}: frame {number}", source.position
+        magic = source.read(8)
+        if not magic:
+            return
+        if magic[:4] == _HDF5:
+            raise DataError(f"{name}: HDF5 can't be read as it arrives; leave out --stream, or send {_RECIPE[9:]}")
+        if magic[:6] != _MAGIC[: len(magic)]:
+            raise DataError(f"{where}, byte {start}: not a .npy array but {magic!r}; {_RECIPE}")
+        shape, fortran, dtype = _header(source, magic, where)
+        body = source.read(int(np.prod(shape)) * dtype.itemsize)
+        _check_whole(source, where)
+        array = np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+        yield as_frame(array[:, :3], where)
+        number += 1
+
+
+def _header(source: _Bytes, magic: bytes, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, Fortran order and dtype of the array that follows, checked before any of it is read."""
+    _check_whole(source, where)
+    if magic[6:] != b"\x01\x00":  # later versions are for headers of more than 64 kB, which no plain array has
+        raise DataError(f"{where}: .npy version {magic[6]}.{magic[7]}, expected 1.0; {_RECIPE}")
+    try:
+        shape, fortran, dtype = np.lib.format.read_array_header_1_0(source)
+    except ValueError as error:
+        _check_whole(source, where)
+        raise DataError(f"{where}: damaged .npy header ({error}); {_RECIPE}") from None
+    if len(shape) != 2 or shape[1] < 3 or dtype.kind not in "uif":
+        raise DataError(f"{where}: array of shape {shape}, {dtype}; expected one frame's float32 (points, 3)")
+    if not 0 <= shape[0] <= _MOST_POINTS or shape[1] > 64:
+        raise DataError(
+            f"{where}: its header says {shape}; expected at most {_MOST_POINTS:,} points (a damaged stream?)"
+        )
+    return shape, fortran, dtype
+
+
+def _check_whole(source: _Bytes, where: str) -> None:
+    if source.ended:
+        raise DataError(f"{where}: truncated, the stream ends inside it after {source.position:,} bytes in all")
+
+
+def as_frame(points: np.ndarray, where: str) -> np.ndarray:
+    """Points as f32 (P,3) of their own; DataError unless they are finite."""
+    with np.errstate(over="ignore"):
+        frame = np.array(points, np.float32, order="C")
+    bad = int((~np.isfinite(frame)).any(1).sum())
+    if bad:
+        raise DataError(f"{where}: {bad} of {len(frame)} points are NaN or infinite; drop them before sending")
+    return frame
+
+
+def _folder_frames(folder: Path, follow: float, files: CloudFiles) -> Iterator[np.ndarray]:
+    """Files in name order, the newest once it has settled; ends when none came for `follow` seconds."""
+    taken, last, since, told = 0, None, time.monotonic(), False
+    while True:
+        paths = [p for p in folder.iterdir() if p.suffix.lower() in files.suffixes and not p.name.startswith(".")]
+        keyed = sorted((files.order(path), path) for path in paths)
+        fresh = [pair for pair in keyed if last is None or pair[0] > last]
+        if len(keyed) - len(fresh) > taken and not told:
+            log.warn(f"{folder}: a file came after its successor by name and is left out; names must rise")
+            told = True
+        for position, (key, path) in enumerate(fresh):
+            if position == len(fresh) - 1 and not _settled(path, since + follow):
+                break
+            yield as_frame(files.read(path), str(path))
+            taken, last, since = taken + 1, key, time.monotonic()
+        if not fresh and time.monotonic() - since >= follow:
+            return
+        time.sleep(_POLL)
+
+
+def _settled(path: Path, deadline: float) -> bool:
+    """Whether the file is not empty and stays as it is for a moment; after the deadline it is taken as it is."""
+    before = path.stat()
+    time.sleep(_SETTLED)
+    after = path.stat()
+    same = (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns)
+    return (same and after.st_size > 0) or time.monotonic() > deadline

@@ -1,0 +1,41 @@
+"""Which videos of a file a command works on, and what it says of them."""
+
+from __future__ import annotations
+
+from dpcli.classify.clips import ClipSource
+from dpcli.classify.model_file import ModelInfo
+from dpcli.errors import DataError
+from dpcli.runtime.progress import log
+from dpcli.store import CloudsReader
+
+
+def select_videos(reader: CloudsReader, split: str) -> list[int]:
+    """Sequences of a split, of all for `all`; `auto` is the test split where there is one. DataError when there are none."""
+    wanted = split
+    if split == "auto":
+        wanted = "test" if "test" in reader.splits else "all"
+    chosen = [i for i, name in enumerate(reader.splits) if wanted == "all" or name == wanted]
+    if not chosen:
+        raise DataError(f"{reader.path}: no sample of split {wanted!r}; it has {sorted(set(reader.splits))}")
+    if split == "auto":
+        log.info(f"scoring split {wanted!r}: {len(chosen)} of {len(reader)} videos (--split chooses)")
+    return chosen
+
+
+def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> None:
+    """DataError that names the first class in which the file and the model differ."""
+    if reader.class_names and reader.class_names != info.class_names:
+        pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
+        index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
+        raise DataError(
+            f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; the model was trained for other classes"
+        )
+
+
+def report_short(source: ClipSource, frames: int) -> None:
+    """Name the videos that are dropped or padded, with a message each."""
+    for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
+        if names:
+            log.info(
+                f"{len(names)} videos shorter than {frames} frames are {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
+            )

@@ -1,0 +1,105 @@
+"""Files of kind `embedding`: a vector for each sample and stream, with a place in the plane to draw it at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, read_strings, root_attributes, write_root
+
+_PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+
+
+@dataclass
+class StreamEmbedding:
+    """features f32 (S,D); coordinates f32 (S,2), without unit; values: figures by name, such as neighbour_accuracy."""
+
+    features: np.ndarray
+    coordinates: np.ndarray
+    values: dict[str, float] = field(default_factory=dict)
+
+
+def write_embedding(
+    path: str | Path, names: Sequence[str], labels: np.ndarray, splits: Sequence[str], streams: dict[str, StreamEmbedding], *,
+    class_names: Sequence[str], source: str = "", seed: int = 0, provenance: Sequence[dict] = (), force: bool = False,
+) -> None:  # fmt: skip
+    """Write the file whole or not at all. UsageError when it exists and `force` is off, DataError on malformed arrays."""
+    if Path(path).exists() and not force:
+        raise UsageError(f"{path}: exists already; --force replaces it")
+    _check(str(path), names, labels, splits, streams)
+    atomic = AtomicFile(path)
+    try:
+        file = atomic.file
+        write_root(
+            file,
+            "embedding",
+            length_unit="",
+            source=source,
+            seed=seed,
+            class_names=class_names,
+            provenance=provenance,
+        )
+        file.create_dataset("name", data=np.array(list(names), dtype=object), dtype=STRING)
+        file.create_dataset("split", data=np.array(list(splits), dtype=object), dtype=STRING)
+        file.create_dataset("label", data=np.asarray(labels, np.int32), **_PACKED)
+        for stream, said in streams.items():
+            file.create_dataset(f"features/{stream}", data=said.features)
+            file.create_dataset(f"coordinates/{stream}", data=said.coordinates).attrs.update(said.values)
+    except BaseException as error:
+        atomic.failed(type(error), error, None)
+        raise
+    atomic.commit()
+
+
+def _check(
+    path: str, names: Sequence[str], labels: np.ndarray, splits: Sequence[str], streams: dict[str, StreamEmbedding]
+) -> None:
+    if not streams:
+        raise DataError(f"{path}: no stream to keep; expected at least one under features/")
+    if len(set(names)) != len(names) or not len(names) == len(labels) == len(splits):
+        raise DataError(
+            f"{path}: {len(set(names))} different names, {len(labels)} labels, {len(splits)} splits; expected as many"
+        )
+    for stream, said in streams.items():
+        for key, value, width in (("features", said.features, None), ("coordinates", said.coordinates, 2)):
+            if value.ndim != 2 or len(value) != len(names) or (width and value.shape[1] != width):
+                raise DataError(
+                    f"{path}: {key}/{stream} has shape {value.shape}, expected ({len(names)}, {width or 'D'})"
+                )
+            if value.dtype != np.float32 or not np.isfinite(value).all():
+                raise DataError(f"{path}: {key}/{stream} must be finite float32 numbers, found {value.dtype}")
+
+
+class EmbeddingReader:
+    """An `embedding` file in memory: names, splits, labels i32 (S), class_names, streams {name: StreamEmbedding}.
+
+    Raises DataError when shapes disagree or a value is not finite.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        with open_store(path, ["embedding"]) as file:
+            self.attributes, self.provenance = root_attributes(file), read_provenance(file)
+            self.class_names = read_strings(file, "class_names")
+            self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
+            for key in ("label", "features", "coordinates"):
+                if key not in file:
+                    raise DataError(f"{path}: {key!r} is missing; the file is incomplete, make it again")
+            self.labels = file["label"][:]
+            if set(file["features"]) != set(file["coordinates"]):
+                raise DataError(
+                    f"{path}: features of {sorted(file['features'])}, coordinates of {sorted(file['coordinates'])}"
+                )
+            self.streams = {
+                stream: StreamEmbedding(
+                    file["features"][stream][:],
+                    file["coordinates"][stream][:],
+                    {key: float(value) for key, value in file["coordinates"][stream].attrs.items()},
+                )
+                for stream in file["features"]
+            }
+        _check(str(path), self.names, self.labels, self.splits, self.streams)
