@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.ops.jit import arithmetic_kernel
+from dpcli.ops.jit import arithmetic_kernel, parallel_kernel
 from dpcli.ops.kernels_simd import higher, lanes, load, lower, power_of_two, ramp, reciprocal, store, total, where_lower
+from dpcli.ops.kernels_splat_lists import PACKED, TALL, WIDE, tile_lists
+from dpcli.ops.kernels_splat_simd import constants, power, totals
 from dpcli.ops.splatting import rasterization, rasterization_reference
 from tests.splatting_helpers import assert_renders, cameras, render, scene
 
@@ -134,6 +136,18 @@ def _powers(values, out):
         store(out, i, power_of_two(load(values, i)))
 
 
+@parallel_kernel
+def _table_powers(table, values, out):
+    for block in numba.prange(values.size // 8):
+        store(out, 8 * block, power(table, load(values, 8 * block)))
+
+
+@arithmetic_kernel
+def _totals(values, out):
+    store(out, 0, totals(load(values, 0), load(values, 8), load(values, 16), load(values, 24), load(values, 32),
+                         load(values, 40), load(values, 48), load(values, 56)))  # fmt: skip
+
+
 @arithmetic_kernel
 def _everything(a, b, out, sums):
     u, v = load(a, 0), load(b, 0)
@@ -147,13 +161,19 @@ def _everything(a, b, out, sums):
     sums[0] = total(u)
 
 
-def test_lanes_power_of_two() -> None:
+def _powers_from_table(values, out):
+    _table_powers(constants(), values, out)
+
+
+@pytest.mark.parametrize("powers", [_powers, _powers_from_table])
+def test_lanes_power_of_two(powers) -> None:
+    """`power` where the compiler may reorder, as in the rasteriser: it could cancel what rounds."""
     values = np.concatenate([np.linspace(-126, 1, 1 << 20), np.linspace(-9, 0, 1 << 20)]).astype(np.float32)
     out = np.empty_like(values)
-    _powers(values, out)
+    powers(values, out)
     assert np.abs(out / np.exp2(values.astype(np.float64)) - 1).max() < 3e-7
     values, out = np.float32([-1e30, -200, -127, -126, 0, 1, 2, 3]), np.empty(8, np.float32)
-    _powers(values, out)
+    powers(values, out)
     assert (out[:4] <= 2.4e-38).all() and (out[:4] > 0).all()
     np.testing.assert_allclose(out[4:], [1, 2, 4, 8], rtol=3e-7)
 
@@ -166,3 +186,39 @@ def test_lanes_do_as_numpy_does() -> None:
     where = np.where(a < b, np.arange(8), 9)
     wanted = [a + b, a - b, a * b, np.minimum(a, b), np.maximum(a, b), where, 1 / a]
     assert np.array_equal(out.reshape(7, 8), np.float32(wanted)) and sums[0] == a.sum()
+
+
+def test_eight_totals_at_once() -> None:
+    values, out = np.random.default_rng(1).integers(-99, 99, (8, 8)).astype(np.float32), np.empty(8, np.float32)
+    _totals(values.reshape(-1), out)
+    assert np.array_equal(out, values.sum(1))
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_tile_lists_hold_every_gaussian_by_depth(workers: int) -> None:
+    """Against loops over all tiles: ties by index, negative depths, Gaussians without radius, places of pairs."""
+    rng, (cameras, count, width, height) = np.random.default_rng(2), (2, 150, 70, 50)
+    means = rng.uniform(-10, 80, (cameras, count, 2)).astype(np.float32)
+    conics = np.tile(np.float32([0.1, 0.02, 0.05]), (cameras, count, 1))
+    opacities = rng.uniform(0, 1, (1, count)).astype(np.float32)
+    radii = np.repeat(rng.integers(0, 3, (cameras, count, 1)), 2, axis=2).astype(np.int32)
+    depths = (rng.integers(-3, 4, (cameras, count)) / np.float32(3)).astype(np.float32)
+    packed, box = np.empty((cameras, count, PACKED), np.float32), np.empty((cameras, count, 4), np.int32)
+    pair_start = np.empty((cameras, count), np.int64)
+    tasks, start, gaussian = tile_lists(means, conics, opacities, radii, depths.view(np.int32), width, height, workers,
+                                        np.zeros(1, np.int64), packed, box, pair_start)  # fmt: skip
+    assert not box[radii[..., 0] == 0].any()
+    across, down, places = -(-width // WIDE), -(-height // TALL), []
+    for c in range(cameras):
+        x0, x1, y0, y1 = box[c].T
+        held = np.zeros((down, across, count), bool)
+        for row, column in np.ndindex(down, across):
+            x, y = column * WIDE, row * TALL
+            held[row, column] = (x0 < x1) & (x0 < x + WIDE) & (x1 > x) & (y0 < y1) & (y0 < y + TALL) & (y1 > y)
+            tile, order = (c * down + row) * across + column, np.argsort(depths[c], kind="stable")
+            wanted = order[held[row, column][order]]
+            assert np.array_equal(gaussian[start[tile] : start[tile + 1]], wanted)
+            assert (tile in tasks) == (wanted.size > 0)
+        for n, pairs in enumerate(held.sum((0, 1))):
+            places += range(pair_start[c, n], pair_start[c, n] + pairs) if pairs else []
+    assert sorted(places) == list(range(len(gaussian))) and len(set(tasks.tolist())) == len(tasks)

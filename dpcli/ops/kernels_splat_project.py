@@ -11,60 +11,86 @@ from numba import prange
 
 from dpcli.ops.jit import arithmetic_kernel, parallel_kernel
 
-_BLOCK = 64  # Gaussians that share scratch memory
+_BLOCK = 128  # Gaussians a thread takes at once
 
 
 @arithmetic_kernel
-def _geometry(mean, quat, view, K, width, height, camera, jacobian, rotation, turned):
-    """Fill camera (3), jacobian (6: fx/z, -fx tx/z^2, fy/z, -fy ty/z^2, and 1 where tx, ty is not clamped), R (3,3), U (2,3)."""
-    for i in range(3):
-        camera[i] = view[i, 0] * mean[0] + view[i, 1] * mean[1] + view[i, 2] * mean[2] + view[i, 3]
-    x, y, z = camera[0], camera[1], camera[2]
+def _lens(view, K, width, height):
+    """(fx, fy, cx, cy), the least and largest x/z and y/z of the Jacobian, and the rows of W."""
     fx, fy, cx, cy = np.float64(K[0, 0]), np.float64(K[1, 1]), np.float64(K[0, 2]), np.float64(K[1, 2])
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
-    tx = min(max(x / z, -cx / fx - margin_x), (width - cx) / fx + margin_x)
-    ty = min(max(y / z, -cy / fy - margin_y), (height - cy) / fy + margin_y)
-    jacobian[0], jacobian[1], jacobian[2], jacobian[3] = fx / z, -fx * tx / z, fy / z, -fy * ty / z
-    jacobian[4], jacobian[5] = (1.0 if tx == x / z else 0.0), (1.0 if ty == y / z else 0.0)
-    length = np.sqrt(
-        np.float64(quat[0]) ** 2 + np.float64(quat[1]) ** 2 + np.float64(quat[2]) ** 2 + np.float64(quat[3]) ** 2
-    )
-    length = max(length, 1e-12)
-    w, a, b, c = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
-    rotation[0, 0], rotation[0, 1], rotation[0, 2] = 1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)
-    rotation[1, 0], rotation[1, 1], rotation[1, 2] = 2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)
-    rotation[2, 0], rotation[2, 1], rotation[2, 2] = 2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)
-    for j in range(3):
-        seen_x = view[0, 0] * rotation[0, j] + view[0, 1] * rotation[1, j] + view[0, 2] * rotation[2, j]
-        seen_y = view[1, 0] * rotation[0, j] + view[1, 1] * rotation[1, j] + view[1, 2] * rotation[2, j]
-        seen_z = view[2, 0] * rotation[0, j] + view[2, 1] * rotation[1, j] + view[2, 2] * rotation[2, j]
-        turned[0, j] = jacobian[0] * seen_x + jacobian[1] * seen_z
-        turned[1, j] = jacobian[2] * seen_y + jacobian[3] * seen_z
+    limits = -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
+    rows = view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2]
+    return (fx, fy, cx, cy), limits, rows
 
 
 @arithmetic_kernel
-def _add_quat(quat, g, to_unit, to_quat):
-    """Add the gradient g (3,3) of the rotation to to_quat (4): through the unit quaternion (to_unit: scratch), then its length."""
-    length = np.sqrt(
-        np.float64(quat[0]) ** 2 + np.float64(quat[1]) ** 2 + np.float64(quat[2]) ** 2 + np.float64(quat[3]) ** 2
-    )
-    length = max(length, 1e-12)
-    w, x, y, z = quat[0] / length, quat[1] / length, quat[2] / length, quat[3] / length
-    to_unit[0] = x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1])
-    to_unit[1] = (
-        y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2])
-    )
-    to_unit[2] = (
-        x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2])
-    )
-    to_unit[3] = (
-        x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1])
-    )
-    along = w * to_unit[0] + x * to_unit[1] + y * to_unit[2] + z * to_unit[3]
-    to_quat[0] += 2 * (to_unit[0] - along * w) / length
-    to_quat[1] += 2 * (to_unit[1] - along * x) / length
-    to_quat[2] += 2 * (to_unit[2] - along * y) / length
-    to_quat[3] += 2 * (to_unit[3] - along * z) / length
+def _camera(mean, view):
+    m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+    x = view[0, 0] * m0 + view[0, 1] * m1 + view[0, 2] * m2 + view[0, 3]
+    y = view[1, 0] * m0 + view[1, 1] * m1 + view[1, 2] * m2 + view[1, 3]
+    z = view[2, 0] * m0 + view[2, 1] * m1 + view[2, 2] * m2 + view[2, 3]
+    return x, y, z
+
+
+@arithmetic_kernel
+def _unit(quat):
+    """The unit quaternion and 1 / length."""
+    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
+    shrink = 1 / max(np.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    return w * shrink, x * shrink, y * shrink, z * shrink, shrink
+
+
+@arithmetic_kernel
+def _rotation(w, a, b, c):
+    return (
+        1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b),
+        2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a),
+        2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b),
+    )  # fmt: skip
+
+
+@arithmetic_kernel
+def _jacobian(x, y, nearness, lens, limits):
+    """fx/z, -fx tx/z^2, fy/z, -fy ty/z^2, and 1 where tx, ty is not clamped; nearness is 1/z."""
+    u, v = x * nearness, y * nearness
+    tx, ty = min(max(u, limits[0]), limits[1]), min(max(v, limits[2]), limits[3])
+    across, down = lens[0] * nearness, lens[1] * nearness
+    return across, -across * tx, down, -down * ty, (1.0 if tx == u else 0.0), (1.0 if ty == v else 0.0)
+
+
+@arithmetic_kernel
+def _rows(jacobian, w):
+    """J W (2,3) as six numbers."""
+    a, b, c, d = jacobian[0], jacobian[1], jacobian[2], jacobian[3]
+    return (
+        a * w[0] + b * w[6], a * w[1] + b * w[7], a * w[2] + b * w[8],
+        c * w[3] + d * w[6], c * w[4] + d * w[7], c * w[5] + d * w[8],
+    )  # fmt: skip
+
+
+@arithmetic_kernel
+def _turned(p, r):
+    """U = (J W) R (2,3) as six numbers."""
+    return (
+        p[0] * r[0] + p[1] * r[3] + p[2] * r[6], p[0] * r[1] + p[1] * r[4] + p[2] * r[7],
+        p[0] * r[2] + p[1] * r[5] + p[2] * r[8], p[3] * r[0] + p[4] * r[3] + p[5] * r[6],
+        p[3] * r[1] + p[4] * r[4] + p[5] * r[7], p[3] * r[2] + p[4] * r[5] + p[5] * r[8],
+    )  # fmt: skip
+
+
+@arithmetic_kernel
+def _add_quat(w, x, y, z, shrink, g, to_quat):
+    """Add the gradient g (3,3 as nine numbers) of the rotation to to_quat (4): through the unit quaternion, then its length."""
+    to_w = 2 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
+    to_x = 2 * (y * (g[1] + g[3]) + z * (g[2] + g[6]) + w * (g[7] - g[5]) - 2 * x * (g[4] + g[8]))
+    to_y = 2 * (x * (g[1] + g[3]) + z * (g[5] + g[7]) + w * (g[2] - g[6]) - 2 * y * (g[0] + g[8]))
+    to_z = 2 * (x * (g[2] + g[6]) + y * (g[5] + g[7]) + w * (g[3] - g[1]) - 2 * z * (g[0] + g[4]))
+    along = w * to_w + x * to_x + y * to_y + z * to_z
+    to_quat[0] += (to_w - along * w) * shrink
+    to_quat[1] += (to_x - along * x) * shrink
+    to_quat[2] += (to_y - along * y) * shrink
+    to_quat[3] += (to_z - along * z) * shrink
 
 
 @parallel_kernel
@@ -77,30 +103,35 @@ def project(
     """
     cameras, count = depths.shape
     for block in prange((count + _BLOCK - 1) // _BLOCK):
-        camera, jacobian, rotation, turned = np.empty(3), np.empty(6), np.empty((3, 3)), np.empty((2, 3))
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             for c in range(cameras):
                 m, q = (c if means.shape[0] > 1 else 0), (c if quats.shape[0] > 1 else 0)
                 s, o = (c if scales.shape[0] > 1 else 0), (c if opacities.shape[0] > 1 else 0)
-                _geometry(means[m, n], quats[q, n], views[c], Ks[c], width, height, camera, jacobian, rotation, turned)
-                z = camera[2]
+                lens, limits, rows = _lens(views[c], Ks[c], width, height)
+                x, y, z = _camera(means[m, n], views[c])
                 depths[c, n] = z
-                means2d[c, n, 0], means2d[c, n, 1] = Ks[c, 0, 2], Ks[c, 1, 2]
-                conics[c, n], radii[c, n] = 0, 0
+                means2d[c, n, 0], means2d[c, n, 1] = lens[2], lens[3]
+                conics[c, n, 0] = conics[c, n, 1] = conics[c, n, 2] = 0
+                radii[c, n, 0] = radii[c, n, 1] = 0
                 if not near <= z <= far:
                     continue
-                u, v = Ks[c, 0, 0] * camera[0] / z + Ks[c, 0, 2], Ks[c, 1, 1] * camera[1] / z + Ks[c, 1, 2]
+                nearness = 1 / z
+                u, v = lens[0] * x * nearness + lens[2], lens[1] * y * nearness + lens[3]
                 means2d[c, n, 0], means2d[c, n, 1] = u, v
-                xx, xy, yy = eps, 0.0, eps
-                for j in range(3):
-                    variance = np.float64(scales[s, n, j]) ** 2
-                    xx += turned[0, j] * turned[0, j] * variance
-                    xy += turned[0, j] * turned[1, j] * variance
-                    yy += turned[1, j] * turned[1, j] * variance
+                unit = _unit(quats[q, n])
+                turned = _turned(
+                    _rows(_jacobian(x, y, nearness, lens, limits), rows), _rotation(unit[0], unit[1], unit[2], unit[3])
+                )
+                s0, s1, s2 = np.float64(scales[s, n, 0]), np.float64(scales[s, n, 1]), np.float64(scales[s, n, 2])
+                a0, a1, a2 = turned[0] * s0, turned[1] * s1, turned[2] * s2
+                b0, b1, b2 = turned[3] * s0, turned[4] * s1, turned[5] * s2
+                xx, yy = eps + a0 * a0 + a1 * a1 + a2 * a2, eps + b0 * b0 + b1 * b1 + b2 * b2
+                xy = a0 * b0 + a1 * b1 + a2 * b2
                 det, opacity = xx * yy - xy * xy, np.float64(opacities[o, n])
                 if not (det > 0 and det < 1e300 and opacities[o, n] >= np.float32(1 / 255)):
                     continue
-                conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = yy / det, -xy / det, xx / det
+                shrink = 1 / det
+                conics[c, n, 0], conics[c, n, 1], conics[c, n, 2] = yy * shrink, -xy * shrink, xx * shrink
                 extent = min(3.33, np.sqrt(2 * np.log(max(255 * opacity, 1.0))))
                 across, down = np.ceil(extent * np.sqrt(xx)), np.ceil(extent * np.sqrt(yy))
                 inside = u + across > 0 and u - across < width and v + down > 0 and v - down < height
@@ -115,48 +146,60 @@ def project_backward(
     """Add to to_means, to_quats, to_scales (as the inputs, zero) what comes through means2d, conics and depths."""
     cameras, count = to_depths.shape
     for block in prange((count + _BLOCK - 1) // _BLOCK):
-        camera, jacobian, rotation, turned = np.empty(3), np.empty(6), np.empty((3, 3)), np.empty((2, 3))
-        to_turned, to_rotation, to_camera, to_quat = np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty(4)
         for n in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             for c in range(cameras):
                 if radii[c, n, 0] <= 0:
                     continue
                 m, q = (c if means.shape[0] > 1 else 0), (c if quats.shape[0] > 1 else 0)
-                s = c if scales.shape[0] > 1 else 0
-                view, mean, quat = views[c], means[m, n], quats[q, n]
-                _geometry(mean, quat, view, Ks[c], width, height, camera, jacobian, rotation, turned)
+                s, to_scale = (c if scales.shape[0] > 1 else 0), to_scales[c if scales.shape[0] > 1 else 0, n]
+                lens, limits, rows = _lens(views[c], Ks[c], width, height)
+                x, y, z = _camera(means[m, n], views[c])
+                nearness = 1 / z
+                qw, qx, qy, qz, shrink = _unit(quats[q, n])
+                rotation, jacobian = _rotation(qw, qx, qy, qz), _jacobian(x, y, nearness, lens, limits)
+                seen = _rows(jacobian, rows)
+                turned = _turned(seen, rotation)
                 xx, xy, yy = np.float64(conics[c, n, 0]), np.float64(conics[c, n, 1]), np.float64(conics[c, n, 2])
                 a, b, d = np.float64(to_conics[c, n, 0]), 0.5 * to_conics[c, n, 1], np.float64(to_conics[c, n, 2])
-                # the covariance's gradient -K G K, with K the conic and G its gradient as a symmetric matrix
-                to_xx = -(a * xx * xx + 2 * b * xx * xy + d * xy * xy)
-                to_xy = -(a * xx * xy + b * (xx * yy + xy * xy) + d * xy * yy)
-                to_yy = -(a * xy * xy + 2 * b * xy * yy + d * yy * yy)
-                for j in range(3):
-                    scale = np.float64(scales[s, n, j])
-                    across = 2 * (to_xx * turned[0, j] + to_xy * turned[1, j]) * scale
-                    down = 2 * (to_xy * turned[0, j] + to_yy * turned[1, j]) * scale
-                    to_scales[s, n, j] += across * turned[0, j] + down * turned[1, j]
-                    to_turned[0, j], to_turned[1, j] = across * scale, down * scale
-                j00 = j02 = j11 = j12 = 0.0
-                for i in range(3):
-                    across = jacobian[0] * view[0, i] + jacobian[1] * view[2, i]
-                    down = jacobian[2] * view[1, i] + jacobian[3] * view[2, i]
-                    to_across = to_down = 0.0
-                    for j in range(3):
-                        to_rotation[i, j] = across * to_turned[0, j] + down * to_turned[1, j]
-                        to_across += to_turned[0, j] * rotation[i, j]
-                        to_down += to_turned[1, j] * rotation[i, j]
-                    j00, j02 = j00 + to_across * view[0, i], j02 + to_across * view[2, i]
-                    j11, j12 = j11 + to_down * view[1, i], j12 + to_down * view[2, i]
-                _add_quat(quat, to_rotation, to_quat, to_quats[q, n])
-                fx, fy, z = Ks[c, 0, 0], Ks[c, 1, 1], camera[2]
+                # the covariance's gradient -K G K, with K the conic and G its gradient as a symmetric matrix; twice that
+                left, right, low, high = a * xx + b * xy, b * xx + d * xy, a * xy + b * yy, b * xy + d * yy
+                to_xx, to_xy, to_yy = (
+                    -2 * (left * xx + right * xy),
+                    -2 * (left * xy + right * yy),
+                    -2 * (low * xy + high * yy),
+                )
+                s0, s1, s2 = np.float64(scales[s, n, 0]), np.float64(scales[s, n, 1]), np.float64(scales[s, n, 2])
+                a0, b0 = (to_xx * turned[0] + to_xy * turned[3]) * s0, (to_xy * turned[0] + to_yy * turned[3]) * s0
+                a1, b1 = (to_xx * turned[1] + to_xy * turned[4]) * s1, (to_xy * turned[1] + to_yy * turned[4]) * s1
+                a2, b2 = (to_xx * turned[2] + to_xy * turned[5]) * s2, (to_xy * turned[2] + to_yy * turned[5]) * s2
+                to_scale[0] += a0 * turned[0] + b0 * turned[3]
+                to_scale[1] += a1 * turned[1] + b1 * turned[4]
+                to_scale[2] += a2 * turned[2] + b2 * turned[5]
+                a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2  # of U
+                to_rotation = (
+                    seen[0] * a0 + seen[3] * b0, seen[0] * a1 + seen[3] * b1, seen[0] * a2 + seen[3] * b2,
+                    seen[1] * a0 + seen[4] * b0, seen[1] * a1 + seen[4] * b1, seen[1] * a2 + seen[4] * b2,
+                    seen[2] * a0 + seen[5] * b0, seen[2] * a1 + seen[5] * b1, seen[2] * a2 + seen[5] * b2,
+                )  # fmt: skip
+                _add_quat(qw, qx, qy, qz, shrink, to_rotation, to_quats[q, n])
+                r = rotation
+                g0, g1, g2 = (
+                    a0 * r[0] + a1 * r[1] + a2 * r[2],
+                    a0 * r[3] + a1 * r[4] + a2 * r[5],
+                    a0 * r[6] + a1 * r[7] + a2 * r[8],
+                )
+                h0, h1, h2 = (
+                    b0 * r[0] + b1 * r[1] + b2 * r[2],
+                    b0 * r[3] + b1 * r[4] + b2 * r[5],
+                    b0 * r[6] + b1 * r[7] + b2 * r[8],
+                )
+                j00, j02 = g0 * rows[0] + g1 * rows[1] + g2 * rows[2], g0 * rows[6] + g1 * rows[7] + g2 * rows[8]
+                j11, j12 = h0 * rows[3] + h1 * rows[4] + h2 * rows[5], h0 * rows[6] + h1 * rows[7] + h2 * rows[8]
+                across, down = lens[0] * nearness, lens[1] * nearness
                 u, v = np.float64(to_means2d[c, n, 0]), np.float64(to_means2d[c, n, 1])
-                to_camera[0] = fx / z * (u - jacobian[4] * j02 / z)
-                to_camera[1] = fy / z * (v - jacobian[5] * j12 / z)
-                to_camera[2] = to_depths[c, n] - (fx * camera[0] * u + fy * camera[1] * v) / z**2
-                to_camera[2] -= (fx * j00 + fy * j11 + (1 + jacobian[4]) * jacobian[1] * j02 * z) / z**2
-                to_camera[2] -= (1 + jacobian[5]) * jacobian[3] * j12 / z
-                for i in range(3):
-                    to_means[m, n, i] += (
-                        view[0, i] * to_camera[0] + view[1, i] * to_camera[1] + view[2, i] * to_camera[2]
-                    )
+                to_x, to_y = across * (u - jacobian[4] * j02 * nearness), down * (v - jacobian[5] * j12 * nearness)
+                to_z = to_depths[c, n] - (across * x * u + down * y * v + across * j00 + down * j11) * nearness
+                to_z -= ((1 + jacobian[4]) * jacobian[1] * j02 + (1 + jacobian[5]) * jacobian[3] * j12) * nearness
+                to_means[m, n, 0] += rows[0] * to_x + rows[3] * to_y + rows[6] * to_z
+                to_means[m, n, 1] += rows[1] * to_x + rows[4] * to_y + rows[7] * to_z
+                to_means[m, n, 2] += rows[2] * to_x + rows[5] * to_y + rows[8] * to_z

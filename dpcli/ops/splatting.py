@@ -7,9 +7,11 @@ a torch reference and a fast CPU form; on CUDA compositing is gsplat's own kerne
 from __future__ import annotations
 
 import functools
+import math
 import sys
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -164,6 +166,13 @@ def _pixels_gsplat(
     return rasterize_to_pixels(means2d, conics, colors, opacities, width, height, tile_size, offsets, ids)
 
 
+def _finite(tensor: Tensor) -> bool:
+    if not tensor.is_cpu:
+        return bool(torch.isfinite(tensor).all())
+    with np.errstate(all="ignore"):  # numpy's sum wakes no threads of torch's
+        return math.isfinite(tensor.numpy().sum()) or bool(torch.isfinite(tensor).all())
+
+
 def _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, sh_degree, render_mode) -> None:
     if render_mode not in _MODES:
         raise ValueError(f"render_mode must be one of {', '.join(_MODES)}, but is {render_mode!r}")
@@ -178,7 +187,7 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, s
     for name, (tensor, tail) in tails.items():
         if tuple(tensor.shape) not in (tail, (cameras, *tail)):
             raise ValueError(f"{name} must have shape {tail} or {(cameras, *tail)}, but has {tuple(tensor.shape)}")
-        if not torch.isfinite(tensor.detach().sum()) and not torch.isfinite(tensor.detach()).all():
+        if not _finite(tensor.detach()):
             raise ValueError(f"{name} holds NaN or infinite values")
     if sh_degree is not None and colors.shape[-2] < (sh_degree + 1) ** 2:
         raise ValueError(

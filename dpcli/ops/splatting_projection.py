@@ -51,10 +51,10 @@ class _Projection(torch.autograd.Function):
     def backward(ctx, to_means2d, to_conics, to_depths, _):
         kernels = parallel_kernels("kernels_splat_project")
         *inputs, conics, radii = ctx.saved_tensors
-        gradients = [torch.zeros_like(t) for t in inputs]
+        gradients = [np.zeros(t.shape, np.float32) for t in inputs]  # wakes no threads of torch's
         incoming = [t.contiguous().numpy() for t in (to_means2d, to_conics, to_depths)]
-        inputs, outputs = ([t.detach().numpy() for t in tensors] for tensors in (inputs, gradients))
+        inputs = [t.detach().numpy() for t in inputs]
         kernels.project_backward(
-            *inputs, *ctx.cameras, *ctx.size, conics.detach().numpy(), radii.numpy(), *incoming, *outputs
+            *inputs, *ctx.cameras, *ctx.size, conics.detach().numpy(), radii.numpy(), *incoming, *gradients
         )
-        return *gradients, None, None, None, None, None, None
+        return *(torch.from_numpy(g) for g in gradients), None, None, None, None, None, None
