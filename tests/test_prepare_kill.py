@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import itertools
 import os
+import shutil
 import signal
 import subprocess
 import time
@@ -19,6 +22,7 @@ from dpcli.prepare import pipeline
 from dpcli.prepare.pipeline import convert, convert_item
 from dpcli.runtime import pool
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store import writer as writer_module
 from dpcli.store.journal import Journal
 from tests.prepare_helpers import DPC, ROOT, ToyReader, dpc
 
@@ -41,9 +45,17 @@ def options(config: int = 1) -> dict:
     return {"class_names": ["a", "b"], "fields": ["track", "time"], "resume": True, "provenance": {"config": config}}
 
 
+@pytest.fixture(autouse=True, scope="module")
+def small_chunks():
+    """So that samples of a few points span several chunks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(writer_module, "POINTS_PER_CHUNK", 4)
+        yield
+
+
 @pytest.fixture(scope="module")
-def killed(tmp_path_factory) -> tuple[bytes, list[int], str]:
-    """The journal of five samples, where each of them ends in it, and the digest of the file they make."""
+def killed(small_chunks, tmp_path_factory) -> tuple[bytes, list[int], bytes, str]:
+    """The journal of five samples, where each of them ends in it, the unfinished HDF5, and the whole file's digest."""
     folder = tmp_path_factory.mktemp("kill")
     ends, journal = [], folder / ".a.h5.part"
     with pytest.raises(Stopped), CloudsWriter(folder / "a.h5", **options()) as writer:
@@ -51,19 +63,20 @@ def killed(tmp_path_factory) -> tuple[bytes, list[int], str]:
             ends.append(journal.stat().st_size)
             writer.write(sequence(number))
         ends.append(journal.stat().st_size)
+        unfinished = (folder / ".a.h5.new").read_bytes()  # as a kill leaves it: HDF5 has written nothing else yet
         raise Stopped("now")
     content = journal.read_bytes()
     with CloudsWriter(folder / "whole.h5", **options()) as writer:
         for number in range(5):
             writer.write(sequence(number))
-    return content, ends, digest(folder / "whole.h5")
+    return content, ends, unfinished, digest(folder / "whole.h5")
 
 
 @settings(max_examples=80, deadline=None)
 @given(data=st.data())
 def test_a_journal_cut_anywhere_or_damaged_gives_the_samples_before(killed, tmp_path_factory, data):
-    """Every state that a kill or a lost block can leave; the HDF5 file beside it may be anything."""
-    content, ends, whole = killed
+    """Every state that a kill or a lost block can leave."""
+    content, ends, unfinished, whole = killed
     folder = tmp_path_factory.mktemp("cut")
     cut = data.draw(st.one_of(st.sampled_from(ends), st.integers(0, len(content))))
     left = bytearray(content[:cut])
@@ -72,23 +85,104 @@ def test_a_journal_cut_anywhere_or_damaged_gives_the_samples_before(killed, tmp_
         sound = data.draw(st.integers(0, cut - 1))
         left[sound] ^= data.draw(st.integers(1, 255))
     (folder / ".a.h5.part").write_bytes(left)
-    (folder / ".a.h5.new").write_bytes(data.draw(st.sampled_from([b"", b"\x89HDF\r\n\x1a\n", b"x" * 5000])))
-    expected = max([0, *(k for k, end in enumerate(ends) if end <= sound)])
-    with CloudsWriter(folder / "a.h5", **options()) as writer:
-        assert writer.written_names == [sequence(k).name for k in range(expected)]
-        for number in range(expected, 5):
-            writer.write(sequence(number))
+    (folder / ".a.h5.new").write_bytes(unfinished)
+    (folder / ".a.h5.alt").write_bytes(data.draw(st.sampled_from([b"", b"\x89HDF\r\n\x1a\n", b"x" * 5000])))
+    (folder / ".a.h5.part.new").write_bytes(data.draw(st.sampled_from([b"", content[: cut // 2]])))
+    go_on(folder, max([0, *(k for k, end in enumerate(ends) if end <= sound)]))
     assert digest(folder / "a.h5") == whole
     assert [path.name for path in folder.iterdir()] == ["a.h5"]
 
 
+def go_on(folder: Path, expected: int) -> None:
+    with CloudsWriter(folder / "a.h5", **options()) as writer:
+        assert writer.written_names == [sequence(k).name for k in range(expected)]
+        for number in range(expected, 5):
+            writer.write(sequence(number))
+
+
+@pytest.mark.parametrize("number", [1, 3])
+@pytest.mark.parametrize("damage", ["changed", "cut", "gone"])
+def test_points_that_are_not_in_the_unfinished_file_are_not_taken(killed, tmp_path, number, damage):
+    """Blocks that never came to the disk: the samples before are kept, where there are any."""
+    content, _, unfinished, whole = killed
+    (tmp_path / ".a.h5.part").write_bytes(content)
+    at = unfinished.index(chunk_of(number))
+    if damage == "changed":
+        (tmp_path / ".a.h5.new").write_bytes(
+            unfinished[: at + 5] + bytes([unfinished[at + 5] ^ 1]) + unfinished[at + 6 :]
+        )
+    elif damage == "cut":
+        (tmp_path / ".a.h5.new").write_bytes(unfinished[: at + 5])
+    go_on(tmp_path, number if damage != "gone" else first_placed())
+    assert digest(tmp_path / "a.h5") == whole
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def chunk_of(number: int) -> bytes:
+    """Of the first whole chunk that ends in a sample, the last bytes."""
+    ends = np.cumsum([len(sequence(k).points) for k in range(5)])
+    start = ends[number] - len(sequence(number).points)
+    end = (start // 4 + 1) * 4
+    assert end <= ends[number]
+    return sequence(number).points[: end - start].tobytes()
+
+
+def first_placed() -> int:
+    """The first sample with a whole chunk: it is the first that points into the HDF5 file."""
+    return int(np.argmax(np.cumsum([len(sequence(k).points) for k in range(5)]) >= 4))
+
+
+@pytest.mark.parametrize("reached", [0, 2, 3, 4])
+def test_a_kill_while_going_on_loses_nothing(killed, tmp_path, monkeypatch, reached):
+    """What an earlier run left stays until the new file holds all of it, whichever of the two names it has."""
+    content, ends, unfinished, whole = killed
+    folder, left = tmp_path / "a", tmp_path / "left"
+    folder.mkdir()
+    (folder / ".a.h5.part").write_bytes(content[: ends[4]])
+    (folder / ".a.h5.new").write_bytes(unfinished)
+    note, count = CloudsWriter._note, itertools.count()
+
+    def killed_there(self, *given):
+        if next(count) == reached:
+            shutil.copytree(folder, left)
+            raise Stopped("here")
+        note(self, *given)
+
+    with monkeypatch.context() as patch, pytest.raises(Stopped, match="here"):
+        patch.setattr(CloudsWriter, "_note", killed_there)
+        with CloudsWriter(folder / "a.h5", **options()) as writer:
+            writer.write(sequence(4))
+    for place in (folder, left):
+        for stop in (True, False):  # stopped: the file of the other name is the one to go on with
+            with contextlib.suppress(Stopped), CloudsWriter(place / "a.h5", **options()) as writer:
+                assert len(writer.written_names) == 4
+                if stop:
+                    raise Stopped("now")
+                writer.write(sequence(4))
+        assert digest(place / "a.h5") == whole
+        assert [path.name for path in place.iterdir()] == ["a.h5"]
+
+
+def test_a_journal_of_another_version_starts_over(killed, tmp_path):
+    (tmp_path / ".a.h5.part").write_bytes(killed[0].replace(b"dpc journal 2", b"dpc journal 1", 1))
+    (tmp_path / ".a.h5.new").write_bytes(killed[2])
+    go_on(tmp_path, 0)
+    assert digest(tmp_path / "a.h5") == killed[3]
+
+
 def test_a_journal_gives_back_what_went_in(tmp_path):
     given_values = [sequence(3), np.arange(6.0).reshape(2, 3)[:, ::2], [np.zeros((0, 3), np.float32)], "x", 4, None]
-    journal = Journal(tmp_path / "j", ABOUT)
-    assert list(journal.samples()) == []
-    journal.append(given_values)
+    data = tmp_path / ".j.new"
+    data.write_bytes(b"123" + given_values[0].points.tobytes())
+    placed = (given_values[0].points, [(3, 12), (15, 4)])  # the rest goes to the journal
+    journal = Journal(tmp_path / ".j.part", ABOUT)
+    assert journal.data_name == ""
+    with data.open("r+b") as file:
+        journal.begin(data, file.fileno())
+    journal.append(given_values, placed)
     journal.keep()
-    journal = Journal(tmp_path / "j", ABOUT)
+    journal = Journal(tmp_path / ".j.part", ABOUT)
+    assert journal.data_name == data.name
     (back,) = journal.samples()
     for key, value in vars(given_values[0]).items():
         np.testing.assert_array_equal(getattr(back[0], key), value)
@@ -111,6 +205,7 @@ def test_of_two_writers_of_one_file_the_second_is_refused(tmp_path):
 def test_a_journal_of_other_work_is_not_continued_and_force_starts_over(killed, tmp_path):
     for more in ({"provenance": {"config": 2}}, {"force": True}):
         (tmp_path / ".a.h5.part").write_bytes(killed[0])
+        (tmp_path / ".a.h5.new").write_bytes(killed[2])
         with CloudsWriter(tmp_path / "a.h5", **{**options(), **more}) as writer:
             assert writer.written_names == []
             writer.write(sequence(0))

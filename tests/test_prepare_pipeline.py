@@ -227,7 +227,7 @@ def test_a_stopped_run_is_continued_to_the_same_bytes(tmp_path, monkeypatch, num
         Stopper(patch, 3, getattr(signal, number))
         with pytest.raises(raised):
             convert(reader, path, points=20)
-    assert not path.exists() and len(list(tmp_path.iterdir())) == 2  # the part is kept beside
+    assert {p.name for p in tmp_path.iterdir()} == {"whole.h5", ".a.h5.part", ".a.h5.new"}
     read = []
     monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
     report = convert(reader, path, points=20)

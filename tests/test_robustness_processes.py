@@ -94,12 +94,12 @@ def test_a_file_size_limit_is_told_like_a_full_disk(raw, tmp_path):
 
 
 def start(raw: Path, output: Path, count: int) -> subprocess.Popen:
-    """A conversion in two worker processes, returned once `count` samples are in the part file."""
+    """A conversion in two worker processes, returned once `count` samples are in the unfinished file."""
     process = subprocess.Popen(
         [*DPC, "-v", "prepare", "msraction3d", raw, "-o", output, "--jobs", "2", "--points", "4000", "--sampling", "fps"],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    part, limit = output.with_name(f".{output.name}.part"), time.monotonic() + 120
+    part, limit = output.with_name(f".{output.name}.new"), time.monotonic() + 120
     while time.monotonic() < limit and process.poll() is None:
         if part.exists() and part.stat().st_size > count * 300_000:
             break
@@ -134,7 +134,7 @@ def test_a_signal_in_the_middle_keeps_what_is_done(raw, tmp_path, number, code, 
         pytest.skip("the conversion was over before the signal came")
     assert process.returncode == code, told
     assert "Traceback" not in told and "samples are kept" in told
-    assert leftovers(tmp_path) == [".out.h5.part"]
+    assert leftovers(tmp_path) == [".out.h5.new", ".out.h5.part"]
     limit = time.monotonic() + 20
     while alive(process.pid) and time.monotonic() < limit:
         time.sleep(0.05)

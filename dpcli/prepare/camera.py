@@ -64,6 +64,13 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
     return rays.reshape(-1, 3)
 
 
+@lru_cache(maxsize=8)
+def _complex_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
+    """x + iy of `pixel_rays`, complex64 (H*W): one number is taken three times as fast as a row."""
+    rays = np.ascontiguousarray(pixel_rays(height, width, intrinsics)[:, :2])
+    return rays.view(np.complex64).reshape(-1)
+
+
 def back_project(
     depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +80,7 @@ def back_project(
     order within each frame, frames one after the other; counts i64 (T) of points per frame.
     """
     frames, height, width = depth.shape
-    rays = pixel_rays(height, width, intrinsics)
+    rays = _complex_rays(height, width, intrinsics)
     # what is not seen is dropped before anything is computed: most pixels of a cut-out person or hand
     seen = [_seen(frame, np.float32(unit), near, far) for frame in depth.reshape(frames, height * width)]
     counts = np.array([len(pixels) for pixels, _ in seen], np.int64)
@@ -81,8 +88,10 @@ def back_project(
     start = 0
     for pixels, z in seen:
         block = points[start : start + len(pixels)]
-        rays.take(pixels, axis=0, out=block, mode="clip")
-        block *= z[:, None]
+        ray = rays.take(pixels, mode="clip")
+        np.multiply(ray.real, z, out=block[:, 0])  # column by column: long loops instead of many of three numbers
+        np.multiply(ray.imag, z, out=block[:, 1])
+        block[:, 2] = z
         start += len(pixels)
     return points, counts
 

@@ -10,11 +10,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DpcError
+from dpcli.runtime import handover
 from dpcli.runtime.memory import keep_freed_memory
 
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
@@ -97,16 +99,27 @@ def ordered_map(
     own = executor is None
     strangers = set(multiprocessing.active_children())
     pool = executor or _new_pool(jobs)
+    guarded = partial(_guarded, function)
+    work = partial(handover.packed, guarded) if own and handover.POSSIBLE else guarded
     waiting: deque = deque()
+
+    def first() -> tuple[Any, Any]:
+        done, future = waiting.popleft()
+        result = future.result()
+        if isinstance(result, handover.Parcel):
+            try:
+                return done, handover.unpacked(result)
+            except OSError:  # not allowed here, or that worker is gone: then this finds the pool broken
+                return done, pool.submit(guarded, done).result()
+        return done, result
+
     try:
         for item in items:
-            waiting.append((item, pool.submit(_guarded, function, item)))
+            waiting.append((item, pool.submit(work, item)))
             if len(waiting) >= 2 * max(jobs, 1):
-                done, future = waiting.popleft()
-                yield done, future.result()
+                yield first()
         while waiting:
-            done, future = waiting.popleft()
-            yield done, future.result()
+            yield first()
     except BrokenProcessPool:
         # the executor ends the other workers by SIGTERM, which they ignore, and would wait for them for ever
         for child in set(multiprocessing.active_children()) - strangers if own else ():

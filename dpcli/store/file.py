@@ -16,7 +16,7 @@ from dpcli import __version__
 from dpcli.errors import DataError, DpcError
 
 SCHEMA = 1
-KINDS = ("clouds", "views", "scores", "parts", "gaussians")
+KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 STRING = h5py.string_dtype("utf-8")
 
@@ -175,7 +175,7 @@ class AtomicFile:
             raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
         try:
             self.file = h5py.File(self.part, mode)
-            self._handle = self.file.id.get_vfd_handle()
+            self.handle = self.file.id.get_vfd_handle()
         except OSError as error:
             busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
             why = "another dpc is writing it" if busy else str(error).splitlines()[0]
@@ -205,20 +205,27 @@ class AtomicFile:
             raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
 
     def discard(self) -> None:
+        self._close()
+        self.part.unlink(missing_ok=True)
+
+    def _close(self) -> None:
         try:
             self.file.close()
         except (OSError, RuntimeError):  # closing flushes, which fails again on a full disk
             pass
-        self.part.unlink(missing_ok=True)
 
     def failed(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Discard after an exception; re-raise a failed write in words."""
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None,
+        keep: bool = False,
+    ) -> None:  # fmt: skip
+        """Discard after an exception, or `keep` the part unfinished; re-raise a failed write in words."""
         worded = self.problem(error) if error is not None else None
         if worded is not None:
             self._let_go()
-        self.discard()
+        if keep:
+            self._close()
+        else:
+            self.discard()
         if worded is not None:
             raise worded from None
 
@@ -229,7 +236,7 @@ class AtomicFile:
         """
         try:
             elsewhere = os.open(os.devnull, os.O_RDWR)
-            os.dup2(elsewhere, self._handle, inheritable=False)
+            os.dup2(elsewhere, self.handle, inheritable=False)
             os.close(elsewhere)
         except OSError:  # closed already
             pass

@@ -10,9 +10,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError, Stopped, UsageError
+from dpcli.errors import DataError, DpcError, Stopped, UsageError
+from dpcli.store.chunks import WholeChunks
 from dpcli.store.file import STRING, AtomicFile, write_positions, write_root, write_skipped
-from dpcli.store.journal import Journal
+from dpcli.store.journal import Journal, Placed, data_suffix, journal_path, second_path
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
 COMPRESSIONS = ("none", "lzf", "gzip")
@@ -30,7 +31,8 @@ class CloudsWriter:
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
     written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
     the next writer with the same provenance continues, `written_names` lists what is already there, and the file gets
-    the bytes it would have had. That takes a journal (`.NAME.part`) as large as the samples until the file is whole.
+    the bytes it would have had. Until the file is whole that takes a journal (`.NAME.part`), small beside uncompressed
+    points, as large as the samples of a compressed file.
     `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose). Set before the
     block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
     kept in the file; a shard may be empty. Raises UsageError when `path` exists and `force` is off.
@@ -71,24 +73,23 @@ class CloudsWriter:
         self._index: dict[str, list] = {name: [] for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
         self._journal: Journal | None = None
+        self._chunks: WholeChunks | None = None
+        self._placed: Placed | None = None
         self.written_names: list[str] = []
-        self._opening = True
         self._open(force)
-        self._opening = False
 
     def _open(self, force: bool) -> None:
-        folder = self.path.parent
+        folder, before = self.path.parent, None
         if self.resume and folder.is_dir() and not self.path.is_dir():  # AtomicFile explains what is wrong otherwise
-            self._journal = Journal(folder / f".{self.path.name}.part", self._about())
+            before = Journal(journal_path(self.path), self._about())
         try:
-            self._atomic = AtomicFile(self.path, suffix=".new" if self._journal else ".part")
+            self._atomic = AtomicFile(self.path, suffix=data_suffix(before.data_name) if before else ".part")
             self._file = self._atomic.file
             self._create()
-            if self._journal:
-                self._continue(self._journal, force)
+            if before:
+                self._continue(before, force)
         except BaseException as error:
-            if self._journal and self._journal.was_there:  # nothing of the earlier run may be lost
-                self._journal.keep()
+            self._give_up(before)
             self._leave(type(error), error, None)
             raise
 
@@ -96,14 +97,30 @@ class CloudsWriter:
         """What decides whether a journal is of this very work."""
         return {"kind": self.kind, "provenance": self.provenance}
 
-    def _continue(self, journal: Journal, force: bool) -> None:
+    def _continue(self, before: Journal, force: bool) -> None:
         """Write what an earlier run had written, if it was the same work."""
-        if force:
-            journal.begin_again()
+        if force or not before.data_name:
+            self._journal = before
+            before.begin(self._atomic.part, self._atomic.handle)
+            before.remove_others(self._atomic.part.name)
             return
-        for given in journal.samples():
+        self._journal = Journal(second_path(before.path), self._about())
+        self._journal.begin(self._atomic.part, self._atomic.handle)
+        for given in before.samples():
             self.write(*given)
             self.written_names.append(given[0].name)
+        self._journal.replace(before)
+
+    def _give_up(self, before: Journal | None) -> None:
+        """Opening failed: nothing of the earlier run may be lost."""
+        if self._journal not in (None, before):
+            self._journal.path.unlink(missing_ok=True)
+            self._journal.close()
+        self._journal = None
+        if before and before.was_there:
+            before.keep()
+        elif before:
+            before.discard()
 
     def _create(self) -> None:
         file = self._file
@@ -141,8 +158,9 @@ class CloudsWriter:
 
     def _note(self, sequence: CloudSequence, *said: Any) -> None:
         """From here on the sample counts as written; `said`: what else `write` was given."""
-        if self._journal and not self._opening:  # what comes from it need not go to it again
-            self._journal.append([sequence, *said])
+        if self._journal:
+            self._journal.append([sequence, *said], self._placed)
+        self._placed = None
         self._names.add(sequence.name)
 
     def _check(self, sequence: CloudSequence) -> None:
@@ -178,11 +196,19 @@ class CloudsWriter:
             self._file.create_dataset(
                 name, (0, *shape), np.float64, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
             )
-        self._extend(name, values)
+        if name == "points" and self.compression == "none":
+            self._append_whole_chunks(values)
+        else:
+            self._extend(name, values)
         self._unflushed += getattr(values, "nbytes", 0)
         if self._unflushed > _FLUSH_BYTES:
             self._file.flush()
             self._unflushed = 0
+
+    def _append_whole_chunks(self, points: np.ndarray) -> None:
+        self._chunks = self._chunks or WholeChunks(self._file["points"])
+        places = self._chunks.append(points)
+        self._placed = (points, places) if points.dtype == np.float32 else None
 
     def _extend(self, name: str, values: np.ndarray | list) -> None:
         if name not in self._data:  # kept open: closing would write its unfinished chunk, each time
@@ -211,17 +237,25 @@ class CloudsWriter:
     ) -> None:
         """Nothing stays but, after a stop, the journal."""
         stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
-        if self._journal and stopped and len(self):
+        kept = bool(self._journal and stopped and len(self))
+        if hasattr(self, "_atomic"):
+            try:
+                self._atomic.failed(kind, error, trace, keep=kept)
+            finally:
+                self._leave_journal(kept)
+
+    def _leave_journal(self, kept: bool) -> None:
+        if self._journal and kept:
             self._journal.keep()
         elif self._journal:
             self._journal.discard()
-        if hasattr(self, "_atomic"):
-            self._atomic.failed(kind, error, trace)
 
     def _finish(self) -> None:
         try:
             if not len(self) and self.positions is None:
                 raise DataError(f"{self.path}: not one good sample to write; nothing was written")
+            if self._chunks:
+                self._chunks.finish()
             for name, values in self._index.items():
                 if values:
                     self._extend(name, values)
@@ -231,6 +265,9 @@ class CloudsWriter:
         except BaseException as error:
             self._leave(type(error), error, None)
             raise
-        self._atomic.commit()
-        if self._journal:
-            self._journal.discard()
+        try:
+            self._atomic.commit()
+        except DpcError:  # the HDF5 file is gone, and with it what the journal points to
+            self._leave_journal(kept=False)
+            raise
+        self._leave_journal(kept=False)
