@@ -114,7 +114,10 @@ def test_pooled_gradient_is_sorted_by_rows(threshold):
 def test_largest_takes_the_first_of_equals():
     rows = np.random.default_rng(0).integers(0, 4, (6, 9, 45)).astype(np.float32) - 2
     best, where = np.empty((6, 45), np.float32), np.empty((6, 45), np.int32)
-    parallel_kernels("kernels_grouped").largest(rows.reshape(-1), 9, best, where)
+    kernels = parallel_kernels("kernels_grouped")
+    for first in (0, 2):  # two pieces
+        piece = rows[first : first + 4 if first else 2]
+        kernels.largest(piece.reshape(-1), 9, first, best, where)
     assert (best == rows.max(1)).all() and (where == rows.argmax(1)).all()
 
 

@@ -19,7 +19,9 @@ from dpcli.ops.backend import chosen_backend
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 
-_PIECE = 1 << 22  # bytes of activations between two matrix products, which then stay in the cache
+# Bytes of activations between two matrix products, which then stay in the cache. What comes with each piece (Python, torch's
+# dispatch) runs on one thread: half the size makes the products faster and the rest slower, twice the size the reverse.
+_PIECE = 1 << 22
 _BLOCKS = 32  # pieces of work of a sum: more than threads, for balance; fixed, so that sums repeat exactly
 _HELD = 8  # pieces summed in float32
 _SPLITS = 4  # the same where each needs a copy of a large target
@@ -182,20 +184,21 @@ class _FromPositions:
         self.scale, self.inverse = scale, inverse
         weight = self.weight * scale[:, None]
         bias = shift - (weight.double() @ self.mean).float()
-        self.folded = (weight.t().contiguous().numpy(), bias.numpy())
+        self.inputs = (*self.arrays, weight.t().contiguous().numpy(), bias.numpy())
 
     def hidden(self, first: int, out: np.ndarray) -> None:
         """The layer's activations of a piece (rows,C) from centroid `first` on."""
-        self.kernels.hidden_xyz(*self.arrays, *self.folded, first, out)
+        self.kernels.hidden_xyz(*self.inputs, first, out)
 
     def begin_backward(self) -> int:
         """Returns how many copies of the weight's gradient `back` fills."""
         self.sums = torch.zeros(_SPLITS, 4, self.channels, dtype=torch.float64)
+        self.targets = (self.sums.numpy(), _width(self.channels, _SPLITS))
         return _SPLITS
 
     def back(self, first: int, *arrays: np.ndarray) -> None:
         """Take in a piece's gradient: arrays as the kernel's hidden .. grad_weight."""
-        self.kernels.back_xyz(*arrays, *self.arrays, first, self.sums.numpy(), _width(self.channels, _SPLITS))
+        self.kernels.back_xyz(*arrays, *self.arrays, first, *self.targets)
 
     def gradients(self) -> tuple[Tensor | None, ...]:
         """Of (table, offset, weight, bias, norm weight, norm bias); table and offset are not inputs here."""
@@ -230,23 +233,24 @@ class _FromTable:
     def fold(self, scale: Tensor, inverse: Tensor, shift: Tensor) -> None:
         """Take batch norm into the table: relu(scale * (table - offset - mean) + shift)."""
         self.scale, self.inverse = scale, inverse
-        self.folded = ((self.table * scale + (shift - self.mean * scale)).numpy(), (self.offset * scale).numpy())
+        table = torch.addcmul(shift - self.mean * scale, self.table, scale)
+        self.inputs = (table.numpy(), (self.offset * scale).numpy(), self.idx.numpy())
 
     def hidden(self, first: int, out: np.ndarray) -> None:
         """The layer's activations of a piece (rows,C) from centroid `first` on."""
-        self.kernels.hidden_table(*self.folded, self.idx.numpy(), first, out)
+        self.kernels.hidden_table(*self.inputs, first, out)
 
     def begin_backward(self) -> int:
         """Returns how many copies of the weight's gradient `back` fills."""
         batch, nodes, channels = self.table.shape
         self.packed = torch.zeros(-(-channels // (2 * _LANES)), batch, nodes, 2 * _LANES)
         self.to_offset = torch.empty_like(self.sums)
-        self.targets = (self.packed.view(-1).numpy(), self.to_offset.view(-1).numpy(), nodes)
+        self.targets = (self.packed.view(-1).numpy(), self.to_offset.view(-1).numpy(), nodes, _width(channels))
         return 1
 
     def back(self, first: int, *arrays: np.ndarray) -> None:
         """Take in a piece's gradient: arrays as the kernel's hidden .. grad_weight."""
-        self.kernels.back_table(*arrays, self.idx.numpy(), first, *self.targets, _width(self.channels))
+        self.kernels.back_table(*arrays, self.inputs[2], first, *self.targets)
 
     def gradients(self) -> tuple[Tensor | None, ...]:
         """Of (table, offset, weight, bias, norm weight, norm bias); weight and bias are reached through the table."""
@@ -276,20 +280,18 @@ def _width(channels: int, splits: int = 1) -> int:
     return -(-blocks // tasks)
 
 
-@dataclass
 class _Room:
     """Where a piece's activations live, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
 
-    hidden: Tensor
-    wide: Tensor
+    def __init__(self, hidden: Tensor, wide: Tensor) -> None:
+        self.hidden, self.wide = hidden, wide
+        self.transposed, self.ones = hidden.t(), torch.ones(1, len(hidden))
+        self.array = hidden.numpy()
+        self.flat = (self.array.reshape(-1), wide.numpy().reshape(-1))
 
-    def __post_init__(self) -> None:
-        self.arrays = (self.hidden.numpy(), self.wide.numpy())
-        self.flat = tuple(array.reshape(-1) for array in self.arrays)
 
-
-def _pieces(first: _FromPositions | _FromTable, widest: int) -> Iterator[tuple[slice, _Room]]:
-    """Centroids in ranges of about _PIECE bytes of activations, (rows,C1) and (rows,widest), which share their room."""
+def _pieces(first: _FromPositions | _FromTable, widest: int) -> Iterator[tuple[int, _Room]]:
+    """First centroids of pieces of about _PIECE bytes of activations, (rows,C1) and (rows,widest), and their shared room."""
     neighbors = first.idx.shape[2]
     count = first.rows // neighbors
     step = min(count, max(1, _PIECE // (4 * neighbors * (first.channels + widest))))
@@ -298,7 +300,7 @@ def _pieces(first: _FromPositions | _FromTable, widest: int) -> Iterator[tuple[s
         if count - low < step:
             rows = (count - low) * neighbors
             room = _Room(room.hidden[:rows], room.wide[:rows])
-        yield slice(low, min(low + step, count)), room
+        yield low, room
 
 
 class _Moments:
@@ -306,15 +308,13 @@ class _Moments:
 
     def __init__(self, channels: int) -> None:
         self.gram, self.total = (torch.zeros(shape, dtype=torch.float64) for shape in ((channels, channels), channels))
-        self.parts = torch.empty(channels, channels), torch.empty(1, channels)
-        self.ones, self.held = torch.ones(1, 0), 0
+        self.parts, self.held = (torch.empty(channels, channels), torch.empty(1, channels)), 0
 
-    def add(self, hidden: Tensor) -> None:
+    def add(self, room: _Room) -> None:
         """One more piece."""
-        if self.ones.shape[1] != len(hidden):
-            self.ones = torch.ones(1, len(hidden))
-        for part, left in zip(self.parts, (hidden.t(), self.ones)):
-            torch.addmm(part, left, hidden, beta=1 if self.held else 0, out=part)
+        gram, total = self.parts
+        torch.addmm(gram, room.transposed, room.hidden, beta=1 if self.held else 0, out=gram)
+        torch.addmm(total, room.ones, room.hidden, beta=1 if self.held else 0, out=total)
         self.held += 1
         if self.held == _HELD:
             self.flush()
@@ -338,11 +338,11 @@ def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Te
     best, where = torch.empty(count, c2), torch.empty(count, c2, dtype=torch.int32)
     targets = (best.numpy(), where.numpy())
     moments, weight = _Moments(first.channels), weight.t()
-    for piece, room in _pieces(first, c2):
-        first.hidden(piece.start, room.arrays[0])
+    for start, room in _pieces(first, c2):
+        first.hidden(start, room.array)
         torch.mm(room.hidden, weight, out=room.wide)
-        moments.add(room.hidden)
-        first.kernels.largest(room.flat[1], neighbors, *(array[piece] for array in targets))
+        moments.add(room)
+        first.kernels.largest(room.flat[1], neighbors, start, *targets)
     moments.flush()
     return best, where, moments.gram, moments.total
 
@@ -372,10 +372,10 @@ def _back_pool(
     packed = weight[:, columns].view(len(weight), -1, 2 * _LANES).transpose(0, 1).contiguous()
     parts = torch.zeros(splits, *packed.shape)
     arrays = (constant.numpy(), *pooled, packed.view(-1).numpy(), parts.view(splits, -1).numpy())
-    for piece, room in _pieces(first, c1):
-        first.hidden(piece.start, room.arrays[0])
+    for start, room in _pieces(first, c1):
+        first.hidden(start, room.array)
         torch.mm(room.hidden, mixed, out=room.wide)
-        first.back(piece.start, *room.flat, *arrays)
+        first.back(start, *room.flat, *arrays)
     return parts.sum(0).transpose(0, 1).reshape(len(weight), -1)[:, :c1]
 
 

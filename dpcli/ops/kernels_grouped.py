@@ -94,15 +94,15 @@ def hidden_table(table, offset, idx, first, out):
 
 
 @parallel_kernel
-def largest(rows, neighbors, best, where):
-    """Per centroid and channel the largest value over its rows, and which row; ties: the first.
+def largest(rows, neighbors, first, best, where):
+    """Per centroid and channel of a piece the largest value over its rows, and which row; ties: the first.
 
-    rows (M*K*C), best (M,C), where (M,C) i32, at least WIDTH channels. Four vectors of running maxima stay in registers
-    while the rows go by; where fewer channels are left, vectors overlap.
+    rows (rows*C), best (M,C) and where (M,C) i32 for all centroids, at least WIDTH channels. Four vectors of running maxima
+    stay in registers while the rows go by; where fewer channels are left, vectors overlap.
     """
-    count, channels = best.shape
+    channels = best.shape[1]
     tasks = (channels + 4 * WIDTH - 1) // (4 * WIDTH)
-    for i in prange(count):
+    for i in prange(rows.size // channels // neighbors):
         at = np.empty(channels, np.float32)  # row numbers: exact below 2^24
         top = np.empty(channels, np.float32)
         for task in range(tasks):
@@ -129,8 +129,8 @@ def largest(rows, neighbors, best, where):
             store(at, c2, k2)
             store(at, c3, k3)
         for c in range(np.uintp(channels)):
-            best[i, c] = top[c]
-            where[i, c] = np.int32(at[c])
+            best[first + i, c] = top[c]
+            where[first + i, c] = np.int32(at[c])
 
 
 @parallel_kernel
