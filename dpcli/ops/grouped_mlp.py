@@ -100,6 +100,8 @@ def _norm_relu(values: Tensor, norm: Norm) -> tuple[Tensor, tuple[Tensor, Tensor
     """Batch norm by the batch's own statistics and ReLU; ReLU alone where given statistics are folded in already."""
     if norm.mean is not None:
         return (torch.relu(values) if values.requires_grad else values.relu_()), (norm.mean, norm.var)
+    if values.dtype == torch.bfloat16:  # products may come in bfloat16, whose eight bits are too few for statistics
+        values = values.float()
     var, mean = torch.var_mean(values, tuple(range(values.dim() - 1)), correction=0)
     scale = norm.weight * torch.rsqrt(var + norm.eps)
     return torch.relu(values * scale + (norm.bias - mean * scale)), (mean.detach(), var.detach())
