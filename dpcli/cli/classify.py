@@ -1,4 +1,4 @@
-"""`dpc classify`: train, predict, profile."""
+"""`dpc classify`: train, predict, fuse, profile."""
 
 from __future__ import annotations
 
@@ -8,17 +8,11 @@ import typer
 
 from dpcli.cli import classify_stream
 from dpcli.cli.classify_explain import app as explain_app
-from dpcli.cli.options import Device, Force, Json, Seed
+from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
 from dpcli.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True)
 app.add_typer(explain_app, name="explain")
-TrustedBackbone = Annotated[
-    str | None,
-    typer.Option(
-        "--backbone", help="module:Class of a model made on a backbone of your own: your leave to run that code."
-    ),
-]
 
 
 @app.command()
@@ -183,6 +177,21 @@ def predict(
 
     run_prediction(data, model, output, split=split, clips_per_video=clips_per_video or None, drop_short=drop_short, batch=batch,
                    seed=seed, device=device, force=force, backbone=backbone)  # fmt: skip
+
+
+@app.command()
+def fuse(
+    scores: Annotated[list[str], typer.Argument(help="Scores files of the same videos; one may be - for a pipe.")],
+    output: Output,
+    weights: Annotated[
+        str | None, typer.Option("--weights", help="One per file, with commas, as 0.7,0.3. Default: all alike.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Average the scores of several models, such as one on points and one on flow; each stays as a stream of its own."""
+    from dpcli.classify.fuse import run_fusion
+
+    run_fusion(scores, output, weights=weights, force=force)
 
 
 @app.command()

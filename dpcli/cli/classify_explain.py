@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from dpcli.cli.options import Device, Force, Json, Output, Seed
+from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
 from dpcli.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, help="Look into a model: activations of points (pac), maps of videos (tsne).")
@@ -15,12 +15,6 @@ app = typer.Typer(no_args_is_help=True, help="Look into a model: activations of 
 Data = Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")]
 Model = Annotated[
     str, typer.Option("--model", help="A .safetensors file, a folder made by train, or a shipped model's name.")
-]
-TrustedBackbone = Annotated[
-    str | None,
-    typer.Option(
-        "--backbone", help="module:Class of a model made on a backbone of your own: your leave to run that code."
-    ),
 ]
 Split = Annotated[str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")]
 Stream = Annotated[

@@ -15,3 +15,9 @@ OnError = Annotated[str, typer.Option("--on-error", help="A bad sample: skip (li
 Force = Annotated[bool, typer.Option("--force", help="Start over, even if the output or a part of it exists.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Picture = Annotated[Path | None, typer.Option("--picture", help="Write a picture (.png) to this file.")]
+TrustedBackbone = Annotated[
+    str | None,
+    typer.Option(
+        "--backbone", help="module:Class of a model made on a backbone of your own: your leave to run that code."
+    ),
+]

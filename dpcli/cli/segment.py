@@ -1,4 +1,4 @@
-"""`dpc segment`: train, flow, predict, profile."""
+"""`dpc segment`: train, flow, estimate-flow, predict, profile."""
 
 from __future__ import annotations
 
@@ -177,6 +177,43 @@ def flow(
     from dpcli.segment.flow_command import run_flow_training
 
     run_flow_training(data, output, config=config, steps=steps, batch=batch, seed=seed, device=device, force=force)
+
+
+@app.command("estimate-flow")
+def estimate_flow(
+    data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
+    output: Output,
+    flow: Annotated[
+        str,
+        typer.Option(
+            help="icp (rigid pieces), nearest (point), or a trained estimator's file or folder (dpc segment flow)."
+        ),
+    ] = "icp",
+    points: Annotated[
+        int, typer.Option(min=0, help="Points drawn from each frame; 0 takes all. Smaller frames are kept whole.")
+    ] = 512,
+    as_points: Annotated[
+        bool,
+        typer.Option(
+            "--as-points",
+            help="Write the flow as the points themselves, for a second classifier; scaled, one factor a sequence, so that "
+            "its norms' 99th percentile is that of the points' distances from their mean.",
+        ),
+    ] = False,
+    split: Annotated[str, typer.Option("--split", help="Sequences of this split, or all.")] = "all",
+    seed: Seed = 0,
+    device: Device = "auto",
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", min=1, help="Processes. Default: for icp the CPUs this process may use, else 1."),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Scene flow of every frame to the next, as the field scene_flow of a clouds file (last frame: to the one before)."""
+    from dpcli.segment.estimate_command import run_flow_estimate
+
+    run_flow_estimate(data, output, flow=flow, points=points, as_points=as_points, split=split, seed=seed, device=device,
+                      jobs=jobs, force=force)  # fmt: skip
 
 
 @app.command()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,30 +29,27 @@ _WORTH_WORKERS = 200  # frames; fewer are done by one process before a second ha
 
 
 @dataclass(frozen=True)
-class FlowOfSequences:
-    """What to do with each sequence of a file; picklable, for worker processes. points: per frame, 0 = all."""
+class FlowOfSequence:
+    """What to do with each sequence; picklable, for worker processes. points: drawn from each frame, 0 = all."""
 
-    reader: CloudsReader
     flow: str
     points: int = 512
     as_points: bool = False
     seed: int = 0
     device: str = "cpu"
 
-    @property
-    def fields(self) -> list[str]:
-        """Of the result: those of the input beside the flow; of points that are flow vectors, only the time."""
+    def fields(self, given: Sequence[str]) -> list[str]:
+        """Of the result: those given beside the flow; where flow vectors are the points, only the time."""
         if self.as_points:
-            return [name for name in self.reader.fields if name == "time"]
-        return [*(name for name in self.reader.fields if name != "scene_flow"), "scene_flow"]
+            return [name for name in given if name == "time"]
+        return [*(name for name in given if name != "scene_flow"), "scene_flow"]
 
-    def __call__(self, index: int) -> CloudSequence:
-        """Sequence `index` with some points of each frame, and their flow."""
-        kept = [name for name in self.fields if name != "scene_flow"]
-        whole = self.reader.read(index, fields=kept)
-        frames = [whole.frame(t) for t in range(whole.num_frames)]
-        drawn = draw_points(whole, self.points, generator(self.seed, _KEY, index))
-        drawn.scene_flow = sequence_flow(drawn, frames, self.flow, self.device)
+    def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
+        """The sequence of that number in its file: some points of each frame, and their flow."""
+        index, sequence = numbered
+        drawn = draw_points(sequence, self.points, generator(self.seed, _KEY, index))
+        whole = [sequence.frame(t) for t in range(sequence.num_frames)]
+        drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
         if self.as_points:
             drawn.points, drawn.scene_flow = flow_as_points(drawn), None
         return drawn
@@ -127,13 +124,14 @@ def run_flow_estimate(
         inputs = {"clouds": path} | ({"flow": weights} if weights else {})
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
         device = str(choose_device(device)) if weights else "cpu"
-        work = FlowOfSequences(reader, flow, points, as_points, seed, device)
+        work = FlowOfSequence(flow, points, as_points, seed, device)
         if force or not _already_there(target, history[-1]):
             keep_freed_memory()
             with CloudsWriter(target, class_names=reader.class_names, length_unit=reader.length_unit, seed=seed,
-                              source=reader.path.name if data != "-" else "stdin", provenance=history, fields=work.fields,
+                              source=reader.path.name if data != "-" else "stdin", provenance=history, fields=work.fields(reader.fields),
                               force=force, resume=output != "-") as writer:  # fmt: skip
-                _estimate_all(work, chosen, writer, _processes(jobs, work, chosen))
+                frames = int(reader.frame_counts[chosen].sum())
+                _estimate_all(reader, chosen, work, writer, _processes(jobs, work, frames))
     if output != "-":
         print(f"{output}: flow of {len(chosen)} sequences, {int(reader.frame_counts[chosen].sum())} frames")
 
@@ -148,15 +146,14 @@ def _weights(flow: str) -> Path | None:
     from dpcli.segment.flow.model_file import load_flow_model
 
     load_flow_model(flow)
-    return find_weights(flow, Path(flow), "dpc segment flow", "--flow")
+    return find_weights(flow, Path(__file__).parent / "flow" / "weights", "dpc segment flow", "--flow")
 
 
-def _processes(jobs: int | None, work: FlowOfSequences, chosen: list[int]) -> int:
-    """Rigid bodies are found on one core: by all cores at a time, if it takes long. The other methods use all anyway."""
+def _processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
+    """Rigid bodies are found on one core: if that takes long, by a process for each. The other methods use all anyway."""
     if work.device != "cpu":
         return 1  # one process on an accelerator
-    many = work.flow == "icp" and int(work.reader.frame_counts[chosen].sum()) > _WORTH_WORKERS
-    return min(jobs or (cpu_count() if many else 1), len(chosen))
+    return jobs or (cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1)
 
 
 def _already_there(target: Path, entry: dict) -> bool:
@@ -174,23 +171,25 @@ def _already_there(target: Path, entry: dict) -> bool:
     return True
 
 
-def _estimate_all(work: FlowOfSequences, chosen: list[int], writer: CloudsWriter, jobs: int) -> None:
+def _estimate_all(
+    reader: CloudsReader, chosen: list[int], work: FlowOfSequence, writer: CloudsWriter, jobs: int
+) -> None:
     done = len(writer.written_names)
-    with stop_requested() as stop, Progress("segment estimate-flow", len(chosen), "sequence") as bar:
+    read = [name for name in work.fields(reader.fields) if name in reader.fields and name != "scene_flow"]
+    todo = ((index, reader.read(index, fields=read)) for index in chosen[done:])
+    with (
+        stop_requested() as stop,
+        Progress("segment estimate-flow", len(chosen), "sequence") as bar,
+        closing(ordered_map(work, todo, jobs)) as results,
+    ):
         bar.skip(done)
-        for sequence in _results(work, chosen[done:], writer, jobs):
-            writer.write(sequence)
-            bar.advance(1, frames=sequence.num_frames)
-            stop.check(f"{len(writer)} of {len(chosen)} sequences are kept beside the output")
-
-
-def _results(work: FlowOfSequences, chosen: list[int], writer: CloudsWriter, jobs: int) -> Iterator[CloudSequence]:
-    with closing(ordered_map(work, chosen, jobs)) as results:
         try:
             for _, result in results:
                 if isinstance(result, Exception):
                     raise result
-                yield result
+                writer.write(result)
+                bar.advance(1, frames=result.num_frames)
+                stop.check(f"{len(writer)} of {len(chosen)} sequences are kept beside the output")
         except DpcError as error:
             writer.keep = not isinstance(error, DataError)  # a lost worker says nothing about what is written
             raise

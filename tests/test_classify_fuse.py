@@ -1,0 +1,141 @@
+"""`dpc classify fuse`: the mean by hand, videos matched by name, what doesn't fit refused with its first difference."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dpcli.classify.fuse import parse_weights, run_fusion, stream_names
+from dpcli.cli.app import app
+from dpcli.errors import DataError, UsageError
+from dpcli.store import ScoresReader, ScoresWriter
+
+CLASSES = ["push", "wave", "bend"]
+POINTS = {"v0": (0, [0.6, 0.3, 0.1]), "v1": (1, [0.5, 0.4, 0.1]), "v2": (2, [0.2, 0.2, 0.6])}
+FLOW = {"v2": (2, [0.1, 0.1, 0.8]), "v0": (0, [0.3, 0.4, 0.3]), "v1": (1, [0.1, 0.8, 0.1])}
+MEAN = {"v0": [0.45, 0.35, 0.2], "v1": [0.3, 0.6, 0.1], "v2": [0.15, 0.15, 0.7]}
+
+
+def write(path: Path, rows: dict, classes: list[str] = CLASSES, split: str = "test") -> Path:
+    path.parent.mkdir(exist_ok=True)
+    with ScoresWriter(path, class_names=classes, provenance={"config": path.name}) as writer:
+        for name, (label, scores) in rows.items():
+            writer.write(name, np.array(scores), label=label, split=split)
+    return path
+
+
+@pytest.fixture
+def two(tmp_path) -> list[Path]:
+    return [write(tmp_path / "points.h5", POINTS), write(tmp_path / "flow.h5", FLOW)]
+
+
+def fuse(inputs: list, output: Path, weights: str | None = None, force: bool = False) -> ScoresReader:
+    run_fusion([str(path) for path in inputs], str(output), weights=weights, force=force)
+    return ScoresReader(output)
+
+
+def test_the_mean_by_hand(two, tmp_path, capsys):
+    found = fuse(two, tmp_path / "both.h5")
+    assert capsys.readouterr().out == f"{tmp_path / 'both.h5'}: mean of 2 scores of 3 videos\n"
+    assert found.names == ["v0", "v1", "v2"] and found.labels.tolist() == [0, 1, 2] and found.splits == ["test"] * 3
+    np.testing.assert_allclose(found.scores, list(MEAN.values()), atol=1e-7)
+    np.testing.assert_array_equal(found.streams["points"], np.float32([row for _, row in POINTS.values()]))
+    np.testing.assert_array_equal(found.streams["flow"], np.float32([FLOW[name][1] for name in found.names]))
+    entry = found.provenance[-1]
+    assert entry["config"]["fuse"] == ["points", "flow"] and entry["config"]["weights"] == [0.5, 0.5]
+    assert entry["config"]["sources"] == [[{"config": "points.h5"}], [{"config": "flow.h5"}]]
+    assert set(entry["inputs"]) == {"points", "flow"}
+
+
+def test_the_order_of_files_and_videos_does_not_matter(two, tmp_path):
+    rng = np.random.default_rng(0)
+    draws = rng.dirichlet(np.ones(3), 6)
+    third = write(tmp_path / "third.h5", {f"v{k}": (-1, draws[k]) for k in (1, 2, 0)}, split="")
+    one, other = fuse([*two, third], tmp_path / "abc.h5"), fuse([third, two[1], two[0]], tmp_path / "cba.h5")
+    assert other.names == ["v1", "v2", "v0"] and other.labels.tolist() == [1, 2, 0] and other.splits == ["test"] * 3
+    np.testing.assert_array_equal(other.scores, one.scores[[1, 2, 0]])
+    np.testing.assert_allclose(one.scores[0], (np.array([0.9, 0.7, 0.4]) + draws[0]) / 3, atol=1e-7)
+
+
+def test_weights(two, tmp_path):
+    found = fuse(two, tmp_path / "weighed.h5", "3,1")
+    np.testing.assert_allclose(found.scores[0], [0.525, 0.325, 0.15], atol=1e-7)
+    np.testing.assert_array_equal(fuse(two, tmp_path / "first.h5", "1,0").scores, found.streams["points"])
+    np.testing.assert_allclose(parse_weights("0.7,0.3", 2), [0.7, 0.3])
+    for text, message in (
+        ("0.5", "1 weights for 2"), ("a,b", "expected numbers"), ("-1,2", "from 0 up"), ("0,0", "not all"),
+        ("nan,1", "from 0 up"), ("inf,1", "from 0 up"),
+    ):  # fmt: skip
+        with pytest.raises(UsageError, match=message):
+            parse_weights(text, 2)
+    with pytest.raises(UsageError, match="two or more"):
+        parse_weights(None, 1)
+
+
+def test_streams_have_names_of_their_own(two, tmp_path):
+    assert stream_names(["a", "b", "a", "fused", "a"]) == ["a", "b", "a-2", "fused-2", "a-3"]
+    assert stream_names(["a", "a", "a-2"]) == ["a", "a-2", "a-2-2"]
+    again = write(tmp_path / "other" / "points.h5", POINTS)
+    assert set(fuse([two[0], again], tmp_path / "out.h5").streams) == {"points", "points-2"}
+
+
+@pytest.mark.parametrize(
+    ("rows", "classes", "split", "message"),
+    [
+        (
+            {k: v for k, v in FLOW.items() if k != "v1"},
+            CLASSES,
+            "test",
+            r"other.h5: no scores of 'v1', which .*points.h5 has \(1",
+        ),
+        ({**FLOW, "w": (0, [1, 0, 0])}, CLASSES, "test", "points.h5: no scores of 'w', which .*other.h5 has"),
+        ({**FLOW, "v1": (2, [1, 0, 0])}, CLASSES, "test", "other.h5: label 2 of 'v1', in .*points.h5 it is 1"),
+        (FLOW, ["push", "bend", "wave"], "test", "class 1 is 'bend', in .*points.h5 it is 'wave'"),
+        ({k: (0, [*v, 0]) for k, (_, v) in FLOW.items()}, [*CLASSES, "x"], "test", "4 classes, in .* 3"),
+        (FLOW, CLASSES, "train", "'v0' is of split 'train', in .* of 'test'"),
+    ],
+)
+def test_the_first_difference_is_named(two, tmp_path, rows, classes, split, message):
+    other = write(tmp_path / "other.h5", rows, classes, split)
+    with pytest.raises(DataError, match=message):
+        fuse([two[0], other], tmp_path / "out.h5")
+    assert not (tmp_path / "out.h5").exists()
+
+
+def test_labels_that_only_later_files_know_must_agree_too(tmp_path):
+    unknown = write(tmp_path / "unknown.h5", {"v": (-1, [1, 0, 0])})
+    one, two = (write(tmp_path / f"{k}.h5", {"v": (k, [1, 0, 0])}) for k in (1, 2))
+    assert fuse([unknown, one], tmp_path / "fine.h5").labels.tolist() == [1]
+    with pytest.raises(DataError, match="2.h5: label 2 of 'v', in .*1.h5 it is 1"):
+        fuse([unknown, one, two], tmp_path / "out.h5")
+
+
+def test_files_named_twice_and_other_outputs_are_refused(two, tmp_path):
+    for inputs, output in (([two[0], two[0]], tmp_path / "out.h5"), (two, two[1])):
+        with pytest.raises(UsageError, match="named twice"):
+            fuse(inputs, output, force=True)
+    with pytest.raises(UsageError, match="stdin is one file"):
+        fuse(["-", two[0], "-"], tmp_path / "out.h5")
+    before = fuse(two, tmp_path / "out.h5").path.read_bytes()
+    fuse(two, tmp_path / "out.h5")  # complete
+    with pytest.raises(UsageError, match="or --force"):
+        fuse(two, tmp_path / "out.h5", "3,1")
+    assert before == (tmp_path / "out.h5").read_bytes() != fuse(two, tmp_path / "out.h5", "3,1", True).path.read_bytes()
+
+
+def test_a_pipe_and_the_evaluation(dpc, two, tmp_path):
+    done = dpc("classify", "fuse", "-", two[1], "-o", "-", stdin=two[0].read_bytes())
+    assert done.returncode == 0, done.stderr.decode()
+    (tmp_path / "piped.h5").write_bytes(done.stdout)
+    np.testing.assert_array_equal(ScoresReader(tmp_path / "piped.h5").scores, fuse(two, tmp_path / "both.h5").scores)
+    said = CliRunner().invoke(app, ["evaluate", "classification", str(tmp_path / "piped.h5"), "--json"])
+    streams = json.loads(said.stdout)["metrics"]["streams"]
+    assert {name: round(values["accuracy"], 3) for name, values in streams.items()} == {
+        "flow": 0.667, "stdin": 0.667, "fused": 1.0,
+    }  # fmt: skip
+    refused = CliRunner().invoke(app, ["classify", "fuse", str(two[0]), "-o", str(tmp_path / "x.h5")])
+    assert refused.exit_code != 0 and "two or more" in str(refused.exception)
