@@ -21,12 +21,19 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test bench lint clean table-4.1 table-4.2 table-5.2
+.PHONY: table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
 	@echo "make test                     the whole test suite"
 	@echo "make lint                     ruff over everything"
 	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
+	@echo "make table-3.1 NVGESTURE=folder [MODELNET=folder]  ablations of Kinet; or MSRACTION=folder"
+	@echo "make table-3.2 NVGESTURE=folder, table-3.3 SHREC17=folder, table-3.5 NTU60=folder  accuracy"
+	@echo "make table-3.4 MSRACTION=folder accuracy on 4 to 24 frames, three seeds; some 8 hours on 2 cores"
+	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; days"
+	@echo "make figure-3.8 MSRACTION=folder parameters, FLOPs, accuracy of three backbones (= table-A.1)"
+	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/tables.md says more of all of these"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
@@ -64,6 +71,65 @@ demo: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+# Chapter 3 and appendix A (docs/tables.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
+# PRESET quick or thesis; SEEDS; BUDGET: words for `dpc classify train`, such as "--epochs 40 --batch 16"; CLIPS per video
+# at prediction; PREPARE: words for `dpc prepare`.
+NVGESTURE ?=
+SHREC17   ?=
+NTU60     ?=
+MODELNET  ?=
+PRESET    ?= quick
+SEEDS     ?= 0,1,2
+FRAMES    ?= 4,8,12,16,24
+FOLDS     ?= 10
+FLOW      ?= icp
+needs      = $(if $(strip $($(1))),,$(error make $@ needs $(1)=folder, $(2)))
+needs_either = $(if $(strip $(NVGESTURE)$(MSRACTION)),,$(error make $@ needs NVGESTURE=folder or MSRACTION=folder))
+MSR_IS    := the folder of MSRAction-3D's depth videos
+NV_IS     := the folder of NvGesture's lists and Video_data
+EITHER     = $(if $(strip $(NVGESTURE)),nvgesture "$(NVGESTURE)",msraction3d "$(MSRACTION)")
+PLAN       = --preset $(PRESET) --seeds "$(SEEDS)" $(if $(CLIPS),--clips $(CLIPS)) $(if $(PREPARE),--prepare="$(PREPARE)")
+TABLES    := $(BIN)/python -m tests.tables
+
+table-3.1: $(READY)
+	$(call needs_either)
+	$(TABLES).table_3_1 $(EITHER) table/3.1 $(if $(MODELNET),--modelnet "$(MODELNET)") \
+	    $(if $(PRETRAIN),--pretrain="$(PRETRAIN)") $(PLAN) -- $(BUDGET)
+
+table-3.2: $(READY)
+	$(call needs,NVGESTURE,$(NV_IS))
+	$(TABLES).accuracy_tables 3.2 "$(NVGESTURE)" table/3.2 $(PLAN) -- $(BUDGET)
+
+table-3.3: $(READY)
+	$(call needs,SHREC17,the folder of train_gestures.txt and gesture_1 ...)
+	$(TABLES).accuracy_tables 3.3 "$(SHREC17)" table/3.3 $(PLAN) -- $(BUDGET)
+
+table-3.4: $(READY)
+	$(call needs,MSRACTION,$(MSR_IS))
+	$(TABLES).accuracy_tables 3.4 "$(MSRACTION)" table/3.4 --only "$(FRAMES)" $(PLAN) -- $(BUDGET)
+
+table-3.5: $(READY)
+	$(call needs,NTU60,the folder of nturgb+d_depth_masked or of its ZIPs)
+	$(TABLES).accuracy_tables 3.5 "$(NTU60)" table/3.5 $(PLAN) -- $(BUDGET)
+
+# SWEEPS: "group-size=2,4 radius=0.25,0.5" replaces the values of these; "radius=" leaves one out.
+figure-3.5: $(READY)
+	$(call needs_either)
+	$(TABLES).figure_3_5 $(EITHER) table/figure-3.5 --preset $(PRESET) --folds $(FOLDS) \
+	    $(foreach sweep,$(SWEEPS),--sweep $(sweep)) $(if $(PREPARE),--prepare="$(PREPARE)") -- $(BUDGET)
+
+# FLOW: icp, nearest, or a folder that `dpc segment flow` made. PROFILE=only: without data, without accuracies.
+figure-3.8 table-A.1: $(READY)
+	$(if $(filter only,$(PROFILE)),,$(if $(MSRACTION),,$(error make $@ needs MSRACTION=folder, $(MSR_IS); or PROFILE=only)))
+	$(TABLES).figure_3_8 "$(or $(MSRACTION),-)" table/figure-3.8 --flow "$(FLOW)" $(if $(BACKBONES),--backbones $(BACKBONES)) \
+	    $(if $(filter only,$(PROFILE)),--profile-only) $(PLAN) -- $(BUDGET)
+
+figure-A.4: $(READY)
+	$(call needs,MSRACTION,$(MSR_IS))
+	$(TABLES).accuracy_tables 3.4 "$(MSRACTION)" table/3.4 --only 16 $(PLAN) -- $(BUDGET)
+	$(TABLES).figure_a_4 table/figure-A.4 table/3.4/$(PRESET)-16-seed*/scores.h5 \
+	    --flow table/figure-3.8/pointnet2/$(PRESET)-two-streams-seed*.h5
 
 # Table 4.2 of the thesis on three categories that training never sees; SAPIEN names a folder of PartNet-Mobility objects.
 SAPIEN  ?=

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dpcli.classify.augment import NONE, PEERS, Augmentation
 from dpcli.classify.clips import ClipSource, clip_frames, clip_starts, normalize, sample_points, uniform_frames
 from dpcli.classify.config import KinetConfig
-from dpcli.classify.split import carve_validation, default_rule
+from dpcli.classify.split import carve_validation, default_rule, folds
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
@@ -140,6 +142,36 @@ def test_validation_comes_from_training_subjects_only(reader):
     for bad in ("subjects:9", "subjects:0,1,2,3,4", "1.5", "some", "subjects:x"):
         with pytest.raises(UsageError):
             carve_validation(reader, bad, 0)
+
+
+def test_a_fold_is_held_out_of_the_training_videos(reader):
+    held = [carve_validation(reader, f"fold:{k}/5", 0) for k in range(5)]
+    assert sorted(i for _, part in held for i in part) == [0, 1, 2, 3, 4]  # never the test video
+    assert all(sorted(train + part) == [0, 1, 2, 3, 4] and len(part) == 1 for train, part in held)
+    for bad in ("fold:5/5", "fold:-1/5", "fold:0/1", "fold:0/6", "fold:1", "fold:a/b", "folds"):
+        with pytest.raises(UsageError, match="fold"):
+            carve_validation(reader, bad, 0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.data(), videos=st.integers(2, 60), seed=st.integers(0, 5))
+def test_folds_are_disjoint_complete_and_fair(data, videos, seed):
+    """Every video is in one fold; classes and folds are spread evenly, or subjects stay whole where there are enough."""
+    draw = st.lists(st.integers(0, 3), min_size=videos, max_size=videos)
+    labels, subjects = (np.array(data.draw(draw), np.int32) for _ in range(2))
+    subjects -= data.draw(st.integers(0, 1))  # -1: unknown
+    count = data.draw(st.integers(2, videos))
+    found = folds(labels, subjects, count, seed)
+    assert np.array_equal(found, folds(labels, subjects, count, seed))
+    sizes = np.bincount(found, minlength=count)
+    assert len(sizes) == count and sizes.sum() == videos and sizes.min() >= 1
+    if subjects.min() >= 0 and len(set(subjects)) >= count:
+        assert all(len(set(found[subjects == one])) == 1 for one in set(subjects))
+        return
+    assert sizes.max() - sizes.min() <= 1
+    for label in set(labels):
+        share = np.bincount(found[labels == label], minlength=count)
+        assert share.max() - share.min() <= 1
 
 
 def test_without_a_training_split_the_splits_are_named(tmp_path, make_sequence):

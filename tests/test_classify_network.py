@@ -143,6 +143,17 @@ def test_fusion_rules():
     torch.testing.assert_close(fuse(static, dynamic, "logits"), torch.tensor([[1.0, 2.0]]).softmax(-1))
 
 
+def test_the_table_s_total_counts_the_frozen_static_stream_once():
+    """Facts: 3.13 for the release with 20 classes (thesis: 3.20); with the static stream's moments it would be 4.55."""
+    report = measure(Kinet(KinetConfig.release(num_frames=4, points_per_frame=256)).eval(), torch.device("cpu"))
+    assert round(report["paper_style_parameters"]["total"], 2) == 3.13
+
+
+def test_a_group_too_small_for_coordinates_is_refused():
+    with pytest.raises(UsageError, match="three coordinates"):
+        KinetConfig(**TINY, group_size=2, xyz_group=True)
+
+
 def test_config_survives_json_and_refuses_nonsense():
     config = KinetConfig.release(num_classes=7, radii=(0.2, 0.4))
     assert KinetConfig.from_json(config.to_json()) == config

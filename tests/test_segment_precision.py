@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.runtime.precision import full_precision, is_reduced, reduced_products, wanted
 from dpcli.segment.commands import default_model
 from dpcli.segment.config import Layer, PartConfig
 from dpcli.segment.losses import supervised_loss
 from dpcli.segment.model_file import load_model
 from dpcli.segment.neighbourhood import kernel_weights
 from dpcli.segment.network import PartNetwork
-from dpcli.runtime.precision import full_precision, is_reduced, reduced_products, wanted
 
 CPU = torch.device("cpu")
 

@@ -69,6 +69,11 @@ class KinetConfig:
     def _check_sizes(self) -> None:
         if self.backbone == "pointnet2":
             self._check_centroids()
+        if self.xyz_group and self.group_size < 3:
+            raise UsageError(
+                f"--group-size {self.group_size}: one group holds the three coordinates (presets quick, tiny, release);"
+                " expected at least 3, or --preset thesis"
+            )
         reach = 2 * self.temporal_radius + 1
         if self.grouping == "balanced" and self.neighbors < reach:
             raise UsageError(

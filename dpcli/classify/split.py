@@ -22,11 +22,13 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
     """(training, validation) sequences from the split `train`.
 
     `rule`: `none`; `subject` (the training subject with the highest number, the default where there are several);
-    `subjects:3,5`; or a fraction such as `0.15`, drawn for each class.
+    `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
     """
     chosen = labelled(reader, "train")
     if rule == "none":
         return chosen, []
+    if rule.startswith("fold"):
+        return _one_fold(reader, chosen, rule, seed)
     if rule.startswith("subject"):
         held = _held_out(reader, chosen, rule)
         rest = [i for i in chosen if reader.subjects[i] not in held]
@@ -36,7 +38,9 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
     except ValueError:
         share = -1
     if not 0 < share < 1:
-        raise UsageError(f"--validation {rule}: expected none, subject, subjects:3,5 or a fraction such as 0.15")
+        raise UsageError(
+            f"--validation {rule}: expected none, subject, subjects:3,5, fold:3/10 or a fraction such as 0.15"
+        )
     return _stratified(reader, chosen, share, seed)
 
 
@@ -63,6 +67,40 @@ def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int
         count = min(round(share * len(members)), len(members) - 1)
         held.update(int(members[k]) for k in generator(seed, 3, label).permutation(len(members))[:count])
     return [i for i in chosen if i not in held], sorted(held)
+
+
+def folds(labels: np.ndarray, subjects: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Which of `count` folds each video is in, i64 (N), for cross-validation (figure 3.5 of the thesis).
+
+    labels, subjects: i32 (N). Whole subjects share a fold where all are known and there are at least `count` of them,
+    as FlickerNet leaves subjects out; else each class is spread over the folds, whose sizes differ by at most one.
+    The same seed gives the same folds whichever of them is asked for.
+    """
+    people = np.unique(subjects)
+    fold = np.empty(len(labels), np.int64)
+    if len(people) >= count and people[0] >= 0:
+        for place, k in enumerate(generator(seed, 4).permutation(len(people))):
+            fold[subjects == people[k]] = place % count
+        return fold
+    members = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+    shuffled = [own[generator(seed, 4, k).permutation(len(own))] for k, own in enumerate(members)]
+    fold[np.concatenate(shuffled)] = np.arange(len(labels)) % count
+    return fold
+
+
+def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> tuple[list[int], list[int]]:
+    try:
+        which, count = (int(word) for word in rule.removeprefix("fold:").split("/"))
+    except ValueError:
+        which, count = -1, 0
+    if not 0 <= which < count or count < 2:
+        raise UsageError(
+            f"--validation {rule}: expected fold:I/N with I = 0 ... N-1 and N at least 2, such as fold:3/10"
+        )
+    if count > len(chosen):
+        raise UsageError(f"--validation {rule}: {count} folds of {len(chosen)} training videos; ask for fewer folds")
+    of = folds(reader.labels[chosen], reader.subjects[chosen], count, seed)
+    return [i for i, k in zip(chosen, of) if k != which], [i for i, k in zip(chosen, of) if k == which]
 
 
 def default_rule(reader: CloudsReader) -> str:

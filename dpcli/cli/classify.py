@@ -49,7 +49,8 @@ def train(
     validation: Annotated[
         str | None,
         typer.Option(
-            help="Carved from the training videos: subject, subjects:3,5, a fraction, or none. Default: subject, or 0.15 without subjects."
+            help="Carved from the training videos: subject, subjects:3,5, fold:3/10 (counted from 0), a fraction, or none."
+            " Default: subject, or 0.15 without subjects."
         ),
     ] = None,
     batch: Annotated[

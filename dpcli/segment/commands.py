@@ -15,6 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.memory import keep_freed_memory
+from dpcli.runtime.precision import wanted
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seed import generator
@@ -27,7 +28,6 @@ from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Objective
 from dpcli.segment.pair_flow import pair_flow
 from dpcli.segment.pairs import MOTION_FIELDS, PairSource
-from dpcli.runtime.precision import wanted
 from dpcli.segment.predict import Estimate, Refinement, Segmenter, network_segmenter, predict_parts
 from dpcli.segment.train import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file

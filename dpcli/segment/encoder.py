@@ -9,10 +9,10 @@ from torch import Tensor, nn
 
 from dpcli.ops import fps
 from dpcli.ops.gather import gather_points
+from dpcli.runtime.precision import full_precision
 from dpcli.segment.config import PartConfig
 from dpcli.segment.icosahedron import GROUPS
 from dpcli.segment.neighbourhood import RULES, Neighbourhood
-from dpcli.runtime.precision import full_precision
 from dpcli.segment.se3_conv import SeparableConv
 
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from dpcli.ops import three_nn_interpolate
+from dpcli.runtime.precision import full_precision
 from dpcli.segment.config import PartConfig
 from dpcli.segment.encoder import CanonicalFrames, Level
-from dpcli.runtime.precision import full_precision
 
 
 class PointMLP(nn.Module):

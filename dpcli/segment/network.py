@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from dpcli.ops.gather import gather_points
 from dpcli.ops.nearest import knn
+from dpcli.runtime.precision import reduced_products
 from dpcli.segment.config import PartConfig
 from dpcli.segment.encoder import Encoder, Level
 from dpcli.segment.heads import SegmentationHead
 from dpcli.segment.motion_head import MotionHead, choose_motion
-from dpcli.runtime.precision import reduced_products
 
 
 @dataclass

@@ -10,11 +10,11 @@ from torch.utils.checkpoint import checkpoint
 
 from dpcli.ops.backend import chosen_backend, run_in_threads
 from dpcli.ops.kernel_conv import kernel_convolution
+from dpcli.runtime.precision import REDUCED, is_reduced
 from dpcli.segment.config import Layer, PartConfig
 from dpcli.segment.icosahedron import GROUPS
 from dpcli.segment.kernel_points import kernel_points
 from dpcli.segment.neighbourhood import Neighbourhood, kernel_weights
-from dpcli.runtime.precision import REDUCED, is_reduced
 
 
 class SpatialConv(nn.Module):

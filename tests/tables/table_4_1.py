@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.tables.runs import cut, dpc
 
 METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 _PAST = ("--flow-decay", "1", "--consensus", "none", "--no-motion-head")
@@ -42,14 +43,6 @@ ROWS = {
 _FIRST = "full"  # trained first: it estimates the first flows that the others take over
 
 
-def dpc(*words: object) -> str:
-    """A command's stdout; ends this program with its exit code when it fails (75: stopped, run again)."""
-    done = subprocess.run([sys.executable, "-m", "dpcli", *map(str, words)], stdout=subprocess.PIPE, text=True)
-    if done.returncode:
-        sys.exit(done.returncode)
-    return done.stdout
-
-
 def run_row(key: str, train: Path, test: Path, folder: Path, budget: list[str], protocol: str, split: str) -> dict:
     """Train, predict and judge one row, each only as far as it isn't done. The metrics as shares of 1, None for 0/0."""
     model, parts = folder / key, folder / f"{key}.h5"
@@ -74,9 +67,7 @@ def table(found: dict[str, dict], about: str) -> str:
 
 
 def main(argv: list[str] | None = None) -> None:
-    argv = list(sys.argv[1:] if argv is None else argv)
-    cut = argv.index("--") if "--" in argv else len(argv)
-    own, budget = argv[:cut], argv[cut + 1 :]
+    own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("train", type=Path)
     parser.add_argument("test", type=Path)

@@ -11,10 +11,12 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+
+from tests.tables import runs
 
 ROWS = {
     "(a) non-rigid motion only": ("--no-rigid", "--no-sparse"),
@@ -27,13 +29,7 @@ THESIS = {"(a)": (22.3, 0.795), "(b)": (25.3, 0.841), "(c)": (28.5, 0.875), "(d)
 CLIPS = "Cow:Gallop,Fox:Walk,Trex:TRex_Run,Spider:Spider_Walk"
 
 
-def dpc(*words: object) -> str:
-    """One command in a process of its own with one thread; its stdout. Ends the script when it fails."""
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-m", "dpcli", *map(str, words)], stdout=subprocess.PIPE, text=True, env=environment)
-    if done.returncode:
-        sys.exit(f"dpc {' '.join(map(str, words))}: exit {done.returncode}")
-    return done.stdout
+dpc = partial(runs.dpc, threads=1)  # a clip each in as many processes as there are cores
 
 
 def film(meshes: Path, clip: str, out: Path, size: int) -> Path:
