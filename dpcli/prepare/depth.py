@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics, back_project
 from dpcli.prepare.depth_files import VIDEO_SUFFIXES, image_paths, read_depth_video
 from dpcli.prepare.labels import LabelTable, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
 
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
@@ -53,6 +53,7 @@ class DepthVideos:
     fps: float | None = None
     stride: int = 1
     labels: Path | None = None
+    chooses: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if self.background not in BACKGROUNDS:
@@ -98,7 +99,7 @@ class DepthVideos:
         found = list(items.values())
         return self._table.apply(found) if self._table else found
 
-    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
         video = read_depth_video(item.path, self.stride)
         depth, unit = self._raw(video.frames, item.path)
         if self.background != "none":
@@ -106,7 +107,7 @@ class DepthVideos:
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
         points, counts = back_project(
-            depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far
+            depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far, choose=choose
         )
         kept, notes = drop_empty_frames(str(item.path), counts)
         rate = (self.fps or video.fps or DEFAULT_FPS) / self.stride

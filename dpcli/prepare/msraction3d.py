@@ -6,13 +6,13 @@ import re
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics, back_project
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
@@ -111,6 +111,7 @@ class MSRAction3D:
     focal: float = 280.0  # pixels; a guess of the MeteorNet authors, no calibration was published
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
+    chooses: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         if not (self.focal > 0 and self.scale > 0):
@@ -154,14 +155,14 @@ class MSRAction3D:
             split="train" if subject in self.train_subjects else "test",
         )  # fmt: skip
 
-    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
         notes: dict[str, int] = {}
         if item.path.suffix.lower() == ".bin":
             depth, notes = read_bin(item.path)
         else:
             depth = read_mat(item.path)
         height, width = depth.shape[1:]
-        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
+        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2), choose=choose)
         kept, dropped = drop_empty_frames(str(item.path), counts)
         points *= np.float32(1 / self.scale)
         sequence = CloudSequence(item.name, points, offsets(counts[kept]), **describe(item))

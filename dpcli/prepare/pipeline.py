@@ -60,8 +60,9 @@ def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[i
     if item.problem:
         raise DataError(item.problem)
     rng = generator(seed, index)
+    choose = thinning.blind(rng) if getattr(reader, "chooses", False) else None
     try:
-        sample = reader.read(item, rng)
+        sample = reader.read(item, rng, choose) if choose else reader.read(item, rng)
     except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
         raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
     sample.sequence = thinning.apply(sample.sequence, rng)

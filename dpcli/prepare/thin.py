@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,8 +40,22 @@ class Thinning:
             from dpcli.ops import fps_numpy
 
             return np.asarray(fps_numpy(cloud, self.points))
-        candidates = voxel_representatives(cloud, self.points) if self.sampling == "voxel" else np.arange(len(cloud))
-        return candidates[np.sort(rng.choice(len(candidates), self.points, replace=False))]
+        if self.sampling == "random":
+            return self._draw(len(cloud), rng)
+        candidates = voxel_representatives(cloud, self.points)
+        return candidates[self._draw(len(candidates), rng)]
+
+    def _draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        return np.sort(rng.choice(count, self.points, replace=False))
+
+    def blind(self, rng: np.random.Generator) -> Callable[[int], np.ndarray | slice] | None:
+        """What `apply` keeps of a frame, from its number of points alone: for readers that can leave the rest unmade.
+
+        To be asked for every frame once, in order. None where the choice depends on where the points are.
+        """
+        if not self.points or self.sampling != "random":
+            return None
+        return lambda count: self._draw(count, rng) if count > self.points else slice(None)
 
     def apply(self, sequence: CloudSequence, rng: np.random.Generator) -> CloudSequence:
         """The sequence with each frame thinned; per-point fields follow their points."""
