@@ -527,9 +527,9 @@ def test_pac_writes_clouds_pictures_and_animations(data, weights, tmp_path, monk
             assert values.min() >= 0 and values.max() == 1
         source = CloudsReader(data).read(2, [0, 1, 2, 3])
         np.testing.assert_array_equal(reader.read(1).points, source.points)
-    picture, moving = Image.open(png), Image.open(gif)
-    assert picture.width > 3 * 130 and picture.height > 4 * 130 and moving.n_frames == 4
-    assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 50
+    with Image.open(png) as picture, Image.open(gif) as moving:
+        assert picture.width > 3 * 130 and picture.height > 4 * 130 and moving.n_frames == 4
+        assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 50
     before = out.read_bytes()
     assert dpc(*words, "-o", out) == 2 and out.read_bytes() == before
     assert b"--force" in capsysbinary.readouterr().err
