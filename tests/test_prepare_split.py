@@ -146,3 +146,25 @@ def test_the_command(whole, tmp_path):
     assert sorted(parts(tmp_path / "d")) == ["test", "train"]
     wrong = dpc("prepare", "split", whole, "-o", tmp_path / "e", "--fractions", "0.5,0.5")
     assert wrong.returncode == 2 and "expected three numbers" in wrong.stderr
+
+
+def test_stopped_in_the_middle_it_goes_on_to_the_same_bytes(whole, tmp_path, monkeypatch):
+    """Ctrl-C at the sixth sample of the first part: five are not read again, and both parts end as those of one run."""
+    split(whole, tmp_path / "once", SplitChoice())
+    read, calls = CloudsReader.read, []
+
+    def counted(self, index, *more, **options):
+        calls.append(index)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return read(self, index, *more, **options)
+
+    monkeypatch.setattr(CloudsReader, "read", counted)
+    with pytest.raises(KeyboardInterrupt):
+        split(whole, tmp_path / "twice", SplitChoice())
+    assert not list((tmp_path / "twice").glob("*.h5"))
+    split(whole, tmp_path / "twice", SplitChoice())
+    assert calls[6:] == [5, 6, 7, 8, 9, 10, 11]
+    assert sorted(path.name for path in (tmp_path / "twice").iterdir()) == ["test.h5", "train.h5"]
+    for name in ("train.h5", "test.h5"):
+        assert (tmp_path / "twice" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()

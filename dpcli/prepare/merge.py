@@ -224,7 +224,7 @@ def _write(
             output, class_names=pattern.class_names, length_unit=pattern.length_unit, source=pattern.made_by,
             seed=pattern.seed, fields=pattern.fields, compression=compression, provenance=entry, force=force, resume=resume,
         ) as writer, Progress("prepare merge", total=len(samples), unit="video") as bar:  # fmt: skip
-            done = _copied_before(writer, [_name(source, source.names[index], prefix) for source, index, _ in samples])
+            done = copied_before(writer, [_name(source, source.names[index], prefix) for source, index, _ in samples])
             bar.skip(done)
             for source, index, label in samples[done:]:
                 sequence = _relabelled(files.read(source.path, index), source, pattern, label, prefix)
@@ -237,7 +237,7 @@ def _write(
     return count_samples(report, output)
 
 
-def _copied_before(writer: CloudsWriter, names: list[str]) -> int:
+def copied_before(writer: CloudsWriter, names: list[str]) -> int:
     """How many of the samples, from the first on, a stopped run left; UsageError when it left others, which stay."""
     done = len(writer.written_names)
     if writer.written_names != names[:done]:

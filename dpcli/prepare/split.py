@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.merge import Source, read_source
+from dpcli.prepare.merge import Source, copied_before, read_source
 from dpcli.prepare.pipeline import already_complete
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seed import generator
+from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
+from dpcli.store.journal import sweep
 
 SPLITS = ("train", "validation", "test")
 _DRAW = 5005  # the key of this draw among all that a seed gives
@@ -130,7 +132,8 @@ def split(
 ) -> dict[str, int]:
     """Write `output/SPLIT.h5` for each split, or, when `output` ends in .h5, one file whose samples have new splits.
 
-    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams.
+    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams; stopped
+    or killed, it goes on from the last sample when run again.
     """
     source = read_source(path)
     with CloudsReader(path) as reader:
@@ -162,16 +165,20 @@ def _copy(
 ) -> None:  # fmt: skip
     history = [*source.provenance, entry]
     if not force and already_complete(output, entry):
+        sweep(output)
         log.info(f"{output}: already complete (--force makes it again)")
         return
     chosen = [index for index, name in enumerate(splits) if name in wanted]
-    with CloudsWriter(
+    with stop_requested() as stop, CloudsWriter(
         output, class_names=source.class_names, length_unit=source.length_unit, source=source.made_by, seed=source.seed,
-        fields=source.fields, compression=compression, provenance=history, force=force,
+        fields=source.fields, compression=compression, provenance=history, force=force, resume=True,
     ) as writer, Progress(f"prepare split {output.stem}", total=len(chosen), unit="video") as bar:  # fmt: skip
-        for index in chosen:
+        done = copied_before(writer, [reader.names[index] for index in chosen])
+        bar.skip(done)
+        for index in chosen[done:]:
             sequence = reader.read(index)
             sequence.split = splits[index]
             writer.write(sequence)
             bar.advance(1, frames=sequence.num_frames)
+            stop.check(f"{len(writer)} of {len(chosen)} samples of {output} are kept")
         writer.skipped = source.skipped
