@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,8 @@ from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store import ScoresWriter
+
+_CTRL_C = "SIGINT"
 
 
 class Lines:
@@ -87,7 +91,7 @@ def run_stream(
         target = ScoresWriter(
             output, class_names=info.class_names, seed=seed, source=source, streams=predictor.streams, force=force
         )
-    with target if target is not None else nullcontext(), stop_requested() as stop:
+    with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
         problem = _follow(predictor, frames, Lines(info.class_names, predictor.streams, json_output), stop)
         if not predictor.clips:
             raise problem or DataError(f"{source}: not one frame came; the program before the pipe wrote nothing")
@@ -102,6 +106,25 @@ def run_stream(
         log.info(f"{output}: the stream's mean scores in {len(info.class_names)} classes")
     if problem is not None:
         raise problem
+
+
+@contextmanager
+def _interrupt_asks(stop: StopRequest) -> Iterator[None]:
+    """The first Ctrl-C ends the stream between two frames; raised anywhere, it could be lost in a library's callback."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, frame: object) -> None:
+        if stop.requested:
+            raise KeyboardInterrupt
+        stop.requested, stop.name = True, _CTRL_C
+
+    before = signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _follow(
@@ -130,7 +153,9 @@ def _follow(
         log.info(f"{predictor.window.count} frames are fewer than the window's {predictor.window.size}")
         lines.write(made, arrived, feed.waiting)
     count = predictor.window.count
-    if stop.requested and problem is None:
+    if stop.requested and problem is None and stop.name == _CTRL_C:
+        problem = KeyboardInterrupt()
+    elif stop.requested and problem is None:
         problem = Stopped(f"stopped by {stop.name} after {count} frames; what came before is predicted")
     if predictor.clips:
         lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
