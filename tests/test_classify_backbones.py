@@ -447,6 +447,7 @@ def test_a_model_file_knows_its_backbone(tmp_path):
         ("tiny_backbone:Thing", "no attribute 'Thing'"),
         ("tiny_backbone:annotations", "lacks group, taps"),
         ("torch.nn:Linear", "lacks group, taps;"),
+        ("dpcli.classify.backbone:Backbone", "lacks group, taps, forward;"),
     ],
 )
 def test_names_that_are_no_backbone(name, message):

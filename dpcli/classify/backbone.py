@@ -7,6 +7,7 @@ before they are pooled; the dynamic stream fits its surfaces to those. docs/back
 from __future__ import annotations
 
 import importlib
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
@@ -50,7 +51,7 @@ class Stage:
     activations: list[Tensor]
 
 
-class Backbone(nn.Module):
+class Backbone(nn.Module, ABC):
     """A static network of point clouds. Built as `Class(config)`; `config.num_classes` is the width of its logits.
 
     `tap_widths` are the channels of the activations that `taps` shows, a tuple a stage. The points that a stage groups are
@@ -59,17 +60,17 @@ class Backbone(nn.Module):
 
     tap_widths: tuple[tuple[int, ...], ...]
 
+    @abstractmethod
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
         """Neighbourhoods that follow from positions alone. points (B,N,3) of all frames, times (B,N) their frame numbers."""
-        raise NotImplementedError
 
+    @abstractmethod
     def forward(self, groups: list[Grouping]) -> Tensor:
         """Class logits (B,C): what the static stream is trained with."""
-        raise NotImplementedError
 
+    @abstractmethod
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """What the dynamic stream reads, in eval mode: each stage with its activations; and the logits."""
-        raise NotImplementedError
 
 
 def resolve_backbone(name: str) -> type[nn.Module]:
@@ -85,7 +86,10 @@ def resolve_backbone(name: str) -> type[nn.Module]:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise UsageError(f"--backbone {name}: {error}; is its folder on PYTHONPATH?") from None
-    missing = [method for method in ("group", "taps", "forward") if not callable(getattr(found, method, None))]
+    left = getattr(found, "__abstractmethods__", ())  # named by Backbone and not written
+    missing = [
+        name for name in ("group", "taps", "forward") if name in left or not callable(getattr(found, name, None))
+    ]
     if missing or not (isinstance(found, type) and issubclass(found, nn.Module)):
         lacks = f"lacks {', '.join(missing)}" if missing else "is no torch.nn.Module"
         raise UsageError(f"--backbone {name}: {lacks}; docs/backbones.md shows the three methods")
