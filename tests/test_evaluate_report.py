@@ -26,13 +26,9 @@ from dpcli.evaluate.report.clouds import Cloud, _renamed, packed
 from dpcli.evaluate.report.text import latex
 from dpcli.evaluate.report.thesis import chosen_tables, thesis_tables
 from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
+from tests.browser import needs_browser, open_page
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-_FLAGS = (
-    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update"
-    " --disable-sync --disable-gpu --hide-scrollbars --virtual-time-budget=3000 --window-size=700,600"
-    " --enable-logging=stderr"
-).split()
+_FLAGS = "--disable-gpu --virtual-time-budget=3000 --window-size=700,600 --enable-logging=stderr".split()
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
 NAMES = ["wave", f"b {EVIL}", "50% & #1_{x}"]
 
@@ -432,7 +428,7 @@ def test_the_command(scores, tmp_path):
     assert os.listdir(tmp_path) and not list(tmp_path.glob(".*.part"))
 
 
-@pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium brings one")
+@needs_browser
 def test_a_browser_opens_and_sorts_the_page(page, tmp_path):
     """Ascending and descending by a number, and the missing last both ways; no script of a file has run."""
     made = table("S", ("name", "x"), [["a", "10 %"], ["b", "9 %"], ["c", "-"], ["d", "100 %"]], key="toy")
@@ -441,11 +437,9 @@ def test_a_browser_opens_and_sorts_the_page(page, tmp_path):
     path = tmp_path / "page.html"
     path.write_text(page.replace("<main>", "<main>" + _table(made)), "utf-8")
     for direction, order in (("ascending", "badc"), ("descending", "dabc")):
-        command = [BROWSER, *_FLAGS, f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom",
-                   f"{path.as_uri()}#sort=toy:1:{direction}"]  # fmt: skip
-        done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-        assert 'data-state="ready"' in done.stdout and "CONSOLE" not in done.stderr
-        toy = re.search(r'data-key="toy">(.*?)</table>', done.stdout, re.S)[1]
+        html, said = open_page(f"{path.as_uri()}#sort=toy:1:{direction}", tmp_path, *_FLAGS)
+        assert 'data-state="ready"' in html and "CONSOLE" not in said
+        toy = re.search(r'data-key="toy">(.*?)</table>', html, re.S)[1]
         assert "".join(re.findall(r'<th scope="row">(\w)</th>', toy)) == order
         assert f'aria-sort="{direction}"' in toy and "<button" in toy
-        assert "<img" not in done.stdout
+        assert "<img" not in html

@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-import shutil
-import subprocess
 import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,15 +21,13 @@ from dpcli.generate4d.render import Look, Renderer
 from dpcli.generate4d.viewer import packed, write_page
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store.gaussians import write_scene
+from tests.browser import needs_browser, open_page
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 WIDTH, HEIGHT = 420, 320
 _FLAGS = (
-    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update"
-    " --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars --virtual-time-budget=4000"
+    "--use-angle=swiftshader --enable-unsafe-swiftshader --virtual-time-budget=4000"
     " --run-all-compositor-stages-before-draw"  # or the picture may be taken before the canvas is in it
 ).split()
-needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium brings one")
 
 
 @dataclass
@@ -57,13 +53,13 @@ def _shown(page: Path, state: str, tmp_path: Path) -> Shown:
     from PIL import Image
 
     picture = tmp_path / "shown.png"
-    command = [BROWSER, *_FLAGS, f"--window-size={WIDTH},{HEIGHT}", f"--user-data-dir={tmp_path / 'profile'}",
-               "--dump-dom", f"--screenshot={picture}", f"{page.as_uri()}#{state}"]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    found = re.search(r'<html[^>]*data-state="(\w+)"', done.stdout)
-    error = re.search(r'id="error"[^>]*>([^<]*)<', done.stdout)
-    assert found and error, done.stderr[-2000:]
-    return Shown(np.asarray(Image.open(picture).convert("RGB")), found[1], error[1], done.stdout)
+    html, said = open_page(
+        f"{page.as_uri()}#{state}", tmp_path, *_FLAGS, f"--window-size={WIDTH},{HEIGHT}", f"--screenshot={picture}"
+    )
+    found = re.search(r'<html[^>]*data-state="(\w+)"', html)
+    error = re.search(r'id="error"[^>]*>([^<]*)<', html)
+    assert found and error, said[-2000:]
+    return Shown(np.asarray(Image.open(picture).convert("RGB")), found[1], error[1], html)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import torch
@@ -12,8 +13,9 @@ from dpcli.classify.sync_norm import SyncNorm
 
 def check_norm(target: str) -> None:
     """Each process norms its half of a batch; the first one writes outputs, gradients and statistics of both halves."""
-    dist.init_process_group("gloo")
-    rank = dist.get_rank()
+    # Its own file, not torchrun's store: a second group there could read the addresses of the first, already gone.
+    rank = int(os.environ["RANK"])
+    dist.init_process_group("gloo", init_method=f"file://{target}.store", rank=rank, world_size=2)
     values = torch.linspace(-1, 1, 6 * 3 * 2, dtype=torch.float64).sin().view(6, 3, 2) * 3
     mine = values[3 * rank : 3 * rank + 3].clone().requires_grad_()
     norm = SyncNorm(3, eps=1e-3).double()

@@ -67,7 +67,14 @@ def process_group(device: torch.device) -> Iterator[Processes]:
         log.level = 0
     if device.type == "cuda":
         torch.cuda.set_device(processes.local_rank)
-    dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    kind = "nccl" if device.type == "cuda" else "gloo"
+    try:
+        dist.init_process_group(kind)
+    except (RuntimeError, ValueError) as error:
+        raise DpcError(
+            f"process {processes.rank} of {processes.count} could not reach the others: {str(error).splitlines()[0]};"
+            f" start them with torchrun, and name the network to use in {kind.upper()}_SOCKET_IFNAME if there are several"
+        ) from None
     try:
         yield processes
     except RuntimeError as error:

@@ -1,0 +1,34 @@
+"""A page in headless Chromium: what it became and, asked for, its picture. Nothing else lives here."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium found; apt-get install chromium brings one")
+_FLAGS = (
+    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update"
+    " --disable-sync --hide-scrollbars --dump-dom"
+).split()
+_TRIES, _SECONDS = 3, 80  # a page takes 2 to 5; on a busy machine a browser may hang while it starts
+
+
+def open_page(address: str, folder: Path, *flags: str) -> tuple[str, str]:
+    """The page's final HTML and the browser's stderr. A browser that hangs is killed and another one asked."""
+    for attempt in range(_TRIES):
+        command = [BROWSER, *_FLAGS, f"--user-data-dir={folder / f'profile{attempt}'}", *flags, address]
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+        try:
+            return process.communicate(timeout=_SECONDS)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)  # its helpers too: they would keep the pipes open
+            said = process.communicate()[1]
+    pytest.fail(f"{_TRIES} browsers hung for {_SECONDS} s on {address}: {said[-1000:]}")
