@@ -64,6 +64,24 @@ def dpc() -> Callable[..., subprocess.CompletedProcess]:
 
 
 @pytest.fixture
+def dpc_here(capfd) -> Callable[..., subprocess.CompletedProcess]:
+    """As `dpc`, in this process: for tests about what a command says or makes, not about processes. Saves the start."""
+    from dpcli.cli.app import main
+
+    def run(*words: object) -> subprocess.CompletedProcess:
+        command, code = list(map(str, words)), 0
+        capfd.readouterr()
+        try:
+            main(command)
+        except SystemExit as ended:
+            code = int(ended.code or 0)
+        said = capfd.readouterr()
+        return subprocess.CompletedProcess(command, code, said.out.encode(), said.err.encode())
+
+    return run
+
+
+@pytest.fixture
 def make_sequence() -> Callable[..., CloudSequence]:
     """A random sequence; frames have different sizes, so that offsets matter."""
 

@@ -80,20 +80,20 @@ def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, 
     assert value == pytest.approx((a.scores.argmax(1) == a.labels).mean())
 
 
-def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc, tmp_path):
+def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc_here, tmp_path):
     for size in (1, 7):
-        dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / f"{size}.h5", "--batch", size)
+        dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / f"{size}.h5", "--batch", size)
     a, b = (ScoresReader(tmp_path / f"{size}.h5").scores for size in (1, 7))
     np.testing.assert_allclose(a, b, atol=2e-5)
 
 
-def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_folder, dpc, tmp_path):
+def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_folder, dpc_here, tmp_path):
     words = ("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
-    assert dpc(*words).returncode == 0
+    assert dpc_here(*words).returncode == 0
     before = (tmp_path / "s.h5").read_bytes()
-    again = dpc(*words)
+    again = dpc_here(*words)
     assert again.returncode == 0 and b"already complete" in again.stderr
-    other = dpc(*words, "--split", "all")
+    other = dpc_here(*words, "--split", "all")
     assert other.returncode == 2 and b"--force" in other.stderr and (tmp_path / "s.h5").read_bytes() == before
 
 
@@ -151,8 +151,8 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
         time.sleep(0.02)
 
 
-def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc):
-    other = dpc("classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5)
+def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc_here):
+    other = dpc_here("classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5)
     assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
 
 
@@ -179,37 +179,37 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
         RunFolder(tmp_path, {}, columns=["loss"])
 
 
-def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc, tmp_path, make_sequence):
+def test_other_classes_and_wrong_kinds_are_refused(data, run_folder, dpc_here, tmp_path, make_sequence):
     with CloudsWriter(tmp_path / "other.h5", class_names=["up", "down"]) as writer:
         writer.write(make_sequence("x", label=0, frames=6))
-    wrong = dpc("classify", "predict", tmp_path / "other.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
+    wrong = dpc_here("classify", "predict", tmp_path / "other.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert wrong.returncode == 3 and b"'up'" in wrong.stderr and b"'left'" in wrong.stderr
-    dpc("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "scores.h5")
-    kind = dpc("classify", "predict", tmp_path / "scores.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
+    dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "scores.h5")
+    kind = dpc_here("classify", "predict", tmp_path / "scores.h5", "--model", run_folder, "-o", tmp_path / "s.h5")
     assert kind.returncode == 3 and b"holds 'scores'" in kind.stderr and not (tmp_path / "s.h5").exists()
-    none = dpc("classify", "predict", data, "--model", "nowhere", "-o", tmp_path / "s.h5")
+    none = dpc_here("classify", "predict", data, "--model", "nowhere", "-o", tmp_path / "s.h5")
     assert none.returncode == 2 and b"nowhere" in none.stderr
 
 
-def test_truncated_and_foreign_weights_are_refused(data, run_folder, dpc, tmp_path):
+def test_truncated_and_foreign_weights_are_refused(data, run_folder, dpc_here, tmp_path):
     weights = (run_folder / "best.safetensors").read_bytes()
     (tmp_path / "half.safetensors").write_bytes(weights[: len(weights) // 2])
     (tmp_path / "pickle.safetensors").write_bytes(b"\x80\x04K\x01.")
     for name in ("half", "pickle"):
-        run = dpc("classify", "predict", data, "--model", tmp_path / f"{name}.safetensors", "-o", tmp_path / "s.h5")
+        run = dpc_here("classify", "predict", data, "--model", tmp_path / f"{name}.safetensors", "-o", tmp_path / "s.h5")
         assert run.returncode == 3 and b"safetensors" in run.stderr, name
 
 
-def test_profile_prints_true_and_paper_counts(dpc):
-    run = dpc("classify", "profile", "--variant", "release", "--classes", 20, "--frames", 4, "--points", 256, "--json")
+def test_profile_prints_true_and_paper_counts(dpc_here):
+    run = dpc_here("classify", "profile", "--variant", "release", "--classes", 20, "--frames", 4, "--points", 256, "--json")
     assert run.returncode == 0, run.stderr.decode()
     report = json.loads(run.stdout)
     assert report["parameters"]["static"] == 741_652 and report["parameters"]["total"] == 1_586_906
     assert report["paper_style_parameters"]["static"] == 2.126 and report["macs_per_clip"]["total"] > 1e9
 
 
-def test_static_weights_of_another_run_are_a_start(data, run_folder, dpc, tmp_path):
-    run = dpc(
+def test_static_weights_of_another_run_are_a_start(data, run_folder, dpc_here, tmp_path):
+    run = dpc_here(
         "classify",
         "train",
         data,
@@ -247,7 +247,7 @@ def test_only_the_room_that_is_asked_for_is_loaded():
         assert sorted(rooms & {name.split(".")[-1] for name in found}) == loaded, run.stdout + run.stderr
 
 
-def test_every_start_is_scored(data, run_folder, dpc, tmp_path):
+def test_every_start_is_scored(data, run_folder, dpc_here, tmp_path):
     """6 frames, clips of 4: three clips a video; their mean is the video's score."""
     import torch
 

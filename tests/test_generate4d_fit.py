@@ -68,16 +68,16 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     assert again.returncode == 2 and "--force" in again.stderr.decode()
 
 
-def test_given_views_make_the_side_right(tmp_path, dpc):
+def test_given_views_make_the_side_right(tmp_path, dpc_here, one_thread):
     """The same steps with and without two more views: the picture from a camera that neither has seen is better with them."""
     views = toy_views(tmp_path / "views.h5", train=3, test=2)
     values = {}
     for prior in ("none", "views"):
         scene = tmp_path / f"with_{prior}.h5"
-        steps = ("--dense-steps", 80, "--sparse-steps", 40)
-        done = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", prior, *steps)
+        steps = ("--dense-steps", 50, "--sparse-steps", 30)
+        done = dpc_here("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", prior, *steps)
         assert done.returncode == 0, done.stderr
-        scored = dpc("evaluate", "video", scene, "--truth", views, "--metrics", "psnr", "--json")
+        scored = dpc_here("evaluate", "video", scene, "--truth", views, "--metrics", "psnr", "--json")
         assert scored.returncode == 0, scored.stderr
         values[prior] = json.loads(scored.stdout)["metrics"]["per_role"]["test"]["psnr"]
     assert values["views"] > values["none"] + 1.0, values
@@ -104,14 +104,14 @@ def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc):
     np.testing.assert_array_equal(one.part_probability, two.part_probability)
 
 
-def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc):
+def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc_here):
     views = toy_views(tmp_path / "views.h5")
     steps = ("--preset", "tiny", "--dense-steps", 8, "--sparse-steps", 8)
     scenes = {}
     for name, switches in {
         "a": ("--no-rigid", "--no-sparse"), "c": ("--no-fusion", "--no-sparse"), "e": (),
     }.items():  # fmt: skip
-        done = dpc("generate4d", "fit", views, "-o", tmp_path / f"{name}.h5", *steps, *switches)
+        done = dpc_here("generate4d", "fit", views, "-o", tmp_path / f"{name}.h5", *steps, *switches)
         assert done.returncode == 0, done.stderr
         scenes[name] = read_scene(tmp_path / f"{name}.h5")
     assert len(scenes["a"].control_point) == 0 and len(scenes["e"].control_point) == 24
@@ -119,7 +119,7 @@ def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc):
     assert 0 < scenes["e"].rigid_weight.mean() < 1
 
 
-def test_what_is_wrong_is_said(tmp_path, dpc):
+def test_what_is_wrong_is_said(tmp_path, dpc_here):
     views, blank = toy_views(tmp_path / "views.h5"), toy_views(tmp_path / "blank.h5", empty=True)
     for code, words, arguments in (
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
@@ -129,17 +129,17 @@ def test_what_is_wrong_is_said(tmp_path, dpc):
         (2, "--run FOLDER", (views, "-o", "-", "--preset", "tiny")),
         (3, "not an HDF5 file", (__file__, "-o", tmp_path / "a.h5")),
     ):
-        done = dpc("generate4d", "fit", *arguments)
+        done = dpc_here("generate4d", "fit", *arguments)
         assert done.returncode == code and words in done.stderr.decode(), done.stderr
         assert b"Traceback" not in done.stderr and not (tmp_path / "a.h5").exists()
 
 
-def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc):
+def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     from dpcli.generate4d.fit import COLUMNS
     from dpcli.runtime.run_folder import RunFolder
 
     RunFolder(tmp_path / "scene.fit", {"config": 1}, columns=COLUMNS)
     with pytest.raises(UsageError, match="another configuration"):
         RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
-    done = dpc("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
+    done = dpc_here("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
     assert done.returncode == 2 and b"another configuration" in done.stderr

@@ -72,10 +72,10 @@ def test_training_leaves_what_people_look_for(run_folder):
     assert (run_folder / "curves.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_running_again_continues_and_another_configuration_is_refused(dpc, data, run_folder):
-    again = dpc("segment", "train", data, "-o", run_folder, *TRAIN)
+def test_running_again_continues_and_another_configuration_is_refused(dpc_here, data, run_folder):
+    again = dpc_here("segment", "train", data, "-o", run_folder, *TRAIN)
     assert again.returncode == 0 and b"continuing" in again.stderr
-    other = dpc("segment", "train", data, "-o", run_folder, *TRAIN[:-1], 4)
+    other = dpc_here("segment", "train", data, "-o", run_folder, *TRAIN[:-1], 4)
     assert other.returncode == 2 and b"another configuration" in other.stderr
 
 
@@ -125,8 +125,8 @@ def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tm
 
 
 @pytest.mark.parametrize("method", ["dbscan", "ward", "ssc", "trajaffn"])
-def test_classical_methods_write_the_same_kind_of_file(dpc, data, tmp_path, method):
-    done = dpc("segment", "predict", data, "--method", method, "--flow", "nearest", "-o", tmp_path / "p.h5", "--split", "test")
+def test_classical_methods_write_the_same_kind_of_file(dpc_here, data, tmp_path, method):
+    done = dpc_here("segment", "predict", data, "--method", method, "--flow", "nearest", "-o", tmp_path / "p.h5", "--split", "test")
     assert done.returncode == 0, done.stderr.decode()
     with PartsReader(tmp_path / "p.h5") as reader:
         assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
@@ -148,9 +148,9 @@ def test_classical_methods_write_the_same_kind_of_file(dpc, data, tmp_path, meth
         (("predict", "nothing.h5", "-o", "OUT", "--method", "ward"), 3, b"no such file"),
     ],
 )
-def test_mistakes_end_with_a_sentence(dpc, data, tmp_path, words, code, message):
+def test_mistakes_end_with_a_sentence(dpc_here, data, tmp_path, words, code, message):
     words = [str(data) if w == "DATA" else str(tmp_path / "out") if w == "OUT" else w for w in words]
-    done = dpc("segment", *words)
+    done = dpc_here("segment", *words)
     assert done.returncode == code and message in done.stderr, done.stderr.decode()
     assert b"a bug" not in done.stderr and not (tmp_path / "out").is_file()
 

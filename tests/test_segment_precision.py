@@ -98,11 +98,11 @@ def test_the_loss_falls() -> None:
 
 
 @pytest.mark.parametrize("words", [["--amp"], []])
-def test_the_switch_reaches_the_file(dpc, tmp_path, words: list[str]) -> None:
-    made = dpc("prepare", "synthetic", "articulated", "-o", tmp_path / "o.h5", "--objects", 1, "--sequences-per-object", 1,
+def test_the_switch_reaches_the_file(dpc_here, tmp_path, words: list[str]) -> None:
+    made = dpc_here("prepare", "synthetic", "articulated", "-o", tmp_path / "o.h5", "--objects", 1, "--sequences-per-object", 1,
                "--frames", 2, "--points", 64)  # fmt: skip
     assert made.returncode == 0, made.stderr.decode()
-    done = dpc("segment", "predict", tmp_path / "o.h5", "-o", tmp_path / "p.h5", *words)
+    done = dpc_here("segment", "predict", tmp_path / "o.h5", "-o", tmp_path / "p.h5", *words)
     assert done.returncode == 0, done.stderr.decode()
-    told = json.loads(dpc("info", tmp_path / "p.h5", "--json").stdout)
+    told = json.loads(dpc_here("info", tmp_path / "p.h5", "--json").stdout)
     assert told["provenance"][-1]["config"].get("amp", False) is bool(words)
