@@ -42,8 +42,8 @@ def own_files(monkeypatch) -> handover._MemoryFiles:
     files = handover._MemoryFiles()
     monkeypatch.setattr(handover, "_files", files)
     yield files
-    for number in files._numbers:
-        os.close(number)
+    for file in files._files:
+        file.close()
 
 
 def test_what_is_packed_comes_back_and_can_be_written_to(own_files):
@@ -88,6 +88,25 @@ def test_without_memory_left_results_go_through_the_pipe(own_files, monkeypatch)
 
     monkeypatch.setattr(os, "memfd_create", refuse)
     assert_same(handover.packed(values, 2), 2)
+
+
+def test_a_full_memory_is_noticed_before_it_is_touched(own_files, monkeypatch):
+    def refuse(*where: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    assert_same(handover.packed(values, 2), 2)
+
+
+def test_a_memory_file_grows_with_the_results(own_files):
+    """One that is free again, too small for what comes next."""
+    parcels = []
+    for seed in (1, 2, 3, 4, 5, 6):
+        parcels.append(handover.packed(values, seed))
+        found = handover.unpacked(parcels[-1])
+        assert_same(found, seed)
+        del found
+    assert len({parcel.path for parcel in parcels}) == 1 and len({parcel.lengths for parcel in parcels}) == 6
 
 
 @pytest.mark.parametrize("refused", [False, True])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics, back_project
-from dpcli.prepare.depth_files import VIDEO_SUFFIXES, image_paths, read_depth_video
+from dpcli.prepare.depth_files import VIDEO_SUFFIXES, has_images, read_depth_video
 from dpcli.prepare.labels import LabelTable, read_labels
 from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
@@ -150,11 +151,14 @@ def find_videos(path: Path) -> list[Path]:
     """The depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of images)."""
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
-    if path.is_file() or image_paths(path):
+    if path.is_file() or has_images(path):
         return [path]
-    below = sorted(path.rglob("*"), key=lambda p: natural_key(p.relative_to(path).as_posix()))
-    suffixes = (*VIDEO_SUFFIXES, ".npy")
-    found = [p for p in below if (p.is_dir() and image_paths(p)) or (p.is_file() and p.suffix.lower() in suffixes)]
+    found, suffixes = [], (*VIDEO_SUFFIXES, ".npy")
+    for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
+        found += [below for name in folders if has_images(below := Path(folder, name))]
+        named = (Path(folder, name) for name in files if name.lower().endswith(suffixes))
+        found += [file for file in named if file.is_file()]
+    found.sort(key=lambda p: natural_key(p.relative_to(path).as_posix()))
     if not found:
         raise DataError(
             f"{path}: no depth video in it; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)}"

@@ -107,12 +107,22 @@ def read_image_folder(folder: Path, stride: int = 1) -> np.ndarray:
     paths = image_paths(folder)[::stride]
     if not paths:
         raise DataError(f"{folder}: no depth images ({', '.join(IMAGE_SUFFIXES)})")
-    frames = [read_image(path) for path in paths]
-    for path, frame in zip(paths, frames, strict=True):
-        if (frame.shape, frame.dtype) != (frames[0].shape, frames[0].dtype):
-            first = f"{frames[0].shape[1]}x{frames[0].shape[0]} {frames[0].dtype}"
-            raise DataError(f"{path}: {frame.shape[1]}x{frame.shape[0]} {frame.dtype}; the first image is {first}")
-    return np.stack(frames)
+    first = read_image(paths[0])
+    frames = np.empty((len(paths), *first.shape), first.dtype)
+    frames[0] = first
+    for index, path in enumerate(paths[1:], start=1):
+        frame = read_image(path)
+        if (frame.shape, frame.dtype) != (first.shape, first.dtype):
+            size = f"{first.shape[1]}x{first.shape[0]} {first.dtype}"
+            raise DataError(f"{path}: {frame.shape[1]}x{frame.shape[0]} {frame.dtype}; the first image is {size}")
+        frames[index] = frame  # while it is in the cache
+    return frames
+
+
+def has_images(folder: Path) -> bool:
+    """Whether `image_paths` finds any, without asking for all."""
+    with os.scandir(folder) as entries:
+        return any(entry.name.lower().endswith(IMAGE_SUFFIXES) for entry in entries)
 
 
 def image_paths(folder: Path) -> list[Path]:

@@ -34,27 +34,50 @@ class Parcel:
     lengths: tuple[int, ...]
 
 
+class _MemoryFile:
+    """One of this process's, and a view of it: copying into that takes a third of the time of writing to a file."""
+
+    def __init__(self) -> None:
+        self.number, self._view = os.memfd_create("dpc result"), None
+
+    def view(self, size: int) -> mmap.mmap:
+        """At least its first `size` bytes. OSError: no memory left."""
+        if self._view is None or len(self._view) < size:
+            size = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
+            os.posix_fallocate(self.number, 0, size)  # or the first touch without memory would kill the process
+            self._view = mmap.mmap(self.number, size)
+        return self._view
+
+    def in_use(self) -> bool:
+        return self._view is not None and self._view[:1] == _USED
+
+    def close(self) -> None:
+        os.close(self.number)
+        if self._view is not None:
+            self._view.close()
+
+
 class _MemoryFiles:
     """Those of this process: taken for a result, free again when the parent says so."""
 
     def __init__(self) -> None:
-        self._numbers: list[int] = []
+        self._files: list[_MemoryFile] = []
         self._process = 0
 
-    def take(self) -> int | None:
-        """The number of an open memory file that nobody reads; None when there are too many."""
+    def take(self) -> _MemoryFile | None:
+        """One that nobody reads; None when there are too many."""
         if self._process != os.getpid():  # after a fork they are another's
-            self._numbers, self._process = [], os.getpid()
-        free = [number for number in self._numbers if os.pread(number, 1, 0) != _USED]
-        for number in free[_SPARE:]:
-            os.close(number)
-            self._numbers.remove(number)
+            self._files, self._process = [], os.getpid()
+        free = [file for file in self._files if not file.in_use()]
+        for file in free[_SPARE:]:
+            file.close()
+            self._files.remove(file)
         if free:
             return free[0]
-        if len(self._numbers) >= _MOST:
+        if len(self._files) >= _MOST:
             return None
-        self._numbers.append(os.memfd_create("dpc result"))
-        return self._numbers[-1]
+        self._files.append(_MemoryFile())
+        return self._files[-1]
 
 
 _files = _MemoryFiles()
@@ -69,17 +92,19 @@ def packed(function: Callable[[Any], Any], item: Any) -> Any:
     if sum(len(array) for array in arrays) < _SMALL:
         return result
     try:
-        number = _files.take()
-        if number is None:
+        file = _files.take()
+        if file is None:
             return result
         mark, at = os.urandom(_HEAD - 1), _HEAD
-        for array in arrays:
-            _write(number, array, at)
-            at += _aligned(len(array))
-        _write(number, memoryview(_USED + mark), 0)
+        view = file.view(_HEAD + sum(_aligned(len(array)) for array in arrays))
     except OSError:  # no memory left for it, too many open files
         return result
-    return Parcel(f"/proc/{os.getpid()}/fd/{number}", mark, pickled, tuple(len(array) for array in arrays))
+    whole = np.frombuffer(view, np.uint8)
+    for array in arrays:
+        whole[at : at + len(array)] = array
+        at += _aligned(len(array))
+    view[:_HEAD] = _USED + mark
+    return Parcel(f"/proc/{os.getpid()}/fd/{file.number}", mark, pickled, tuple(len(array) for array in arrays))
 
 
 def unpacked(parcel: Parcel) -> Any:
@@ -104,12 +129,6 @@ def unpacked(parcel: Parcel) -> Any:
 
 def _release(memory: mmap.mmap) -> None:
     memory[:1] = _FREE
-
-
-def _write(number: int, data: memoryview, at: int) -> None:
-    while len(data):
-        written = os.pwrite(number, data, at)
-        data, at = data[written:], at + written
 
 
 def _aligned(length: int) -> int:

@@ -175,7 +175,7 @@ class AtomicFile:
             raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
         try:
             self.file = h5py.File(self.part, mode)
-            self.handle = self.file.id.get_vfd_handle()
+            self.handle, self._written_out = self.file.id.get_vfd_handle(), 0
         except OSError as error:
             busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
             why = "another dpc is writing it" if busy else str(error).splitlines()[0]
@@ -189,6 +189,15 @@ class AtomicFile:
             if getattr(error, "errno", None) == number or f"errno = {number}," in text:
                 return DpcError(f"{self.target}: {words}; nothing was left under that name. Free space, then run again")
         return None
+
+    def flush(self) -> None:
+        """Hand everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
+        self.file.flush()
+        if hasattr(os, "posix_fadvise"):
+            size = os.fstat(self.handle).st_size
+            # What it says is that the pages won't be needed; as they are new, Linux begins to write them and keeps them.
+            os.posix_fadvise(self.handle, self._written_out, size - self._written_out, os.POSIX_FADV_DONTNEED)
+            self._written_out = size
 
     def commit(self) -> None:
         """Close, flush to the disk, rename."""

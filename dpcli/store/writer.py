@@ -202,7 +202,7 @@ class CloudsWriter:
             self._extend(name, values)
         self._unflushed += getattr(values, "nbytes", 0)
         if self._unflushed > _FLUSH_BYTES:
-            self._file.flush()
+            self._atomic.flush()
             self._unflushed = 0
 
     def _append_whole_chunks(self, points: np.ndarray) -> None:
