@@ -146,3 +146,15 @@ def test_help_imports_nothing_heavy() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, cwd=ROOT, timeout=60)
     assert result.stdout.decode().splitlines()[-1] == "HEAVY []"
+
+
+def test_what_the_system_refuses_is_said_in_words(capsys) -> None:
+    """Not as a bug: a folder that may not be read, a file where a folder should be. An error without a file is one."""
+    from dpcli.cli.app import _explain
+
+    for error in (PermissionError(13, "Permission denied", "there"), NotADirectoryError(20, "Not a directory", "there")):
+        assert _explain(error) == 1
+        said = capsys.readouterr().err
+        assert said.startswith("dpc: error: there: ") and "Errno" not in said and "bug" not in said
+    with pytest.raises(OSError):
+        _explain(OSError(5, "Input/output error"))

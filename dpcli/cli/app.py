@@ -115,6 +115,9 @@ def _explain(error: BaseException) -> int:
             f"no space left on the device while writing {error.filename or 'the output'}; free some and run again"
         )
         return 1
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
+        return 1
     raise error
 
 

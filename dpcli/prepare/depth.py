@@ -151,7 +151,7 @@ def find_videos(path: Path) -> list[Path]:
     """The depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of images)."""
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
-    if path.is_file() or has_images(path):
+    if not path.is_dir() or has_images(path):
         return [path]
     found, suffixes = [], (*VIDEO_SUFFIXES, ".npy")
     for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
