@@ -55,6 +55,8 @@ class DepthVideos:
     stride: int = 1
     labels: Path | None = None
     chooses: ClassVar[bool] = True
+    length_unit: ClassVar[str] = "m"
+    fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         if self.background not in BACKGROUNDS:
@@ -71,14 +73,6 @@ class DepthVideos:
     @property
     def class_names(self) -> list[str]:
         return self._table.class_names if self._table else []
-
-    @property
-    def length_unit(self) -> str:
-        return "m"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("time",)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -107,24 +107,15 @@ class KittiDetection:
     objects: tuple[str, ...] = ("Car",)
     view: View = View()
     coordinates: str = "published"
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "m"
+    fields: ClassVar[tuple[str, ...]] = ("part",)
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
         unknown = sorted(set(self.objects) - set(TYPES))
         if unknown or not self.objects:
             raise UsageError(f"--objects {','.join(self.objects)}: expected some of {', '.join(TYPES)}")
-
-    @property
-    def class_names(self) -> list[str]:
-        return []
-
-    @property
-    def length_unit(self) -> str:
-        return "m"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part",)
 
     @property
     def config(self) -> dict[str, Any]:

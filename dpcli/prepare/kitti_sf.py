@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -87,6 +87,9 @@ class KittiSceneFlow:
     labels: str = "instance"
     far: float = 35.0
     coordinates: str = "published"
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "m"
+    fields: ClassVar[tuple[str, ...]] = ("part", "scene_flow")
 
     def __post_init__(self) -> None:
         class_numbers(self.objects)
@@ -95,18 +98,6 @@ class KittiSceneFlow:
             raise UsageError(f"--labels {self.labels}: expected {' or '.join(LABELS)}")
         if not self.far > 0:
             raise UsageError(f"--far {self.far}: expected a distance above 0, metres")
-
-    @property
-    def class_names(self) -> list[str]:
-        return []
-
-    @property
-    def length_unit(self) -> str:
-        return "m"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part", "scene_flow")
 
     @property
     def config(self) -> dict[str, Any]:

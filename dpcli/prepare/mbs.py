@@ -7,7 +7,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -112,18 +112,9 @@ class MultiBodySync:
     """Reader of a folder of meta.json and data/%06d.npz."""
 
     raw: Path
-
-    @property
-    def class_names(self) -> list[str]:
-        return []
-
-    @property
-    def length_unit(self) -> str:
-        return "as published"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part", "pose")
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "as published"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     @property
     def config(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
@@ -63,6 +63,8 @@ class ModelNet40:
     """Reader of the folder; a sample is a sequence of one frame."""
 
     raw: Path
+    length_unit: ClassVar[str] = "unit sphere"
+    fields: ClassVar[tuple[str, ...]] = ()
 
     @property
     def class_names(self) -> list[str]:
@@ -73,14 +75,6 @@ class ModelNet40:
         if len(names) != len(CLASS_NAMES) or len(set(names)) != len(names):
             raise DataError(f"{path}: {len(names)} names, {len(set(names))} of them different; expected 40")
         return names
-
-    @property
-    def length_unit(self) -> str:
-        return "unit sphere"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ()
 
     @property
     def config(self) -> dict[str, Any]:

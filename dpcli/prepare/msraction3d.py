@@ -112,6 +112,7 @@ class MSRAction3D:
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
     chooses: ClassVar[bool] = True
+    fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if not (self.focal > 0 and self.scale > 0):
@@ -124,10 +125,6 @@ class MSRAction3D:
     @property
     def length_unit(self) -> str:
         return f"{self.scale:g} raw depth units" if self.scale != 1 else "raw depth unit"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ()
 
     @property
     def config(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -83,6 +83,7 @@ class NTU60:
     protocol: str = "xsub"
     intrinsics: Intrinsics = INTRINSICS["peers"]
     scale: float = 655.35
+    fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         if self.protocol not in PUBLISHED:
@@ -97,10 +98,6 @@ class NTU60:
     @property
     def length_unit(self) -> str:
         return {1.0: "mm", 1000.0: "m"}.get(self.scale, f"{self.scale:g} mm")
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("time",)
 
     @property
     def config(self) -> dict[str, Any]:

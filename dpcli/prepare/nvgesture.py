@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -91,6 +91,7 @@ class NvGesture:
     foreground: str = "otsu"  # otsu | none
     erode: int = 1  # passes of 3x3 erosion
     coordinates: str = "image"  # image: row, column, grey level | camera: pinhole with depth 255 - grey level
+    fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         for option, allowed in (("foreground", ("otsu", "none")), ("coordinates", ("image", "camera"))):
@@ -106,10 +107,6 @@ class NvGesture:
         if self.coordinates == "image":
             return "pixel (row, column), grey level (depth; nearer = larger)"
         return "255 - grey level"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("time",)
 
     @property
     def config(self) -> dict[str, Any]:

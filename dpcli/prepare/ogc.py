@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -119,18 +119,9 @@ class OgcRooms:
     """Reader of the released arrays, of OGC-DR and OGC-DRSV alike."""
 
     raw: Path
-
-    @property
-    def class_names(self) -> list[str]:
-        return []
-
-    @property
-    def length_unit(self) -> str:
-        return "room width"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part", "pose")
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "room width"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     @property
     def config(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import hashlib
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -59,18 +59,9 @@ class GeneratedRooms:
     options: RoomOptions = RoomOptions()
     split: SplitRule = SplitRule(fractions=FRACTIONS)
     seed: int = 0
-
-    @property
-    def class_names(self) -> list[str]:
-        return []
-
-    @property
-    def length_unit(self) -> str:
-        return "room width"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part", "pose")
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "room width"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     @property
     def config(self) -> dict[str, Any]:

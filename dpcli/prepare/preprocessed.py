@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -69,6 +69,7 @@ class PeerClouds:
     form: str
     protocol: str = "xsub"
     scale: float | None = None
+    fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if self.protocol not in ntu60.PUBLISHED:
@@ -89,10 +90,6 @@ class PeerClouds:
     @property
     def _scale(self) -> float:
         return self.scale or {"msraction3d": 300.0, "ntu60": 0.01}[self.form]
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ()
 
     @property
     def config(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -50,6 +50,7 @@ class PtsLabel:
     raw: Path
     labels: int = 28
     lists: Path | None = None
+    fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         if self.labels not in (14, 28):
@@ -69,10 +70,6 @@ class PtsLabel:
         if self._is_nvgesture():
             return "pixel (row, column), grey level (depth; nearer = larger)"
         return "pixel (row, column), mm (depth)"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ()
 
     @property
     def config(self) -> dict[str, Any]:

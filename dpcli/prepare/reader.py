@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -44,10 +44,13 @@ class Sample:
 
 
 class Reader(Protocol):
-    """A raw format. Implementations are frozen dataclasses of their options, so they pickle into worker processes."""
+    """A raw format. Implementations are frozen dataclasses of their options, so they pickle into worker processes.
+
+    What an option decides is a property, what is always the same a ClassVar.
+    """
 
     @property
-    def class_names(self) -> list[str]: ...
+    def class_names(self) -> Sequence[str]: ...
     @property
     def length_unit(self) -> str: ...
     @property

@@ -8,7 +8,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -87,6 +87,8 @@ class Sapien:
     articulation: Articulation = Articulation()
     split: SplitRule = SplitRule()
     seed: int = 0
+    length_unit: ClassVar[str] = "object diameter"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     def __post_init__(self) -> None:
         if self.pairs_per_object < 1:
@@ -95,14 +97,6 @@ class Sapien:
     @property
     def class_names(self) -> list[str]:
         return sorted({found.category for found in find_objects(self.raw)} - {""})
-
-    @property
-    def length_unit(self) -> str:
-        return "object diameter"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part", "pose")
 
     @property
     def config(self) -> dict[str, Any]:

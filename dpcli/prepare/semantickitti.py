@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -72,6 +72,9 @@ class SemanticKitti:
     objects: tuple[str, ...] = ("car", "truck")
     view: View = View()
     coordinates: str = "published"
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "m"
+    fields: ClassVar[tuple[str, ...]] = ("part",)
 
     def __post_init__(self) -> None:
         check_coordinates(self.coordinates)
@@ -82,18 +85,6 @@ class SemanticKitti:
             raise UsageError(f"--objects {','.join(self.objects)}: expected some of {', '.join(CLASSES)}")
         if self.frames < 1:
             raise UsageError(f"--frames {self.frames}: expected 1 or more")
-
-    @property
-    def class_names(self) -> list[str]:
-        return []
-
-    @property
-    def length_unit(self) -> str:
-        return "m"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part",)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -78,6 +78,7 @@ class Shrec17:
     median: int = 3  # side of the median blur, pixels; 0 = none
     close: int = 7  # side of the closing, pixels; 0 = none
     coordinates: str = "image"  # image: row, column, depth | camera: pinhole
+    fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         for option, allowed in (
@@ -95,10 +96,6 @@ class Shrec17:
     @property
     def length_unit(self) -> str:
         return "pixel (row, column), mm (depth)" if self.coordinates == "image" else "mm"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("time",)
 
     @property
     def config(self) -> dict[str, Any]:

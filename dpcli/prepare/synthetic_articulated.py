@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -45,6 +45,8 @@ class SyntheticArticulated:
     articulation: Articulation = Articulation()
     split: SplitRule = SplitRule()
     seed: int = 0
+    length_unit: ClassVar[str] = "object diameter"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     def __post_init__(self) -> None:
         for option in ("objects", "sequences_per_object"):
@@ -57,14 +59,6 @@ class SyntheticArticulated:
     @property
     def class_names(self) -> list[str]:
         return sorted(self.kinds or KINDS)
-
-    @property
-    def length_unit(self) -> str:
-        return "object diameter"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("part", "pose")
 
     @property
     def config(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -98,6 +98,8 @@ class SyntheticGestures:
     size: int = 160
     noise: float = 1.0
     seed: int = 0
+    length_unit: ClassVar[str] = "m"
+    fields: ClassVar[tuple[str, ...]] = ("time", "part")
 
     def __post_init__(self) -> None:
         for option, least in (("videos_per_class", 1), ("frames", 2), ("subjects", 2), ("size", 16)):
@@ -108,14 +110,6 @@ class SyntheticGestures:
     @property
     def class_names(self) -> list[str]:
         return list(CLASS_NAMES)
-
-    @property
-    def length_unit(self) -> str:
-        return "m"
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        return ("time", "part")
 
     @property
     def config(self) -> dict[str, Any]:
