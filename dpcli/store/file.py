@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -196,7 +197,8 @@ class AtomicFile:
         if hasattr(os, "posix_fadvise"):
             size = os.fstat(self.handle).st_size
             # What it says is that the pages won't be needed; as they are new, Linux begins to write them and keeps them.
-            os.posix_fadvise(self.handle, self._written_out, size - self._written_out, os.POSIX_FADV_DONTNEED)
+            with suppress(OSError):  # a file system that takes no advice
+                os.posix_fadvise(self.handle, self._written_out, size - self._written_out, os.POSIX_FADV_DONTNEED)
             self._written_out = size
 
     def commit(self) -> None:
