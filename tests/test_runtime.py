@@ -84,7 +84,7 @@ with stop_requested():
     for _ in range(2):
         process.send_signal(signal.SIGTERM)
         time.sleep(0.3)
-    assert process.wait(timeout=10) == 75
+    assert process.wait(timeout=60) == 75
 
 
 def test_a_batch_log_gets_plain_lines(monkeypatch):
@@ -142,4 +142,4 @@ if __name__ == "__main__":
     )
     process.stdout.readline()
     process.kill()
-    process.communicate(timeout=20)  # returns when the last process holding the pipes is gone
+    process.communicate(timeout=60)  # returns when the last process holding the pipes is gone

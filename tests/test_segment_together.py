@@ -49,7 +49,7 @@ def test_flows_and_network_meet(two_threads) -> None:
     def meet(own: str, other: str) -> None:
         threads.append(torch.get_num_threads())
         begun[own].set()
-        assert begun[other].wait(20), f"no {other} while there is a {own}"
+        assert begun[other].wait(90), f"no {other} while there is a {own}"
 
     def network(points):
         meet("network", "flow")
