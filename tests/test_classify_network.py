@@ -261,6 +261,7 @@ def test_profile_splits_a_training_step_into_its_parts():
     step = result["static_step"]
     assert 0 < step["matrix_products_share"] <= 1 and set(step["ms_per_clip"]) == {
         "matrix_products",
+        "sparse_products",
         "neighbours",
         "other",
     }
