@@ -78,12 +78,33 @@ def test_blocks_of_channels_that_do_not_fill_up(features, widths, monkeypatch):
 def test_kernels_give_the_same_on_any_number_of_threads(features, monkeypatch):
     grad = torch.randn(2, 20, 40, generator=torch.Generator().manual_seed(1))
     results = []
+    monkeypatch.setattr(module, "_PIECE", 1 << 14)  # several tasks
+    monkeypatch.setattr(torch, "set_num_threads", lambda count: None)  # products of whole layers stay as they are
     for count in (1, 2, 3):
-        monkeypatch.setattr(torch, "get_num_threads", lambda count=count: count)  # the kernels', not the products'
+        monkeypatch.setattr(torch, "get_num_threads", lambda count=count: count)  # of those that share the pieces
         pooled, statistics, grads = run(layer(features, widths=(48, 40)), True, grad)
         results.append([pooled, *statistics, *grads.values()])
     for one, two, three in zip(*results):
         assert torch.equal(one, two) and torch.equal(one, three)
+
+
+def test_threads_that_shared_pieces_leave_torch_as_it_was(monkeypatch):
+    """Also when one of them fails; and no piece is lost or done twice."""
+    monkeypatch.setattr(module, "_PIECE", 1 << 12)
+    before, done = torch.get_num_threads(), []
+    points, centers, idx, _, _ = layer(0)
+    pieces = module._Pieces(module._FromPositions(points, centers, idx, torch.ones(16, 3), torch.zeros(16)), 16)
+    tasks = [pieces.of(low, high) for low, high in module._ranges(pieces.count, 5)]
+    pieces.share(tasks, lambda task, low, room: done.append((task, low, len(room.hidden) // pieces.neighbors)))
+    assert sorted(done) == [(t, low, high - low) for t, part in enumerate(tasks) for low, high in part]
+    assert sum(size for _, _, size in done) == pieces.count == idx.shape[0] * idx.shape[1]
+
+    def fail(task, low, room):
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError, match="no"):
+        pieces.share(tasks, fail)
+    assert torch.get_num_threads() == before
 
 
 @pytest.mark.parametrize("widths", [(12, 16), (16, 4)])

@@ -140,8 +140,9 @@ def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
 def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, Any]:
     """Where a training step of the static stream (grouping, forward, loss, backward) spends its time: the fastest of 8.
 
-    Matrix products are the calls of BLAS as torch's profiler sees them in that same step. The fastest, because other
-    programs only ever add time, and to the parts unequally. Sparse products: see `_sparse_products`, the least of 4 steps.
+    On a CPU the parts are those of one thread: threads share the layers' work in whole pieces, products and all. `seconds`
+    is the step with every thread. Matrix products are the calls of BLAS as torch's profiler sees them. The fastest step,
+    because other programs only ever add time, and to the parts unequally. Sparse products: see `_sparse_products`.
     """
     from dpcli.runtime.memory import keep_freed_memory
 
@@ -160,16 +161,20 @@ def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str,
         loss.backward()
         return grouped - began, _now(device) - began
 
-    for _ in range(2):
-        step()
-    (grouping, seconds), inside = min((_profiled(step) for _ in range(8)), key=lambda found: found[0][1])
-    sparse = min(_sparse_products(step) for _ in range(4))
-    model.eval()
+    threads = torch.get_num_threads()
+    seconds = min(step()[1] for _ in range(6))
+    try:
+        torch.set_num_threads(1)
+        (grouping, alone), inside = min((_profiled(step) for _ in range(6)), key=lambda found: found[0][1])
+        sparse = min(_sparse_products(step) for _ in range(4))
+    finally:
+        torch.set_num_threads(threads)
+        model.eval()
     parts = {"matrix_products": inside, "sparse_products": sparse, "neighbours": grouping}
-    parts["other"] = seconds - sum(parts.values())
+    parts["other"] = alone - sum(parts.values())
     return {
-        "batch": batch, "seconds": round(seconds, 4), "matrix_products_share": round(inside / seconds, 3),
-        "sparse_products_share": round(sparse / seconds, 3),
+        "batch": batch, "threads": threads, "seconds": round(seconds, 4), "seconds_on_one_thread": round(alone, 4),
+        "matrix_products_share": round(inside / alone, 3), "sparse_products_share": round(sparse / alone, 3),
         "ms_per_clip": {name: round(1000 * value / batch, 2) for name, value in parts.items()},
     }  # fmt: skip
 
@@ -246,8 +251,9 @@ def render(result: dict[str, Any]) -> str:
         parts = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in step["ms_per_clip"].items())
         dense, sparse = (100 * step[f"{kind}_products_share"] for kind in ("matrix", "sparse"))
         lines.append(
-            f"static step   {step['seconds']} s for {step['batch']} clips,"
-            f" {dense:.0f} % in matrix products, {sparse:.0f} % in sparse ones"
+            f"static step   {step['seconds']} s for {step['batch']} clips with {step['threads']} threads,"
+            f" {step['seconds_on_one_thread']} s with one,"
         )
+        lines.append(f"              of which {dense:.0f} % in matrix products and {sparse:.0f} % in sparse ones")
         lines.append(f"  per clip    {parts} ms")
     return "\n".join(lines)

@@ -8,7 +8,8 @@ C1 x C1 matrix instead of two with C1 x C2. Both give the same numbers; tests co
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +20,12 @@ from dpcli.ops.backend import chosen_backend
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 
-# Bytes of activations between two matrix products, which then stay in the cache. What comes with each piece (Python, torch's
-# dispatch) runs on one thread: half the size makes the products faster and the rest slower, twice the size the reverse.
-_PIECE = 1 << 22
-_BLOCKS = 32  # pieces of work of a sum: more than threads, for balance; fixed, so that sums repeat exactly
-_HELD = 8  # pieces summed in float32
-_SPLITS = 4  # the same where each needs a copy of a large target
+# Bytes of activations between two matrix products, which then stay in the cache. A thread takes whole pieces, its products
+# on itself alone: threads that shared each product would wait for each other five times a piece, and longer than they work.
+_PIECE = 1 << 21
+_HELD = 8  # pieces summed in float32, in one go
+_TASKS = 8  # of a backward pass, each with a target of its own; fixed like _HELD, so that sums repeat exactly
+_BLOCKS = 32  # pieces of work of a sum: more than threads, for balance; fixed, too
 _LANES = 8  # channels in a vector of the kernels
 
 
@@ -192,15 +193,14 @@ class _FromPositions:
         """The layer's activations of a piece (rows,C) from centroid `first` on."""
         self.kernels.hidden_xyz(*self.inputs, first, out)
 
-    def begin_backward(self) -> int:
-        """Returns how many copies of the weight's gradient `back` fills."""
-        self.sums = torch.zeros(_SPLITS, 4, self.channels, dtype=torch.float64)
-        self.targets = (self.sums.numpy(), _width(self.channels, _SPLITS))
-        return _SPLITS
+    def begin_backward(self) -> list[tuple[int, int]]:
+        """Ranges of centroids that may go through `back` at the same time."""
+        self.sums = torch.zeros(_TASKS, 4, self.channels, dtype=torch.float64)
+        return _ranges(self.idx.shape[0] * self.idx.shape[1], _TASKS)
 
-    def back(self, first: int, *arrays: np.ndarray) -> None:
-        """Take in a piece's gradient: arrays as the kernel's hidden .. grad_weight."""
-        self.kernels.back_xyz(*arrays, *self.arrays, first, *self.targets)
+    def back(self, task: int, first: int, *arrays: np.ndarray) -> None:
+        """Take in the gradient of a piece of a range: arrays as the kernel's hidden .. grad_weight."""
+        self.kernels.back_xyz(*arrays, *self.arrays, first, self.sums[task].numpy())
 
     def gradients(self) -> tuple[Tensor | None, ...]:
         """Of (table, offset, weight, bias, norm weight, norm bias); table and offset are not inputs here."""
@@ -242,16 +242,17 @@ class _FromTable:
         """The layer's activations of a piece (rows,C) from centroid `first` on."""
         self.kernels.hidden_table(*self.inputs, first, out)
 
-    def begin_backward(self) -> int:
-        """Returns how many copies of the weight's gradient `back` fills."""
+    def begin_backward(self) -> list[tuple[int, int]]:
+        """Ranges of centroids that may go through `back` at the same time: of whole clouds, as these share no point."""
         batch, nodes, channels = self.table.shape
         self.packed = torch.zeros(-(-channels // (2 * _LANES)), batch, nodes, 2 * _LANES)
         self.to_offset = torch.empty_like(self.sums)
-        self.targets = (self.packed.view(-1).numpy(), self.to_offset.view(-1).numpy(), nodes, _width(channels))
-        return 1
+        self.targets = (self.packed.view(-1).numpy(), self.to_offset.view(-1).numpy(), nodes)
+        count = self.idx.shape[1]
+        return [(low * count, high * count) for low, high in _ranges(batch, _TASKS)]
 
-    def back(self, first: int, *arrays: np.ndarray) -> None:
-        """Take in a piece's gradient: arrays as the kernel's hidden .. grad_weight."""
+    def back(self, task: int, first: int, *arrays: np.ndarray) -> None:
+        """Take in the gradient of a piece of a range: arrays as the kernel's hidden .. grad_weight."""
         self.kernels.back_table(*arrays, self.inputs[2], first, *self.targets)
 
     def gradients(self) -> tuple[Tensor | None, ...]:
@@ -276,14 +277,15 @@ class _FromTable:
         return parts.sum(0).float()
 
 
-def _width(channels: int, splits: int = 1) -> int:
-    """Blocks of channels per task: every thread has a task, the rows being cut into `splits`. No sum depends on it."""
-    tasks, blocks = -(-torch.get_num_threads() // splits), -(-channels // (2 * _LANES))
-    return -(-blocks // tasks)
+def _ranges(count: int, parts: int) -> list[tuple[int, int]]:
+    """0..count cut into at most `parts` ranges that differ by one at most."""
+    parts = max(1, min(parts, count))
+    bounds = [count * part // parts for part in range(parts + 1)]
+    return list(zip(bounds, bounds[1:]))
 
 
 class _Room:
-    """Where a piece's activations live, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
+    """Where a thread's piece of activations lives, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
 
     def __init__(self, hidden: Tensor, wide: Tensor) -> None:
         self.hidden, self.wide = hidden, wide
@@ -291,42 +293,44 @@ class _Room:
         self.array = hidden.numpy()
         self.flat = (self.array.reshape(-1), wide.numpy().reshape(-1))
 
-
-def _pieces(first: _FromPositions | _FromTable, widest: int) -> Iterator[tuple[int, _Room]]:
-    """First centroids of pieces of about _PIECE bytes of activations, (rows,C1) and (rows,widest), and their shared room."""
-    neighbors = first.idx.shape[2]
-    count = first.rows // neighbors
-    step = min(count, max(1, _PIECE // (4 * neighbors * (first.channels + widest))))
-    room = _Room(torch.empty(step * neighbors, first.channels), torch.empty(step * neighbors, widest))
-    for low in range(0, count, step):
-        if count - low < step:
-            rows = (count - low) * neighbors
-            room = _Room(room.hidden[:rows], room.wide[:rows])
-        yield low, room
+    def cut(self, rows: int) -> _Room:
+        """Its first rows."""
+        return self if rows == len(self.hidden) else _Room(self.hidden[:rows], self.wide[:rows])
 
 
-class _Moments:
-    """Of hidden layers h (rows,C) the Gram matrix h'h and the sum: float32 within a few pieces, float64 in all."""
+class _Pieces:
+    """Pieces of about _PIECE bytes of activations, (rows,C1) and (rows,widest), and the threads that share them."""
 
-    def __init__(self, channels: int) -> None:
-        self.gram, self.total = (torch.zeros(shape, dtype=torch.float64) for shape in ((channels, channels), channels))
-        self.parts, self.held = (torch.empty(channels, channels), torch.empty(1, channels)), 0
+    def __init__(self, first: _FromPositions | _FromTable, widest: int) -> None:
+        self.neighbors, self.widths = first.idx.shape[2], (first.channels, widest)
+        self.count = first.rows // self.neighbors
+        self.step = min(self.count, max(1, _PIECE // (4 * self.neighbors * sum(self.widths))))
 
-    def add(self, room: _Room) -> None:
-        """One more piece."""
-        gram, total = self.parts
-        torch.addmm(gram, room.transposed, room.hidden, beta=1 if self.held else 0, out=gram)
-        torch.addmm(total, room.ones, room.hidden, beta=1 if self.held else 0, out=total)
-        self.held += 1
-        if self.held == _HELD:
-            self.flush()
+    def of(self, low: int, high: int) -> list[tuple[int, int]]:
+        """The pieces of centroids low..high-1."""
+        return [(start, min(start + self.step, high)) for start in range(low, high, self.step)]
 
-    def flush(self) -> None:
-        """Bring the float64 sums up to date."""
-        if self.held:
-            self.gram += self.parts[0]
-            self.total += self.parts[1][0]
-        self.held = 0
+    def share(self, tasks: list[list[tuple[int, int]]], work: Callable[[int, int, _Room], None]) -> None:
+        """Call work(task, first centroid, room) for every piece: a task's in order, by one thread, tasks at the same time."""
+        threads = torch.get_num_threads()
+        waiting = iter(enumerate(tasks))
+
+        def run() -> None:
+            torch.set_num_threads(1)  # of this thread's products
+            rows = self.step * self.neighbors
+            room = _Room(*(torch.empty(rows, width) for width in self.widths))
+            for task, pieces in waiting:
+                for low, high in pieces:
+                    work(task, low, room.cut((high - low) * self.neighbors))
+
+        try:
+            with ThreadPoolExecutor(threads) as pool, torch.no_grad():
+                others = [pool.submit(torch.no_grad()(run)) for _ in range(min(threads, len(tasks)) - 1)]
+                run()
+                for other in others:
+                    other.result()
+        finally:
+            torch.set_num_threads(threads)
 
 
 def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -335,18 +339,29 @@ def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Te
     Returns the largest values (M,C2) and their rows i32, and of the hidden layer h the Gram matrix h'h and the sum, in
     float64.
     """
-    neighbors, c2 = first.idx.shape[2], len(weight)
-    count = first.rows // neighbors
-    best, where = torch.empty(count, c2), torch.empty(count, c2, dtype=torch.int32)
+    pieces, c1, c2 = _Pieces(first, len(weight)), first.channels, len(weight)
+    best, where = torch.empty(pieces.count, c2), torch.empty(pieces.count, c2, dtype=torch.int32)
     targets = (best.numpy(), where.numpy())
-    moments, weight = _Moments(first.channels), weight.t()
-    for start, room in _pieces(first, c2):
-        first.hidden(start, room.array)
+    all_pieces = pieces.of(0, pieces.count)
+    held = max(1, min(_HELD, len(all_pieces) // _TASKS))
+    tasks = [all_pieces[start : start + held] for start in range(0, len(all_pieces), held)]
+    moments = [(torch.empty(c1, c1), torch.empty(1, c1)) for _ in tasks]
+    weight = weight.t()
+
+    def work(task: int, low: int, room: _Room) -> None:
+        first.hidden(low, room.array)
         torch.mm(room.hidden, weight, out=room.wide)
-        moments.add(room)
-        first.kernels.largest(room.flat[1], neighbors, start, *targets)
-    moments.flush()
-    return best, where, moments.gram, moments.total
+        (gram, total), more = moments[task], low != tasks[task][0][0]
+        torch.addmm(gram, room.transposed, room.hidden, beta=more, out=gram)
+        torch.addmm(total, room.ones, room.hidden, beta=more, out=total)
+        first.kernels.largest(room.flat[1], pieces.neighbors, low, *targets)
+
+    pieces.share(tasks, work)
+    gram, total = torch.zeros(c1, c1, dtype=torch.float64), torch.zeros(c1, dtype=torch.float64)
+    for one in moments:
+        gram += one[0]
+        total += one[1][0]
+    return best, where, gram, total
 
 
 def _sort_pooled(
@@ -368,16 +383,20 @@ def _back_pool(
 
     Returns the sum of pooled times h, (C2,C1).
     """
-    splits, c1 = first.begin_backward(), first.channels
+    tasks, c1 = first.begin_backward(), first.channels
     columns = torch.arange(-(-c1 // (2 * _LANES)) * 2 * _LANES)
     columns = torch.where(columns < c1, columns, columns - _LANES)  # half a block left: twice the same
     packed = weight[:, columns].view(len(weight), -1, 2 * _LANES).transpose(0, 1).contiguous()
-    parts = torch.zeros(splits, *packed.shape)
-    arrays = (constant.numpy(), *pooled, packed.view(-1).numpy(), parts.view(splits, -1).numpy())
-    for start, room in _pieces(first, c1):
-        first.hidden(start, room.array)
+    parts = torch.zeros(len(tasks), *packed.shape)
+    arrays, targets = (constant.numpy(), *pooled, packed.view(-1).numpy()), [part.view(-1).numpy() for part in parts]
+
+    def work(task: int, low: int, room: _Room) -> None:
+        first.hidden(low, room.array)
         torch.mm(room.hidden, mixed, out=room.wide)
-        first.back(start, *room.flat, *arrays)
+        first.back(task, low, *room.flat, *arrays, targets[task])
+
+    pieces = _Pieces(first, c1)
+    pieces.share([pieces.of(*task) for task in tasks], work)
     return parts.sum(0).transpose(0, 1).reshape(len(weight), -1)[:, :c1]
 
 

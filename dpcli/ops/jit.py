@@ -28,6 +28,7 @@ _skip_blas()
 # No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorise. Nothing that changes
 # a value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
 _FLAGS = {"nnan", "nsz"}
+_ARITHMETIC = {"contract", "nsz", "arcp", "reassoc"}
 
 
 def kernel(function: Callable) -> Callable:
@@ -57,5 +58,9 @@ def parallel_kernel(function: Callable) -> Callable:
 
     Must not run in a process that forks afterwards; `parallel.parallel_kernels` loads modules that use it.
     """
-    options = {"parallel": True, "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "error_model": "numpy"}
-    return _compiled(function, **options)
+    return _compiled(function, parallel=True, fastmath=_ARITHMETIC, error_model="numpy")
+
+
+def piece_kernel(function: Callable) -> Callable:
+    """As `parallel_kernel`, but serial and without the GIL: for work that plain threads share among them."""
+    return _compiled(function, nogil=True, fastmath=_ARITHMETIC, error_model="numpy")

@@ -1,9 +1,9 @@
 """CPU kernels of `grouped_mlp`: the passes around its matrix products, on pieces of rows that stay in the cache.
 
 Rows are neighbours: row r = i * K + k is neighbour k of centroid i, centroids counted through all clouds. A piece is
-centroids first..last-1; its arrays start at its first row. Work is cut by centroids, or by channels where centroids
-share a target: no two threads add to one place, and the order of every sum is fixed, so results repeat exactly on any
-number of threads. All arrays are C-contiguous float32 unless said otherwise. Unsigned indices: numba then drops the
+centroids first..last-1; its arrays start at its first row. Kernels of a piece are serial and release the GIL, the others
+run on numba's threads, cut by centroids: no two threads add to one place, and the order of every sum is fixed, so results
+repeat exactly on any number of threads. All arrays are C-contiguous float32 unless said otherwise. Unsigned indices: numba then drops the
 negative-index case and the loops over channels vectorise.
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from dpcli.ops.jit import parallel_kernel
+from dpcli.ops.jit import parallel_kernel, piece_kernel
 from dpcli.ops.kernels_simd import WIDTH, higher, lanes, load, store, where_lower
 
 PAIR = 2 * WIDTH  # channels that go through a backward kernel together, and the width of a block of its weights
@@ -64,11 +64,11 @@ def moments_table(table, offset, idx, sums, squares):
                 squares[block, c] += products[c]
 
 
-@parallel_kernel
+@piece_kernel
 def hidden_xyz(points, centers, idx, weight, bias, first, out):
     """out[r] = max(weight @ (points[idx[r]] - centers[i]) + bias, 0) of a piece. weight (3,C), bias (C), out (rows,C)."""
     count, neighbors = idx.shape[1], idx.shape[2]
-    for piece in prange(out.shape[0] // neighbors):
+    for piece in range(out.shape[0] // neighbors):
         i = first + piece
         b, m = i // count, i % count
         for k in range(neighbors):
@@ -81,19 +81,20 @@ def hidden_xyz(points, centers, idx, weight, bias, first, out):
                 out[r, c] = max(value, np.float32(0))
 
 
-@parallel_kernel
+@piece_kernel
 def hidden_table(table, offset, idx, first, out):
     """out[r] = max(table[idx[r]] - offset[i], 0) of a piece. table (B,N,C), offset (B,M,C), out (rows,C)."""
     count, neighbors = idx.shape[1], idx.shape[2]
-    for r in prange(out.shape[0]):
-        i, k = first + r // neighbors, r % neighbors
+    for piece in range(out.shape[0] // neighbors):
+        i = first + piece
         b, m = i // count, i % count
-        j, row = np.uintp(idx[b, m, k]), np.uintp(r)
-        for c in range(np.uintp(out.shape[1])):
-            out[row, c] = max(table[b, j, c] - offset[b, m, c], np.float32(0))
+        for k in range(neighbors):
+            j, r = np.uintp(idx[b, m, k]), np.uintp(piece * neighbors + k)
+            for c in range(np.uintp(out.shape[1])):
+                out[r, c] = max(table[b, j, c] - offset[b, m, c], np.float32(0))
 
 
-@parallel_kernel
+@piece_kernel
 def largest(rows, neighbors, first, best, where):
     """Per centroid and channel of a piece the largest value over its rows, and which row; ties: the first.
 
@@ -102,9 +103,9 @@ def largest(rows, neighbors, first, best, where):
     """
     channels = best.shape[1]
     tasks = (channels + 4 * WIDTH - 1) // (4 * WIDTH)
-    for i in prange(rows.size // channels // neighbors):
-        at = np.empty(channels, np.float32)  # row numbers: exact below 2^24
-        top = np.empty(channels, np.float32)
+    at = np.empty(channels, np.float32)  # row numbers: exact below 2^24
+    top = np.empty(channels, np.float32)
+    for i in range(rows.size // channels // neighbors):
         for task in range(tasks):
             last = channels - WIDTH
             c0 = task * 4 * WIDTH
@@ -166,118 +167,107 @@ def sort_pooled(grad, out, best, where, mean, order, values, starts, sums):
                 slots[k] = slot + 1
 
 
-@parallel_kernel
+@piece_kernel
 def back_xyz(
-    hidden, dense, constant, order, values, starts, weight, grad_weights, points, centers, idx, first, sums, width
+    hidden, dense, constant, order, values, starts, weight, grad_weight, points, centers, idx, first, sums
 ):
     """Back through a piece's pooling, second linear layer and the ReLU of `hidden_xyz`.
 
     With g[r] = dense[r] + constant + sum over the row's pooled values of value * weight[o], where hidden[r] > 0, else 0,
-    and x as in `moments_xyz`: sums (splits,4,C1) f64 += sums over rows of g, g x, g y, g z, and
-    grad_weights[split,o] += value * hidden[r]. hidden and dense (rows*C1), constant (C1), order, values, starts: of
-    `sort_pooled`, for all centroids; weight (blocks*C2*2*WIDTH) and grad_weights (splits, the same): in blocks of channels as
-    `grouped_mlp` packs them; width: blocks per task.
+    and x as in `moments_xyz`: sums (4,C1) f64 += sums over rows of g, g x, g y, g z, and grad_weight[o] += value * hidden[r].
+    hidden and dense (rows*C1), constant (C1), order, values, starts: of `sort_pooled`, for all centroids; weight and
+    grad_weight (blocks*C2*2*WIDTH): in blocks of channels as `grouped_mlp` packs them.
     """
     count, neighbors = idx.shape[1], idx.shape[2]
-    splits, _, channels = sums.shape
-    outputs = order.shape[1]
+    channels, outputs = constant.size, order.shape[1]
     blocks = (channels + PAIR - 1) // PAIR
-    tasks = (blocks + width - 1) // width
     piece = hidden.size // channels // neighbors
     zero = lanes(np.float32(0))
-    for task in prange(splits * tasks):
-        split, low = task // tasks, task % tasks * width
-        high = min(low + width, blocks)
-        parts, to_weight = np.empty(8 * WIDTH, np.float32), grad_weights[split]
-        start, stop = split * piece // splits, (split + 1) * piece // splits
-        for chunk in range(start, stop, CHUNK):
-            for block in range(low, high):
-                c0 = block * PAIR
-                c1 = min(c0 + WIDTH, channels - WIDTH)
-                base = block * outputs * PAIR
-                add0, add1 = load(constant, c0), load(constant, c1)
-                for p in range(chunk, min(chunk + CHUNK, stop)):
-                    i = first + p
-                    b, m = i // count, i % count
-                    cx, cy, cz = centers[b, m, 0], centers[b, m, 1], centers[b, m, 2]
-                    t0 = t1 = x0 = x1 = y0 = y1 = z0 = z1 = zero
-                    for k in range(neighbors):
-                        row = (p * neighbors + k) * channels
-                        h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
-                        g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
-                        for slot in range(starts[i, k], starts[i, k + 1]):
-                            w = base + order[i, slot] * PAIR
-                            value = lanes(values[i, slot])
-                            g0 = g0 + value * load(weight, w)
-                            g1 = g1 + value * load(weight, w + WIDTH)
-                            store(to_weight, w, load(to_weight, w) + value * h0)
-                            store(to_weight, w + WIDTH, load(to_weight, w + WIDTH) + value * h1)
-                        g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
-                        j = idx[b, m, k]
-                        x, y, z = lanes(points[b, j, 0] - cx), lanes(points[b, j, 1] - cy), lanes(points[b, j, 2] - cz)
-                        t0, x0, y0, z0 = t0 + g0, x0 + g0 * x, y0 + g0 * y, z0 + g0 * z
-                        t1, x1, y1, z1 = t1 + g1, x1 + g1 * x, y1 + g1 * y, z1 + g1 * z
-                    store(parts, 0 * WIDTH, t0)
-                    store(parts, 1 * WIDTH, x0)
-                    store(parts, 2 * WIDTH, y0)
-                    store(parts, 3 * WIDTH, z0)
-                    store(parts, 4 * WIDTH, t1)
-                    store(parts, 5 * WIDTH, x1)
-                    store(parts, 6 * WIDTH, y1)
-                    store(parts, 7 * WIDTH, z1)
-                    for a in range(4):
-                        for c in range(WIDTH):
-                            sums[split, a, c0 + c] += parts[a * WIDTH + c]
-                            if c1 > c0:
-                                sums[split, a, c1 + c] += parts[(4 + a) * WIDTH + c]
+    parts = np.empty(8 * WIDTH, np.float32)
+    for chunk in range(0, piece, CHUNK):
+        for block in range(blocks):
+            c0 = block * PAIR
+            c1 = min(c0 + WIDTH, channels - WIDTH)
+            base = block * outputs * PAIR
+            add0, add1 = load(constant, c0), load(constant, c1)
+            for p in range(chunk, min(chunk + CHUNK, piece)):
+                i = first + p
+                b, m = i // count, i % count
+                cx, cy, cz = centers[b, m, 0], centers[b, m, 1], centers[b, m, 2]
+                t0 = t1 = x0 = x1 = y0 = y1 = z0 = z1 = zero
+                for k in range(neighbors):
+                    row = (p * neighbors + k) * channels
+                    h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
+                    g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
+                    for slot in range(starts[i, k], starts[i, k + 1]):
+                        w = base + order[i, slot] * PAIR
+                        value = lanes(values[i, slot])
+                        g0 = g0 + value * load(weight, w)
+                        g1 = g1 + value * load(weight, w + WIDTH)
+                        store(grad_weight, w, load(grad_weight, w) + value * h0)
+                        store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
+                    g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+                    j = idx[b, m, k]
+                    x, y, z = lanes(points[b, j, 0] - cx), lanes(points[b, j, 1] - cy), lanes(points[b, j, 2] - cz)
+                    t0, x0, y0, z0 = t0 + g0, x0 + g0 * x, y0 + g0 * y, z0 + g0 * z
+                    t1, x1, y1, z1 = t1 + g1, x1 + g1 * x, y1 + g1 * y, z1 + g1 * z
+                store(parts, 0 * WIDTH, t0)
+                store(parts, 1 * WIDTH, x0)
+                store(parts, 2 * WIDTH, y0)
+                store(parts, 3 * WIDTH, z0)
+                store(parts, 4 * WIDTH, t1)
+                store(parts, 5 * WIDTH, x1)
+                store(parts, 6 * WIDTH, y1)
+                store(parts, 7 * WIDTH, z1)
+                for a in range(4):
+                    for c in range(WIDTH):
+                        sums[a, c0 + c] += parts[a * WIDTH + c]
+                        if c1 > c0:
+                            sums[a, c1 + c] += parts[(4 + a) * WIDTH + c]
 
 
-@parallel_kernel
+@piece_kernel
 def back_table(
-    hidden, dense, constant, order, values, starts, weight, grad_weights, idx, first, to_table, to_offset, nodes, width
+    hidden, dense, constant, order, values, starts, weight, grad_weight, idx, first, to_table, to_offset, nodes
 ):
     """As `back_xyz`, through the ReLU of `hidden_table`: to_table[idx[r]] += g and to_offset[i] = sum of g.
 
     to_table (blocks*B*N*2*WIDTH), in blocks of channels (rows of all channels would fall on few sets of the cache),
-    to_offset (B*M*C1), nodes = N; grad_weights has one split.
+    to_offset (B*M*C1), nodes = N.
     """
-    grad_weight = grad_weights[0]
     batch, count, neighbors = idx.shape
     channels, outputs = constant.size, order.shape[1]
     blocks = (channels + PAIR - 1) // PAIR
     piece = hidden.size // channels // neighbors
     zero = lanes(np.float32(0))
-    for task in prange((blocks + width - 1) // width):
-        low = task * width
-        high = min(low + width, blocks)
-        for chunk in range(0, piece, CHUNK):
-            for block in range(low, high):
-                c0 = block * PAIR
-                c1 = min(c0 + WIDTH, channels - WIDTH)
-                base = block * outputs * PAIR
-                add0, add1 = load(constant, c0), load(constant, c1)
-                for p in range(chunk, min(chunk + CHUNK, piece)):
-                    i = first + p
-                    b, m = i // count, i % count
-                    t0 = t1 = zero
-                    for k in range(neighbors):
-                        row = (p * neighbors + k) * channels
-                        h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
-                        g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
-                        for slot in range(starts[i, k], starts[i, k + 1]):
-                            w = base + order[i, slot] * PAIR
-                            value = lanes(values[i, slot])
-                            g0 = g0 + value * load(weight, w)
-                            g1 = g1 + value * load(weight, w + WIDTH)
-                            store(grad_weight, w, load(grad_weight, w) + value * h0)
-                            store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
-                        g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
-                        t0, t1 = t0 + g0, t1 + g1
-                        at = ((block * batch + b) * nodes + idx[b, m, k]) * PAIR
-                        store(to_table, at, load(to_table, at) + g0)
-                        store(to_table, at + WIDTH, load(to_table, at + WIDTH) + g1)
-                    store(to_offset, i * channels + c0, t0)
-                    store(to_offset, i * channels + c1, t1)
+    for chunk in range(0, piece, CHUNK):
+        for block in range(blocks):
+            c0 = block * PAIR
+            c1 = min(c0 + WIDTH, channels - WIDTH)
+            base = block * outputs * PAIR
+            add0, add1 = load(constant, c0), load(constant, c1)
+            for p in range(chunk, min(chunk + CHUNK, piece)):
+                i = first + p
+                b, m = i // count, i % count
+                t0 = t1 = zero
+                for k in range(neighbors):
+                    row = (p * neighbors + k) * channels
+                    h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
+                    g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
+                    for slot in range(starts[i, k], starts[i, k + 1]):
+                        w = base + order[i, slot] * PAIR
+                        value = lanes(values[i, slot])
+                        g0 = g0 + value * load(weight, w)
+                        g1 = g1 + value * load(weight, w + WIDTH)
+                        store(grad_weight, w, load(grad_weight, w) + value * h0)
+                        store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
+                    g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+                    t0, t1 = t0 + g0, t1 + g1
+                    at = ((block * batch + b) * nodes + idx[b, m, k]) * PAIR
+                    store(to_table, at, load(to_table, at) + g0)
+                    store(to_table, at + WIDTH, load(to_table, at + WIDTH) + g1)
+                store(to_offset, i * channels + c0, t0)
+                store(to_offset, i * channels + c1, t1)
 
 
 @parallel_kernel
