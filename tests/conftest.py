@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from dpcli.store import CloudSequence
+from tests.commands import exit_code
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -65,18 +66,13 @@ def dpc() -> Callable[..., subprocess.CompletedProcess]:
 
 @pytest.fixture
 def dpc_here(capfd) -> Callable[..., subprocess.CompletedProcess]:
-    """As `dpc`, in this process: for tests about what a command says or makes, not about processes. Saves the start."""
-    from dpcli.cli.app import main
+    """As `dpc`, in this process (see commands.py)."""
 
     def run(*words: object) -> subprocess.CompletedProcess:
-        command, code = list(map(str, words)), 0
         capfd.readouterr()
-        try:
-            main(command)
-        except SystemExit as ended:
-            code = int(ended.code or 0)
+        code = exit_code(*words)
         said = capfd.readouterr()
-        return subprocess.CompletedProcess(command, code, said.out.encode(), said.err.encode())
+        return subprocess.CompletedProcess(words, code, said.out.encode(), said.err.encode())
 
     return run
 

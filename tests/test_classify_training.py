@@ -19,10 +19,10 @@ from dpcli.classify.model_file import load_model
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.settings import network_config
 from dpcli.classify.step import LossWatch, StageStep
-from dpcli.cli.app import main
 from dpcli.errors import UsageError
 from dpcli.runtime.processes import Processes
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
+from tests.commands import exit_code as dpc
 from tests.test_classify_commands import gestures
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,15 +30,6 @@ SMALL = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", 
 SHORT = (*SMALL, "--epochs", "3", "--epochs-dynamic", "2", "--lr", "0.0001")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-def dpc(*words: object) -> int:
-    """The exit code of a command that runs in this process."""
-    try:
-        main(list(map(str, words)))
-    except SystemExit as ended:
-        return int(ended.code or 0)
-    return 0
 
 
 @pytest.fixture(scope="module")

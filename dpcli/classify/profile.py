@@ -138,11 +138,12 @@ def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
 
 
 def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, Any]:
-    """Where a training step of the static stream (grouping, forward, loss, backward) spends its time: the fastest of 8.
+    """Where a training step of the static stream (grouping, forward, loss, backward) spends its time: the fastest of 6.
 
     On a CPU the parts are those of one thread: threads share the layers' work in whole pieces, products and all. `seconds`
-    is the step with every thread. Matrix products are the calls of BLAS as torch's profiler sees them. The fastest step,
-    because other programs only ever add time, and to the parts unequally. Sparse products: see `_sparse_products`.
+    is the step with every thread. Matrix products are the calls of BLAS as torch's profiler sees them in that same step;
+    sparse products, which lie inside other kernels: see `_sparse_products`, the least of 4. The fastest step, because other
+    programs only ever add time, and to the parts unequally.
     """
     from dpcli.runtime.memory import keep_freed_memory
 
@@ -209,7 +210,7 @@ def _sparse_products(step: Callable[[], Any]) -> float:
         kernel(*without)
         between = time.perf_counter()
         kernel(*arrays)
-        seconds += time.perf_counter() - between - (between - began)
+        seconds += (time.perf_counter() - between) - (between - began)
 
     def loaded(name: str) -> ModuleType | SimpleNamespace:
         kernels = load(name)

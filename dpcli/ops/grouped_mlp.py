@@ -9,14 +9,13 @@ C1 x C1 matrix instead of two with C1 x C2. Both give the same numbers; tests co
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend
+from dpcli.ops.backend import chosen_backend, run_in_threads
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 
@@ -315,20 +314,17 @@ class _Pieces:
         threads = torch.get_num_threads()
         waiting = iter(enumerate(tasks))
 
-        def run() -> None:
+        def run(*_: int) -> None:
             torch.set_num_threads(1)  # of this thread's products
             rows = self.step * self.neighbors
             room = _Room(*(torch.empty(rows, width) for width in self.widths))
-            for task, pieces in waiting:
-                for low, high in pieces:
-                    work(task, low, room.cut((high - low) * self.neighbors))
+            with torch.no_grad():
+                for task, pieces in waiting:
+                    for low, high in pieces:
+                        work(task, low, room.cut((high - low) * self.neighbors))
 
         try:
-            with ThreadPoolExecutor(threads) as pool, torch.no_grad():
-                others = [pool.submit(torch.no_grad()(run)) for _ in range(min(threads, len(tasks)) - 1)]
-                run()
-                for other in others:
-                    other.result()
+            run_in_threads(run, (), min(threads, len(tasks)), item_ns=1e9)
         finally:
             torch.set_num_threads(threads)
 

@@ -1,10 +1,10 @@
 """CPU kernels of `grouped_mlp`: the passes around its matrix products, on pieces of rows that stay in the cache.
 
 Rows are neighbours: row r = i * K + k is neighbour k of centroid i, centroids counted through all clouds. A piece is
-centroids first..last-1; its arrays start at its first row. Kernels of a piece are serial and release the GIL, the others
-run on numba's threads, cut by centroids: no two threads add to one place, and the order of every sum is fixed, so results
-repeat exactly on any number of threads. All arrays are C-contiguous float32 unless said otherwise. Unsigned indices: numba then drops the
-negative-index case and the loops over channels vectorise.
+centroids first..last-1; its arrays start at its first row. Kernels of a piece are serial and release the GIL; the others
+run on numba's threads, cut by centroids. No two threads add to one place, and the order of every sum is fixed, so results
+repeat exactly on any number of threads. All arrays are C-contiguous float32 unless said otherwise. Unsigned indices:
+numba then drops the negative-index case and the loops over channels vectorise.
 """
 
 from __future__ import annotations
