@@ -1,8 +1,14 @@
-"""`python -m dpcli` and `torchrun -m dpcli` run the same command as `dpc`."""
+"""`dpc`, `python -m dpcli` and `torchrun -m dpcli`: the same command. Worker processes import this, so it imports nothing."""
 
 from __future__ import annotations
 
-from dpcli.cli.app import main
+
+def main() -> None:
+    """Run `dpc` with the words of the command line."""
+    from dpcli.cli.app import main
+
+    main()
+
 
 if __name__ == "__main__":
     main()

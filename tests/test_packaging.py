@@ -129,7 +129,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel: zipfile.ZipFile) ->
     assert {name.split("/")[0].split("-")[0] for name in names} == {"dpcli", "dpc_toolkit"}
     assert any(name.endswith("licenses/LICENSE") for name in names)
     entry = next(name for name in names if name.endswith("entry_points.txt"))
-    assert "dpc = dpcli.cli.app:main" in wheel.read(entry).decode()
+    assert "dpc = dpcli.__main__:main" in wheel.read(entry).decode()
 
 
 def test_the_wheel_has_the_version_of_the_code(wheel: zipfile.ZipFile) -> None:

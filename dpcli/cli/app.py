@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import os
 import sys
@@ -16,7 +17,8 @@ from dpcli.errors import DpcError
 # Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-# A room's options are many and take long to set up: only the room that is asked for is loaded, `dpc --help` loads none.
+# Options are many and take long to set up: only the room that is asked for is loaded, and of it only the command that is
+# asked for is set up; `dpc --help` loads none.
 ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
     "classify": "Recognise actions and gestures (Kinet).",
@@ -42,7 +44,7 @@ def _root(
 
 
 def application(words: Sequence[str] | None = None) -> typer.Typer:
-    """`dpc` with the one room that the words name loaded and the others by name only; with all of them for None."""
+    """`dpc` with the one command that the words name set up and the other rooms by name only; with all of it for None."""
     dpc = typer.Typer(
         name="dpc",
         no_args_is_help=True,
@@ -54,15 +56,37 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
         epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
     )
     dpc.callback()(_root)
-    asked = None if words is None else next((word for word in words if not word.startswith("-")), "")
+    path = None if words is None else [word for word in words if not word.startswith("-")]
+    asked = None if path is None else next(iter(path), "")
     for name, about in ROOMS.items():
         if asked not in (None, name):
             dpc.command(name, help=about)(_not_loaded)
         elif name == "info":
             dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
         else:
-            dpc.add_typer(import_module(f"dpcli.cli.{name}").app, name=name, help=about)
+            room = import_module(f"dpcli.cli.{name}").app
+            dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about)
     return dpc
+
+
+def _narrowed(group: typer.Typer, path: Sequence[str]) -> typer.Typer:
+    """The group with only the command that the path begins with, or as it is where that names none.
+
+    Groups have no options of their own, so the first word that is no option is the command's name.
+    """
+    commands = [entry for entry in group.registered_commands if path and _name(entry) == path[0]]
+    groups = [entry for entry in group.registered_groups if path and entry.name == path[0]]
+    if not commands and not groups:
+        return group
+    one = copy.copy(group)
+    one.registered_commands, one.registered_groups = commands, [copy.copy(entry) for entry in groups]
+    for entry in one.registered_groups:
+        entry.typer_instance = _narrowed(entry.typer_instance, path[1:])
+    return one
+
+
+def _name(command: typer.models.CommandInfo) -> str:
+    return command.name or typer.main.get_command_name(command.callback.__name__)
 
 
 def _not_loaded() -> None:
@@ -127,6 +151,8 @@ def main(argv: list[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = typer.main.get_command(application(arguments))
+    if arguments[:1] == ["prepare"]:  # while the parser loads, which takes as long as all that came before
+        import_module("dpcli.cli.prepare").warm_up(arguments[1:])
     from dpcli.runtime.progress import log
 
     try:

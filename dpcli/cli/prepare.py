@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from functools import partial
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,8 @@ from dpcli.errors import UsageError
 app = typer.Typer(no_args_is_help=True)
 synthetic = typer.Typer(no_args_is_help=True, help="Make data out of nothing, with ground truth.")
 app.add_typer(synthetic, name="synthetic")
+
+_WARM: dict[str, tuple[str, ...]] = {}  # command -> modules that its workers need
 
 
 def _common(
@@ -80,6 +83,11 @@ def _articulated(
     """The options of articulated objects; the fields of Articulation."""
 
 
+@cache
+def _parameters(function: Callable[..., None]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function, eval_str=True).parameters
+
+
 def _split_rule(test: str, validation: str, fractions: str) -> Any:
     from dpcli.prepare.splits import SplitRule
 
@@ -97,13 +105,13 @@ def _reads(
     """Register a function that turns its own options into a Reader as a command that has the common options too.
 
     ``more``: a signature like ``_common`` whose options reach the function as the dict ``articulation``.
-    ``warm``: modules that its workers need; their server imports them while this process imports its own.
+    ``warm``: modules that its workers need, see `warm_up`.
     """
 
     def register(make_reader: Callable[..., Any]) -> Callable[..., Any]:
         own = {k: p for k, p in inspect.signature(make_reader, eval_str=True).parameters.items() if k != "articulation"}
-        shared = inspect.signature(_common, eval_str=True).parameters
-        extra = inspect.signature(more, eval_str=True).parameters if more else {}
+        shared = _parameters(_common)
+        extra = _parameters(more) if more else {}
 
         def run(**options: Any) -> None:
             given = {key: options[key] for key in own}
@@ -116,8 +124,6 @@ def _reads(
                 return
             if not common["output"]:
                 raise UsageError("-o/--output FILE is missing: the file to write, or - for a pipe")
-            if not common["dask"]:
-                _warm_up(warm, **common)
             _convert(make_reader(**given), command, **common)
 
         parameters = {**own, **shared, **extra}
@@ -127,23 +133,32 @@ def _reads(
         run.__annotations__ = {p.name: p.annotation for p in ordered}
         run.__doc__ = make_reader.__doc__
         group.command(name or make_reader.__name__)(run)
+        _WARM[name or make_reader.__name__] = warm
         return make_reader
 
     return register
 
 
-def _warm_up(modules: tuple[str, ...], *, jobs: int | None, points: int, sampling: str, **_: Any) -> None:
-    """Start the workers' server before anything heavy is imported here: a third of a second of a short conversion."""
+def warm_up(words: Sequence[str]) -> None:
+    """Start the server of worker processes that a command line will want: a third of a second of a short conversion.
+
+    words: those after ``dpc prepare``, not parsed yet. A wrong guess costs only time: the pool has what it needs
+    either way.
+    """
+    options = {word.partition("=")[0] for word in words if word.startswith("-")}
+    modules = _WARM.get(words[0] if words else "", ())
+    if not modules or not options & {"-o", "--output"} or options & {"-h", "--help", "--check", "--dask"}:
+        return
     from dpcli.runtime.device import cpu_count
 
-    if not modules or (jobs or cpu_count()) < 2:
+    said = dict(itertools.pairwise(word for long in words for word in long.split("=", 1)))
+    jobs = said.get("--jobs", said.get("-j", ""))
+    if (int(jobs) if jobs.isdigit() else cpu_count()) < 2:
         return
     from dpcli.runtime.pool import start_early
 
-    start_early([
-        "dpcli.cli.app", *modules, "dpcli.prepare.pipeline",
-        *(["dpcli.prepare.warm_fps"] if points and sampling == "fps" else []),
-    ])  # fmt: skip
+    sampling = ["dpcli.prepare.warm_fps"] if said.get("--sampling") == "fps" else []
+    start_early([*modules, "dpcli.prepare.one_item", *sampling])
 
 
 def _check(name: str, make_reader: Callable[[], Any], given: dict[str, Any]) -> None:

@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.prepare.one_item import convert_item
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.shards import WHOLE, Shard, describe_shard
 from dpcli.prepare.thin import Thinning
 from dpcli.runtime.pool import ordered_map, start_early
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
-from dpcli.runtime.seed import generator
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.journal import sweep
@@ -52,21 +52,6 @@ class Report:
             if len(self.skipped) > _LISTED:
                 lines.append(f"  ... and {len(self.skipped) - _LISTED} more; -v names every one")
         return lines
-
-
-def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:
-    """Read and thin one item; its randomness depends on the seed and its index alone. Runs in a worker process."""
-    index, item = indexed
-    if item.problem:
-        raise DataError(item.problem)
-    rng = generator(seed, index)
-    choose = thinning.blind(rng) if getattr(reader, "chooses", False) else None
-    try:
-        sample = reader.read(item, rng, choose) if choose else reader.read(item, rng)
-    except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
-        raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
-    sample.sequence = thinning.apply(sample.sequence, rng)
-    return sample
 
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
@@ -140,11 +125,10 @@ def convert(
 
 
 def _needed_by_workers(reader: Reader, thinning: Thinning) -> list[str]:
-    """Modules that every worker imports and that take long: the main program's, the reader's, the sampling's."""
+    """Modules that every worker imports and that take long: the reader's, the sampling's."""
     video = ["dpcli.prepare.warm_video"] if "dpcli.prepare.depth_files" in sys.modules else []
     sampling = ["dpcli.prepare.warm_fps"] if thinning.points and thinning.sampling == "fps" else []
-    program = [name for name in ("dpcli.cli.app",) if name in sys.modules]
-    return [*program, type(reader).__module__, __name__, *video, *sampling]
+    return [type(reader).__module__, convert_item.__module__, *video, *sampling]
 
 
 class _Run:

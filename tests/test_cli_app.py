@@ -1,0 +1,104 @@
+"""`dpc` sets up only the command that is asked for; nobody may notice, but by the clock."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from dpcli.cli import app as cli
+from dpcli.cli import prepare
+from dpcli.runtime import pool
+
+
+def paths_of(group: typer.Typer) -> list[tuple[str, ...]]:
+    """The words of every command below a group."""
+    own = [(cli._name(command),) for command in group.registered_commands]
+    below = [(entry.name, *path) for entry in group.registered_groups for path in paths_of(entry.typer_instance)]
+    return own + below
+
+
+PATHS = paths_of(cli.application())
+
+
+def said(app: typer.Typer, *words: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(words))
+    return result.exit_code, result.output
+
+
+def test_there_are_commands_at_every_depth():
+    assert {("info",), ("prepare", "nvgesture"), ("prepare", "synthetic", "gestures")} <= set(PATHS)
+    assert len(PATHS) > 40
+
+
+@pytest.fixture(scope="module")
+def whole() -> typer.Typer:
+    return cli.application()
+
+
+@pytest.mark.parametrize("path", PATHS, ids=" ".join)
+def test_a_command_set_up_alone_is_the_same_command(path, whole):
+    words = (*path, "--help")
+    alone = cli.application(words)
+    assert said(alone, *words) == said(whole, *words)
+    assert len(paths_of(alone)) == len(cli.ROOMS)  # the other rooms by name, and of this one a single command
+
+
+@pytest.mark.parametrize("words", [("prepare",), ("prepare", "--help"), ("prepare", "synthetic"), ("--help",), ()])
+def test_groups_list_all_they_have(words, whole):
+    code, text = said(cli.application(words), *words)
+    expected, all_text = said(whole, *words)
+    assert code == expected and sorted(text.splitlines()) == sorted(all_text.splitlines())  # typer puts groups last
+
+
+@pytest.mark.parametrize("words", [("prepare", "nvgestur"), ("prepare", "synthetic", "gesture"), ("prepar",)])
+def test_a_misspelt_command_is_told_the_right_one(words, whole):
+    code, text = said(cli.application(words), *words)
+    assert (code, text) == said(whole, *words)
+    assert code == 2 and "Did you mean" in text
+
+
+@pytest.fixture
+def started(monkeypatch) -> list[list[str]]:
+    calls: list[list[str]] = []
+    monkeypatch.setattr(pool, "start_early", calls.append)
+    return calls
+
+
+def test_the_workers_server_is_started_before_the_words_are_parsed(started):
+    prepare.warm_up(["nvgesture", "raw", "-o", "out.h5", "--jobs", "2", "--sampling=fps"])
+    (modules,) = started
+    assert {"dpcli.prepare.nvgesture", "dpcli.prepare.one_item", "dpcli.prepare.warm_fps"} <= set(modules)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "nvgesture raw", "nvgesture raw -o out.h5 --help", "nvgesture raw -o out.h5 --check", "", "--help",
+        "nvgesture raw -o out.h5 --dask local", "nvgesture raw -o out.h5 --jobs=1", "merge a.h5 -o out.h5",
+        "unknown raw -o out.h5", "nvgesture raw -o out.h5 --jobs 1",
+    ],
+)  # fmt: skip
+def test_no_server_for_what_needs_none(words, started):
+    prepare.warm_up(words.split())
+    assert not started
+
+
+def test_modules_named_for_the_server_exist():
+    named = {module for modules in prepare._WARM.values() for module in modules}
+    assert len(named) > 5
+    assert all(importlib.util.find_spec(module) for module in named)
+
+
+@pytest.mark.parametrize("reader", ["nvgesture", "msraction3d", "depth", "ntu60"])
+def test_what_every_worker_imports_is_little(reader):
+    code = (
+        f"import sys, dpcli.__main__, dpcli.prepare.one_item, dpcli.prepare.{reader}\n"
+        "print(*sorted({'typer', 'h5py', 'torch', 'scipy', 'open3d', 'rich', 'numba'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
