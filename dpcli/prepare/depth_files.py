@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.prepare.gray_png import decode_gray_png
 from dpcli.prepare.reader import natural_key
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
@@ -43,9 +44,10 @@ def open_video(path: Path):  # -> cv2.VideoCapture
     # frame threads cost a quarter more processor time, and the cores are busy with other videos
     single = [cv2.CAP_PROP_N_THREADS, 1]
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, single)
+    # the default conversion of 16-bit frames to 8-bit BGR would cut the lower byte off
     if capture.isOpened() and int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _GRAY16:
-        # the default conversion to 8-bit BGR would cut the lower byte off
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [*single, cv2.CAP_PROP_CONVERT_RGB, 0])
+        if not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0):  # an OpenCV that takes it at the opening only
+            capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [*single, cv2.CAP_PROP_CONVERT_RGB, 0])
     if not capture.isOpened():
         raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
     return capture
@@ -91,8 +93,12 @@ def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> 
 
 def read_image(path: Path) -> np.ndarray:
     """One gray depth image (H,W) u8, u16 or f32; DataError when unreadable or coloured."""
+    data = path.read_bytes()
+    image = decode_gray_png(data)
+    if image is not None:
+        return image
     cv2 = load_cv2()
-    image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
     if image.ndim == 3:

@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.depth_files import load_cv2
+from dpcli.prepare.gray_png import decode_gray_png
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _COLOUR = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with alpha"}
@@ -20,7 +21,7 @@ _COLOUR = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with
 def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple[int, ...] = (16,)) -> np.ndarray:
     """The bytes of a gray PNG -> depth u8 or u16 (H,W). size: (width, height) expected; bits: allowed per pixel.
 
-    Everything is checked before libpng sees it, because decoders fill in what a damaged file lacks, or complain on
+    Everything is checked before libpng sees it, because it fills in what a damaged file lacks, or complains on
     stderr without a name. DataError says what was found at ``where``.
     """
     width, height, depth, colour = _header(data, where)
@@ -29,9 +30,11 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
     if colour != 0 or depth not in bits:
         allowed = " or ".join(str(b) for b in bits)
         raise DataError(f"{where}: {depth}-bit {_COLOUR.get(colour, 'unknown')} PNG; expected {allowed}-bit gray depth")
-    _check_chunks(data, where)
-    cv2 = load_cv2()
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    image = decode_gray_png(data)
+    if image is None:
+        _check_chunks(data, where)
+        cv2 = load_cv2()
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape != (height, width):
         raise DataError(f"{where}: a damaged PNG; copy it again")
     return image

@@ -10,6 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.depth_files import load_cv2
+from dpcli.prepare.gray_png import decode_gray_png
 from dpcli.prepare.reader import require_folder
 
 COORDINATES = ("published", "camera")
@@ -90,8 +91,10 @@ def read_png(
     path: Path, channels: int, size: tuple[int, int] | None = None, bits: tuple[int, ...] = (16,)
 ) -> np.ndarray:
     """An image (H,W) or (H,W,channels) in the file's channel order. DataError unless type and ``size`` (H,W) agree."""
-    data = np.fromfile(path, np.uint8)
-    image = load_cv2().imdecode(data, load_cv2().IMREAD_UNCHANGED) if len(data) else None
+    data = path.read_bytes()
+    image = decode_gray_png(data)
+    if image is None and data:
+        image = load_cv2().imdecode(np.frombuffer(data, np.uint8), load_cv2().IMREAD_UNCHANGED)
     if image is None:
         raise DataError(f"{path}: not a readable PNG (empty or truncated); copy it again")
     if image.dtype.itemsize * 8 not in bits or (image.shape[2] if image.ndim == 3 else 1) != channels:

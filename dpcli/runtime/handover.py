@@ -111,7 +111,8 @@ def unpacked(parcel: Parcel) -> Any:
     """The result in a Parcel; its arrays are views of the memory file. OSError when that can't be opened."""
     number = os.open(parcel.path, os.O_RDWR | os.O_CLOEXEC)
     try:
-        memory = mmap.mmap(number, 0)
+        # all of it will be read: its pages are found once, instead of one fault after the other
+        memory = mmap.mmap(number, 0, flags=mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0))
     except ValueError:
         raise OSError(f"{parcel.path}: is empty") from None
     finally:
