@@ -25,6 +25,7 @@ class WholeChunks:
         self._row_bytes = self._waiting[0].nbytes  # asked of HDF5 each time it would cost as much as the writing
         self._done = len(data)  # rows in whole chunks
         self._filled = 0  # rows that wait
+        self._end = -1  # of the file, after the chunk before
 
     def append(self, values: np.ndarray) -> Pieces:
         """Append (n, ...) -> (offset in the file, bytes), in order, of those first rows of `values` that are there."""
@@ -52,9 +53,11 @@ class WholeChunks:
         place = (self._done, *[0] * (self._waiting.ndim - 1))
         self.data.id.write_direct_chunk(place, chunk)
         self._done += self.rows
-        # HDF5 would find it by going through all chunks. New ones are at the end, unless it wrote notes of its own, too.
-        offset = os.fstat(self._file).st_size - chunk.nbytes
-        if self._is_at(offset, chunk):
+        # HDF5 would find it by going through all chunks. New ones are at the end: the file grew by just the chunk, or it
+        # wrote notes of its own, too, and one has to look.
+        before, self._end = self._end, os.fstat(self._file).st_size
+        offset = self._end - chunk.nbytes
+        if offset == before or self._is_at(offset, chunk):
             return offset
         return int(self.data.id.get_chunk_info_by_coord(place).byte_offset)
 
