@@ -152,7 +152,7 @@ def warm_up(words: Sequence[str]) -> None:
     from dpcli.runtime.device import cpu_count
 
     said = dict(itertools.pairwise(word for long in words for word in long.split("=", 1)))
-    jobs = said.get("--jobs", said.get("-j", ""))
+    jobs = said.get("--jobs", "")
     if (int(jobs) if jobs.isdigit() else cpu_count()) < 2:
         return
     from dpcli.runtime.pool import start_early
