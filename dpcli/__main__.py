@@ -5,6 +5,11 @@ from __future__ import annotations
 
 def main() -> None:
     """Run `dpc` with the words of the command line."""
+    import sys
+
+    from dpcli.prepare.head_start import head_start
+
+    head_start(sys.argv[1:])
     from dpcli.cli.app import main
 
     main()

@@ -11,8 +11,8 @@ import typer
 from typer.testing import CliRunner
 
 from dpcli.cli import app as cli
-from dpcli.cli import prepare
-from dpcli.runtime import pool
+from dpcli.prepare import head_start
+from dpcli.runtime import worker_server
 
 
 def paths_of(group: typer.Typer) -> list[tuple[str, ...]]:
@@ -65,12 +65,13 @@ def test_a_misspelt_command_is_told_the_right_one(words, whole):
 @pytest.fixture
 def started(monkeypatch) -> list[list[str]]:
     calls: list[list[str]] = []
-    monkeypatch.setattr(pool, "start_early", calls.append)
+    monkeypatch.setattr(worker_server, "start_early", calls.append)
     return calls
 
 
-def test_the_workers_server_is_started_before_the_words_are_parsed(started):
-    prepare.warm_up(["nvgesture", "raw", "-o", "out.h5", "--jobs", "2", "--sampling=fps"])
+@pytest.mark.parametrize("words", ["--jobs 2 --sampling=fps", "-q --sampling fps --jobs=2", "--force --sampling fps --jobs 3"])
+def test_the_workers_server_is_started_before_the_words_are_parsed(words, started):
+    head_start.head_start(["-v", "prepare", "nvgesture", "raw", "-o", "out.h5", *words.split()])
     (modules,) = started
     assert {"dpcli.prepare.nvgesture", "dpcli.prepare.one_item", "dpcli.prepare.warm_fps"} <= set(modules)
 
@@ -78,20 +79,30 @@ def test_the_workers_server_is_started_before_the_words_are_parsed(started):
 @pytest.mark.parametrize(
     "words",
     [
-        "nvgesture raw", "nvgesture raw -o out.h5 --help", "nvgesture raw -o out.h5 --check", "", "--help",
-        "nvgesture raw -o out.h5 --dask local", "nvgesture raw -o out.h5 --jobs=1", "merge a.h5 -o out.h5",
-        "unknown raw -o out.h5", "nvgesture raw -o out.h5 --jobs 1",
+        "prepare nvgesture raw", "prepare nvgesture raw -o out.h5 --help", "prepare nvgesture raw -o out.h5 --check", "",
+        "--help", "prepare", "prepare --help", "prepare nvgesture raw -o out.h5 --dask local", "info nvgesture -o x",
+        "prepare nvgesture raw -o out.h5 --jobs=1", "prepare merge a.h5 -o out.h5", "prepare unknown raw -o out.h5",
+        "prepare nvgesture raw -o out.h5 --jobs 1",
     ],
 )  # fmt: skip
 def test_no_server_for_what_needs_none(words, started):
-    prepare.warm_up(words.split())
+    head_start.head_start(words.split())
     assert not started
 
 
-def test_modules_named_for_the_server_exist():
-    named = {module for modules in prepare._WARM.values() for module in modules}
-    assert len(named) > 5
-    assert all(importlib.util.find_spec(module) for module in named)
+def test_what_the_server_is_told_to_import_exists():
+    commands = {path[1] for path in PATHS if path[0] == "prepare"}
+    assert set(head_start.NEEDED) <= commands
+    assert all(importlib.util.find_spec(module) for modules in head_start.NEEDED.values() for module in modules)
+
+
+def test_the_head_start_waits_for_no_library():
+    code = (
+        "import sys, dpcli.prepare.head_start as h, dpcli.runtime.worker_server\n"
+        "print(*sorted({'typer', 'h5py', 'torch', 'numpy', 'rich'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
 
 
 @pytest.mark.parametrize("reader", ["nvgesture", "msraction3d", "depth", "ntu60"])

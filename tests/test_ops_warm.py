@@ -14,7 +14,8 @@ import dpcli.ops.jit  # noqa: F401  (it skips the look)
 
 PROGRAM = """
 import json, os, sys
-from dpcli.runtime.pool import ordered_map, start_early
+from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.worker_server import start_early
 
 def imported(module):
     return [module in sys.modules, os.environ.get("OMP_NUM_THREADS")]

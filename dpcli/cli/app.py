@@ -151,8 +151,6 @@ def main(argv: list[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = typer.main.get_command(application(arguments))
-    if arguments[:1] == ["prepare"]:  # while the parser loads, which takes as long as all that came before
-        import_module("dpcli.cli.prepare").warm_up(arguments[1:])
     from dpcli.runtime.progress import log
 
     try:

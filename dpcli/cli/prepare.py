@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import inspect
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,8 +17,6 @@ from dpcli.errors import UsageError
 app = typer.Typer(no_args_is_help=True)
 synthetic = typer.Typer(no_args_is_help=True, help="Make data out of nothing, with ground truth.")
 app.add_typer(synthetic, name="synthetic")
-
-_WARM: dict[str, tuple[str, ...]] = {}  # command -> modules that its workers need
 
 
 def _common(
@@ -100,12 +97,11 @@ def _split_rule(test: str, validation: str, fractions: str) -> Any:
 
 
 def _reads(
-    group: typer.Typer, name: str | None = None, more: Callable[..., None] | None = None, warm: tuple[str, ...] = ()
+    group: typer.Typer, name: str | None = None, more: Callable[..., None] | None = None
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Register a function that turns its own options into a Reader as a command that has the common options too.
 
     ``more``: a signature like ``_common`` whose options reach the function as the dict ``articulation``.
-    ``warm``: modules that its workers need, see `warm_up`.
     """
 
     def register(make_reader: Callable[..., Any]) -> Callable[..., Any]:
@@ -133,32 +129,9 @@ def _reads(
         run.__annotations__ = {p.name: p.annotation for p in ordered}
         run.__doc__ = make_reader.__doc__
         group.command(name or make_reader.__name__)(run)
-        _WARM[name or make_reader.__name__] = warm
         return make_reader
 
     return register
-
-
-def warm_up(words: Sequence[str]) -> None:
-    """Start the server of worker processes that a command line will want: a third of a second of a short conversion.
-
-    words: those after ``dpc prepare``, not parsed yet. A wrong guess costs only time: the pool has what it needs
-    either way.
-    """
-    options = {word.partition("=")[0] for word in words if word.startswith("-")}
-    modules = _WARM.get(words[0] if words else "", ())
-    if not modules or not options & {"-o", "--output"} or options & {"-h", "--help", "--check", "--dask"}:
-        return
-    from dpcli.runtime.device import cpu_count
-
-    said = dict(itertools.pairwise(word for long in words for word in long.split("=", 1)))
-    jobs = said.get("--jobs", "")
-    if (int(jobs) if jobs.isdigit() else cpu_count()) < 2:
-        return
-    from dpcli.runtime.pool import start_early
-
-    sampling = ["dpcli.prepare.warm_fps"] if said.get("--sampling") == "fps" else []
-    start_early([*modules, "dpcli.prepare.one_item", *sampling])
 
 
 def _check(name: str, make_reader: Callable[[], Any], given: dict[str, Any]) -> None:
@@ -202,7 +175,7 @@ def _numbers(text: str, option: str) -> tuple[int, ...]:
         raise UsageError(f"{option} {text}: expected whole numbers with commas, such as 1,2,3") from None
 
 
-@_reads(app, warm=("dpcli.prepare.msraction3d",))
+@_reads(app)
 def msraction3d(
     raw: Annotated[Path, typer.Argument(help="Folder of aAA_sSS_eEE_sdepth.bin (official) or .mat files.")],
     focal: Annotated[float, typer.Option("--focal", help="Focal length, pixels (as the published protocols).")] = 280.0,
@@ -217,7 +190,7 @@ def msraction3d(
     return MSRAction3D(raw, focal, scale, _numbers(train_subjects, "--train-subjects"))
 
 
-@_reads(app, warm=("dpcli.prepare.nvgesture", "dpcli.prepare.warm_video"))
+@_reads(app)
 def nvgesture(
     raw: Annotated[Path, typer.Argument(help="Folder of the official list files and Video_data/.")],
     foreground: Annotated[str, typer.Option("--foreground", help="otsu (the hand, as the peers) or none.")] = "otsu",
@@ -233,7 +206,7 @@ def nvgesture(
     return NvGesture(raw, foreground, erode, coordinates)
 
 
-@_reads(app, warm=("dpcli.prepare.depth", "dpcli.prepare.warm_video"))
+@_reads(app)
 def depth(
     inputs: Annotated[
         list[Path], typer.Argument(help="Videos (.avi .mp4 .mkv .mov), .npy, folders of images, or folders of these.")
@@ -280,7 +253,7 @@ def depth(
     )  # fmt: skip
 
 
-@_reads(app, warm=("dpcli.prepare.clouds",))
+@_reads(app)
 def clouds(
     raw: Annotated[
         Path, typer.Argument(help="Folder of .ply .pcd .npy .npz .bin .csv .las .xyz frames, or of such folders.")

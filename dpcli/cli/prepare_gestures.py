@@ -11,8 +11,8 @@ import typer
 
 def register(app: typer.Typer, reads: Callable[..., Callable]) -> None:
     """Add the commands to `dpc prepare`; ``reads`` gives them the options that every reader shares."""
-    reads(app, warm=("dpcli.prepare.shrec17", "dpcli.prepare.warm_video"))(shrec17)
-    reads(app, warm=("dpcli.prepare.ntu60", "dpcli.prepare.warm_video"))(ntu60)
+    reads(app)(shrec17)
+    reads(app)(ntu60)
     reads(app)(preprocessed)
     reads(app)(modelnet40)
 

@@ -26,9 +26,9 @@ def register(app: typer.Typer, reads: Callable[..., Callable[..., Any]]) -> None
     """Add the commands to `dpc prepare`; ``reads``: its way to make a command of a function that returns a Reader."""
     reads(app, "ogc-dr", more=_rooms)(ogc_dr)
     reads(app, "ogc-drsv", more=_rooms)(ogc_drsv)
-    reads(app, "kitti-sf", more=_sampled, warm=("dpcli.prepare.kitti_sf",))(kitti_sf)
-    reads(app, "kitti-det", more=_sampled, warm=("dpcli.prepare.kitti_det",))(kitti_det)
-    reads(app, "semantickitti", more=_sampled, warm=("dpcli.prepare.semantickitti",))(semantickitti)
+    reads(app, "kitti-sf", more=_sampled)(kitti_sf)
+    reads(app, "kitti-det", more=_sampled)(kitti_det)
+    reads(app, "semantickitti", more=_sampled)(semantickitti)
 
 
 def _sampled(

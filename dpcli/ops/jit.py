@@ -41,6 +41,11 @@ def kernel(function: Callable) -> Callable:
     return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
 
 
+def inlined(function: Callable) -> Callable:
+    """A helper of a `kernel` whose text goes into the caller: for what is called once a microsecond."""
+    return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy", inline="always")
+
+
 def arithmetic_kernel(function: Callable) -> Callable:
     """As `kernel`, but infinities and NaN pass through as IEEE 754 has them: for work on values nobody has checked."""
     return _compiled(function, nogil=True, error_model="numpy")

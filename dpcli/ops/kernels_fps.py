@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.ops.jit import kernel
+from dpcli.ops.jit import inlined, kernel
 
 BUCKET = 32  # points per bucket: 16 and 64 measured slower or equal on 2 k - 32 k points
 GROUP = 8  # buckets in a group, with a box of its own: 16 is a tenth faster on 32 k points, a quarter slower on 4 k
@@ -100,7 +100,7 @@ def bucket_kernel(points, lengths, order, xyz, box, first, last):
         _fill_buckets(points[b], lengths[b], order[b], xyz[b], box[b])
 
 
-@kernel
+@inlined
 def _box_distance(box, b, cx, cy, cz):
     zero = np.float32(0)
     gx = max(max(box[0, b] - cx, cx - box[1, b]), zero)
@@ -133,7 +133,7 @@ def _interleaved(xyz, n):
     return data
 
 
-@kernel
+@inlined
 def _update_bucket(data, bucket, cx, cy, cz):
     """Lower the distances of one bucket; returns its new maximum."""
     x = np.uintp(4 * BUCKET * bucket)  # unsigned: numba then drops the negative-index case and the loop vectorises
@@ -149,7 +149,7 @@ def _update_bucket(data, bucket, cx, cy, cz):
     return most
 
 
-@kernel
+@inlined
 def _update_group(data, box, top, group, cx, cy, cz, lower):
     """Update a group's buckets that are nearer than their largest distance `top`; returns the group's largest."""
     first = np.uintp(group * GROUP)
@@ -163,7 +163,7 @@ def _update_group(data, box, top, group, cx, cy, cz, lower):
     return most
 
 
-@kernel
+@inlined
 def _farthest(data, top, group_top, order, n):
     """Lowest original index among the points at the largest distance, and that distance."""
     most = np.float32(0)

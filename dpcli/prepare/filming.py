@@ -15,9 +15,10 @@ from dpcli.prepare.animated_mesh import AnimatedMesh, normalised
 from dpcli.prepare.bone_parts import carry, choose_points, heaviest_bones, rigid_parts
 from dpcli.prepare.raycast import FrameCaster
 from dpcli.prepare.views_pipeline import Clip
-from dpcli.runtime.pool import ordered_map, start_early
+from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import log
 from dpcli.runtime.seed import generator
+from dpcli.runtime.worker_server import start_early
 from dpcli.store.views import ViewsHeader
 
 OBJECT_RADIUS = 0.75  # of the ball around the object; the default camera sees 0.83 whole

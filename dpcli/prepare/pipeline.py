@@ -22,10 +22,11 @@ from dpcli.prepare.one_item import convert_item
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.shards import WHOLE, Shard, describe_shard
 from dpcli.prepare.thin import Thinning
-from dpcli.runtime.pool import ordered_map, start_early
+from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.signals import StopRequest, stop_requested
+from dpcli.runtime.worker_server import start_early
 from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.journal import sweep
 

@@ -1,4 +1,4 @@
-"""Imported once by the server of worker processes: OpenCV, silenced. See `pool.start_early`."""
+"""Imported once by the server of worker processes: OpenCV, silenced. See `worker_server.start_early`."""
 
 from __future__ import annotations
 

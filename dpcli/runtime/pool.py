@@ -7,30 +7,24 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DpcError
 from dpcli.runtime import handover
 from dpcli.runtime.memory import keep_freed_memory
-
-# One process per core is the parallelism: libraries inside a worker must not start threads of their own.
-_SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-
-
-_STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]
+from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 
 
 def _start_worker() -> None:
     """The parent decides when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
-    for number in (signal.SIGINT, *_STOPPING):
+    for number in (signal.SIGINT, *STOPPING):
         signal.signal(number, signal.SIG_IGN)
-    os.environ.update({name: "1" for name in _SINGLE_THREAD})
+    os.environ.update({name: "1" for name in SINGLE_THREAD})
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_freed_memory()  # one item takes what the one before gave back
 
@@ -43,36 +37,8 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def start_early(modules: Sequence[str]) -> None:
-    """Start the server that worker processes are forked from, with `modules` imported: once for all, while this goes on.
-
-    For what every worker needs and what takes long to import; a module that fails to import is left to the workers.
-    Without effect where the server runs already. The modules must start no threads: a fork would lose them.
-    """
-    multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
-    _ensure_server()
-
-
-def _ensure_server() -> None:
-    """The server ignores stop signals: if one killed it, its workers would be left behind for ever."""
-    before = {name: os.environ.get(name) for name in _SINGLE_THREAD}
-    os.environ.update({name: "1" for name in _SINGLE_THREAD})  # read by libraries as the server imports them
-    main = threading.current_thread() is threading.main_thread()
-    previous = [signal.signal(number, signal.SIG_IGN) for number in _STOPPING] if main else []
-    try:
-        forkserver.ensure_running()
-    finally:
-        for number, handler in zip(_STOPPING, previous):
-            signal.signal(number, handler)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
-    _ensure_server()
+    ensure_server()
     return ProcessPoolExecutor(jobs, multiprocessing.get_context("forkserver"), initializer=_start_worker)
 
 

@@ -1,0 +1,43 @@
+"""The server that worker processes are forked from. Imports no library: a command can start it before all else."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Sequence
+from multiprocessing import forkserver
+
+# One process per core is the parallelism: libraries inside a worker must not start threads of their own.
+SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]
+
+
+def start_early(modules: Sequence[str]) -> None:
+    """Start the server that worker processes are forked from, with `modules` imported: once for all, while this goes on.
+
+    For what every worker needs and what takes long to import; a module that fails to import is left to the workers.
+    Without effect where the server runs already. The modules must start no threads: a fork would lose them.
+    """
+    multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
+    ensure_server()
+
+
+def ensure_server() -> None:
+    """The server ignores stop signals: if one killed it, its workers would be left behind for ever."""
+    before = {name: os.environ.get(name) for name in SINGLE_THREAD}
+    os.environ.update({name: "1" for name in SINGLE_THREAD})  # read by libraries as the server imports them
+    main = threading.current_thread() is threading.main_thread()
+    previous = [signal.signal(number, signal.SIG_IGN) for number in STOPPING] if main else []
+    try:
+        forkserver.ensure_running()
+    finally:
+        for number, handler in zip(STOPPING, previous):
+            signal.signal(number, handler)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
