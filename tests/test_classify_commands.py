@@ -87,6 +87,14 @@ def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc_here, tmp_p
     np.testing.assert_allclose(a, b, atol=2e-5)
 
 
+def test_runs_are_called_by_the_seed_of_their_training(data, run_folder, dpc_here, tmp_path):
+    """Not by the prediction's, which is 0 for all."""
+    for name in ("a", "b"):
+        dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / f"{name}.h5")
+    text = dpc_here("evaluate", "runs", tmp_path / "a.h5", tmp_path / "b.h5", "--metrics", "accuracy").stdout.decode()
+    assert "seed 3 #1" in text and "seed 3 #2" in text and "seed 0" not in text
+
+
 def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_folder, dpc_here, tmp_path):
     words = ("classify", "predict", data, "--model", run_folder, "-o", tmp_path / "s.h5")
     assert dpc_here(*words).returncode == 0

@@ -218,9 +218,18 @@ def _history(provenance: list[dict]) -> tuple[int | None, list[dict]]:
 
 
 def history_seed(provenance: Sequence[dict]) -> int | None:
-    """The seed of the last training in a file's history, else of its last command; None when there is none."""
-    trained = [entry for entry in provenance if "train" in str(entry.get("command", "")).split()] or provenance
-    seed = trained[-1].get("seed") if trained else None
+    """The seed of the last training in a file's history, or of the model that a command used; else of the last command.
+
+    None when there is none.
+    """
+    for entry in reversed(provenance):
+        config = entry.get("config")
+        model = config.get("model") if isinstance(config, dict) else None
+        if isinstance(model, dict) and isinstance(model.get("seed"), int):
+            return model["seed"]
+        if "train" in str(entry.get("command", "")).split():
+            return entry["seed"] if isinstance(entry.get("seed"), int) else None
+    seed = provenance[-1].get("seed") if provenance else None
     return seed if isinstance(seed, int) else None
 
 
