@@ -7,12 +7,16 @@ def main() -> None:
     """Run `dpc` with the words of the command line."""
     import sys
 
-    from dpcli.prepare.head_start import head_start
+    try:
+        from dpcli.prepare.head_start import head_start
 
-    head_start(sys.argv[1:])
-    from dpcli.cli.app import main
+        head_start(sys.argv[1:])
+        from dpcli.cli.app import main
 
-    main()
+        main()
+    except KeyboardInterrupt:  # while libraries load; later, commands say what they keep
+        sys.stderr.write("dpc: error: interrupted\n")
+        sys.exit(130)
 
 
 if __name__ == "__main__":

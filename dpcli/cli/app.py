@@ -155,6 +155,8 @@ def main(argv: list[str] | None = None) -> None:
 
     try:
         code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
+        if code == INTERRUPTED:
+            log.error("interrupted")
         sys.stdout.flush()
     except SystemExit as ended:  # typer turns Ctrl-C and a closed pipe into this, silently
         code = _explain(ended.__context__) if isinstance(ended.__context__, BrokenPipeError) else ended.code

@@ -5,9 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Sequence
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -26,16 +25,19 @@ def start_early(modules: Sequence[str]) -> None:
 
 
 def ensure_server() -> None:
-    """The server ignores stop signals: if one killed it, its workers would be left behind for ever."""
+    """Start the server unless it runs. Stop signals and Ctrl-C never reach it.
+
+    If one killed it, its workers would be left behind for ever; and what it was importing is nothing to tell a person.
+    """
     before = {name: os.environ.get(name) for name in SINGLE_THREAD}
     os.environ.update({name: "1" for name in SINGLE_THREAD})  # read by libraries as the server imports them
-    main = threading.current_thread() is threading.main_thread()
-    previous = [signal.signal(number, signal.SIG_IGN) for number in STOPPING] if main else []
+    resource_tracker.ensure_running()  # the server's start would start it, and let signals through meanwhile
+    # blocked, not ignored: one that comes now is this process's, a moment later
+    let_through = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
     try:
         forkserver.ensure_running()
     finally:
-        for number, handler in zip(STOPPING, previous):
-            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, let_through)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
