@@ -328,6 +328,21 @@ def test_any_object_is_shown_or_refused_with_a_sentence(metrics, task):
     report_markdown(report), report_latex(report)
 
 
+@pytest.mark.parametrize(
+    "metrics",
+    [
+        {"": [{}]}, {"a": [{}, {}]}, {"": {"": {}}}, {"a": {"b": {}}}, {"a": [{"b": {}}]}, {"a": []},
+        {"m": {"mean": 1.0, "values": []}}, {"m": {"mean": {}}}, {"": {"mean": {}}},
+    ],
+    ids=str,
+)  # fmt: skip
+@pytest.mark.parametrize("more", [{}, {"mcnemar": {}, "runs": [""]}, {"mcnemar": {"p": {}}, "runs": ["", ""]}], ids=str)
+def test_records_without_a_column_are_no_table(metrics, more):
+    data = json.dumps({"task": "x", "metrics": metrics, **more}).encode()
+    report = arrange(collect(["-"], stdin=BytesIO(data), pictures=False))
+    assert report_html(report) and report_markdown(report) and report_latex(report)
+
+
 def test_markdown_escapes_and_lines_up(scores):
     text = report_markdown(arrange(collect([str(scores)]), title="a|b"))
     assert text.startswith("# a\\|b\n") and "\\</script\\>" in text and "<script>" not in re.sub(r"`[^`]*`", "", text)

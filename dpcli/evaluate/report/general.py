@@ -112,14 +112,15 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
     """A row for each metric of a comparison or of runs; then the single runs, a test, and the samples that differ most."""
     if not grouped:
         return []
-    made = [_records_table("metric", list(grouped.items()), units)]
+    records = _records(grouped)
+    made = [_records_table("metric", records, units)] if records else []
     names = found.get("runs", [])
     if isinstance(names, list) and all(isinstance(own.get("values"), list) for own in grouped.values()):
         runs = [(str(name), {key: own["values"][row] for key, own in grouped.items() if row < len(own["values"])})
                 for row, name in enumerate(names)]  # fmt: skip
-        made += [_records_table("run", runs, units)] if runs else []
-    if isinstance(found.get("mcnemar"), Mapping):
-        made.append(_records_table("McNemar's exact test", [("", found["mcnemar"])], {}))
+        made += [_records_table("run", runs, units)] if any(name or own for name, own in runs) else []
+    if (records := _records([found.get("mcnemar")])) is not None:
+        made.append(_records_table("McNemar's exact test", records, {}))
     changed = found.get("most_changed", {})
     for key, rows in changed.items() if isinstance(changed, Mapping) else ():
         if (records := _records(rows)) is not None:
@@ -143,12 +144,13 @@ def _is_scalar(value: Any) -> bool:
 
 
 def _records(value: Any) -> list[tuple[str, Mapping]] | None:
-    """(row name, record) of a list of records or of records by name; None for anything else."""
-    if isinstance(value, list) and value and all(isinstance(own, Mapping) for own in value):
-        return [("", own) for own in value]
-    if isinstance(value, Mapping) and value and all(isinstance(own, Mapping) for own in value.values()):
-        return [(str(name), own) for name, own in value.items()]
-    return None
+    """(row name, record) of a list of records or of records by name; None for anything else, or without a column."""
+    records: list[tuple[str, Mapping]] = []
+    if isinstance(value, list) and all(isinstance(own, Mapping) for own in value):
+        records = [("", own) for own in value]
+    if isinstance(value, Mapping) and all(isinstance(own, Mapping) for own in value.values()):
+        records = [(str(name), own) for name, own in value.items()]
+    return records if any(name or _flat(own) for name, own in records) else None
 
 
 def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> Table:
