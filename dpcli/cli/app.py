@@ -123,8 +123,7 @@ def _explain(error: BaseException) -> int:
         )  # the interpreter flushes stdout once more at exit
         return CLOSED_PIPE
     if isinstance(error, KeyboardInterrupt) or type(error).__name__ == "Abort":
-        log.error("interrupted")
-        return INTERRUPTED
+        return INTERRUPTED  # `main` says so, whatever way it learns of it
     if hasattr(error, "show") and hasattr(error, "exit_code"):  # wrong use, found by the option parser
         error.show(file=sys.stderr)
         return error.exit_code
@@ -155,13 +154,9 @@ def main(argv: list[str] | None = None) -> None:
 
     try:
         code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
-        if code == INTERRUPTED:
-            log.error("interrupted")
         sys.stdout.flush()
     except SystemExit as ended:  # typer turns Ctrl-C and a closed pipe into this, silently
         code = _explain(ended.__context__) if isinstance(ended.__context__, BrokenPipeError) else ended.code
-        if code == INTERRUPTED:
-            log.error("interrupted")
     except (Exception, KeyboardInterrupt) as error:
         if log.debug and not isinstance(error, (BrokenPipeError, KeyboardInterrupt)):
             import traceback
@@ -175,4 +170,6 @@ def main(argv: list[str] | None = None) -> None:
                     f"{type(unexpected).__name__}: {unexpected} (a bug, or an unusual machine; --debug shows where)"
                 )
             code = 1
+    if code == INTERRUPTED:
+        log.error("interrupted")
     sys.exit(code if isinstance(code, int) else 0)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from dpcli.ops.jit import parallel_kernel, piece_kernel
+from dpcli.ops.jit import inlined, parallel_kernel, piece_kernel
 from dpcli.ops.kernels_simd import WIDTH, higher, lanes, load, store, where_lower
 
 PAIR = 2 * WIDTH  # channels that go through a backward kernel together, and the width of a block of its weights
@@ -167,6 +167,26 @@ def sort_pooled(grad, out, best, where, mean, order, values, starts, sums):
                 slots[k] = slot + 1
 
 
+@inlined
+def _through_relu(
+    hidden, dense, at0, at1, add0, add1, order, values, first, last, base, weight, grad_weight, zero
+):  # fmt: skip
+    """Gradient of two runs of WIDTH channels of one row, at `at0` and `at1`, through the ReLU; adds to grad_weight.
+
+    first..last: the outputs whose maximum this row is, in `order`, with their gradients in `values`.
+    """
+    h0, h1 = load(hidden, at0), load(hidden, at1)
+    g0, g1 = load(dense, at0) + add0, load(dense, at1) + add1
+    for slot in range(first, last):
+        w = base + order[slot] * PAIR
+        value = lanes(values[slot])
+        g0 = g0 + value * load(weight, w)
+        g1 = g1 + value * load(weight, w + WIDTH)
+        store(grad_weight, w, load(grad_weight, w) + value * h0)
+        store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
+    return where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+
+
 @piece_kernel
 def back_xyz(
     hidden, dense, constant, order, values, starts, weight, grad_weight, points, centers, idx, first, sums
@@ -197,16 +217,10 @@ def back_xyz(
                 t0 = t1 = x0 = x1 = y0 = y1 = z0 = z1 = zero
                 for k in range(neighbors):
                     row = (p * neighbors + k) * channels
-                    h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
-                    g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
-                    for slot in range(starts[i, k], starts[i, k + 1]):
-                        w = base + order[i, slot] * PAIR
-                        value = lanes(values[i, slot])
-                        g0 = g0 + value * load(weight, w)
-                        g1 = g1 + value * load(weight, w + WIDTH)
-                        store(grad_weight, w, load(grad_weight, w) + value * h0)
-                        store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
-                    g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+                    g0, g1 = _through_relu(
+                        hidden, dense, row + c0, row + c1, add0, add1, order[i], values[i], starts[i, k],
+                        starts[i, k + 1], base, weight, grad_weight, zero,
+                    )  # fmt: skip
                     j = idx[b, m, k]
                     x, y, z = lanes(points[b, j, 0] - cx), lanes(points[b, j, 1] - cy), lanes(points[b, j, 2] - cz)
                     t0, x0, y0, z0 = t0 + g0, x0 + g0 * x, y0 + g0 * y, z0 + g0 * z
@@ -252,16 +266,10 @@ def back_table(
                 t0 = t1 = zero
                 for k in range(neighbors):
                     row = (p * neighbors + k) * channels
-                    h0, h1 = load(hidden, row + c0), load(hidden, row + c1)
-                    g0, g1 = load(dense, row + c0) + add0, load(dense, row + c1) + add1
-                    for slot in range(starts[i, k], starts[i, k + 1]):
-                        w = base + order[i, slot] * PAIR
-                        value = lanes(values[i, slot])
-                        g0 = g0 + value * load(weight, w)
-                        g1 = g1 + value * load(weight, w + WIDTH)
-                        store(grad_weight, w, load(grad_weight, w) + value * h0)
-                        store(grad_weight, w + WIDTH, load(grad_weight, w + WIDTH) + value * h1)
-                    g0, g1 = where_lower(zero, h0, g0, zero), where_lower(zero, h1, g1, zero)
+                    g0, g1 = _through_relu(
+                        hidden, dense, row + c0, row + c1, add0, add1, order[i], values[i], starts[i, k],
+                        starts[i, k + 1], base, weight, grad_weight, zero,
+                    )  # fmt: skip
                     t0, t1 = t0 + g0, t1 + g1
                     at = ((block * batch + b) * nodes + idx[b, m, k]) * PAIR
                     store(to_table, at, load(to_table, at) + g0)

@@ -9,41 +9,33 @@ Names resolve on first use: a process that only makes `CloudSequence`s needs no 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from dpcli.store.file import file_kind
-    from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
-    from dpcli.store.pipes import input_file, output_file
-    from dpcli.store.reader import CloudsReader
-    from dpcli.store.scores import ScoresReader, ScoresWriter
-    from dpcli.store.sequence import CloudSequence
-    from dpcli.store.views import ViewsHeader, ViewsReader, ViewsWriter
-    from dpcli.store.writer import CloudsWriter
+from typing import Any
 
 _HOME = {
-    "file": ("file_kind",),
-    "parts": ("PartsReader", "PartsSample", "PartsWriter"),
-    "pipes": ("input_file", "output_file"),
-    "reader": ("CloudsReader",),
-    "scores": ("ScoresReader", "ScoresWriter"),
-    "sequence": ("CloudSequence",),
-    "views": ("ViewsHeader", "ViewsReader", "ViewsWriter"),
-    "writer": ("CloudsWriter",),
+    "CloudSequence": "sequence",
+    "CloudsReader": "reader",
+    "CloudsWriter": "writer",
+    "PartsReader": "parts",
+    "PartsSample": "parts",
+    "PartsWriter": "parts",
+    "ScoresReader": "scores",
+    "ScoresWriter": "scores",
+    "ViewsHeader": "views",
+    "ViewsReader": "views",
+    "ViewsWriter": "views",
+    "file_kind": "file",
+    "input_file": "pipes",
+    "output_file": "pipes",
 }
 
-__all__ = [
-    "CloudSequence", "CloudsReader", "CloudsWriter", "PartsReader", "PartsSample", "PartsWriter", "ScoresReader", "ScoresWriter",
-    "ViewsHeader", "ViewsReader", "ViewsWriter", "file_kind", "input_file", "output_file",
-]  # fmt: skip
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _HOME.items():
-        if name in names:
-            value = globals()[name] = getattr(import_module(f"{__name__}.{module}"), name)
-            return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return value
 
 
 def __dir__() -> list[str]:
