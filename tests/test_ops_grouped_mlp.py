@@ -9,6 +9,7 @@ import torch
 from dpcli.ops import grouped_mlp as module
 from dpcli.ops.grouped_mlp import Norm, grouped_activations, grouped_mlp
 from dpcli.ops.parallel import parallel_kernels
+from dpcli.ops.pieces import ranges
 from dpcli.ops.plane_fit import (
     normal_equations,
     normal_equations_reference,
@@ -94,7 +95,7 @@ def test_threads_that_shared_pieces_leave_torch_as_it_was(monkeypatch):
     before, done = torch.get_num_threads(), []
     points, centers, idx, _, _ = layer(0)
     pieces = module._Pieces(module._FromPositions(points, centers, idx, torch.ones(16, 3), torch.zeros(16)), 16)
-    tasks = [pieces.of(low, high) for low, high in module._ranges(pieces.count, 5)]
+    tasks = [pieces.of(low, high) for low, high in ranges(pieces.count, 5)]
     pieces.share(tasks, lambda task, low, room: done.append((task, low, len(room.hidden) // pieces.neighbors)))
     assert sorted(done) == [(t, low, high - low) for t, part in enumerate(tasks) for low, high in part]
     assert sum(size for _, _, size in done) == pieces.count == idx.shape[0] * idx.shape[1]

@@ -17,24 +17,25 @@ from dpcli.classify.backbone import Grouping, Stage
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.layers import GlobalHead, he_init
 from dpcli.classify.merge import build_merge
-from dpcli.classify.st_surface import deviations, fit_surface, projected_deviations, surface_normal
+from dpcli.classify.st_surface import along_normal, surface_normal
+from dpcli.classify.surface_pieces import Fit, fit_reduced
 from dpcli.ops import gather_points
 
 
 class DeviationWeights(nn.Module):
-    """Neighbour weights from deviations by one linear map over groups and a sigmoid (eq. 3.8)."""
+    """Logits of neighbour weights from deviations by one linear map over groups (eq. 3.8)."""
 
     def __init__(self, previous: int, groups: int) -> None:
         super().__init__()
         self.linear = nn.Linear(previous, groups)
 
     def forward(self, deviations: Tensor) -> Tensor:
-        """deviations (B,M,n,K') -> weights (B,M,n,K) in (0,1)."""
-        return torch.sigmoid(self.linear(deviations))
+        """deviations (B,M,n,K') -> logits (B,M,n,K); the weights are their sigmoid."""
+        return self.linear(deviations)
 
 
 class ProjectionWeights(nn.Module):
-    """The released form: over groups, then over the projected deviation vector (d+1 -> 2d -> 1), sigmoid."""
+    """The released form: over groups, then over the projected deviation vector (d+1 -> 2d -> 1)."""
 
     def __init__(self, previous: int, groups: int, group_size: int) -> None:
         super().__init__()
@@ -43,9 +44,9 @@ class ProjectionWeights(nn.Module):
         self.out = nn.Linear(2 * group_size, 1)
 
     def forward(self, deviations: Tensor) -> Tensor:
-        """deviations (B,M,n,K',d+1) -> weights (B,M,n,K)."""
+        """deviations (B,M,n,K',d+1) -> logits (B,M,n,K)."""
         mixed = torch.relu(self.over_groups(deviations.transpose(-1, -2))).transpose(-1, -2)
-        return torch.sigmoid(self.out(torch.relu(self.hidden(mixed)))[..., 0])
+        return self.out(torch.relu(self.hidden(mixed)))[..., 0]
 
 
 @dataclass
@@ -76,32 +77,32 @@ class KinematicUnit(nn.Module):
         return self.groups * (self.config.group_size + 1)
 
     def forward(
-        self, activation: Tensor, relative: Tensor, times: Tensor, center_times: Tensor, previous: Tensor | None
-    ) -> Surface:
-        """activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous deviations."""
-        features = self._reduced(activation, relative, times)
-        if not self.config.normals:
-            return Surface(torch.nn.functional.pad(features.amax(2), (0, self.channels - features.shape[-1])), None)
-        weights = self.weigh(previous) if self.weigh is not None and previous is not None else None
+        self, activation: Tensor, relative: Tensor, times: Tensor, center_times: Tensor, previous: Tensor | None,
+        last: bool = False,
+    ) -> Surface:  # fmt: skip
+        """activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous deviations; last: nobody
+        wants this unit's deviations."""
+        config = self.config
+        values = torch.cat([activation, times[..., None]], -1) if config.time_input else activation
+        if not config.normals:
+            return self._pooled(values, relative)
+        logits = self.weigh(previous) if self.weigh is not None and previous is not None else None
         # Measuring time from the centroid's frame only shifts b, so normals and deviations stay; float32 keeps more digits.
-        target = times if self.config.variant == "release" else times - center_times[..., None]
-        grouped = features.view(*features.shape[:3], self.groups, self.config.group_size)
-        surface = fit_surface(grouped, target, weights, self.config.solver, self.config.guard)
-        return Surface(surface_normal(surface).flatten(2), self._deviations(surface, grouped, target))
+        target = times if config.variant == "release" else times - center_times[..., None]
+        fit = Fit(config.group_size, config.solver, config.guard, not last and config.weighting != "none")
+        near = relative if config.xyz_group else None
+        surface, away = fit_reduced(values, (self.reduce.weight, self.reduce.bias), near, target, logits, fit)
+        if away is not None and config.weighting == "projection":
+            away = along_normal(surface, away)
+        return Surface(surface_normal(surface).flatten(2), away)
 
-    def _reduced(self, activation: Tensor, relative: Tensor, times: Tensor) -> Tensor:
-        values = torch.cat([activation, times[..., None]], -1) if self.config.time_input else activation
+    def _pooled(self, values: Tensor, relative: Tensor) -> Surface:
+        """Table 3.1 v: the reduced features' maximum, and the coordinates', in place of normals."""
         features = torch.relu(self.reduce(values))
-        if not self.config.xyz_group:
-            return features
-        padding = relative.new_zeros(*relative.shape[:-1], self.config.group_size - 3)
-        return torch.cat([features, relative, padding], -1)
-
-    def _deviations(self, surface: Tensor, grouped: Tensor, target: Tensor) -> Tensor | None:
-        if self.config.weighting == "none":
-            return None
-        rule = projected_deviations if self.config.weighting == "projection" else deviations
-        return rule(surface, grouped, target)
+        if self.config.xyz_group:
+            features = torch.cat([features, relative], -1)
+        pooled = features.amax(2)
+        return Surface(torch.nn.functional.pad(pooled, (0, self.channels - pooled.shape[-1])), None)
 
 
 class Kinematics(nn.Module):
@@ -127,13 +128,15 @@ class Kinematics(nn.Module):
         """The merged dynamic feature of every centroid of the last stage, (B,M,C)."""
         surfaces: list[Surface] = []
         previous, units, before = None, iter(self.units), None
+        left = len(self.units)
         for stage in stages:
             group = stage.grouping
             relative, times = group.relative(), group.neighbor_times()
             if before is not None and previous is not None:
                 previous = self._to_next_stage(previous, before, group)
             for activation in stage.activations:
-                surface = next(units)(activation, relative, times, group.center_times, previous)
+                left -= 1
+                surface = next(units)(activation, relative, times, group.center_times, previous, last=not left)
                 surfaces.append(surface)
                 previous = surface.deviations
             before = group

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from dpcli.classify.backbone import Grouping
 from dpcli.classify.config import KinetConfig
 from dpcli.errors import UsageError
-from dpcli.ops import gather_points, three_nn_interpolate
+from dpcli.ops import gather_mean, three_nn_interpolate
 
 
 class ResidualMerge(nn.Module):
@@ -34,7 +34,7 @@ class ResidualMerge(nn.Module):
         for level in range(1, len(normals)):
             stage = self.stage_of[level]
             if stage != self.stage_of[level - 1]:
-                state = gather_points(state, groups[stage].idx).mean(2)
+                state = gather_mean(state, groups[stage].idx)
             state = self._activate(level, self.abstract[level](normals[level]) + self.align[level - 1](state))
         return state
 

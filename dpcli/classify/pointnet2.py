@@ -9,7 +9,7 @@ from dpcli.classify.backbone import Backbone, Grouping, Stage
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.layers import GlobalHead, SharedLayers, he_init
 from dpcli.ops import fps, gather_points, space_time_ball_query
-from dpcli.ops.grouped_mlp import grouped_activations
+from dpcli.ops.grouped_mlp import frozen_activations
 
 
 @torch.no_grad()
@@ -44,10 +44,10 @@ class SetAbstraction(SharedLayers):
         """(B,M,C2) from features (B,N,F) of the points that were grouped."""
         return self.pool(group.points, group.centers, group.idx, features)
 
-    def taps(self, group: Grouping, features: Tensor | None) -> list[Tensor]:
-        """Both layers' activations before pooling with running statistics: (B,M,K,C1), (B,M,K,C2)."""
+    def taps(self, group: Grouping, features: Tensor | None) -> tuple[list[Tensor], Tensor]:
+        """Both layers' activations before pooling with running statistics, (B,M,K,C1), (B,M,K,C2), and pooled, (B,M,C2)."""
         assert not self.training, "the dynamic stream reads a frozen static network"
-        return grouped_activations(group.points, group.centers, group.idx, features, *self._arguments())[0]
+        return frozen_activations(group.points, group.centers, group.idx, features, *self._arguments())
 
 
 class PointNet2(Backbone):
@@ -72,10 +72,10 @@ class PointNet2(Backbone):
     @torch.no_grad()
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """Both stages with their two layers' activations, and the logits, in one pass of the frozen network."""
-        first = self.stage1.taps(groups[0], None)
-        second = self.stage2.taps(groups[1], first[-1].amax(2))
+        first, features = self.stage1.taps(groups[0], None)
+        second, features = self.stage2.taps(groups[1], features)
         stages = [Stage(group, taps) for group, taps in zip(groups, (first, second))]
-        return stages, self.head(groups[1].centers, second[-1].amax(2))
+        return stages, self.head(groups[1].centers, features)
 
     def macs_as_written(self) -> int:
         """Multiply-adds of one clip as papers count them: each layer on every gathered neighbour."""

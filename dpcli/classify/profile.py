@@ -14,7 +14,9 @@ import torch
 from torch import nn
 
 from dpcli.classify.backbone import Stage
+from dpcli.classify.kinematic import Kinematics
 from dpcli.classify.kinet import Kinet, fuse
+from dpcli.ops.backend import reference_only
 from dpcli.runtime.memory import peak_memory
 
 _STARTS = 5  # the argument of the backward kernels that says where each row's pooled entries are
@@ -47,23 +49,40 @@ def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
     from torch.utils.flop_counter import FlopCounterMode
 
     groups = model.group(points)
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+    with torch.no_grad(), reference_only(), FlopCounterMode(display=False) as counter:
         stages, _ = model.static.taps(groups)
     static = counter.get_total_flops() // 2
     written = getattr(model.static, "macs_as_written", lambda: static)()
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        model.dynamic(stages)
-    dynamic = counter.get_total_flops() // 2 + _fit_macs(model, stages)
+    dynamic = _linear_macs(model.dynamic, stages) + _fit_macs(model, stages)
     return {"static": static, "static_as_written": written, "dynamic": dynamic, "total": static + dynamic}
 
 
+def _linear_macs(dynamic: Kinematics, stages: list[Stage]) -> int:
+    """Multiply-adds of the dynamic stream's linear layers that are called as such: all but the units' reductions."""
+    counts: list[int] = []
+
+    def count(layer: nn.Linear, _: tuple, out: torch.Tensor) -> None:
+        counts.append(out.numel() * layer.in_features)
+
+    hooks = [layer.register_forward_hook(count) for layer in dynamic.modules() if isinstance(layer, nn.Linear)]
+    try:
+        with torch.no_grad():
+            dynamic(stages)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    return sum(counts)
+
+
 def _fit_macs(model: Kinet, stages: list[Stage]) -> int:
-    """Normal matrix, right side, solution and deviations of every fit: those kernels are invisible to torch's counter."""
+    """Reduction, normal matrix, right side, solution and deviations of every fit, which `_linear_macs` doesn't see."""
     config, size, total = model.config, model.config.group_size + 1, 0
     shapes = [activation.shape[1:3] for stage in stages for activation in stage.activations]
-    for unit, (centroids, neighbors) in zip(model.dynamic.units, shapes):
-        per_neighbor = size * (size + 1) // 2 + size + (0 if config.weighting == "none" else size)
+    for number, (unit, (centroids, neighbors)) in enumerate(zip(model.dynamic.units, shapes), 1):
+        unread = config.weighting == "none" or number == len(shapes)  # nobody's weights come from the last deviations
+        per_neighbor = size * (size + 1) // 2 + size + (0 if unread else size)
         total += centroids * unit.groups * (neighbors * per_neighbor + size * size)
+        total += centroids * neighbors * unit.reduce.weight.numel()
     return total if config.normals else 0
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import normal_equations, plane_deviations, small_inverse
+from dpcli.ops.linalg import GUARDS, MIN_DET
 from dpcli.runtime.precision import full_precision
 
 _RIDGE = 1e-3  # of the mean diagonal; large enough for float32 at rank-deficient neighbourhoods, small beside the data
@@ -37,6 +38,11 @@ def fit_surface(
     return (small_inverse(matrix, guard=guard) * right[..., None, :]).sum(-1)
 
 
+def solve_rule(solver: str, guard: str) -> tuple[float, float, int]:
+    """A solver and guard of `fit_surface` as `ops.kernels_linalg.solve_planes` takes them: (ridge, least determinant, guard)."""
+    return (_RIDGE, 0.0, GUARDS.index("none")) if solver == "ridge" else (0.0, MIN_DET, GUARDS.index(guard))
+
+
 def surface_normal(coefficients: Tensor) -> Tensor:
     """Unit normal (A, -1) / ||(A, -1)|| of eq. 3.7: (...,d+1) coefficients -> (...,d+1)."""
     slopes = coefficients[..., :-1]
@@ -49,10 +55,18 @@ def deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
     return plane_deviations(features, times, coefficients)
 
 
-@full_precision
 def projected_deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
-    """The deviation as a vector along the normal, (A,-1) e / ||(A,-1)||^2, as the released code uses it: (...,n,K,d+1)."""
+    """`along_normal` of the plane's deviations: shapes as `deviations`, -> (...,n,K,d+1)."""
+    return along_normal(coefficients, deviations(coefficients, features, times))
+
+
+@full_precision
+def along_normal(coefficients: Tensor, deviations: Tensor) -> Tensor:
+    """Deviations e as vectors along the normal, (A,-1) e / ||(A,-1)||^2, as the released code uses them.
+
+    coefficients (...,K,d+1), deviations (...,n,K) -> (...,n,K,d+1).
+    """
     slopes = coefficients[..., :-1]
     direction = torch.cat([slopes, -torch.ones_like(slopes[..., :1])], -1)
     scaled = direction / direction.square().sum(-1, keepdim=True)
-    return deviations(coefficients, features, times)[..., None] * scaled[..., None, :, :]
+    return deviations[..., None] * scaled[..., None, :, :]

@@ -18,6 +18,7 @@ _HOME = {
     "knn": "nearest",
     "knn_reference": "nearest",
     "three_nn_interpolate": "interpolate",
+    "gather_mean": "gather",
     "gather_points": "gather",
     "small_inverse": "linalg",
     "small_inverse_reference": "linalg",

@@ -6,10 +6,11 @@ and `numba`, the fast kernels for CPU tensors. The environment variable DPC_BACK
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -45,6 +46,20 @@ def chosen_backend(device: torch.device | str = "cpu") -> str:
     if torch.device(device).type != "cpu" or wanted == "torch":
         return "torch"
     return "numba" if numba_available() else "torch"
+
+
+@contextlib.contextmanager
+def reference_only() -> Iterator[None]:
+    """A block in which `chosen_backend` says torch: for what watches torch's operations, which kernels and threads hide."""
+    before = os.environ.get("DPC_BACKEND")
+    os.environ["DPC_BACKEND"] = "torch"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["DPC_BACKEND"]
+        else:
+            os.environ["DPC_BACKEND"] = before
 
 
 def run_in_threads(kernel: Callable[..., None], arguments: tuple, total: int, item_ns: float) -> None:

@@ -15,15 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.ops.backend import chosen_backend, run_in_threads
+from dpcli.ops.backend import chosen_backend
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
+from dpcli.ops.pieces import TASKS, ranges, share_tasks, steps
 
-# Bytes of activations between two matrix products, which then stay in the cache. A thread takes whole pieces, its products
-# on itself alone: threads that shared each product would wait for each other five times a piece, and longer than they work.
+# Bytes of activations between two matrix products, which then stay in the cache.
 _PIECE = 1 << 21
-_HELD = 8  # pieces summed in float32, in one go
-_TASKS = 8  # of a backward pass, each with a target of its own; fixed like _HELD, so that sums repeat exactly
+_HELD = 8  # pieces summed in float32, in one go; fixed, so that sums repeat exactly
 _BLOCKS = 32  # pieces of work of a sum: more than threads, for balance; fixed, too
 _LANES = 8  # channels in a vector of the kernels
 
@@ -78,6 +77,46 @@ def grouped_activations(
     hidden, statistics1 = _norm_relu(gather_points(table, idx) - offset[:, :, None], norm1)
     out, statistics2 = _norm_relu(torch.nn.functional.linear(hidden, *linear2), norm2)
     return [hidden, out], [*statistics1, *statistics2]
+
+
+def frozen_activations(
+    points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor], norm1: Norm,
+    linear2: tuple[Tensor, Tensor], norm2: Norm,
+) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    """As `grouped_activations` with given statistics, but without gradients, and pooled: the two activations, (B,M,C2)."""
+    with torch.no_grad():
+        plain = points.dtype != torch.float32 or chosen_backend(points.device) != "numba" or torch.is_autocast_enabled("cpu")
+        if plain or len(norm2.weight) % _LANES:
+            taps, _ = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
+            return taps, taps[1].amax(2)
+        folded = _folded(linear1, norm1), _folded(linear2, norm2)
+        return _frozen_pieces(points.contiguous(), centers.contiguous(), idx.contiguous(), features, *folded)
+
+
+def _frozen_pieces(
+    points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor],
+    linear2: tuple[Tensor, Tensor],
+) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    kernels = parallel_kernels("kernels_grouped")
+    if features is None:  # cheaper from positions than gathered: the projected points are many
+        make = kernels.hidden_xyz
+        inputs = (points.numpy(), centers.numpy(), idx.numpy(), linear1[0].t().contiguous().numpy(), linear1[1].numpy())
+    else:
+        make = kernels.hidden_table
+        inputs = (*(tensor.contiguous().numpy() for tensor in _project(points, centers, features, linear1)), idx.numpy())
+    (clouds, count, neighbors), widths = idx.shape, (len(linear1[1]), len(linear2[1]))
+    hidden, wide = (torch.empty(idx.numel(), width) for width in widths)
+    best, weight, bias = torch.empty(clouds * count, widths[1]), linear2[0].t(), linear2[1].numpy()
+
+    def work(_: int, piece: tuple[int, int], room: None) -> None:
+        rows = slice(piece[0] * neighbors, piece[1] * neighbors)
+        make(*inputs, piece[0], hidden[rows].numpy())
+        out = torch.mm(hidden[rows], weight, out=wide[rows])
+        kernels.activate_largest(out.numpy().reshape(-1), bias, neighbors, best[slice(*piece)].numpy().reshape(-1))
+
+    step = max(1, _PIECE // (4 * neighbors * sum(widths)))
+    share_tasks(steps(0, clouds * count, step), lambda: None, work)
+    return [part.view(*idx.shape, -1) for part in (hidden, wide)], best.view(clouds, count, -1)
 
 
 def _folded(linear: tuple[Tensor, Tensor], norm: Norm) -> tuple[Tensor, Tensor]:
@@ -194,8 +233,8 @@ class _FromPositions:
 
     def begin_backward(self) -> list[tuple[int, int]]:
         """Ranges of centroids that may go through `back` at the same time."""
-        self.sums = torch.zeros(_TASKS, 4, self.channels, dtype=torch.float64)
-        return _ranges(self.idx.shape[0] * self.idx.shape[1], _TASKS)
+        self.sums = torch.zeros(TASKS, 4, self.channels, dtype=torch.float64)
+        return ranges(self.idx.shape[0] * self.idx.shape[1], TASKS)
 
     def back(self, task: int, first: int, *arrays: np.ndarray) -> None:
         """Take in the gradient of a piece of a range: arrays as the kernel's hidden .. grad_weight."""
@@ -248,7 +287,7 @@ class _FromTable:
         self.to_offset = torch.empty_like(self.sums)
         self.targets = (self.packed.view(-1).numpy(), self.to_offset.view(-1).numpy(), nodes)
         count = self.idx.shape[1]
-        return [(low * count, high * count) for low, high in _ranges(batch, _TASKS)]
+        return [(low * count, high * count) for low, high in ranges(batch, TASKS)]
 
     def back(self, task: int, first: int, *arrays: np.ndarray) -> None:
         """Take in the gradient of a piece of a range: arrays as the kernel's hidden .. grad_weight."""
@@ -276,13 +315,6 @@ class _FromTable:
         return parts.sum(0).float()
 
 
-def _ranges(count: int, parts: int) -> list[tuple[int, int]]:
-    """0..count cut into at most `parts` ranges that differ by one at most."""
-    parts = max(1, min(parts, count))
-    bounds = [count * part // parts for part in range(parts + 1)]
-    return list(zip(bounds, bounds[1:]))
-
-
 class _Room:
     """Where a thread's piece of activations lives, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
 
@@ -307,26 +339,17 @@ class _Pieces:
 
     def of(self, low: int, high: int) -> list[tuple[int, int]]:
         """The pieces of centroids low..high-1."""
-        return [(start, min(start + self.step, high)) for start in range(low, high, self.step)]
+        return steps(low, high, self.step)
 
     def share(self, tasks: list[list[tuple[int, int]]], work: Callable[[int, int, _Room], None]) -> None:
         """Call work(task, first centroid, room) for every piece: a task's in order, by one thread, tasks at the same time."""
-        threads = torch.get_num_threads()
-        waiting = iter(enumerate(tasks))
+        rows = self.step * self.neighbors
 
-        def run(*_: int) -> None:
-            torch.set_num_threads(1)  # of this thread's products
-            rows = self.step * self.neighbors
-            room = _Room(*(torch.empty(rows, width) for width in self.widths))
-            with torch.no_grad():
-                for task, pieces in waiting:
-                    for low, high in pieces:
-                        work(task, low, room.cut((high - low) * self.neighbors))
+        def through(task: int, pieces: list[tuple[int, int]], room: _Room) -> None:
+            for low, high in pieces:
+                work(task, low, room.cut((high - low) * self.neighbors))
 
-        try:
-            run_in_threads(run, (), min(threads, len(tasks)), item_ns=1e9)
-        finally:
-            torch.set_num_threads(threads)
+        share_tasks(tasks, lambda: _Room(*(torch.empty(rows, width) for width in self.widths)), through)
 
 
 def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -339,7 +362,7 @@ def _pool_linear(first: _FromPositions | _FromTable, weight: Tensor) -> tuple[Te
     best, where = torch.empty(pieces.count, c2), torch.empty(pieces.count, c2, dtype=torch.int32)
     targets = (best.numpy(), where.numpy())
     all_pieces = pieces.of(0, pieces.count)
-    held = max(1, min(_HELD, len(all_pieces) // _TASKS))
+    held = max(1, min(_HELD, len(all_pieces) // TASKS))
     tasks = [all_pieces[start : start + held] for start in range(0, len(all_pieces), held)]
     moments = [(torch.empty(c1, c1), torch.empty(1, c1)) for _ in tasks]
     weight = weight.t()

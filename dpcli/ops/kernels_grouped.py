@@ -95,6 +95,21 @@ def hidden_table(table, offset, idx, first, out):
 
 
 @piece_kernel
+def activate_largest(rows, bias, neighbors, best):
+    """rows (R*C): products in, max(products + bias, 0) out; best (M*C): each centroid's largest. bias (C), C in eights."""
+    channels = bias.size
+    zero = lanes(np.float32(0))
+    for i in range(rows.size // channels // neighbors):
+        for c in range(0, channels, WIDTH):
+            add, most = load(bias, c), zero
+            for row in range(i * neighbors * channels + c, (i + 1) * neighbors * channels + c, channels):
+                value = higher(load(rows, row) + add, zero)
+                store(rows, row, value)
+                most = higher(value, most)
+            store(best, i * channels + c, most)
+
+
+@piece_kernel
 def largest(rows, neighbors, first, best, where):
     """Per centroid and channel of a piece the largest value over its rows, and which row; ties: the first.
 

@@ -7,12 +7,14 @@ from torch import Tensor
 
 from dpcli.ops.backend import chosen_backend, run_in_threads
 
-_GUARDS = ("signed", "release", "none")
-_CLOSED, _BLOCKS, _KERNEL = 4, 16, 8  # largest n of the closed form, of the block partition, and of the CPU kernel
+GUARDS = ("signed", "release", "none")
+MIN_DET = 1e-6
+KERNEL_SIZE = 8  # largest n of the CPU kernels
+_CLOSED, _BLOCKS = 4, 16  # of the closed form, and of the block partition
 _ENTRY_NS = 2.5  # measured, per matrix entry
 
 
-def small_inverse(matrices: Tensor, *, min_det: float = 1e-6, guard: str = "signed") -> Tensor:
+def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
     """Inverses of matrices (...,n,n), differentiable; float32 or float64.
 
     n <= 4: adjugate over determinant, element by element. n <= 16: 2x2 block partition with the Schur complement,
@@ -29,12 +31,12 @@ def small_inverse(matrices: Tensor, *, min_det: float = 1e-6, guard: str = "sign
     n = matrices.shape[-1]
     if n > _BLOCKS:
         return torch.cholesky_inverse(torch.linalg.cholesky(matrices))
-    if n <= _KERNEL and matrices.numel() and chosen_backend(matrices.device) == "numba":
+    if n <= KERNEL_SIZE and matrices.numel() and chosen_backend(matrices.device) == "numba":
         return _KernelInverse.apply(matrices, min_det, guard)
     return _inverse(matrices, min_det, guard)
 
 
-def small_inverse_reference(matrices: Tensor, *, min_det: float = 1e-6, guard: str = "signed") -> Tensor:
+def small_inverse_reference(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
     """The torch twin of `small_inverse`: same arguments, same guard."""
     _check(matrices, guard)
     if matrices.shape[-1] > _BLOCKS:
@@ -47,8 +49,8 @@ def _check(matrices: Tensor, guard: str) -> None:
         raise ValueError(f"matrices must have shape (...,n,n) with n >= 1, but have {tuple(matrices.shape)}")
     if matrices.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"matrices must be float32 or float64, but are {matrices.dtype}")
-    if guard not in _GUARDS:
-        raise ValueError(f"guard must be one of {', '.join(_GUARDS)}, but is {guard!r}")
+    if guard not in GUARDS:
+        raise ValueError(f"guard must be one of {', '.join(GUARDS)}, but is {guard!r}")
 
 
 def _guarded(det: Tensor, min_det: float, guard: str) -> Tensor:
@@ -122,7 +124,7 @@ class _KernelInverse(torch.autograd.Function):
         flat = matrices.detach().reshape(-1, *matrices.shape[-2:]).contiguous()
         inverse, moved = torch.empty_like(flat), torch.empty(len(flat), dtype=torch.bool)
         arrays = (flat.numpy(), inverse.numpy(), moved.numpy())
-        run_in_threads(inverse_kernel, (*arrays, min_det, _GUARDS.index(guard)), len(flat), flat[0].numel() * _ENTRY_NS)
+        run_in_threads(inverse_kernel, (*arrays, min_det, GUARDS.index(guard)), len(flat), flat[0].numel() * _ENTRY_NS)
         ctx.save_for_backward(flat, inverse, moved)
         ctx.settings = (min_det, guard)
         return inverse.view(matrices.shape)

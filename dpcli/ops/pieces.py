@@ -1,0 +1,49 @@
+"""Work cut into pieces that stay in a core's cache, shared by threads each of which computes alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import torch
+
+from dpcli.ops.backend import run_in_threads
+
+Task, Room = TypeVar("Task"), TypeVar("Room")
+
+# Of a sum, each with a target of its own: more than threads, and fixed, so that sums repeat exactly on any number of them.
+TASKS = 8
+
+
+def ranges(count: int, parts: int) -> list[tuple[int, int]]:
+    """0..count cut into at most `parts` ranges that differ by one at most."""
+    parts = max(1, min(parts, count))
+    bounds = [count * part // parts for part in range(parts + 1)]
+    return list(zip(bounds, bounds[1:]))
+
+
+def steps(low: int, high: int, step: int) -> list[tuple[int, int]]:
+    """low..high cut into pieces of `step`, the last of what is left."""
+    return [(start, min(start + step, high)) for start in range(low, high, step)]
+
+
+def share_tasks(tasks: Sequence[Task], make_room: Callable[[], Room], work: Callable[[int, Task, Room], None]) -> None:
+    """Call work(number, task, room) for every task; `room` is what `make_room` gave the thread that does it.
+
+    As many threads as torch has, whose matrix products run on themselves alone: threads that shared each product would
+    wait for each other several times a piece, and longer than they work. No gradients are recorded.
+    """
+    threads, inference = torch.get_num_threads(), torch.is_inference_mode_enabled()
+    waiting = iter(enumerate(tasks))
+
+    def run(*_: int) -> None:
+        torch.set_num_threads(1)  # of this thread's products
+        room = make_room()
+        with torch.inference_mode(inference), torch.no_grad():  # modes are a thread's own, and tensors know theirs
+            for number, task in waiting:
+                work(number, task, room)
+
+    try:
+        run_in_threads(run, (), min(threads, len(tasks)), item_ns=1e9)
+    finally:
+        torch.set_num_threads(threads)
