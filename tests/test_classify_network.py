@@ -256,15 +256,15 @@ def test_the_global_head_in_training_is_batch_norm_written_out():
         torch.testing.assert_close(mine.running_var.double(), other.running_var, rtol=1e-5, atol=1e-6)
 
 
-def test_profile_splits_a_training_step_into_its_parts():
-    result = measure(Kinet(KinetConfig(**TINY)).eval(), torch.device("cpu"), steps=True)
-    step = result["static_step"]
-    assert 0 < step["matrix_products_share"] <= 1 and set(step["ms_per_clip"]) == {
-        "matrix_products",
-        "sparse_products",
-        "neighbours",
-        "other",
-    }
-    total = sum(step["ms_per_clip"].values())
-    assert total == pytest.approx(1000 * step["seconds_on_one_thread"] / step["batch"], rel=0.1, abs=0.05)
+def test_profile_splits_steps_into_their_parts():
+    result = measure(Kinet(KinetConfig(**TINY)).eval(), torch.device("cpu"), with_steps=True)
+    for name in ("static_step", "dynamic_step", "inference"):
+        step = result[name]
+        assert 0 < step["matrix_products_share"] <= 1
+        assert set(step["ms_per_clip"]) == {"matrix_products", "sparse_products", "neighbours", "other"}
+        assert (step["sparse_products_share"] > 0) == (name == "static_step")
+        total = sum(step["ms_per_clip"].values())
+        assert total == pytest.approx(1000 * step["seconds_on_one_thread"] / step["batch"], rel=0.1, abs=0.05)
+        assert f"\n{name.replace('_', ' ')}" in render(result)
+    assert result["dynamic_step"]["seconds_on_one_thread"] > result["inference"]["seconds_on_one_thread"]
     assert "in matrix products" in render(result)

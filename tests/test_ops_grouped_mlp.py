@@ -1,4 +1,4 @@
-"""The fused set-abstraction layer and plane fit give the reference's values and gradients."""
+"""The fused set-abstraction layer gives the reference's values and gradients."""
 
 from __future__ import annotations
 
@@ -7,15 +7,9 @@ import pytest
 import torch
 
 from dpcli.ops import grouped_mlp as module
-from dpcli.ops.grouped_mlp import Norm, grouped_activations, grouped_mlp
+from dpcli.ops.grouped_mlp import Norm, frozen_activations, grouped_activations, grouped_mlp
 from dpcli.ops.parallel import parallel_kernels
 from dpcli.ops.pieces import ranges
-from dpcli.ops.plane_fit import (
-    normal_equations,
-    normal_equations_reference,
-    plane_deviations,
-    plane_deviations_reference,
-)
 
 
 def layer(features: int, dtype=torch.float32, seed: int = 0, repeat: bool = False, widths: tuple[int, int] = (8, 12)):
@@ -175,32 +169,46 @@ def test_given_statistics_are_folded_exactly():
         torch.testing.assert_close(tap, x)
 
 
+def frozen(features, dtype, widths=(8, 16)):
+    """Arguments of `frozen_activations`: a layer with statistics of its own."""
+    points, centers, idx, v, _ = layer(features, dtype, widths=widths)
+    g = torch.Generator().manual_seed(5)
+    mean, var = (torch.rand(sum(widths), generator=g).to(dtype).split(widths) for _ in range(2))
+    norms = [Norm(v[w].detach(), v[b].detach(), m, s + 0.5) for w, b, m, s in zip(("g1", "g2"), ("s1", "s2"), mean, var)]
+    given = None if v["features"] is None else v["features"].detach()
+    linear = [(v[w].detach(), v[b].detach()) for w, b in (("w1", "b1"), ("w2", "b2"))]
+    return points, centers, idx, given, linear[0], norms[0], linear[1], norms[1]
+
+
+@pytest.mark.parametrize("features", [0, 7])
+@pytest.mark.parametrize("widths", [(8, 16), (12, 24), (16, 12)])
+def test_frozen_activations_in_pieces_match_float64(features, widths, monkeypatch):
+    """The last widths fill no vector, and take the reference."""
+    monkeypatch.setattr(module, "_PIECE", 1 << 11)
+    (hidden, wide), pooled = frozen_activations(*frozen(features, torch.float32, widths))
+    expected, _ = grouped_activations(*frozen(features, torch.float64, widths))
+    for ours, exact in zip((hidden, wide, pooled), (*expected, expected[1].amax(2))):
+        assert ours.shape == exact.shape and (exact > 0).any() and (exact == 0).any()
+        assert (ours - exact).abs().max() < 3e-6 * exact.abs().max()  # measured 4e-7
+    assert torch.equal(pooled, wide.amax(2))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_frozen_activations_can_be_had_in_inference_mode(threads, monkeypatch):
+    """Threads are in the caller's mode: outside it they may not write to its tensors."""
+    monkeypatch.setattr(module, "_PIECE", 1 << 11)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        expected = frozen_activations(*frozen(7, torch.float32))
+        with torch.inference_mode():
+            found = frozen_activations(*frozen(7, torch.float32))
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(found[1], expected[1]) and found[1].is_inference() and not expected[1].is_inference()
+
+
 def test_torch_backend_is_used_when_asked_for(monkeypatch):
     monkeypatch.setenv("DPC_BACKEND", "torch")
     monkeypatch.setattr(module, "_fast", lambda *a: pytest.fail("the numba path ran"))
     run(layer(0), True, torch.ones(2, 20, 12))
-
-
-@pytest.mark.parametrize("size", [2, 3, 4])
-@pytest.mark.parametrize("weighted", [False, True])
-def test_plane_fit_kernels_match_float64(size, weighted):
-    g = torch.Generator().manual_seed(0)
-    features, times = torch.randn(3, 5, 9, 6, size, generator=g), torch.randn(3, 5, 9, generator=g)
-    weights = torch.rand(3, 5, 9, 6, generator=g) if weighted else None
-    planes = torch.randn(3, 5, 6, size + 1, generator=g)
-
-    def outputs(dtype, equations, deviations):
-        f, p = features.to(dtype).requires_grad_(), planes.to(dtype).requires_grad_()
-        w = None if weights is None else weights.to(dtype).requires_grad_()
-        matrix, right = equations(f, times.to(dtype), w)
-        out = (matrix * torch.arange(matrix.numel()).view_as(matrix).cos()).sum() + (right * right).sum()
-        out = out + deviations(f, times.to(dtype), p).square().sum()
-        return matrix, right, *torch.autograd.grad(out, [value for value in (f, w, p) if value is not None])
-
-    ours = outputs(torch.float32, normal_equations, plane_deviations)
-    exact = outputs(torch.float64, normal_equations_reference, plane_deviations_reference)
-    for a, b in zip(ours, exact):
-        torch.testing.assert_close(a.double(), b, rtol=2e-5, atol=2e-4)
-    design = torch.cat([features, torch.ones_like(features[..., :1])], -1)[1, 2, :, 3].double()
-    diagonal = torch.ones(9).double() if weights is None else weights[1, 2, :, 3].double()
-    torch.testing.assert_close(exact[0][1, 2, 3], design.T @ diagonal.diag() @ design)

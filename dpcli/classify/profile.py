@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from dpcli.classify.backbone import Stage
+from dpcli.classify.backbone import Grouping, Stage
 from dpcli.classify.kinematic import Kinematics
 from dpcli.classify.kinet import Kinet, fuse
 from dpcli.ops.backend import reference_only
@@ -109,7 +109,7 @@ def _now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-def measure(model: Kinet, device: torch.device, steps: bool = False) -> dict[str, Any]:
+def measure(model: Kinet, device: torch.device, with_steps: bool = False) -> dict[str, Any]:
     """Everything `dpc classify profile` prints, as one object."""
     config = model.config
     torch.manual_seed(0)
@@ -137,8 +137,8 @@ def measure(model: Kinet, device: torch.device, steps: bool = False) -> dict[str
         "peak_memory_mb": _peak(device, before),
         "device": str(device), "threads": torch.get_num_threads(),
     }  # fmt: skip
-    if steps:
-        result["static_step"] = static_step(model, device)
+    if with_steps:
+        result |= steps(model, device)
     return result
 
 
@@ -156,45 +156,64 @@ def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
     return shape + 0.1 * torch.sin(torch.arange(frames) / 3)[None, :, None, None]
 
 
-def static_step(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, Any]:
-    """Where a training step of the static stream (grouping, forward, loss, backward) spends its time: the fastest of 6.
+def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[str, Any]]:
+    """Where a training step of each stream (grouping, forward, loss, backward) and inference of both spend their time.
 
     On a CPU the parts are those of one thread: threads share the layers' work in whole pieces, products and all. `seconds`
     is the step with every thread. Matrix products are the calls of BLAS as torch's profiler sees them in that same step;
-    sparse products, which lie inside other kernels: see `_sparse_products`, the least of 4. The fastest step, because other
-    programs only ever add time, and to the parts unequally.
+    sparse products, which lie inside other kernels of the static stream: see `_sparse_products`, the least of 4. The fastest
+    of 6 steps, because other programs only ever add time, and to the parts unequally.
     """
     from dpcli.runtime.memory import keep_freed_memory
 
     keep_freed_memory()
-    static = model.static.train().requires_grad_(True)
     config = model.config
     points = body_like_clip(config.num_frames, config.points_per_frame, batch).to(device)
     labels = torch.arange(batch, device=device) % config.num_classes
 
-    def step() -> tuple[float, float]:
+    def train(branch: nn.Module, logits: Callable[[list[Grouping]], torch.Tensor]) -> tuple[float, float]:
         began = _now(device)
         groups = model.group(points)
         grouped = _now(device)
-        loss = nn.functional.cross_entropy(static(groups), labels)
-        static.zero_grad(set_to_none=True)
+        loss = nn.functional.cross_entropy(logits(groups), labels)
+        branch.zero_grad(set_to_none=True)
         loss.backward()
         return grouped - began, _now(device) - began
 
+    def infer() -> tuple[float, float]:
+        began = _now(device)
+        with torch.inference_mode():
+            groups = model.group(points)
+            grouped = _now(device)
+            stages, static = model.static.taps(groups)
+            fuse(static, model.dynamic(stages), config.fusion)
+        return grouped - began, _now(device) - began
+
+    model.static.train().requires_grad_(True)
+    found = {"static_step": _measured(partial(train, model.static, model.static), batch, sparse=True)}
+    model.freeze_static()
+    model.dynamic.train()
+    dynamic = partial(train, model.dynamic, lambda groups: model.dynamic(model.static.taps(groups)[0]))
+    found["dynamic_step"] = _measured(dynamic, batch)
+    model.eval()
+    return {**found, "inference": _measured(infer, batch)}
+
+
+def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool = False) -> dict[str, Any]:
+    """One of `steps`, from a function that does it and returns the seconds of its grouping and of all."""
     threads = torch.get_num_threads()
     seconds = min(step()[1] for _ in range(6))
     try:
         torch.set_num_threads(1)
         (grouping, alone), inside = min((_profiled(step) for _ in range(6)), key=lambda found: found[0][1])
-        sparse = min(_sparse_products(step) for _ in range(4))
+        thin = min(_sparse_products(step) for _ in range(4)) if sparse else 0.0
     finally:
         torch.set_num_threads(threads)
-        model.eval()
-    parts = {"matrix_products": inside, "sparse_products": sparse, "neighbours": grouping}
+    parts = {"matrix_products": inside, "sparse_products": thin, "neighbours": grouping}
     parts["other"] = alone - sum(parts.values())
     return {
         "batch": batch, "threads": threads, "seconds": round(seconds, 4), "seconds_on_one_thread": round(alone, 4),
-        "matrix_products_share": round(inside / alone, 3), "sparse_products_share": round(sparse / alone, 3),
+        "matrix_products_share": round(inside / alone, 3), "sparse_products_share": round(thin / alone, 3),
         "ms_per_clip": {name: round(1000 * value / batch, 2) for name, value in parts.items()},
     }  # fmt: skip
 
@@ -266,14 +285,17 @@ def render(result: dict[str, Any]) -> str:
     times = ", ".join(f"{key} {value}" for key, value in result["latency_ms"].items())
     lines.append(f"latency       {times} ms on {result['device']} with {result['threads']} threads, one clip at a time")
     lines.append(f"peak memory   {result['peak_memory_mb']} MB of the process")
-    if "static_step" in result:
-        step = result["static_step"]
-        parts = ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in step["ms_per_clip"].items())
-        dense, sparse = (100 * step[f"{kind}_products_share"] for kind in ("matrix", "sparse"))
-        lines.append(
-            f"static step   {step['seconds']} s for {step['batch']} clips with {step['threads']} threads,"
-            f" {step['seconds_on_one_thread']} s with one,"
-        )
-        lines.append(f"              of which {dense:.0f} % in matrix products and {sparse:.0f} % in sparse ones")
-        lines.append(f"  per clip    {parts} ms")
+    for key in ("static_step", "dynamic_step", "inference"):
+        lines += _step_lines(key.replace("_", " "), result[key]) if key in result else []
     return "\n".join(lines)
+
+
+def _step_lines(name: str, step: dict[str, Any]) -> list[str]:
+    parts = ", ".join(f"{part.replace('_', ' ')} {value}" for part, value in step["ms_per_clip"].items() if value)
+    dense, sparse = (100 * step[f"{kind}_products_share"] for kind in ("matrix", "sparse"))
+    return [
+        f"{name:<13} {step['batch'] / step['seconds']:.3g} clips/s: {step['seconds']} s for {step['batch']} clips with"
+        f" {step['threads']} threads, {step['seconds_on_one_thread']} s with one,",
+        f"              of which {dense:.0f} % in matrix products" + (f" and {sparse:.0f} % in sparse ones" if sparse else ""),
+        f"  per clip    {parts} ms",
+    ]

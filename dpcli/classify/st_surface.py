@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpcli.ops import normal_equations, plane_deviations, small_inverse
+from dpcli.ops import small_inverse
 from dpcli.ops.linalg import GUARDS, MIN_DET
 from dpcli.runtime.precision import full_precision
 
@@ -30,7 +30,9 @@ def fit_surface(
     `ridge` adds 1e-3 of the mean diagonal to it, which bounds the result where the neighbours don't span the space
     (repeated points, dead features). `weights=None` means 1.
     """
-    matrix, right = normal_equations(features, times, weights)
+    design = torch.cat([features, torch.ones_like(features[..., :1])], -1).transpose(-3, -2)
+    weighted = design if weights is None else design * weights.transpose(-1, -2)[..., None]
+    matrix, right = weighted.transpose(-1, -2) @ design, (weighted * times[..., None, :, None]).sum(-2)
     if solver == "ridge":
         mean = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
         matrix = matrix + (_RIDGE * mean + 1e-9) * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
@@ -52,7 +54,8 @@ def surface_normal(coefficients: Tensor) -> Tensor:
 @full_precision
 def deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
     """Fitting deviation A f_j + b - t_j of each neighbour: (...,K,d+1), (...,n,K,d), (...,n) -> (...,n,K)."""
-    return plane_deviations(features, times, coefficients)
+    plane = coefficients[..., None, :, :]
+    return (features * plane[..., :-1]).sum(-1) + plane[..., -1] - times[..., None]
 
 
 def projected_deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:

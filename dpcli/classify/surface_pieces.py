@@ -1,8 +1,8 @@
 """The core of a kinematic unit: reduce a neighbourhood's features, group them, and fit a weighted plane to each group.
 
 `fit_reduced` has a plain torch form (the reference, and the path on a GPU) and a CPU form that goes through the centroids
-in pieces: the reduced features, the largest thing here, live in the cache and are made again for the gradient. Both give
-the same numbers; tests compare them in value and gradient.
+in pieces that stay in the cache, from the features to the deviations. Both give the same numbers; tests compare them in
+value and gradient.
 """
 
 from __future__ import annotations
@@ -139,28 +139,15 @@ class _Layout:
         return places
 
 
-class _Room:
-    """What a thread needs for its piece."""
-
-    def __init__(self, case: _Case) -> None:
-        layout, centroids = case.layout, case.step
-        rows, planes = centroids * case.neighbors, centroids * (layout.size + 1) * layout.groups
-        self.features, self.grad = torch.empty(rows, layout.width), torch.empty(rows, layout.width)
-        self.weights = np.empty(rows * layout.groups, np.float32)
-        self.moments = np.empty(centroids * layout.entries * layout.groups, np.float32)
-        self.to_planes, self.to_right = np.empty(planes, np.float32), np.empty(planes, np.float32)
-        self.to_matrix = np.empty(planes * (layout.size + 1), np.float32)
-        self.ones = torch.ones(1, rows)
-
-
 class _Case:
-    """A call's inputs, and what forward and backward do alike with a piece of them."""
+    """A call's inputs and sizes, and what is made of the inputs on the way to the planes."""
 
     def __init__(self, tensors: tuple[Tensor | None, ...], neighbors: int, layout: _Layout, fit: Fit) -> None:
         from dpcli.ops import kernels_linalg, kernels_surface
 
-        self.rows_kernels, self.solve_kernels = kernels_surface, kernels_linalg
-        self.neighbors, self.layout, self.rule = neighbors, layout, solve_rule(fit.solver, fit.guard)
+        self.row_kernels, self.solve_kernels = kernels_surface, kernels_linalg
+        self.neighbors, self.layout = neighbors, layout
+        self.rule = (layout.places, layout.groups, *solve_rule(fit.solver, fit.guard))
         self.activation, weight, bias, near, times, logits = tensors
         self.weight, self.bias = weight.t(), bias.numpy()
         self.times = times.contiguous().numpy()
@@ -173,27 +160,27 @@ class _Case:
         """The rows of centroids low..high-1."""
         return slice(low * self.neighbors, high * self.neighbors)
 
-    def begin(self, low: int, high: int, room: _Room) -> tuple[np.ndarray, np.ndarray]:
-        """A piece's activated features and its fits' moments, flat; weights go into the room."""
+    def made(self, centroids: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Room for the features, weights and moments of so many centroids."""
+        rows, groups = centroids * self.neighbors, self.layout.groups
+        weights = torch.empty(rows if len(self.logits) else 0, groups)
+        return torch.empty(rows, self.layout.width), weights, torch.empty(centroids, self.layout.entries, groups)
+
+    def parts(self, made: tuple[Tensor, Tensor, Tensor], low: int, high: int) -> tuple[Tensor, Tensor, Tensor]:
+        """What was made of centroids low..high-1."""
+        features, weights, moments = made
+        rows = self.rows(low, high)
+        return features[rows], weights[rows], moments[low:high]
+
+    def begin(self, low: int, high: int, made: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Activated features, weights and moments of a piece, into its part of `made`."""
         rows, groups = self.rows(low, high), self.layout.groups
-        features = torch.mm(self.activation[rows], self.weight, out=room.features[: rows.stop - rows.start])
-        features, moments = _flat(features), room.moments[: (high - low) * self.layout.entries * groups]
-        self.rows_kernels.fit_rows(
+        torch.mm(self.activation[rows], self.weight, out=made[0])
+        features, weights, moments = map(_flat, made)
+        self.row_kernels.fit_rows(
             features, self.bias, self.layout.floor, _cut(self.near, rows, 3), self.layout.learned, self.times[rows],
-            _cut(self.logits, rows, groups), room.weights, moments, *self.sizes,
+            _cut(self.logits, rows, groups), weights, moments, *self.sizes,
         )  # fmt: skip
-        return features, moments
-
-    def planes(self, moments: np.ndarray, out: np.ndarray) -> None:
-        self.solve_kernels.solve_planes(moments, self.layout.places, self.layout.groups, *self.rule, out)
-
-    def planes_back(self, moments: np.ndarray, grad: np.ndarray, room: _Room) -> tuple[np.ndarray, np.ndarray]:
-        """The gradients at the normal matrices, made symmetric, and at the right sides."""
-        found = room.to_matrix[: len(grad) * (self.layout.size + 1)], room.to_right[: len(grad)]
-        self.solve_kernels.solve_planes_back(
-            moments, self.layout.places, self.layout.groups, *self.rule, grad, *found
-        )
-        return found
 
 
 def _flat(tensor: Tensor) -> np.ndarray:
@@ -216,55 +203,69 @@ class _SurfaceFit(torch.autograd.Function):
         planes = torch.empty(case.count, layout.size + 1, layout.groups)
         away = torch.empty(len(times) if fit.deviations else 0, layout.groups)
         out = _flat(away)
+        kept = case.made(case.count) if any(ctx.needs_input_grad) else None
 
-        def work(_: int, piece: tuple[int, int], room: _Room) -> None:
-            features, moments = case.begin(*piece, room)
-            found = _flat(planes[slice(*piece)])
-            case.planes(moments, found)
+        def work(_: int, piece: tuple[int, int], room: tuple[Tensor, Tensor, Tensor] | None) -> None:
+            made = case.parts(room or kept, *((0, piece[1] - piece[0]) if room else piece))
+            case.begin(*piece, made)
+            found, rows = _flat(planes[slice(*piece)]), case.rows(*piece)
+            case.solve_kernels.solve_planes(_flat(made[2]), *case.rule, found)
             if fit.deviations:
-                rows = case.rows(*piece)
-                case.rows_kernels.deviation_rows(
-                    features, case.times[rows], found, _cut(out, rows, layout.groups), *case.sizes
+                case.row_kernels.deviation_rows(
+                    _flat(made[0]), case.times[rows], found, _cut(out, rows, layout.groups), *case.sizes
                 )
 
-        share_tasks(steps(0, case.count, case.step), lambda: _Room(case), work)
-        ctx.save_for_backward(*tensors, planes)
-        ctx.rest = (neighbors, layout, fit)
+        share_tasks(steps(0, case.count, case.step), lambda: None if kept else case.made(case.step), work)
+        if kept:
+            ctx.save_for_backward(*tensors, planes, *kept)
+            ctx.rest = (neighbors, layout, fit)
         return planes, away
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_planes, grad_away):
-        *tensors, planes = ctx.saved_tensors
-        case, layout = _Case(tuple(tensors), *ctx.rest), ctx.rest[1]
-        to_planes = _flat(grad_planes)
-        to_away = _flat(grad_away) if grad_away is not None else _NOTHING
+        *tensors, planes, features, weights, moments = ctx.saved_tensors
+        case, layout, made = _Case(tuple(tensors), *ctx.rest), ctx.rest[1], (features, weights, moments)
+        to_planes, to_away = _flat(grad_planes), _NOTHING if grad_away is None else _flat(grad_away)
         to_logits = None if tensors[5] is None else torch.empty_like(tensors[5])
         logits = _NOTHING if to_logits is None else _flat(to_logits)
         tasks = ranges(case.count, TASKS)
         sums = [(torch.zeros_like(tensors[1]), torch.zeros(1, layout.width)) for _ in tasks]
 
-        def work(number: int, task: tuple[int, int], room: _Room) -> None:
+        def work(number: int, task: tuple[int, int], room: _Gradients) -> None:
+            to_weight, to_bias = sums[number]
             for low, high in steps(*task, case.step):
-                rows = case.rows(low, high)
-                features, moments = case.begin(low, high, room)
-                plane = slice(low * (layout.size + 1) * layout.groups, high * (layout.size + 1) * layout.groups)
-                away, to_plane = _cut(to_away, rows, layout.groups), to_planes[plane]
+                rows, (some, weight, moment) = case.rows(low, high), map(_flat, case.parts(made, low, high))
+                plane = slice(*(end * (layout.size + 1) * layout.groups for end in (low, high)))
+                away = _cut(to_away, rows, layout.groups)
+                to_plane, to_matrix, to_right = room.of_fits(high - low)
+                to_plane[:] = to_planes[plane]
                 if len(away):
-                    part = room.to_planes[: len(to_plane)]
-                    case.rows_kernels.deviation_back(features, away, part, *case.sizes)
-                    part += to_plane
-                    to_plane = part
-                to_features = room.grad[: rows.stop - rows.start]
-                case.rows_kernels.fit_back(
-                    features, room.weights if len(logits) else _NOTHING, case.times[rows], _flat(planes)[plane], away,
-                    *case.planes_back(moments, to_plane, room), _flat(to_features), _cut(logits, rows, layout.groups),
-                    *case.sizes,
+                    case.row_kernels.deviation_back(some, away, to_plane, *case.sizes)
+                case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right)
+                to_features = room.features[: rows.stop - rows.start]
+                case.row_kernels.fit_back(
+                    some, weight, case.times[rows], _flat(planes)[plane], away, to_matrix, to_right, _flat(to_features),
+                    _cut(logits, rows, layout.groups), *case.sizes,
                 )  # fmt: skip
-                to_weight, to_bias = sums[number]
                 torch.addmm(to_weight, to_features.t(), case.activation[rows], out=to_weight)
                 torch.addmm(to_bias, room.ones[:, : len(to_features)], to_features, out=to_bias)
 
-        share_tasks(tasks, lambda: _Room(case), work)
+        share_tasks(tasks, lambda: _Gradients(case), work)
         to_weight, to_bias = (torch.stack(parts).sum(0) for parts in zip(*sums))
         return None, to_weight, to_bias[0], None, None, to_logits, None, None, None
+
+
+class _Gradients:
+    """Where a thread puts the gradients of its piece."""
+
+    def __init__(self, case: _Case) -> None:
+        rows, self.size = case.step * case.neighbors, (case.layout.size + 1) * case.layout.groups
+        self.features, self.ones = torch.empty(rows, case.layout.width), torch.ones(1, rows)
+        self.planes, self.right = (np.empty(case.step * self.size, np.float32) for _ in range(2))
+        self.matrix = np.empty(case.step * self.size * (case.layout.size + 1), np.float32)
+
+    def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For so many centroids: of their planes, normal matrices and right sides."""
+        numbers = count * self.size
+        return self.planes[:numbers], self.matrix[: numbers * len(self.matrix) // len(self.planes)], self.right[:numbers]

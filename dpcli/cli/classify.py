@@ -208,7 +208,7 @@ def profile(
     classes: Annotated[int, typer.Option("--classes", help="Number of classes.")] = 20,
     frames: Annotated[int | None, typer.Option(help="Frames per clip. Default: the preset's.")] = None,
     points: Annotated[int | None, typer.Option(help="Points per frame. Default: the preset's.")] = None,
-    steps: Annotated[bool, typer.Option("--steps", help="Also where a static training step spends its time.")] = False,
+    steps: Annotated[bool, typer.Option("--steps", help="Also clips/s of training and inference, and where the time goes.")] = False,
     device: Device = "auto",
     json_output: Json = False,
 ) -> None:

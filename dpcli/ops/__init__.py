@@ -22,8 +22,6 @@ _HOME = {
     "gather_points": "gather",
     "small_inverse": "linalg",
     "small_inverse_reference": "linalg",
-    "normal_equations": "plane_fit",
-    "plane_deviations": "plane_fit",
     "weighted_kabsch": "rigid",
     "apply_motions": "rigid",
     "rigid_flow": "rigid",

@@ -58,6 +58,9 @@ def grouped_mlp(
     fast = fast and len(norm1.weight) % _LANES == 0 and len(norm2.weight) >= _LANES
     if fast:
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
+    if norm1.mean is not None and norm2.mean is not None and not torch.is_grad_enabled():
+        pooled = frozen_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)[1]
+        return pooled, [norm1.mean, norm1.var, norm2.mean, norm2.var]
     taps, statistics = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
     return taps[1].amax(2), statistics
 

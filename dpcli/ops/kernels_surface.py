@@ -77,12 +77,9 @@ def deviation_rows(features, times, coefficients, out, size, groups, neighbors):
 
 @piece_kernel
 def deviation_back(features, grad, out, size, groups, neighbors):
-    """out (centroids*(size+1)*groups) = the gradient at [A, b] from that at the deviations, grad (R*groups)."""
-    zero = lanes(np.float32(0))
+    """out (centroids*(size+1)*groups) += the gradient at [A, b] from that at the deviations, grad (R*groups)."""
     for p in range(grad.size // groups // neighbors):
         plane = p * (size + 1) * groups
-        for e in range(plane, plane + (size + 1) * groups, WIDTH):
-            store(out, e, zero)
         for r in range(p * neighbors, (p + 1) * neighbors):
             row = r * size * groups
             for k in range(0, groups, WIDTH):
