@@ -106,6 +106,17 @@ def test_dead_features_are_as_the_reference_has_them(solver, guard):
     assert (ours[2][4:8] == 0).all() and (ours[2][0] == 0).all()
 
 
+@pytest.mark.parametrize("where", ["activation", "logits"])
+def test_nan_is_not_hidden(where):
+    """A loss that runs away must be seen, not rounded to a weight or a ReLU's zero."""
+    arguments, _ = unit(4, 8, False, True, torch.float32)
+    with torch.no_grad():
+        (arguments[0] if where == "activation" else arguments[4])[1, 5, 3] = float("nan")
+    planes, away = fit_reduced(*arguments, Fit(4, "ridge"))
+    assert planes[1, 5].isnan().all() and away[1, 5].isnan().any()
+    assert planes[0].isfinite().all() and planes[1, :5].isfinite().all() and planes[1, 6:].isfinite().all()
+
+
 @pytest.mark.parametrize("guard", ["signed", "release"])
 @pytest.mark.parametrize("least", [1e-6, 1.0, 1e3])
 @pytest.mark.parametrize("size", range(1, 8))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.ops.jit import piece_kernel
-from dpcli.ops.kernels_simd import WIDTH, higher, lanes, load, lower, power_of_two, reciprocal, store, where_lower
+from dpcli.ops.kernels_simd import WIDTH, lanes, load, lower, power_of_two, reciprocal, store, where_lower
 
 _LOG2E = 1.4426950408889634
 
@@ -23,10 +23,10 @@ def fit_rows(features, bias, floor, xyz, at, times, logits, weights, moments, si
     features (R*size*groups): products in, max(products + bias, floor) out; bias (size*groups), floor (groups). xyz (R*3),
     or nothing: coordinates that become group `at`, whose bias is 0 and whose floor is low. times (R). logits (R*groups), or
     nothing for weights of 1; weights (R*groups) = sigmoid(logits). moments (centroids*entries*groups): for each
-    feature a the sums of w x_a x_b for b = 0..a, of w x_a and of w x_a t; last of w and of w t.
+    feature a the sums of w x_a x_b for b = 0..a, of w x_a and of w x_a t; last of w and of w t. NaN stays NaN: whoever watches the loss has to see it.
     """
     weighted, zero, one = logits.size > 0, lanes(np.float32(0)), lanes(np.float32(1))
-    most, base2 = lanes(np.float32(126)), lanes(np.float32(-_LOG2E))
+    most, base2, endless = lanes(np.float32(126)), lanes(np.float32(-_LOG2E)), lanes(np.float32(np.inf))
     entries = (size + 1) * (size + 2) // 2 + size + 1
     for p in range(times.size // neighbors):
         start = p * entries * groups
@@ -41,11 +41,14 @@ def fit_rows(features, bias, floor, xyz, at, times, logits, weights, moments, si
             for k in range(0, groups, WIDTH):
                 w = one
                 if weighted:
-                    w = reciprocal(one + power_of_two(lower(load(logits, r * groups + k) * base2, most)))
+                    logit = load(logits, r * groups + k)
+                    w = reciprocal(one + power_of_two(lower(logit * base2, most)))
+                    w = where_lower(logit, endless, w, logit)
                     store(weights, r * groups + k, w)
                 lowest, e = load(floor, k), start + k
                 for a in range(size):
-                    x = higher(load(features, row + a * groups + k) + load(bias, a * groups + k), lowest)
+                    x = load(features, row + a * groups + k) + load(bias, a * groups + k)
+                    x = where_lower(x, lowest, lowest, x)
                     store(features, row + a * groups + k, x)
                     wx = w * x
                     for b in range(a + 1):
