@@ -19,6 +19,7 @@ from dpcli.classify.kinet import Kinet, fuse
 from dpcli.ops.backend import reference_only
 from dpcli.runtime.memory import peak_memory
 
+_STEPS = 4  # of each kind that are timed
 _STARTS = 5  # the argument of the backward kernels that says where each row's pooled entries are
 
 
@@ -161,8 +162,8 @@ def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[
 
     On a CPU the parts are those of one thread: threads share the layers' work in whole pieces, products and all. `seconds`
     is the step with every thread. Matrix products are the calls of BLAS as torch's profiler sees them in that same step;
-    sparse products, which lie inside other kernels of the static stream: see `_sparse_products`, the least of 4. The fastest
-    of 6 steps, because other programs only ever add time, and to the parts unequally.
+    sparse products, which lie inside other kernels of the static stream: see `_sparse_products`. The fastest of _STEPS
+    steps, because other programs only ever add time, and to the parts unequally.
     """
     from dpcli.runtime.memory import keep_freed_memory
 
@@ -202,11 +203,11 @@ def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[
 def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool = False) -> dict[str, Any]:
     """One of `steps`, from a function that does it and returns the seconds of its grouping and of all."""
     threads = torch.get_num_threads()
-    seconds = min(step()[1] for _ in range(6))
+    seconds = min(step()[1] for _ in range(_STEPS))
     try:
         torch.set_num_threads(1)
-        (grouping, alone), inside = min((_profiled(step) for _ in range(6)), key=lambda found: found[0][1])
-        thin = min(_sparse_products(step) for _ in range(4)) if sparse else 0.0
+        (grouping, alone), inside = min((_profiled(step) for _ in range(_STEPS)), key=lambda found: found[0][1])
+        thin = min(_sparse_products(step) for _ in range(_STEPS)) if sparse else 0.0
     finally:
         torch.set_num_threads(threads)
     parts = {"matrix_products": inside, "sparse_products": thin, "neighbours": grouping}

@@ -449,7 +449,10 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
     for low in range(0, count, TILE):
         size = min(TILE, count - low)
         _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
-        kept[:] = tile
+        for i in range(n):
+            for j in range(n):
+                for w in range(TILE):  # a slice assignment would compile an error message for 4 s
+                    kept[i, j, w] = tile[i, j, w]
         acted[:] = False
         _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
         for i in range(n):
