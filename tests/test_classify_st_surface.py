@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.classify.st_surface import deviations, fit_surface, projected_deviations, surface_normal
+from dpcli.classify.st_surface import along_normal, deviations, fit_surface, surface_normal
 
 
 def moving_plane(normal, velocity, count=60, seed=0, dtype=torch.float64):
@@ -77,7 +77,7 @@ def test_deviations_vanish_on_the_plane_and_project_onto_the_normal():
     surface = fit_surface(points, times)
     assert deviations(surface, points, times).abs().max() < 1e-9
     moved = points + torch.tensor([0.1, 0.0, -0.2], dtype=torch.float64)
-    vector = projected_deviations(surface, moved, times)
+    vector = along_normal(surface, deviations(surface, moved, times))
     normal = surface_normal(surface)[0]
     along = vector[:, 0] @ normal
     torch.testing.assert_close(vector[:, 0], along[:, None] * normal)

@@ -128,15 +128,15 @@ class Kinematics(nn.Module):
         """The merged dynamic feature of every centroid of the last stage, (B,M,C)."""
         surfaces: list[Surface] = []
         previous, units, before = None, iter(self.units), None
-        left = len(self.units)
         for stage in stages:
             group = stage.grouping
             relative, times = group.relative(), group.neighbor_times()
             if before is not None and previous is not None:
                 previous = self._to_next_stage(previous, before, group)
             for activation in stage.activations:
-                left -= 1
-                surface = next(units)(activation, relative, times, group.center_times, previous, last=not left)
+                unit = next(units)
+                last = unit is self.units[-1]
+                surface = unit(activation, relative, times, group.center_times, previous, last)
                 surfaces.append(surface)
                 previous = surface.deviations
             before = group

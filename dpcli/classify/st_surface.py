@@ -58,11 +58,6 @@ def deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
     return (features * plane[..., :-1]).sum(-1) + plane[..., -1] - times[..., None]
 
 
-def projected_deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
-    """`along_normal` of the plane's deviations: shapes as `deviations`, -> (...,n,K,d+1)."""
-    return along_normal(coefficients, deviations(coefficients, features, times))
-
-
 @full_precision
 def along_normal(coefficients: Tensor, deviations: Tensor) -> Tensor:
     """Deviations e as vectors along the normal, (A,-1) e / ||(A,-1)||^2, as the released code uses them.

@@ -148,8 +148,6 @@ def _explain(error: BaseException) -> int:
 
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
-    # torch's and numba's threads take turns: spinning while they wait, each pool would hold the cores the other needs
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = typer.main.get_command(application(arguments))
     from dpcli.runtime.progress import log
