@@ -176,7 +176,8 @@ def test_config_survives_json_and_refuses_nonsense():
         ({"dropout": float("nan")}, "--dropout nan: expected a probability"),
         ({"radii": (-0.5, -1.0)}, "--radius -0.5: expected a number above 0"),
         ({"radii": (float("inf"), float("inf"))}, "--radius inf: expected a number above 0"),
-        ({"centroids": (256, 512)}, "the second not above the first"),
+        ({"centroids": (256, 512)}, "--centroids 256 512: expected two counts, the second not above the first"),
+        ({"neighbors": 0}, "--neighbors 0: expected at least 1"),
         ({"num_classes": 0}, "number of classes 0: expected at least 1"),
     ],
 )

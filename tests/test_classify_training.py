@@ -198,7 +198,7 @@ def test_a_killed_loader_ends_with_a_sentence_and_the_run_continues(data, tmp_pa
 
 
 def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
-    """`--init`: weights of 4 frames begin a run of 6; with no epochs they stay as they are."""
+    """`--init`: weights of 4 frames begin a run of 6, of other neighbourhoods; with no epochs they stay as they are."""
     longer = [*SHORT]
     longer[longer.index("4")] = "6"
     assert (
@@ -215,12 +215,18 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
             0,
             "--init",
             alone,
+            "--centroids",
+            48,
+            24,
+            "--neighbors",
+            9,
         )
         == 0
     )
     assert "tensors taken" in capfd.readouterr().err
     ours, theirs = load_model(str(tmp_path / "six")), load_model(str(alone))
-    assert ours[1].config.num_frames == 6
+    config = ours[1].config
+    assert (config.num_frames, config.centroids, config.neighbors) == (6, (48, 24), 9)
     for key, value in theirs[0].state_dict().items():
         assert torch.equal(ours[0].state_dict()[key], value), key
     assert (

@@ -83,7 +83,7 @@ class KinetConfig:
     def _check_centroids(self) -> None:
         first, second = self.centroids
         if not 1 <= second <= first:
-            raise UsageError(f"centroids = {self.centroids}: expected two counts, the second not above the first")
+            raise UsageError(f"--centroids {first} {second}: expected two counts, the second not above the first")
         have = self.points_per_frame * self.num_frames
         if have < first:
             raise UsageError(
@@ -141,7 +141,7 @@ _LEAST = {
     "num_classes": (1, "number of classes"),
     "num_frames": (1, "--frames"),
     "points_per_frame": (1, "--points"),
-    "neighbors": (1, "neighbors"),
+    "neighbors": (1, "--neighbors"),
     "group_size": (1, "--group-size"),
     "temporal_radius": (0, "--temporal-radius"),
 }

@@ -91,6 +91,17 @@ def train(
     radius: Annotated[
         float | None, typer.Option(help="Spatial radius of stage 1, in the input's unit; stage 2 doubles it.")
     ] = None,
+    centroids: Annotated[
+        tuple[int, int] | None,
+        typer.Option(
+            metavar="N N",
+            help="Neighbourhoods of a clip in the two stages (pointnet2). No weight depends on it: train with few, then go on"
+            " by --init with the preset's (thesis 1024 512, quick 256 128).",
+        ),
+    ] = None,
+    neighbors: Annotated[
+        int | None, typer.Option(help="Points of a neighbourhood: likewise. Default: the preset's (thesis 64, quick 32).")
+    ] = None,
     dropout: Annotated[float | None, typer.Option(help="Dropout before each head's last layer.")] = None,
     no_normals: Annotated[
         bool, typer.Option("--no-normals", help="Ablation v: pool reduced features instead of fitting surfaces.")
@@ -116,8 +127,8 @@ def train(
     network = {
         "num_frames": frames, "points_per_frame": points, "normalize": normalize, "grouping": grouping, "solver": solver,
         "group_size": group_size, "reduction": reduction, "temporal_radius": temporal_radius, "dropout": dropout,
-        "radii": None if radius is None else (radius, 2 * radius), "normals": False if no_normals else None,
-        "weighting": "none" if no_weights or no_normals else None,
+        "radii": None if radius is None else (radius, 2 * radius), "centroids": centroids, "neighbors": neighbors,
+        "normals": False if no_normals else None, "weighting": "none" if no_weights or no_normals else None,
     }  # fmt: skip
     schedule = {
         "batch": batch, "learning_rate": lr, "learning_rate_dynamic": lr_dynamic, "decay": decay, "workers": workers,
