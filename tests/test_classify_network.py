@@ -154,6 +154,17 @@ def test_a_group_too_small_for_coordinates_is_refused():
         KinetConfig(**TINY, group_size=2, xyz_group=True)
 
 
+@pytest.mark.filterwarnings("error")
+def test_groups_wider_than_a_layer_leave_it_the_coordinates_alone():
+    """Figure 3.5's largest groups on a narrow network: the layer has no features to fit, and nobody is warned of it."""
+    model = Kinet(KinetConfig(**{**TINY, "xyz_group": True, "group_size": 16})).eval()
+    assert [unit.groups for unit in model.dynamic.units] == [1, 1, 1, 2]
+    static, dynamic = model(body_like_clip(4, 64))
+    dynamic.sum().backward()
+    assert torch.isfinite(static).all() and torch.isfinite(dynamic).all()
+    assert all(torch.isfinite(p.grad).all() for p in model.dynamic.parameters() if p.grad is not None)
+
+
 def test_config_survives_json_and_refuses_nonsense():
     config = KinetConfig.release(num_classes=7, radii=(0.2, 0.4))
     assert KinetConfig.from_json(config.to_json()) == config

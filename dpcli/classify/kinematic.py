@@ -7,6 +7,7 @@ become one feature per centroid is the business of `merge`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -64,7 +65,9 @@ class KinematicUnit(nn.Module):
         super().__init__()
         self.config, self.groups = config, config.groups(width)
         learned = self.groups - 1 if config.xyz_group else self.groups
-        self.reduce = nn.Linear(width + int(config.time_input), learned * config.group_size)
+        with warnings.catch_warnings():  # a narrow layer may have no group of its own beside the coordinates'
+            warnings.filterwarnings("ignore", "Initializing zero-element tensors")
+            self.reduce = nn.Linear(width + int(config.time_input), learned * config.group_size)
         self.weigh: nn.Module | None = None
         if previous and config.weighting == "deviation":
             self.weigh = DeviationWeights(previous, self.groups)
