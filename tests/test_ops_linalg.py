@@ -134,3 +134,30 @@ def test_rejects(matrices: torch.Tensor, guard: str, message: str) -> None:
 def test_cholesky_refuses_an_indefinite_matrix() -> None:
     with pytest.raises(torch.linalg.LinAlgError):
         small_inverse(-torch.eye(17))
+    with pytest.raises(torch.linalg.LinAlgError):
+        small_inverse(torch.zeros(17, 17), guard="none")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("guard", ["signed", "release"])
+def test_cholesky_lifts_singular_matrices_alone(guard: str, dtype: torch.dtype) -> None:
+    """Dead features and doubled neighbours: a regular matrix beside them keeps its inverse to the bit, theirs is that of
+    the lifted matrix, and all gradients are finite."""
+    regular = spd(0, n=20)
+    dead = regular.clone()
+    dead[:7], dead[:, :7] = 0, 0
+    one = torch.full((20, 20), 3.0, dtype=torch.float64)  # rank one
+    leaf = torch.stack([regular, dead, one, torch.zeros_like(one)]).to(dtype).requires_grad_()
+    got = small_inverse(leaf, guard=guard)
+    assert torch.equal(got[0], small_inverse(regular.to(dtype), guard="none"))
+    for number, lift in ((1, 1e-6 * dead.trace()), (2, 1e-6 * 60), (3, 1e-6)):
+        exact = (leaf[number].detach().double() + lift * torch.eye(20, dtype=torch.float64)).inverse()
+        torch.testing.assert_close(got[number].double(), exact, rtol=0.05, atol=1e-3 * float(exact.abs().max()))
+    got.sum().backward()
+    assert torch.isfinite(leaf.grad).all()
+
+
+def test_cholesky_keeps_nan_where_it_is() -> None:
+    matrices = torch.stack([torch.eye(17), torch.full((17, 17), torch.nan)])
+    found = small_inverse(matrices)
+    assert torch.equal(found[0], torch.eye(17)) and found[1].isnan().all()

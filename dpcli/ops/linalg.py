@@ -23,14 +23,15 @@ def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "s
     guard: what happens to a determinant (in a block partition: of a block) with |det| < min_det. "signed" moves it to
     min_det with its own sign (0 counts as positive), "release" to +min_det, whatever its sign, as the released Kinet
     does, "none" leaves it: a singular matrix then gives inf or nan. A moved determinant carries no gradient.
-    Cholesky knows no guard. Backends: to n = 8 a numba kernel on CPU, else torch; equal up to rounding.
-    Raises ValueError on a wrong shape, dtype or guard; torch.linalg.LinAlgError where Cholesky meets a matrix that is
-    not positive definite.
+    Cholesky has no determinant to move: with a guard, a matrix with a pivot below min_det of its trace has that much added
+    to its diagonal (a matrix of zeros min_det itself), and that carries no gradient either.
+    Backends: to n = 8 a numba kernel on CPU, else torch; equal up to rounding. Raises ValueError on a wrong shape, dtype
+    or guard; torch.linalg.LinAlgError where Cholesky meets a finite matrix that is not even then positive definite.
     """
     _check(matrices, guard)
     n = matrices.shape[-1]
     if n > _BLOCKS:
-        return torch.cholesky_inverse(torch.linalg.cholesky(matrices))
+        return _cholesky_inverse(matrices, min_det, guard)
     if n <= KERNEL_SIZE and matrices.numel() and chosen_backend(matrices.device) == "numba":
         return _KernelInverse.apply(matrices, min_det, guard)
     return _inverse(matrices, min_det, guard)
@@ -40,7 +41,7 @@ def small_inverse_reference(matrices: Tensor, *, min_det: float = MIN_DET, guard
     """The torch twin of `small_inverse`: same arguments, same guard."""
     _check(matrices, guard)
     if matrices.shape[-1] > _BLOCKS:
-        return torch.cholesky_inverse(torch.linalg.cholesky(matrices))
+        return _cholesky_inverse(matrices, min_det, guard)
     return _inverse(matrices, min_det, guard)
 
 
@@ -81,6 +82,22 @@ def _block_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
     upper = -right @ corner
     top = torch.cat([a_inverse - upper @ left, upper], -1)
     return torch.cat([top, torch.cat([-corner @ left, corner], -1)], -2)
+
+
+def _cholesky_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
+    """By Cholesky's factor; where it is (nearly) singular and a guard is on, of the matrix with a lifted diagonal."""
+    if guard != "none":
+        with torch.no_grad():
+            factor, failed = torch.linalg.cholesky_ex(m)
+            trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)
+            lift = min_det * torch.where(trace == 0, torch.ones_like(trace), trace)
+            small = (failed > 0) | (factor.diagonal(dim1=-2, dim2=-1).square().amin(-1) < lift)
+            lift = torch.where(small, lift, torch.zeros_like(lift))
+        m = m + torch.diag_embed(lift[..., None].expand(m.shape[:-1]))
+    finite = m.isfinite().all(-1).all(-1)[..., None, None]
+    known = torch.where(finite, m, torch.eye(m.shape[-1], dtype=m.dtype, device=m.device))
+    # what isn't finite stays so, as in the closed form: whoever trains notices a loss, not an error from here
+    return torch.where(finite, torch.cholesky_inverse(torch.linalg.cholesky(known)), torch.nan)
 
 
 def _adjugate1(a: Tensor) -> tuple[list[Tensor], Tensor]:
