@@ -20,7 +20,7 @@ def train(
     data: Annotated[str, typer.Argument(help="A clouds file with labels and a split 'train', or - for a pipe.")],
     output: Annotated[str, typer.Option("-o", "--output", help="Folder for checkpoints, logs and curves.")],
     preset: Annotated[
-        str, typer.Option(help="thesis, release, quick (half the centroids and neighbours, fits a CPU) or tiny (demo).")
+        str, typer.Option(help="thesis, release, quick (a seventh of the operations, fits a CPU) or tiny (demo).")
     ] = "quick",
     backbone: Annotated[
         str | None,
@@ -100,7 +100,8 @@ def train(
         ),
     ] = None,
     neighbors: Annotated[
-        int | None, typer.Option(help="Points of a neighbourhood: likewise. Default: the preset's (thesis 64, quick 32).")
+        int | None,
+        typer.Option(help="Points of a neighbourhood: likewise, but for spidercnn. Default: the preset's (thesis 64, quick 32)."),
     ] = None,
     dropout: Annotated[float | None, typer.Option(help="Dropout before each head's last layer.")] = None,
     no_normals: Annotated[
