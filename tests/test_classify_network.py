@@ -189,6 +189,7 @@ def test_config_survives_json_and_refuses_nonsense():
         ({"radii": (float("inf"), float("inf"))}, "--radius inf: expected a number above 0"),
         ({"centroids": (256, 512)}, "--centroids 256 512: expected two counts, the second not above the first"),
         ({"neighbors": 0}, "--neighbors 0: expected at least 1"),
+        ({"neighbors": 6145}, "--neighbors 6145: the frames within --temporal-radius 1 hold 6144 points"),
         ({"num_classes": 0}, "number of classes 0: expected at least 1"),
     ],
 )

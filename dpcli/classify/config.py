@@ -79,6 +79,11 @@ class KinetConfig:
             raise UsageError(
                 f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
             )
+        near = min(reach, self.num_frames) * self.points_per_frame
+        if self.neighbors > near:
+            raise UsageError(
+                f"--neighbors {self.neighbors}: the frames within --temporal-radius {self.temporal_radius} hold {near} points"
+            )
 
     def _check_centroids(self) -> None:
         first, second = self.centroids
