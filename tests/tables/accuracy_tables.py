@@ -26,6 +26,7 @@ from tests.tables.runs import (  # fmt: skip
     numbers,
     samples,
     shares,
+    some,
     spread,
     thesis_rows,
     write_json,
@@ -164,7 +165,7 @@ def make(
     about = (
         f"Ours: `dpc classify train {' '.join(['--preset', plan.preset, '--validation none', *plan.budget])}` and each "
         f"line's own {', '.join(word for word in experiment.settings[0].words if word.startswith('--'))}; "
-        f"{f'{plan.clips} clips' if plan.clips else 'every clip'} of a video scored. Thesis: its own data and budget"
+        f"{some(plan.clips, 'clip') if plan.clips else 'every clip'} of a video scored. Thesis: its own data and budget"
         + (", mean of 10 runs." if experiment.short else ".")
     )
     cells: dict[str, dict[int, dict]] = {one.key: {} for one in experiment.settings}

@@ -19,7 +19,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.classification import predicted_labels
 from dpcli.store import ScoresReader
-from tests.tables.runs import DASH, markdown, write_json, write_text
+from tests.tables.runs import DASH, markdown, some, write_json, write_text
 
 SAID = {  # A.2.2: what the thesis says of single classes; the figure prints no numbers
     "kinet": {"high throw": "more than +30", "hand catch": "more than +30", "horizontal arm wave": "about -6"},
@@ -109,12 +109,12 @@ def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict
     """Picture and table of scores files. flow: the flow baseline's, which hold its static scores as a stream too."""
     names, base, own = gains(files)
     found = {"kinet": own}
-    about = f"Ours: means over {len(files)} runs (seeds)."
+    about = f"Ours: mean over {some(len(files), 'run')} (seeds)."
     if flow:
         others, _, found["flow"] = gains(flow)
         if others != names:
             raise DataError(f"{flow[0]}: other classes than {files[0]}")
-        about += f" Flow-based two streams: {len(flow)} runs, over their own static networks."
+        about += f" Flow-based two streams: {some(len(flow), 'run')}, over their own static networks."
     write_json(folder / "results.json", {"figure": "A.4", "classes": names, "static": base.tolist(),
                                          "gain": {key: value.tolist() for key, value in found.items()}})  # fmt: skip
     write_text(folder / "table.md", table(names, base, found, about))
