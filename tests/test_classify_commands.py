@@ -13,6 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.classify.config import KinetConfig
+from dpcli.classify.model_file import ModelInfo
+from dpcli.classify.split import carve_validation
+from dpcli.classify.videos import held_out
+from dpcli.errors import UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -103,6 +108,39 @@ def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_fo
     assert again.returncode == 0 and b"already complete" in again.stderr
     other = dpc_here(*words, "--split", "all")
     assert other.returncode == 2 and b"--force" in other.stderr and (tmp_path / "s.h5").read_bytes() == before
+
+
+def test_the_videos_held_out_of_training_choose_the_streams_weights(data, run_folder, dpc_here, tmp_path):
+    reader = CloudsReader(data)
+    held = {reader.names[i] for i in carve_validation(reader, "0.34", 3)[1]}
+    words = ("classify", "predict", data, "--model", run_folder, "-o")
+    assert dpc_here(*words, tmp_path / "held.h5", "--split", "validation").returncode == 0
+    found = ScoresReader(tmp_path / "held.h5")
+    assert held == set(found.names) and set(found.splits) == {"validation"} and 0 < len(held) < 8
+    dpc_here(*words, tmp_path / "test.h5")
+    fused = dpc_here("classify", "fuse", tmp_path / "test.h5", "-o", tmp_path / "w.h5", "--weights-from", tmp_path / "held.h5")
+    assert fused.returncode == 0, fused.stderr.decode()
+    done = dpc_here("evaluate", "classification", tmp_path / "w.h5", "--json")
+    assert set(json.loads(done.stdout)["metrics"]["streams"]) == {"static", "dynamic", "fused"}
+    other = gestures(tmp_path / "other.h5", videos=15)
+    refused = dpc_here("classify", "predict", other, "--model", run_folder, "-o", tmp_path / "x.h5", "--split", "validation")
+    assert refused.returncode == 3 and b"not the file that" in refused.stderr
+    assert not (tmp_path / "x.h5").exists()
+
+
+def test_held_out_videos(data):
+    reader = CloudsReader(data)
+    info = ModelInfo(KinetConfig(), ["left", "right"], "clips", {"validation": "none"})
+    with pytest.raises(UsageError, match="a model held no video out"):
+        held_out(reader, info, "a model")
+    subjects = [3, 3, 7, 7]
+    with CloudsWriter(data.parent / "subjects.h5", class_names=["left", "right"]) as writer:
+        for i, subject in enumerate(subjects):
+            writer.write(CloudSequence.from_frames(f"s{i}", [np.zeros((4, 3), np.float32)], label=i % 2, split="train", subject=subject))
+    info.notes["validation"] = "subject"  # needs no digest: whoever has the highest number
+    assert held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model") == [2, 3]
+    info.notes["validation"] = "subjects:3"
+    assert held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model") == [0, 1]
 
 
 def last_weights(folder: Path) -> dict:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dpcli.classify.fuse import parse_weights, run_fusion, stream_names
+from dpcli.classify.fuse import likelihood_weights, parse_weights, run_fusion, stream_names
 from dpcli.cli.app import app
 from dpcli.errors import DataError, UsageError
 from dpcli.store import ScoresReader, ScoresWriter
@@ -65,15 +65,17 @@ def test_weights(two, tmp_path):
     found = fuse(two, tmp_path / "weighed.h5", "3,1")
     np.testing.assert_allclose(found.scores[0], [0.525, 0.325, 0.15], atol=1e-7)
     np.testing.assert_array_equal(fuse(two, tmp_path / "first.h5", "1,0").scores, found.streams["points"])
-    np.testing.assert_allclose(parse_weights("0.7,0.3", 2), [0.7, 0.3])
+    np.testing.assert_allclose(parse_weights("0.7,0.3", ["a", "b"]), [0.7, 0.3])
+    np.testing.assert_allclose(parse_weights("b=0.3,a=0.7", ["a", "b"]), [0.7, 0.3])
     for text, message in (
         ("0.5", "1 weights for 2"), ("a,b", "expected numbers"), ("-1,2", "from 0 up"), ("0,0", "not all"),
-        ("nan,1", "from 0 up"), ("inf,1", "from 0 up"),
+        ("nan,1", "from 0 up"), ("inf,1", "from 0 up"), ("a=1,c=1", "expected a=NUMBER,b=NUMBER"), ("a=1,a=1", "expected a="),
+        ("a=1,b", "expected numbers"),
     ):  # fmt: skip
         with pytest.raises(UsageError, match=message):
-            parse_weights(text, 2)
-    with pytest.raises(UsageError, match="two or more"):
-        parse_weights(None, 1)
+            parse_weights(text, ["a", "b"])
+    with pytest.raises(UsageError, match="expected a=NUMBER,b=NUMBER"):
+        parse_weights("1,2", ["a", "b"], named=True)
 
 
 def test_streams_have_names_of_their_own(two, tmp_path):
@@ -139,3 +141,81 @@ def test_a_pipe_and_the_evaluation(dpc, two, tmp_path):
     }  # fmt: skip
     refused = CliRunner().invoke(app, ["classify", "fuse", str(two[0]), "-o", str(tmp_path / "x.h5")])
     assert refused.exit_code != 0 and "two or more" in str(refused.exception)
+
+
+def with_streams(path: Path, rows: dict, split: str = "test") -> Path:
+    """rows: name -> (label, static, dynamic); the fused scores are their mean."""
+    with ScoresWriter(path, class_names=CLASSES, streams=("static", "dynamic")) as writer:
+        for name, (label, static, dynamic) in rows.items():
+            own = {"static": np.array(static), "dynamic": np.array(dynamic)}
+            writer.write(name, sum(own.values()) / 2, label=label, split=split, streams=own)
+    return path
+
+
+def test_the_streams_of_one_file_get_another_mean(dpc, tmp_path):
+    rows = {"v0": (0, [0.6, 0.3, 0.1], [0.2, 0.3, 0.5]), "v1": (1, [1, 0, 0], [0, 1, 0])}
+    one = with_streams(tmp_path / "one.h5", rows)
+    found = fuse([one], tmp_path / "out.h5", "static=1,dynamic=3")
+    np.testing.assert_allclose(found.scores, [[0.3, 0.3, 0.4], [0.25, 0.75, 0]], atol=1e-7)
+    np.testing.assert_array_equal(found.streams["static"], ScoresReader(one).streams["static"])
+    np.testing.assert_allclose(fuse([one], tmp_path / "same.h5").scores, ScoresReader(one).scores, atol=1e-7)
+    with pytest.raises(UsageError, match="expected dynamic=NUMBER,static=NUMBER"):
+        fuse([one], tmp_path / "x.h5", "1,3")
+    done = dpc("classify", "fuse", "-", "-o", tmp_path / "piped.h5", "--weights", "dynamic=3,static=1", stdin=one.read_bytes())
+    assert done.returncode == 0, done.stderr.decode()
+    assert "weights dynamic 0.75, static 0.25" in done.stdout.decode()
+    np.testing.assert_array_equal(ScoresReader(tmp_path / "piped.h5").scores, found.scores)
+
+
+@pytest.mark.parametrize("models", [2, 3])
+def test_likelihood_weights_are_the_best_there_are(models):
+    draws = np.random.default_rng(models).beta(1, 2, (models, 40))
+
+    def likelihood(weights):
+        return np.log(weights @ draws).sum()
+
+    found = likelihood_weights(draws)
+    np.testing.assert_allclose(found.sum(), 1)
+    steps = np.linspace(0, 1, 101)
+    grid = np.stack(np.meshgrid(*[steps] * (models - 1)), -1).reshape(-1, models - 1)
+    grid = np.concatenate([grid, 1 - grid.sum(1, keepdims=True)], 1)
+    best = max(likelihood(weights) for weights in grid[grid[:, -1] >= -1e-9].clip(0))
+    assert best <= likelihood(found) + 1e-9 and likelihood(found) < best + 0.05  # not a likelihood of something else
+    assert likelihood(found) > likelihood(np.full(models, 1 / models)) + 1e-3  # equal weights are rejected
+    np.testing.assert_allclose(likelihood_weights(np.array([[0.5, 0.9], [0.0, 0.1]])), [1, 0], atol=1e-6)
+    np.testing.assert_allclose(likelihood_weights(np.full((2, 5), 0.3)), [0.5, 0.5])
+    np.testing.assert_allclose(likelihood_weights(np.array([[1.0, 0], [0, 1], [0, 1]])), [0.5, 0.25, 0.25], atol=1e-6)
+
+
+def test_weights_are_chosen_on_other_videos(tmp_path):
+    rows = {"v0": (0, [0.6, 0.3, 0.1], [0.2, 0.3, 0.5]), "v1": (1, [1, 0, 0], [0, 1, 0])}
+    one = with_streams(tmp_path / "one.h5", rows)
+    held = {"w0": (0, [0.1, 0.9, 0], [0.4, 0.3, 0.3]), "w1": (1, [0.5, 0.5, 0], [0.4, 0.4, 0.2]),
+            "w2": (-1, [1, 0, 0], [0, 0, 1])}  # fmt: skip
+    judge = with_streams(tmp_path / "held.h5", held, "validation")
+
+    def chosen(inputs, by, output="out.h5"):
+        run_fusion([str(path) for path in inputs], str(tmp_path / output), weights=None, force=True, weights_from=by)
+        return ScoresReader(tmp_path / output)
+
+    found = chosen([one], str(judge))
+    entry = found.provenance[-1]["config"]
+    assert entry["fuse"] == ["dynamic", "static"] and len(entry["weights_from"]) == 1
+    best = likelihood_weights(np.array([[0.4, 0.4], [0.1, 0.5]]))
+    np.testing.assert_allclose(entry["weights"], best, atol=1e-6)
+    np.testing.assert_allclose(found.scores[0], best[0] * np.array([0.2, 0.3, 0.5]) + best[1] * np.array([0.6, 0.3, 0.1]), atol=1e-6)
+
+    two = [write(tmp_path / "points.h5", POINTS), write(tmp_path / "flow.h5", FLOW)]
+    judges = [write(tmp_path / "a.h5", {"w": (0, [0.9, 0.1, 0])}), write(tmp_path / "b.h5", {"w": (0, [0.1, 0.9, 0])})]
+    by = ",".join(map(str, judges))
+    np.testing.assert_allclose(chosen(two, by).provenance[-1]["config"]["weights"], [1, 0], atol=1e-3)
+    for inputs, judged, error, message in (
+        ([one], str(one), DataError, "'v0' is among the fused videos"), (two, str(judge), UsageError, "1 files for 2"),
+        ([one], str(two[0]), UsageError, "without streams"), (two, f"{two[0]},{two[1]}", DataError, r"\(3 such videos\)"),
+        ([one], str(with_streams(tmp_path / "unknown.h5", {"w": (-1, [1, 0, 0], [1, 0, 0])})), DataError, "no video has a label"),
+    ):  # fmt: skip
+        with pytest.raises(error, match=message):
+            chosen(inputs, judged, "x.h5")
+    assert not (tmp_path / "x.h5").exists()
+    with pytest.raises(UsageError, match="one of the two"):
+        run_fusion([str(one)], str(tmp_path / "x.h5"), weights="static=1,dynamic=1", force=False, weights_from=str(judge))

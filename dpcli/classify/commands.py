@@ -13,7 +13,7 @@ from dpcli.classify.kinet import STREAMS, Kinet
 from dpcli.classify.model_file import find_model, load_model
 from dpcli.classify.predict import predict_videos
 from dpcli.classify.settings import network_config
-from dpcli.classify.videos import check_classes, report_short, select_videos
+from dpcli.classify.videos import check_classes, held_out, report_short, select_videos
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -33,8 +33,9 @@ def run_prediction(
     streams = tuple(info.notes.get("streams", STREAMS))
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
-        sequences = select_videos(reader, split)
         check_classes(reader, info, model_name)
+        validation = split == "validation" and split not in reader.splits
+        sequences = held_out(reader, info, model_name) if validation else select_videos(reader, split)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=seed)
         report_short(source, info.config.num_frames)
         config = {"split": split, "clips_per_video": clips_per_video, "drop_short": drop_short, "dropped": source.dropped,
@@ -45,7 +46,7 @@ def run_prediction(
         keep_freed_memory()
         with ScoresWriter(target, class_names=info.class_names, seed=seed, source=reader.path.name if data != "-" else "stdin",
                           provenance=history, streams=streams, force=force) as writer:  # fmt: skip
-            _score(model.to(chosen), source, writer, streams, clips_per_video, batch, chosen)
+            _score(model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if validation else None)
     if output != "-":
         print(f"{output}: scores of {len(writer)} videos in {len(info.class_names)} classes")
 
@@ -69,14 +70,15 @@ def _already_scored(target: Path, entry: dict) -> bool:
 
 def _score(
     model: Kinet, source: ClipSource, writer: ScoresWriter, streams: tuple[str, ...], count: int | None, batch: int,
-    device: torch.device,
+    device: torch.device, split: str | None,
 ) -> None:  # fmt: skip
+    """split: what to call the videos' split; None: as their file does."""
     reader = source.reader
     with stop_requested() as stop, Progress("classify predict", len(source.sequences), "video") as bar:
         for video in predict_videos(model, source, count, batch, device, streams):
             i = video.sequence
             writer.write(
-                reader.names[i], video.fused, label=int(reader.labels[i]), split=reader.splits[i], streams=video.streams
+                reader.names[i], video.fused, label=int(reader.labels[i]), split=split or reader.splits[i], streams=video.streams
             )
             bar.advance(1, clips=video.clips)
             stop.check(f"{len(writer)} videos were scored, none kept")

@@ -1,9 +1,10 @@
-"""`dpc classify fuse`: the mean of the scores of several models, as of two streams (thesis A.1.5)."""
+"""`dpc classify fuse`: the weighted mean of the scores of several models, or of one file's streams (thesis A.1.5)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,45 +14,137 @@ from dpcli.runtime import provenance
 from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
+_STEPS = 10_000  # of expectation-maximisation; some hundred are usual
+_LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
 
 
-def run_fusion(inputs: Sequence[str], output: str, *, weights: str | None, force: bool) -> None:
-    """Scores files of the same videos, in any order, become one whose `streams` are its inputs."""
-    shares = parse_weights(weights, len(inputs))
+@dataclass(frozen=True)
+class Source:
+    """What is fused: a file's scores f32 (S,C) or a stream of it; labels i32 (S)."""
+
+    scores: np.ndarray
+    labels: np.ndarray
+    names: list[str]
+    splits: list[str]
+    class_names: list[str]
+    provenance: list[dict]
+
+
+def run_fusion(
+    inputs: Sequence[str], output: str, *, weights: str | None, force: bool, weights_from: str | None = None
+) -> None:
+    """Scores files of the same videos, in any order, become one whose `streams` are its inputs; of one file, its streams
+    get another mean.
+
+    weights: `parse_weights`; weights_from: scores files with commas between, as many as inputs and of other, labelled
+    videos, on which `likelihood_weights` chooses.
+    """
+    if weights is not None and weights_from is not None:
+        raise UsageError("--weights says them and --weights-from chooses them; give one of the two")
+    judges = weights_from.split(",") if weights_from is not None else []
+    if weights_from is not None and len(judges) != len(inputs):
+        raise UsageError(f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order")
     _refuse_repeats([*inputs, output])
     with ExitStack() as stack:
         paths = [stack.enter_context(input_file(name)) for name in inputs]
         target = stack.enter_context(output_file(output))
-        sources = [ScoresReader(path) for path in paths]
         called = [str(path) if name != "-" else "stdin" for name, path in zip(inputs, paths)]
-        streams = stream_names(["stdin" if name == "-" else Path(name).stem for name in inputs])
+        files = streams = stream_names([Path(name).stem for name in called])
+        sources = [_source(ScoresReader(path)) for path in paths]
+        if len(inputs) == 1:
+            streams, sources = _streams_of(ScoresReader(paths[0]), called[0])
+            called = called * len(streams)
         rows = matching_rows(sources, called)
+        shares = parse_weights(weights, streams, len(inputs) == 1)
+        if judges:
+            shares = _chosen_weights(judges, streams, sources[0])
         config = {"fuse": streams, "weights": shares.tolist(), "sources": [source.provenance for source in sources]}
-        entry = provenance.record(config, 0, dict(zip(streams, paths)))
+        if judges:
+            config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
+        entry = provenance.record(config, 0, dict(zip(files, paths)))
         if not force and _already_there(target, entry):
             return
-        with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(Path(n).name for n in called),
+        with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(dict.fromkeys(Path(name).name for name in called)),
                           provenance=entry, streams=streams, force=force) as writer:  # fmt: skip
             _write(writer, sources, rows, streams, shares)
     if output != "-":
-        print(f"{output}: mean of {len(inputs)} scores of {len(writer)} videos")
+        said = "" if np.ptp(shares) == 0 else f", weights {', '.join(f'{n} {w:.3g}' for n, w in zip(streams, shares))}"
+        print(f"{output}: mean of {len(streams)} scores of {len(writer)} videos{said}")
 
 
-def parse_weights(text: str | None, count: int) -> np.ndarray:
-    """Weights f64 (count) that sum to 1, from `0.5,0.5`; None weighs all alike. UsageError when they don't fit."""
-    if count < 2:
-        raise UsageError(f"{count} scores file; name two or more to fuse")
+def _source(reader: ScoresReader, scores: np.ndarray | None = None) -> Source:
+    return Source(reader.scores if scores is None else scores, reader.labels, reader.names, reader.splits, reader.class_names,
+                  reader.provenance)  # fmt: skip
+
+
+def _streams_of(reader: ScoresReader, called: str) -> tuple[list[str], list[Source]]:
+    if len(reader.streams) < 2:
+        raise UsageError(f"{called}: one file without streams to fuse; name two or more files")
+    return list(reader.streams), [_source(reader, scores) for scores in reader.streams.values()]
+
+
+def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -> np.ndarray:
+    """Weights f64 (K) that sum to 1, from `0.5,0.5` or `static=0.3,dynamic=0.7`; None weighs all alike.
+
+    named: names are needed, as streams have no order to go by. UsageError when they don't fit.
+    """
     if text is None:
-        return np.full(count, 1 / count)
+        return np.full(len(names), 1 / len(names))
+    words = text.split(",")
+    if named or "=" in text:
+        pairs = dict(word.partition("=")[::2] for word in words)
+        if set(pairs) != set(names) or len(pairs) != len(words):
+            raise UsageError(f"--weights {text}: expected {','.join(f'{name}=NUMBER' for name in names)}")
+        words = [pairs[name] for name in names]
     try:
-        values = np.array([float(word) for word in text.split(",")])
+        values = np.array([float(word) for word in words])
     except ValueError:
         raise UsageError(f"--weights {text}: expected numbers with commas, such as 0.5,0.5") from None
-    if len(values) != count:
-        raise UsageError(f"--weights {text}: {len(values)} weights for {count} files; one for each")
+    if len(values) != len(names):
+        raise UsageError(f"--weights {text}: {len(values)} weights for {len(names)} files; one for each")
     if not np.isfinite(values).all() or values.min() < 0 or not 0 < values.sum() < np.inf:
         raise UsageError(f"--weights {text}: expected numbers from 0 up, not all of them 0")
     return values / values.sum()
+
+
+def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
+    """Weights f64 (K), sum 1, of the mean that gives labelled samples the greatest likelihood.
+
+    probabilities: (K,S), what each of K models gives the true class of each sample. The logarithm of the likelihood, sum_s log
+    sum_k w_k p_ks, is concave in w, so expectation-maximisation from equal weights ends at its maximum.
+    """
+    found = np.clip(np.asarray(probabilities, np.float64), _LEAST, None)
+    weights = np.full(len(found), 1 / len(found))
+    for _ in range(_STEPS):
+        shares = weights[:, None] * found
+        new = (shares / shares.sum(0)).mean(1)
+        if np.abs(new - weights).max() < 1e-10:
+            break
+        weights = new
+    return new
+
+
+def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: Source) -> np.ndarray:
+    """Weights chosen on labelled videos that are not among the fused ones. DataError when they don't fit."""
+    readers = [ScoresReader(name) for name in judges]
+    called = list(judges)
+    sources = [_source(reader) for reader in readers]
+    if len(judges) == 1:
+        names, sources = _streams_of(readers[0], called[0])
+        called = called * len(names)
+        if names != list(streams):
+            raise DataError(f"{called[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
+    _same_classes(fused.class_names, sources[0].class_names, "what is fused", called[0])
+    rows = matching_rows(sources, called)
+    both = sorted(set(fused.names) & set(sources[0].names))
+    if both:
+        raise DataError(f"{called[0]}: {both[0]!r} is among the fused videos, too ({len(both)} such videos); weights are chosen "
+                        "on other videos, such as those held out of training (predict --split validation)")  # fmt: skip
+    labels = np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
+    known = np.flatnonzero(labels >= 0)
+    if not len(known):
+        raise DataError(f"{called[0]}: no video has a label; weights are chosen on labelled videos")
+    return likelihood_weights(np.stack([source.scores[at][known, labels[known]] for source, at in zip(sources, rows)]))
 
 
 def stream_names(stems: Sequence[str]) -> list[str]:
@@ -66,7 +159,7 @@ def stream_names(stems: Sequence[str]) -> list[str]:
     return names
 
 
-def matching_rows(sources: Sequence[ScoresReader], called: Sequence[str]) -> list[np.ndarray]:
+def matching_rows(sources: Sequence[Source], called: Sequence[str]) -> list[np.ndarray]:
     """Where each file has the videos of the first one, i64 (S) each.
 
     DataError unless all hold the same classes and videos and, where known (label >= 0, split not empty), the same labels
@@ -102,7 +195,7 @@ def _same_videos(one: list[str], two: list[str], first: str, other: str) -> None
 
 
 def _same_truth(
-    one: ScoresReader, rows: np.ndarray, two: ScoresReader, others: np.ndarray, first: str, other: str
+    one: Source, rows: np.ndarray, two: Source, others: np.ndarray, first: str, other: str
 ) -> None:
     mine, theirs = one.labels[rows], two.labels[others]
     differ = np.flatnonzero((mine != theirs) & (mine >= 0) & (theirs >= 0))
@@ -135,7 +228,7 @@ def _already_there(target: Path, entry: dict) -> bool:
 
 
 def _write(
-    writer: ScoresWriter, sources: Sequence[ScoresReader], rows: Sequence[np.ndarray], streams: Sequence[str],
+    writer: ScoresWriter, sources: Sequence[Source], rows: Sequence[np.ndarray], streams: Sequence[str],
     shares: np.ndarray,
 ) -> None:  # fmt: skip
     """In the first file's order; unknown labels and splits are taken from the files that know them."""

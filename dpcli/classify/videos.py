@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dpcli.classify.clips import ClipSource
 from dpcli.classify.model_file import ModelInfo
-from dpcli.errors import DataError
+from dpcli.classify.split import carve_validation
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
@@ -20,6 +22,20 @@ def select_videos(reader: CloudsReader, split: str) -> list[int]:
     if split == "auto":
         log.info(f"scoring split {wanted!r}: {len(chosen)} of {len(reader)} videos (--split chooses)")
     return chosen
+
+
+def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int]:
+    """The training videos that the model's training held out for validation, by the rule and seed in its notes.
+
+    UsageError when it held none out; DataError when the rule needs the file it was trained on and this is another.
+    """
+    rule = info.notes.get("validation", "none")
+    if rule == "none":
+        raise UsageError(f"--split validation: {model_name} held no video out (--validation none); ask for another split")
+    if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
+        raise DataError(f"{reader.path}: not the file that {model_name} was trained on, and its validation videos were drawn "
+                        f"from that (--validation {rule}); predict on that file")  # fmt: skip
+    return carve_validation(reader, rule, int(info.notes.get("seed", 0)))[1]
 
 
 def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> None:

@@ -154,7 +154,8 @@ def predict(
     ] = None,
     backbone: TrustedBackbone = None,
     split: Annotated[
-        str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")
+        str, typer.Option(help="Which samples: a split's name, all, auto (test where there is one), or validation: "
+                          "the training videos that the model's training held out.")
     ] = "auto",
     clips_per_video: Annotated[int, typer.Option(help="Clips spread evenly over a video; 0 takes every start.")] = 0,
     drop_short: Annotated[
@@ -194,17 +195,27 @@ def predict(
 
 @app.command()
 def fuse(
-    scores: Annotated[list[str], typer.Argument(help="Scores files of the same videos; one may be - for a pipe.")],
+    scores: Annotated[
+        list[str],
+        typer.Argument(help="Scores files of the same videos, or one, whose streams are averaged anew; one may be - for a pipe."),
+    ],
     output: Output,
     weights: Annotated[
-        str | None, typer.Option("--weights", help="One per file, with commas, as 0.7,0.3. Default: all alike.")
+        str | None,
+        typer.Option("--weights", help="One per file, with commas, as 0.7,0.3; or by name, as static=0.3,dynamic=0.7. "
+                     "Default: all alike."),
+    ] = None,
+    weights_from: Annotated[
+        str | None,
+        typer.Option("--weights-from", help="Scores of other, labelled videos, one file per file with commas between: the weights "
+                     "are those that suit them best (greatest likelihood)."),
     ] = None,
     force: Force = False,
 ) -> None:
     """Average the scores of several models, such as one on points and one on flow; each stays as a stream of its own."""
     from dpcli.classify.fuse import run_fusion
 
-    run_fusion(scores, output, weights=weights, force=force)
+    run_fusion(scores, output, weights=weights, weights_from=weights_from, force=force)
 
 
 @app.command()
