@@ -207,8 +207,8 @@ def fuse(
     ] = None,
     weights_from: Annotated[
         str | None,
-        typer.Option("--weights-from", help="Scores of other, labelled videos, one file per file with commas between: the weights "
-                     "are those that suit them best (greatest likelihood)."),
+        typer.Option("--weights-from", help="Scores of other, labelled videos by the same models, as many files as are fused, with "
+                     "commas between: the weights that suit them best (greatest likelihood)."),
     ] = None,
     force: Force = False,
 ) -> None:
