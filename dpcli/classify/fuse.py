@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +16,6 @@ from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
 _STEPS = 10_000  # of expectation-maximisation; some hundred are usual
 _LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
-
-
-@dataclass(frozen=True)
-class Source:
-    """What is fused: a file's scores f32 (S,C) or a stream of it; labels i32 (S)."""
-
-    scores: np.ndarray
-    labels: np.ndarray
-    names: list[str]
-    splits: list[str]
-    class_names: list[str]
-    provenance: list[dict]
 
 
 def run_fusion(
@@ -49,22 +37,18 @@ def run_fusion(
         paths = [stack.enter_context(input_file(name)) for name in inputs]
         target = stack.enter_context(output_file(output))
         called = [str(path) if name != "-" else "stdin" for name, path in zip(inputs, paths)]
-        files = streams = stream_names([Path(name).stem for name in called])
-        sources = [_source(ScoresReader(path)) for path in paths]
-        if len(inputs) == 1:
-            streams, sources = _streams_of(ScoresReader(paths[0]), called[0])
-            called = called * len(streams)
-        rows = matching_rows(sources, called)
+        readers = [ScoresReader(path) for path in paths]
+        streams, sources, rows = _streams(readers, called)
         shares = parse_weights(weights, streams, len(inputs) == 1)
         if judges:
             shares = _chosen_weights(judges, streams, sources[0])
-        config = {"fuse": streams, "weights": shares.tolist(), "sources": [source.provenance for source in sources]}
+        config = {"fuse": streams, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
         if judges:
             config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
-        entry = provenance.record(config, 0, dict(zip(files, paths)))
+        entry = provenance.record(config, 0, dict(zip(stream_names([Path(name).stem for name in called]), paths)))
         if not force and _already_there(target, entry):
             return
-        with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(dict.fromkeys(Path(name).name for name in called)),
+        with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(Path(name).name for name in called),
                           provenance=entry, streams=streams, force=force) as writer:  # fmt: skip
             _write(writer, sources, rows, streams, shares)
     if output != "-":
@@ -72,15 +56,25 @@ def run_fusion(
         print(f"{output}: mean of {len(streams)} scores of {len(writer)} videos{said}")
 
 
-def _source(reader: ScoresReader, scores: np.ndarray | None = None) -> Source:
-    return Source(reader.scores if scores is None else scores, reader.labels, reader.names, reader.splits, reader.class_names,
-                  reader.provenance)  # fmt: skip
+def _streams(
+    readers: Sequence[ScoresReader], called: Sequence[str]
+) -> tuple[list[str], list[ScoresReader], list[np.ndarray]]:
+    """What is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
+    if len(readers) > 1:
+        return stream_names([Path(name).stem for name in called]), list(readers), matching_rows(readers, called)
+    if len(readers[0].streams) < 2:
+        raise UsageError(f"{called[0]}: one file without streams to fuse; name two or more files")
+    views = []
+    for scores in readers[0].streams.values():
+        view = copy(readers[0])
+        view.scores = scores
+        views.append(view)
+    return list(readers[0].streams), views, [np.arange(len(readers[0].names))] * len(views)
 
 
-def _streams_of(reader: ScoresReader, called: str) -> tuple[list[str], list[Source]]:
-    if len(reader.streams) < 2:
-        raise UsageError(f"{called}: one file without streams to fuse; name two or more files")
-    return list(reader.streams), [_source(reader, scores) for scores in reader.streams.values()]
+def _labels(sources: Sequence[ScoresReader], rows: Sequence[np.ndarray]) -> np.ndarray:
+    """i32 (S): a label that only some files know is taken from them."""
+    return np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
 
 
 def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -> np.ndarray:
@@ -124,26 +118,20 @@ def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
     return new
 
 
-def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: Source) -> np.ndarray:
+def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: ScoresReader) -> np.ndarray:
     """Weights chosen on labelled videos that are not among the fused ones. DataError when they don't fit."""
-    readers = [ScoresReader(name) for name in judges]
-    called = list(judges)
-    sources = [_source(reader) for reader in readers]
-    if len(judges) == 1:
-        names, sources = _streams_of(readers[0], called[0])
-        called = called * len(names)
-        if names != list(streams):
-            raise DataError(f"{called[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
-    _same_classes(fused.class_names, sources[0].class_names, "what is fused", called[0])
-    rows = matching_rows(sources, called)
+    names, sources, rows = _streams([ScoresReader(name) for name in judges], judges)
+    if len(judges) == 1 and names != list(streams):
+        raise DataError(f"{judges[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
+    _same_classes(fused.class_names, sources[0].class_names, "what is fused", judges[0])
     both = sorted(set(fused.names) & set(sources[0].names))
     if both:
-        raise DataError(f"{called[0]}: {both[0]!r} is among the fused videos, too ({len(both)} such videos); weights are chosen "
+        raise DataError(f"{judges[0]}: {both[0]!r} is among the fused videos, too ({len(both)} such videos); weights are chosen "
                         "on other videos, such as those held out of training (predict --split validation)")  # fmt: skip
-    labels = np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
+    labels = _labels(sources, rows)
     known = np.flatnonzero(labels >= 0)
     if not len(known):
-        raise DataError(f"{called[0]}: no video has a label; weights are chosen on labelled videos")
+        raise DataError(f"{judges[0]}: no video has a label; weights are chosen on labelled videos")
     return likelihood_weights(np.stack([source.scores[at][known, labels[known]] for source, at in zip(sources, rows)]))
 
 
@@ -159,7 +147,7 @@ def stream_names(stems: Sequence[str]) -> list[str]:
     return names
 
 
-def matching_rows(sources: Sequence[Source], called: Sequence[str]) -> list[np.ndarray]:
+def matching_rows(sources: Sequence[ScoresReader], called: Sequence[str]) -> list[np.ndarray]:
     """Where each file has the videos of the first one, i64 (S) each.
 
     DataError unless all hold the same classes and videos and, where known (label >= 0, split not empty), the same labels
@@ -195,7 +183,7 @@ def _same_videos(one: list[str], two: list[str], first: str, other: str) -> None
 
 
 def _same_truth(
-    one: Source, rows: np.ndarray, two: Source, others: np.ndarray, first: str, other: str
+    one: ScoresReader, rows: np.ndarray, two: ScoresReader, others: np.ndarray, first: str, other: str
 ) -> None:
     mine, theirs = one.labels[rows], two.labels[others]
     differ = np.flatnonzero((mine != theirs) & (mine >= 0) & (theirs >= 0))
@@ -228,14 +216,14 @@ def _already_there(target: Path, entry: dict) -> bool:
 
 
 def _write(
-    writer: ScoresWriter, sources: Sequence[Source], rows: Sequence[np.ndarray], streams: Sequence[str],
+    writer: ScoresWriter, sources: Sequence[ScoresReader], rows: Sequence[np.ndarray], streams: Sequence[str],
     shares: np.ndarray,
 ) -> None:  # fmt: skip
     """In the first file's order; unknown labels and splits are taken from the files that know them."""
     own = np.stack([source.scores[at] for source, at in zip(sources, rows)])  # (files, S, C)
     weighed = np.sort(own * shares[:, None, None], axis=0)  # sorted: the sum doesn't depend on the files' order
     mean = weighed.sum(0)
-    labels = np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
+    labels = _labels(sources, rows)
     for row, name in enumerate(sources[0].names):
         split = next((s.splits[at[row]] for s, at in zip(sources, rows) if s.splits[at[row]]), "")
         writer.write(name, mean[row], label=int(labels[row]), split=split, streams=dict(zip(streams, own[:, row])))

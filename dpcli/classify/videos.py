@@ -29,7 +29,7 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
 
     UsageError when it held none out; DataError when the rule needs the file it was trained on and this is another.
     """
-    rule = info.notes.get("validation", "none")
+    rule = str(info.notes.get("validation", "none"))
     if rule == "none":
         raise UsageError(f"--split validation: {model_name} held no video out (--validation none); ask for another split")
     if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
