@@ -117,6 +117,9 @@ def test_the_videos_held_out_of_training_choose_the_streams_weights(data, run_fo
     assert dpc_here(*words, tmp_path / "held.h5", "--split", "validation").returncode == 0
     found = ScoresReader(tmp_path / "held.h5")
     assert held == set(found.names) and set(found.splits) == {"validation"} and 0 < len(held) < 8
+    looked = ("classify", "explain", "pac", data, "--model", run_folder, "-o", tmp_path / "pac.h5", "--samples", "99")
+    assert dpc_here(*looked, "--split", "validation").returncode == 0
+    assert set(CloudsReader(tmp_path / "pac.h5").names) == held
     dpc_here(*words, tmp_path / "test.h5")
     fused = dpc_here("classify", "fuse", tmp_path / "test.h5", "-o", tmp_path / "w.h5", "--weights-from", tmp_path / "held.h5")
     assert fused.returncode == 0, fused.stderr.decode()

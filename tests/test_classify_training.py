@@ -27,7 +27,7 @@ from tests.test_classify_commands import gestures
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "none")
-SHORT = (*SMALL, "--epochs", "3", "--epochs-dynamic", "2", "--lr", "0.0001")
+SHORT = (*SMALL, "--epochs", "3", "--epochs-dynamic", "2", "--lr", "0.0001", "--label-smoothing", "0.05")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -107,6 +107,22 @@ def test_a_batch_in_parts_has_the_gradient_of_the_batch():
         Schedule(batch=4, accumulate=3).share(1)
     with pytest.raises(UsageError, match="3 processes"):
         Schedule(batch=4).share(3)
+
+
+def test_label_smoothing_is_the_loss_against_a_share_of_every_class(alone):
+    """Loss of clip i: (1 - s) of its class's -log p and s of the mean over the classes."""
+    torch.manual_seed(0)
+    model = Kinet(network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3)).eval()
+    points, labels = torch.randn(4, 2, 64, 3) * 0.3, torch.tensor([0, 1, 2, 1])
+    with torch.no_grad():
+        surprise = -torch.log_softmax(model.static_logits(points), -1).double()
+    expected = 0.7 * surprise[torch.arange(4), labels].sum() + 0.3 * surprise.mean(-1).sum()
+    step = StageStep(model, 0, Schedule((1, 1), batch=4, label_smoothing=0.3), torch.device("cpu"), Processes())
+    assert step(points, labels, 1e-3)[0] == pytest.approx(float(expected), rel=1e-5)
+    for share in (-0.1, 1.0, float("nan")):
+        with pytest.raises(UsageError, match=f"--label-smoothing {share}"):
+            Schedule(label_smoothing=share)
+    assert json.loads((alone / "config.json").read_text())["schedule"]["label_smoothing"] == 0.05
 
 
 def test_mixed_precision_trains_both_streams_near_float32(monkeypatch):

@@ -13,7 +13,7 @@ from dpcli.classify.kinet import STREAMS, Kinet
 from dpcli.classify.model_file import find_model, load_model
 from dpcli.classify.predict import predict_videos
 from dpcli.classify.settings import network_config
-from dpcli.classify.videos import check_classes, held_out, report_short, select_videos
+from dpcli.classify.videos import check_classes, report_short, select_videos
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -34,8 +34,7 @@ def run_prediction(
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         check_classes(reader, info, model_name)
-        validation = split == "validation" and split not in reader.splits
-        sequences = held_out(reader, info, model_name) if validation else select_videos(reader, split)
+        sequences = select_videos(reader, split, info, model_name)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=seed)
         report_short(source, info.config.num_frames)
         config = {"split": split, "clips_per_video": clips_per_video, "drop_short": drop_short, "dropped": source.dropped,
@@ -46,7 +45,7 @@ def run_prediction(
         keep_freed_memory()
         with ScoresWriter(target, class_names=info.class_names, seed=seed, source=reader.path.name if data != "-" else "stdin",
                           provenance=history, streams=streams, force=force) as writer:  # fmt: skip
-            _score(model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if validation else None)
+            _score(model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if split == "validation" else None)
     if output != "-":
         print(f"{output}: scores of {len(writer)} videos in {len(info.class_names)} classes")
 

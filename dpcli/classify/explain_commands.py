@@ -60,7 +60,7 @@ def run_pac(
         reader = CloudsReader(path)
         check_classes(reader, info, model_name)
         axes = view_axes(view, reader.length_unit)
-        sequences = chosen_samples(reader, samples, _pool(reader, samples, split))
+        sequences = chosen_samples(reader, samples, _pool(reader, samples, split, info, model_name))
         source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=seed)
         report_short(source, info.config.num_frames)
         config = {"streams": list(streams), "rule": rule, "class": target, "stage": stage, "samples": samples, "split": split,
@@ -95,8 +95,9 @@ def _target(wanted: str | None, class_names: list[str]) -> str | int:
     raise UsageError(f"--class {wanted}: the model knows {', '.join(class_names)}; or say predicted or label")
 
 
-def _pool(reader: CloudsReader, samples: str, split: str) -> list[int]:
-    return select_videos(reader, split) if _is_count(reader, samples) else list(range(len(reader)))
+def _pool(reader: CloudsReader, samples: str, split: str, info: ModelInfo, model_name: str) -> list[int]:
+    counted = _is_count(reader, samples)
+    return select_videos(reader, split, info, model_name) if counted else list(range(len(reader)))
 
 
 def _is_count(reader: CloudsReader, samples: str) -> bool:
@@ -168,7 +169,8 @@ def run_tsne(
     with input_file(data) as path, output_file(output) as place:
         reader = CloudsReader(path)
         check_classes(reader, info, model_name)
-        source = ClipSource(reader, select_videos(reader, split), info.config, timing=info.timing, seed=seed)
+        sequences = select_videos(reader, split, info, model_name)
+        source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=seed)
         kept = source.sequences
         width = chosen_perplexity(perplexity, len(kept))
         report_short(source, info.config.num_frames)

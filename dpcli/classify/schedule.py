@@ -34,6 +34,7 @@ class Schedule:
             f"--batch {self.batch}: expected at least 1": self.batch < 1,
             f"--epochs {self.epochs}: expected 0 or more": min(self.epochs) < 0,
             f"--lr {rates}: expected numbers above 0": any(rate is not None and not rate > 0 for rate in rates),
+            f"--label-smoothing {self.label_smoothing}: expected 0 to below 1": not 0 <= self.label_smoothing < 1,
             f"--decay {self.decay}: expected cosine, staircase or constant": self.decay not in DECAYS,
             f"--accumulate {self.accumulate}: expected at least 1": self.accumulate < 1,
             f"--workers {self.workers}: expected 0 or more": self.workers < 0,

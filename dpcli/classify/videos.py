@@ -11,9 +11,12 @@ from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
 
-def select_videos(reader: CloudsReader, split: str) -> list[int]:
-    """Sequences of a split, of all for `all`; `auto` is the test split where there is one. DataError when there are none."""
+def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name: str) -> list[int]:
+    """Sequences of a split, of all for `all`; `auto` is the test split where there is one, `validation` is `held_out` where
+    no sample bears that name. DataError when there are none."""
     wanted = split
+    if split == "validation" and split not in reader.splits:
+        return held_out(reader, info, model_name)
     if split == "auto":
         wanted = "test" if "test" in reader.splits else "all"
     chosen = [i for i, name in enumerate(reader.splits) if wanted == "all" or name == wanted]

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from dpcli.cli import classify_stream
+from dpcli.cli.classify_explain import Split
 from dpcli.cli.classify_explain import app as explain_app
 from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
 from dpcli.errors import UsageError
@@ -68,6 +69,13 @@ def train(
         float | None, typer.Option(help="The same for the dynamic stage. Default: the preset's.")
     ] = None,
     decay: Annotated[str | None, typer.Option(help="cosine, staircase (x0.7 every 200,000 clips) or constant.")] = None,
+    label_smoothing: Annotated[
+        float | None,
+        typer.Option(
+            help="Share of each label spread over all classes, 0 to below 1: streams less sure of themselves."
+            " Default: the preset's (quick 0.1, others 0)."
+        ),
+    ] = None,
     augment: Annotated[
         str | None, typer.Option(help="ours, peers (axis scales), release or none. Default: the preset's.")
     ] = None,
@@ -134,6 +142,7 @@ def train(
     schedule = {
         "batch": batch, "learning_rate": lr, "learning_rate_dynamic": lr_dynamic, "decay": decay, "workers": workers,
         "clips_per_video": clips_per_video, "epochs": (epochs, epochs_dynamic), "accumulate": accumulate, "amp": amp,
+        "label_smoothing": label_smoothing,
     }  # fmt: skip
     from dpcli.classify.train_command import run_training
 
@@ -153,10 +162,7 @@ def predict(
         typer.Option("-o", "--output", help="File to write, or - for a pipe. With --stream: may be left out."),
     ] = None,
     backbone: TrustedBackbone = None,
-    split: Annotated[
-        str, typer.Option(help="Which samples: a split's name, all, auto (test where there is one), or validation: "
-                          "the training videos that the model's training held out.")
-    ] = "auto",
+    split: Split = "auto",
     clips_per_video: Annotated[int, typer.Option(help="Clips spread evenly over a video; 0 takes every start.")] = 0,
     drop_short: Annotated[
         bool, typer.Option("--drop-short", help="Leave out videos shorter than a clip instead of padding.")

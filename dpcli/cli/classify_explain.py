@@ -16,7 +16,13 @@ Data = Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")]
 Model = Annotated[
     str, typer.Option("--model", help="A .safetensors file, a folder made by train, or a shipped model's name.")
 ]
-Split = Annotated[str, typer.Option(help="Which samples: a split's name, all, or auto (test where there is one).")]
+Split = Annotated[
+    str,
+    typer.Option(
+        help="Which samples: a split's name, all, auto (test where there is one), or validation: the training videos that"
+        " the model's training held out."
+    ),
+]
 Stream = Annotated[
     str | None,
     typer.Option(
