@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import softmax
 from typer.testing import CliRunner
 
-from dpcli.classify.fuse import likelihood_weights, parse_weights, run_fusion, stream_names
+from dpcli.classify.fuse import geometric_weights, likelihood_weights, parse_weights, pooled, run_fusion, stream_names
 from dpcli.cli.app import app
 from dpcli.errors import DataError, UsageError
 from dpcli.store import ScoresReader, ScoresWriter
@@ -187,6 +188,54 @@ def test_likelihood_weights_are_the_best_there_are(models):
     np.testing.assert_allclose(likelihood_weights(np.array([[1.0, 0], [0, 1], [0, 1]])), [0.5, 0.25, 0.25], atol=1e-6)
 
 
+def test_the_geometric_mean_is_that_of_logits(two, tmp_path, capsys):
+    run_fusion([str(path) for path in two], str(tmp_path / "g.h5"), weights="3,1", force=False, mean="geometric")
+    assert "geometric mean of 2 scores of 3 videos" in capsys.readouterr().out
+    found = ScoresReader(tmp_path / "g.h5")
+    for row, name in enumerate(found.names):
+        logits = 0.75 * np.log(POINTS[name][1]) + 0.25 * np.log(FLOW[name][1])
+        np.testing.assert_allclose(found.scores[row], np.exp(logits) / np.exp(logits).sum(), rtol=1e-5)
+    assert np.abs(found.scores - fuse(two, tmp_path / "a.h5", "3,1").scores).max() > 0.01
+    assert found.provenance[-1]["config"]["mean"] == "geometric"
+    draws = np.random.default_rng(0).dirichlet(np.ones(4), (3, 5))
+    draws[0, 0] = [1, 0, 0, 0]  # a score of 0 is finite for the others
+    weights = np.array([0.5, 0.3, 0.2])
+    for mean in ("arithmetic", "geometric"):
+        there, back = pooled(draws, weights, mean), pooled(draws[::-1], weights[::-1], mean)
+        np.testing.assert_array_equal(there, back)
+        assert np.isfinite(there).all()
+        np.testing.assert_allclose(there.sum(-1), 1)
+    with pytest.raises(UsageError, match="--mean harmonic: expected arithmetic or geometric"):
+        run_fusion([str(path) for path in two], str(tmp_path / "x.h5"), weights=None, force=False, mean="harmonic")
+
+
+@pytest.mark.parametrize("models", [2, 3])
+def test_geometric_weights_are_the_best_there_are(models):
+    rng = np.random.default_rng(models)
+    draws, labels = rng.dirichlet(np.ones(4), (models, 60)), rng.integers(0, 4, 60)
+    for k in range(models):  # models that are right more or less often
+        named = np.where(rng.random(60) < 0.4 + 0.15 * k, labels, rng.integers(0, 4, 60))
+        draws[k, np.arange(60), named] += 0.5
+    draws /= draws.sum(-1, keepdims=True)
+
+    def likelihood(powers):
+        logits = np.tensordot(powers, np.log(draws), 1)
+        return float(np.log(softmax(logits, -1)[np.arange(60), labels]).sum())
+
+    found = geometric_weights(draws, labels)
+    np.testing.assert_allclose(found.sum(), 1)
+    scales = np.linspace(0.2, 8, 200)
+    best = max(likelihood(found * scale) for scale in scales)
+    others = [weights for weights in rng.dirichlet(np.ones(models), 60) if np.abs(weights - found).max() > 0.05]
+    assert all(best > likelihood(weights * scale) for weights in others for scale in scales)
+    equal = max(likelihood(np.full(models, scale / models)) for scale in scales)
+    assert best > equal + 1e-3 and np.argmax(found) == models - 1
+    sure = np.full((2, 3, 2), 0.5)
+    sure[0], sure[1] = [0.9, 0.1], [0.4, 0.6]
+    np.testing.assert_allclose(geometric_weights(sure, np.zeros(3, int)), [1, 0])  # one always right, one always wrong
+    np.testing.assert_allclose(geometric_weights(np.full((2, 3, 2), 0.5), np.zeros(3, int)), [0.5, 0.5])
+
+
 def test_weights_are_chosen_on_other_videos(tmp_path):
     rows = {"v0": (0, [0.6, 0.3, 0.1], [0.2, 0.3, 0.5]), "v1": (1, [1, 0, 0], [0, 1, 0])}
     one = with_streams(tmp_path / "one.h5", rows)
@@ -206,6 +255,10 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
     np.testing.assert_allclose(found.scores[0], best[0] * np.array([0.2, 0.3, 0.5]) + best[1] * np.array([0.6, 0.3, 0.1]), atol=1e-6)
 
     two = [write(tmp_path / "points.h5", POINTS), write(tmp_path / "flow.h5", FLOW)]
+    run_fusion([str(one)], str(tmp_path / "g.h5"), weights=None, force=False, weights_from=str(judge), mean="geometric")
+    static, dynamic = np.array([held[name][1:] for name in ("w0", "w1")]).swapaxes(0, 1)
+    np.testing.assert_allclose(ScoresReader(tmp_path / "g.h5").provenance[-1]["config"]["weights"],
+                               geometric_weights(np.stack([dynamic, static]), np.array([0, 1])), atol=1e-5)  # fmt: skip
     judges = [write(tmp_path / "a.h5", {"w": (0, [0.9, 0.1, 0])}), write(tmp_path / "b.h5", {"w": (0, [0.1, 0.9, 0])})]
     by = ",".join(map(str, judges))
     np.testing.assert_allclose(chosen(two, by).provenance[-1]["config"]["weights"], [1, 0], atol=1e-3)

@@ -1,4 +1,7 @@
-"""`dpc classify fuse`: the weighted mean of the scores of several models, or of one file's streams (thesis A.1.5)."""
+"""`dpc classify fuse`: the weighted mean of the scores of several models, or of one file's streams (thesis A.1.5).
+
+Arithmetic as the thesis writes it, or geometric, which is the mean of logits that the published code takes.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +17,24 @@ from dpcli.runtime import provenance
 from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
+MEANS = ("arithmetic", "geometric")
 _STEPS = 10_000  # of expectation-maximisation; some hundred are usual
+_POWER = 100.0  # scores are taken to no higher power: where every model is right, none would be high enough
 _LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
 
 
 def run_fusion(
-    inputs: Sequence[str], output: str, *, weights: str | None, force: bool, weights_from: str | None = None
-) -> None:
+    inputs: Sequence[str], output: str, *, weights: str | None, force: bool, weights_from: str | None = None,
+    mean: str = "arithmetic",
+) -> None:  # fmt: skip
     """Scores files of the same videos, in any order, become one whose `streams` are its inputs; of one file, its streams
     get another mean.
 
     weights: `parse_weights`; weights_from: scores files with commas between, as many as inputs and of other, labelled
-    videos, on which `likelihood_weights` chooses.
+    videos, on which `likelihood_weights` chooses; mean: `pooled`.
     """
+    if mean not in MEANS:
+        raise UsageError(f"--mean {mean}: expected {' or '.join(MEANS)}")
     if weights is not None and weights_from is not None:
         raise UsageError("--weights says them and --weights-from chooses them; give one of the two")
     judges = weights_from.split(",") if weights_from is not None else []
@@ -41,8 +49,8 @@ def run_fusion(
         streams, sources, rows = _streams(readers, called)
         shares = parse_weights(weights, streams, len(inputs) == 1)
         if judges:
-            shares = _chosen_weights(judges, streams, sources[0])
-        config = {"fuse": streams, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
+            shares = _chosen_weights(judges, streams, sources[0], mean)
+        config = {"fuse": streams, "mean": mean, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
         if judges:
             config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
         entry = provenance.record(config, 0, dict(zip(stream_names([Path(name).stem for name in called]), paths)))
@@ -50,10 +58,11 @@ def run_fusion(
             return
         with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(Path(name).name for name in called),
                           provenance=entry, streams=streams, force=force) as writer:  # fmt: skip
-            _write(writer, sources, rows, streams, shares)
+            _write(writer, sources, rows, streams, shares, mean)
     if output != "-":
         said = "" if np.ptp(shares) == 0 else f", weights {', '.join(f'{n} {w:.3g}' for n, w in zip(streams, shares))}"
-        print(f"{output}: mean of {len(streams)} scores of {len(writer)} videos{said}")
+        kind = "mean" if mean == "arithmetic" else f"{mean} mean"
+        print(f"{output}: {kind} of {len(streams)} scores of {len(writer)} videos{said}")
 
 
 def _streams(
@@ -101,8 +110,45 @@ def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -
     return values / values.sum()
 
 
+def pooled(scores: np.ndarray, weights: np.ndarray, mean: str) -> np.ndarray:
+    """Mean f64 (S,C) of what K models say, scores (K,S,C), by weights (K) of sum 1; the models' order makes no difference.
+
+    geometric: the product of the scores to the power of their weights, normalised to sum 1: softmax of the mean of logits. A
+    class needs every model's consent, where arithmetic lets the surest one decide.
+    """
+    if mean == "arithmetic":
+        return np.sort(scores * weights[:, None, None], axis=0).sum(0)
+    logits = np.sort(np.log(np.clip(scores, _LEAST, None)) * weights[:, None, None], axis=0).sum(0)
+    powers = np.exp(logits - logits.max(-1, keepdims=True))
+    return powers / powers.sum(-1, keepdims=True)
+
+
+def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Weights f64 (K), sum 1, of the geometric mean of scores (K,S,C) for labels i (S), by likelihood.
+
+    Fitted as powers from 0 up whose sum is free, as that says how sure the mean is and not which class it names: a convex
+    problem (multinomial regression without an intercept), solved by L-BFGS.
+    """
+    from scipy.optimize import minimize
+
+    logits = np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None))
+    true = logits[:, np.arange(len(labels)), labels]  # (K,S)
+
+    def loss(powers: np.ndarray) -> tuple[float, np.ndarray]:
+        mixed = np.tensordot(powers, logits, 1)
+        top = mixed.max(-1)
+        shares = np.exp(mixed - top[:, None])
+        total = shares.sum(-1)
+        expected = np.einsum("ksc,sc->ks", logits, shares / total[:, None])
+        return float((np.log(total) + top - powers @ true).mean()), (expected - true).mean(1)
+
+    start = np.full(len(logits), 1 / len(logits))
+    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(0, _POWER)] * len(logits)).x
+    return found / found.sum() if found.sum() > 0 else start
+
+
 def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
-    """Weights f64 (K), sum 1, of the mean that gives labelled samples the greatest likelihood.
+    """Weights f64 (K), sum 1, of the arithmetic mean that gives labelled samples the greatest likelihood.
 
     probabilities: (K,S), what each of K models gives the true class of each sample. The logarithm of the likelihood, sum_s log
     sum_k w_k p_ks, is concave in w, so expectation-maximisation from equal weights ends at its maximum.
@@ -118,7 +164,7 @@ def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
     return new
 
 
-def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: ScoresReader) -> np.ndarray:
+def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str) -> np.ndarray:
     """Weights chosen on labelled videos that are not among the fused ones. DataError when they don't fit."""
     names, sources, rows = _streams([ScoresReader(name) for name in judges], judges)
     if len(judges) == 1 and names != list(streams):
@@ -132,7 +178,10 @@ def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: Scores
     known = np.flatnonzero(labels >= 0)
     if not len(known):
         raise DataError(f"{judges[0]}: no video has a label; weights are chosen on labelled videos")
-    return likelihood_weights(np.stack([source.scores[at][known, labels[known]] for source, at in zip(sources, rows)]))
+    scores = np.stack([source.scores[at][known] for source, at in zip(sources, rows)])
+    if mean == "geometric":
+        return geometric_weights(scores, labels[known])
+    return likelihood_weights(scores[:, np.arange(len(known)), labels[known]])
 
 
 def stream_names(stems: Sequence[str]) -> list[str]:
@@ -217,13 +266,12 @@ def _already_there(target: Path, entry: dict) -> bool:
 
 def _write(
     writer: ScoresWriter, sources: Sequence[ScoresReader], rows: Sequence[np.ndarray], streams: Sequence[str],
-    shares: np.ndarray,
+    shares: np.ndarray, mean: str,
 ) -> None:  # fmt: skip
     """In the first file's order; unknown labels and splits are taken from the files that know them."""
     own = np.stack([source.scores[at] for source, at in zip(sources, rows)])  # (files, S, C)
-    weighed = np.sort(own * shares[:, None, None], axis=0)  # sorted: the sum doesn't depend on the files' order
-    mean = weighed.sum(0)
+    main = pooled(own, shares, mean)
     labels = _labels(sources, rows)
     for row, name in enumerate(sources[0].names):
         split = next((s.splits[at[row]] for s, at in zip(sources, rows) if s.splits[at[row]]), "")
-        writer.write(name, mean[row], label=int(labels[row]), split=split, streams=dict(zip(streams, own[:, row])))
+        writer.write(name, main[row], label=int(labels[row]), split=split, streams=dict(zip(streams, own[:, row])))

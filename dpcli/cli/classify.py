@@ -216,12 +216,15 @@ def fuse(
         typer.Option("--weights-from", help="Scores of other, labelled videos by the same models, as many files as are fused, with "
                      "commas between: the weights that suit them best (greatest likelihood)."),
     ] = None,
+    mean: Annotated[
+        str, typer.Option(help="arithmetic (thesis), or geometric: mean of logits, as in the published code.")
+    ] = "arithmetic",
     force: Force = False,
 ) -> None:
     """Average the scores of several models, such as one on points and one on flow; each stays as a stream of its own."""
     from dpcli.classify.fuse import run_fusion
 
-    run_fusion(scores, output, weights=weights, weights_from=weights_from, force=force)
+    run_fusion(scores, output, weights=weights, weights_from=weights_from, mean=mean, force=force)
 
 
 @app.command()
