@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 from dpcli.errors import UsageError
+from dpcli.runtime.products import choose_products
 
 
 def cpu_count() -> int:
@@ -18,15 +19,20 @@ def cpu_count() -> int:
 
 
 def choose_device(name: str = "auto"):
-    """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError when a CUDA device is asked for and absent."""
+    """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError when a CUDA device is asked for and absent.
+
+    For a CPU it also chooses the library that multiplies matrices (`products`).
+    """
     import torch
 
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        name = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         device = torch.device(name)
     except RuntimeError:
         raise UsageError(f"--device {name}: unknown device; use auto, cpu, cuda or cuda:N") from None
     if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
         raise UsageError(f"--device {name}: {torch.cuda.device_count()} CUDA devices are visible; use --device cpu")
+    if device.type == "cpu":
+        choose_products()
     return device

@@ -1,0 +1,50 @@
+"""Which library multiplies float32 matrices on a CPU."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+_SIDE = 256  # of the product that is tried
+_CLOSE = 1e-5  # relative error of float32 sums of that length; of bfloat16 it is 2.4e-3
+
+
+@functools.cache
+def choose_products() -> bool:
+    """Let oneDNN multiply float32 matrices where that is faster than torch's choice, as exactly; True where it does.
+
+    torch asks MKL, which on AMD's processors uses half of the vector width (AVX2), where oneDNN uses all of it (AVX-512):
+    2.3 times as fast. torch's only way to oneDNN is its leave to round factors to bfloat16. Processors without units for
+    that don't round; so a product is tried, and where its error isn't that of float32, or torch is older than 2.9 and has
+    no such setting, MKL stays. The setting is the whole process's.
+    """
+    import torch
+
+    settings = getattr(torch.backends.mkldnn, "matmul", None)
+    if not hasattr(settings, "fp32_precision") or not _wide_amd():
+        return False
+    before = settings.fp32_precision
+    settings.fp32_precision = "bf16"
+    if _error() < _CLOSE:
+        return True
+    settings.fp32_precision = before
+    return False
+
+
+def _wide_amd() -> bool:
+    import torch
+
+    try:
+        amd = "AuthenticAMD" in Path("/proc/cpuinfo").read_text().partition("flags")[0]
+    except OSError:  # not Linux
+        return False
+    return amd and torch.backends.cpu.get_cpu_capability() == "AVX512"
+
+
+def _error() -> float:
+    """Relative error of a product of float32 matrices, as this process computes it."""
+    import torch
+
+    left, right = torch.randn(2, _SIDE, _SIDE, generator=torch.Generator().manual_seed(0))
+    exact = left.double() @ right.double()
+    return float(((left @ right) - exact).norm() / exact.norm())
