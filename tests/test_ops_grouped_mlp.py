@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -82,6 +87,16 @@ def test_kernels_give_the_same_on_any_number_of_threads(features, one_thread, mo
         results.append([pooled, *statistics, *grads.values()])
     for one, two, three in zip(*results):
         assert torch.equal(one, two) and torch.equal(one, three)
+
+
+def test_numba_s_threads_leave_torch_the_number_it_was_given():
+    """numba starts its threads once a process, as many as there are CPUs; a job that asked for one keeps to one."""
+    code = ("import numba, torch; from dpcli.ops.parallel import parallel_kernels; parallel_kernels('kernels_grouped');"
+            "print(torch.get_num_threads(), numba.get_num_threads())")  # fmt: skip
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_NUM_THREADS"}
+    asked = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**environment, **asked})
+    assert done.stdout.split() == ["1", "1"], done.stderr
 
 
 def test_threads_that_shared_pieces_leave_torch_as_it_was(monkeypatch):

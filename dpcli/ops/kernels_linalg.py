@@ -468,11 +468,12 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
                     u[i, w] += out[j, i, w] * given[j, w]
         for w in range(size):
             p, k = (low + w) // groups, (low + w) % groups
-            trace = np.float32(0)
+            trace, asked = np.float32(0), False
             for i in range(n):
                 grad_right[(p * n + i) * groups + k] = u[i, w]
                 trace -= u[i, w] * x[i, w]
-            if acted[w]:
+                asked |= given[i, w] != 0
+            if acted[w] and asked:  # of a plane that nothing depends on, often a dead feature's, all gradients are 0
                 for i in range(n):
                     for j in range(n):
                         one[i, j], one_grad[i, j] = kept[i, j, w], np.float64(given[i, w]) * side[j, w]

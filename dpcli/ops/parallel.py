@@ -14,5 +14,8 @@ def parallel_kernels(module: str) -> ModuleType:
     import numba
     import torch
 
-    numba.set_num_threads(max(1, min(torch.get_num_threads(), numba.config.NUMBA_NUM_THREADS)))
+    threads = torch.get_num_threads()
+    numba.set_num_threads(max(1, min(threads, numba.config.NUMBA_NUM_THREADS)))
+    if torch.get_num_threads() != threads:  # starting its own threads, numba gives OpenMP, and so torch, as many
+        torch.set_num_threads(threads)
     return import_module(f"dpcli.ops.{module}")
