@@ -13,10 +13,11 @@ _CLOSE = 1e-5  # relative error of float32 sums of that length; of bfloat16 it i
 def choose_products() -> bool:
     """Let oneDNN multiply float32 matrices where that is faster than torch's choice, as exactly; True where it does.
 
-    torch asks MKL, which on AMD's processors uses half of the vector width (AVX2), where oneDNN uses all of it (AVX-512):
-    2.3 times as fast on Zen 5; Zen 4, whose units are half as wide, should gain little. torch's only way to oneDNN is its leave to round factors to bfloat16. Processors without units for
-    that don't round; so a product is tried, and where its error isn't that of float32, or torch is older than 2.9 and has
-    no such setting, MKL stays. The setting is the whole process's.
+    torch asks MKL, which on AMD's processors uses half of the vector width (AVX2), where oneDNN uses all of it
+    (AVX-512): 2.3 times as fast on Zen 5; Zen 4, whose units are half as wide, should gain little. torch's only way
+    to oneDNN is its leave to round factors to bfloat16. Processors without units for that don't round; so a product
+    is tried, and where its error isn't that of float32, or torch is older than 2.9 and has no such setting, MKL
+    stays. The setting is the whole process's.
     """
     import torch
 
