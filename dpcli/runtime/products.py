@@ -15,9 +15,9 @@ def choose_products() -> bool:
 
     torch asks MKL, which on AMD's processors uses half of the vector width (AVX2), where oneDNN uses all of it
     (AVX-512): 2.3 times as fast on Zen 5; Zen 4, whose units are half as wide, should gain little. torch's only way
-    to oneDNN is its leave to round factors to bfloat16. Processors without units for that don't round; so a product
-    is tried, and where its error isn't that of float32, or torch is older than 2.9 and has no such setting, MKL
-    stays. The setting is the whole process's.
+    to oneDNN is its leave to round factors to bfloat16, which oneDNN makes use of where the processor has AMX. So a
+    product is tried, and where its error isn't that of float32, or torch is older than 2.9 and has no such setting,
+    MKL stays. The setting is the whole process's.
     """
     import torch
 
