@@ -16,19 +16,18 @@ def choose_products() -> bool:
     torch asks MKL, which on AMD's processors uses half of the vector width (AVX2), where oneDNN uses all of it
     (AVX-512): 2.3 times as fast on Zen 5; Zen 4, whose units are half as wide, should gain little. torch's only way
     to oneDNN is its leave to round factors to bfloat16, which oneDNN makes use of where the processor has AMX. So a
-    product is tried, and where its error isn't that of float32, or torch is older than 2.9 and has no such setting,
-    MKL stays. The setting is the whole process's.
+    product is tried, and where its error isn't that of float32, MKL stays. The setting is the whole process's, and
+    would concern a GPU, too: where there is one, nothing is changed.
     """
     import torch
 
-    settings = getattr(torch.backends.mkldnn, "matmul", None)
-    if not hasattr(settings, "fp32_precision") or not _wide_amd():
+    if torch.cuda.is_available() or not _wide_amd():
         return False
-    before = settings.fp32_precision
-    settings.fp32_precision = "bf16"
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("medium")
     if _error() < _CLOSE:
         return True
-    settings.fp32_precision = before
+    torch.set_float32_matmul_precision(before)
     return False
 
 
