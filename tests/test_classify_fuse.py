@@ -270,5 +270,9 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
         with pytest.raises(error, match=message):
             chosen(inputs, judged, "x.h5")
     assert not (tmp_path / "x.h5").exists()
+    kept = judge.read_bytes()
+    with pytest.raises(UsageError, match="held.h5: is named twice"):
+        chosen([one], str(judge), "held.h5")  # the output would have taken its place
+    assert judge.read_bytes() == kept
     with pytest.raises(UsageError, match="one of the two"):
         run_fusion([str(one)], str(tmp_path / "x.h5"), weights="static=1,dynamic=1", force=False, weights_from=str(judge))

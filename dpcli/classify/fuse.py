@@ -41,6 +41,7 @@ def run_fusion(
     if weights_from is not None and len(judges) != len(inputs):
         raise UsageError(f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order")
     _refuse_repeats([*inputs, output])
+    _refuse_repeats([*judges, output])
     with ExitStack() as stack:
         paths = [stack.enter_context(input_file(name)) for name in inputs]
         target = stack.enter_context(output_file(output))
@@ -118,9 +119,13 @@ def pooled(scores: np.ndarray, weights: np.ndarray, mean: str) -> np.ndarray:
     """
     if mean == "arithmetic":
         return np.sort(scores * weights[:, None, None], axis=0).sum(0)
-    logits = np.sort(np.log(np.clip(scores, _LEAST, None)) * weights[:, None, None], axis=0).sum(0)
-    powers = np.exp(logits - logits.max(-1, keepdims=True))
-    return powers / powers.sum(-1, keepdims=True)
+    from scipy.special import softmax
+
+    return softmax(np.sort(_logits(scores) * weights[:, None, None], axis=0).sum(0), -1)
+
+
+def _logits(scores: np.ndarray) -> np.ndarray:
+    return np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None))
 
 
 def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
@@ -130,17 +135,15 @@ def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
     problem (multinomial regression without an intercept), solved by L-BFGS.
     """
     from scipy.optimize import minimize
+    from scipy.special import logsumexp, softmax
 
-    logits = np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None))
+    logits = _logits(scores)
     true = logits[:, np.arange(len(labels)), labels]  # (K,S)
 
     def loss(powers: np.ndarray) -> tuple[float, np.ndarray]:
         mixed = np.tensordot(powers, logits, 1)
-        top = mixed.max(-1)
-        shares = np.exp(mixed - top[:, None])
-        total = shares.sum(-1)
-        expected = np.einsum("ksc,sc->ks", logits, shares / total[:, None])
-        return float((np.log(total) + top - powers @ true).mean()), (expected - true).mean(1)
+        expected = np.einsum("ksc,sc->ks", logits, softmax(mixed, -1))
+        return float((logsumexp(mixed, -1) - powers @ true).mean()), (expected - true).mean(1)
 
     start = np.full(len(logits), 1 / len(logits))
     found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(0, _POWER)] * len(logits)).x
