@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.augment import NONE, PEERS, Augmentation
+from dpcli.classify.augment import NONE, PEERS, Augmentation, find_augmentation
 from dpcli.classify.clips import ClipSource, clip_frames, clip_starts, normalize, sample_points, uniform_frames
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.split import carve_validation, default_rule, folds
@@ -188,3 +188,31 @@ def test_a_uniform_training_clip_spans_most_of_the_video_in_order(reader):
     assert min(f[-1] - f[0] for f in seen) >= 2 and {f[0] for f in seen} >= {0, 1, 2} and len(set(seen)) > 20
     assert all(max(np.diff(f)) - min(np.diff(f)) <= 1 for f in seen)  # even steps: speeds must mean something
     assert source.clips(None)[0].frames == uniform_frames(10, 4) and len(source.clips(3)) == 3
+
+
+def test_a_clip_at_another_speed_leaves_out_or_repeats_frames(reader):
+    source = ClipSource(reader, [3], CONFIG, augmentation=Augmentation(speed=0.8))
+    seen = [np.array(source.epoch(n, 1)[0].frames) for n in range(400)]
+    steps = [np.diff(f) for f in seen]
+    assert all(f[0] >= 0 and f[-1] < 10 and (step >= 0).all() for f, step in zip(seen, steps))
+    assert all(step.max() - step.min() <= 1 for step in steps)  # a speed is one for the clip
+    spans = np.array([f[-1] - f[0] for f in seen])
+    assert set(spans) == {1, 2, 3, 4, 5, 6}  # 3 frames at 1/1.8 to 1.8 of the speed
+    assert abs(spans.mean() - 3 * (1.8 - 1 / 1.8) / (2 * np.log(1.8))) < 0.25  # 3 times the mean of a log-uniform factor
+    assert {int(f[-1]) for f in seen} >= {8, 9} and {int(f[0]) for f in seen} >= {0, 1, 6}
+
+
+def test_without_a_speed_clips_are_drawn_as_ever(reader):
+    still = ClipSource(reader, [2, 3], CONFIG, augmentation=Augmentation(), seed=5)
+    assert still.epoch(3, 2) == ClipSource(reader, [2, 3], CONFIG, seed=5).epoch(3, 2)
+    assert all((np.diff(clip.frames) == 1).all() for clip in still.epoch(3, 2) if clip.sequence == 3)
+
+
+def test_an_augmentation_is_a_preset_and_changes():
+    assert find_augmentation("ours") == Augmentation() and find_augmentation("none") == NONE
+    changed = find_augmentation("peers,turn=0.4,speed=0.3,per_axis=0")
+    assert changed == Augmentation(0.1, False, 0.4, 0, 0, 0, 0, 0, 0.3)
+    wrong = ("sped=1", "turn", "turn=x", "turn=-1", "turn=nan", "dropout=1", "")
+    for bad in ("", "mine", "turn=1", *(f"ours,{change}" for change in wrong)):
+        with pytest.raises(UsageError, match="--augment"):
+            find_augmentation(bad)

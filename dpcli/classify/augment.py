@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+
+from dpcli.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,14 @@ class Augmentation:
     jitter: float = 0.002  # length units, standard deviation for each point
     dropout: float = 0.2  # largest share of points replaced by their predecessor
     crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
+    speed: float = 0.0  # consecutive frames: played up to 1+s times as fast or as slow (frames left out or repeated)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            below_one = field.name in ("scale", "dropout", "crop")
+            if not 0 <= value < (1 if below_one else np.inf):
+                raise UsageError(f"--augment {field.name}={value}: expected 0 or more{', below 1' * below_one}")
 
     def __call__(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """points f32 (T,P,3) -> the same shape, a new array."""
@@ -38,6 +48,14 @@ class Augmentation:
             )
         return self._drop(moved, rng)
 
+    def frame_steps(self, frames: int, rng: np.random.Generator) -> np.ndarray:
+        """int (frames): a clip's frames counted from its first, at a random speed; 0, 1, 2, … without `speed`."""
+        if not self.speed:
+            return np.arange(frames)
+        fastest = np.log1p(self.speed)
+        factor = np.exp(rng.uniform(-fastest, fastest))
+        return np.floor(np.arange(frames) * factor + rng.random()).astype(int)
+
     def _drop(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if not self.dropout:
             return points
@@ -51,6 +69,26 @@ NONE = Augmentation(0, False, 0, 0, 0, 0, 0, 0)
 PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0, 0)
 RELEASE = Augmentation(0.1, False, 0, 0.06, 0, 0, 0.2, 0)
 PRESETS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
+
+
+def find_augmentation(text: str) -> Augmentation:
+    """A preset and changes to it: `ours`, or `peers,turn=0.4,speed=0.3`. UsageError lists what there is."""
+    preset, *changes = text.split(",")
+    known = [field.name for field in fields(Augmentation)]
+    if preset not in PRESETS:
+        raise UsageError(f"--augment {preset}: expected one of {', '.join(PRESETS)}, then changes such as ours,speed=0.3")
+    values: dict[str, float | bool] = {}
+    for change in changes:
+        name, _, number = change.partition("=")
+        try:
+            values[name] = float(number)
+        except ValueError:
+            raise UsageError(f"--augment {change}: expected NAME=NUMBER, with a name of {', '.join(known)}") from None
+        if name not in known:
+            raise UsageError(f"--augment {change}: expected one of {', '.join(known)}")
+    if "per_axis" in values:
+        values["per_axis"] = bool(values["per_axis"])
+    return replace(PRESETS[preset], **values)
 
 
 def _rotation(angles: np.ndarray) -> np.ndarray:

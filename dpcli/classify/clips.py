@@ -94,7 +94,9 @@ class ClipSource:
             lost = int(rng.uniform(0, self.augmentation.crop) * length)
             start = int(rng.integers(lost + 1))
             return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random())))
-        return Clip(sequence, clip_frames(length, frames, int(rng.integers(max(length - frames, 0) + 1))))
+        steps = self.augmentation.frame_steps(frames, rng)
+        start = int(rng.integers(max(length - 1 - int(steps[-1]), 0) + 1))
+        return Clip(sequence, tuple(min(start + int(step), length - 1) for step in steps))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:
         """The clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""

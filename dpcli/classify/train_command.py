@@ -8,7 +8,7 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
-from dpcli.classify.augment import PRESETS as AUGMENTATIONS
+from dpcli.classify.augment import find_augmentation
 from dpcli.classify.clips import ClipSource
 from dpcli.classify.curves import COLUMNS, draw_curves
 from dpcli.classify.kinet import Kinet
@@ -41,8 +41,6 @@ def run_training(
     """`dpc classify train`, alone or as one of torchrun's processes."""
     if timing not in ("clips", "uniform"):
         raise UsageError(f"--timing {timing}: expected clips or uniform")
-    if augment is not None and augment not in AUGMENTATIONS:
-        raise UsageError(f"--augment {augment}: expected one of {', '.join(AUGMENTATIONS)}")
     if static_from and init:
         raise UsageError("--init starts both streams, --static-from the static one: give one of them")
     if data == "-" and from_environment().count > 1:
@@ -50,7 +48,7 @@ def run_training(
     if pretrain:
         network, schedule = _pretraining(network, schedule)
     chosen = choose_device(device)
-    augmentation = AUGMENTATIONS[augment] if augment else find_preset(preset).augmentation
+    augmentation = find_augmentation(augment) if augment is not None else find_preset(preset).augmentation
     plan = training_schedule(preset, schedule, chosen)
     with input_file(data) as path, process_group(chosen) as processes:
         chosen = processes.place(chosen)

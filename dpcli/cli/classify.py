@@ -77,7 +77,12 @@ def train(
         ),
     ] = None,
     augment: Annotated[
-        str | None, typer.Option(help="ours, peers (axis scales), release or none. Default: the preset's.")
+        str | None,
+        typer.Option(
+            help="ours, peers (axis scales), release or none; then changes, as in ours,speed=0.3: scale, dropout, crop"
+            " (shares), turn, tilt (rad), shift, jitter (length units), per_axis (0, 1), speed (0.3: consecutive frames up to"
+            " 1.3 times as fast or slow). Default: the preset's."
+        ),
     ] = None,
     variant: Annotated[
         str | None, typer.Option(help="thesis or release: where text and published code disagree.")
