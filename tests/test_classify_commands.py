@@ -205,6 +205,15 @@ def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, d
     assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
 
 
+def test_a_random_speed_is_for_random_clips_of_consecutive_frames(data, tmp_path, dpc_here):
+    words = ("classify", "train", data, "-o", tmp_path / "run", *TRAIN, "--augment", "ours,speed=0.3")
+    for more in (("--timing", "uniform"), ("--clips-per-video", "0")):
+        refused = dpc_here(*words, *more)
+        assert refused.returncode == 2 and b"random clips" in refused.stderr and not (tmp_path / "run").exists()
+    assert dpc_here(*words, "--epochs", 1, "--epochs-dynamic", 0).returncode == 0
+    assert json.loads((tmp_path / "run" / "config.json").read_text())["augmentation"]["speed"] == 0.3
+
+
 def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
     from dpcli.classify.schedule import Schedule
     from dpcli.errors import DataError, UsageError

@@ -8,6 +8,8 @@ import numpy as np
 
 from dpcli.errors import UsageError
 
+_LIMITS = {"scale": 1, "dropout": 1, "crop": 1, "speed": 10}  # what a range must stay below
+
 
 @dataclass(frozen=True)
 class Augmentation:
@@ -25,14 +27,14 @@ class Augmentation:
     jitter: float = 0.002  # length units, standard deviation for each point
     dropout: float = 0.2  # largest share of points replaced by their predecessor
     crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
-    speed: float = 0.0  # consecutive frames: played up to 1+s times as fast or as slow (frames left out or repeated)
+    speed: float = 0.0  # with --timing clips, random clips: up to 1+s times as fast or slow (frames left out or repeated)
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
-            below_one = field.name in ("scale", "dropout", "crop")
-            if not 0 <= value < (1 if below_one else np.inf):
-                raise UsageError(f"--augment {field.name}={value}: expected 0 or more{', below 1' * below_one}")
+            value, limit = getattr(self, field.name), _LIMITS.get(field.name, np.inf)
+            if not 0 <= value < limit:
+                up = f"to below {limit}" if field.name in _LIMITS else "up"
+                raise UsageError(f"--augment {field.name}={value}: expected a finite number from 0 {up}")
 
     def __call__(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """points f32 (T,P,3) -> the same shape, a new array."""

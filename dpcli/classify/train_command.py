@@ -50,6 +50,9 @@ def run_training(
     chosen = choose_device(device)
     augmentation = find_augmentation(augment) if augment is not None else find_preset(preset).augmentation
     plan = training_schedule(preset, schedule, chosen)
+    if augmentation.speed and (timing == "uniform" or plan.clips_per_video is None):
+        raise UsageError(f"--augment {augment}: speed changes random clips of consecutive frames; leave it out with --timing uniform"
+                         " or --clips-per-video 0")  # fmt: skip
     with input_file(data) as path, process_group(chosen) as processes:
         chosen = processes.place(chosen)
         reader = CloudsReader(path)
