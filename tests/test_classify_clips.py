@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.classify.augment import NONE, PEERS, Augmentation, find_augmentation
-from dpcli.classify.clips import ClipSource, clip_frames, clip_starts, normalize, sample_points, uniform_frames
+from dpcli.classify.clips import Clip, ClipSource, clip_frames, clip_starts, normalize, sample_points, uniform_frames
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.split import carve_validation, default_rule, folds
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.seed import generator
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 CONFIG = KinetConfig(
@@ -205,6 +206,10 @@ def test_a_clip_at_another_speed_leaves_out_or_repeats_frames(reader):
 def test_without_a_speed_clips_are_drawn_as_ever(reader):
     still = ClipSource(reader, [2, 3], CONFIG, augmentation=Augmentation(), seed=5)
     assert still.epoch(3, 2) == ClipSource(reader, [2, 3], CONFIG, seed=5).epoch(3, 2)
+    rng, lengths = generator(5, 1, 3), reader.frame_counts
+    starts = [(s, int(rng.integers(max(int(lengths[s]) - 4, 0) + 1))) for s in (2, 3) for _ in range(2)]
+    drawn = [Clip(s, clip_frames(int(lengths[s]), 4, start)) for s, start in starts]  # one number a clip, then the order
+    assert still.epoch(3, 2) == [drawn[i] for i in rng.permutation(4)]
     assert all((np.diff(clip.frames) == 1).all() for clip in still.epoch(3, 2) if clip.sequence == 3)
 
 

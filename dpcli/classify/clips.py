@@ -95,8 +95,9 @@ class ClipSource:
             start = int(rng.integers(lost + 1))
             return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random())))
         steps = self.augmentation.frame_steps(frames, rng)
-        start = int(rng.integers(max(length - 1 - int(steps[-1]), 0) + 1))
-        return Clip(sequence, tuple(min(start + int(step), length - 1) for step in steps))
+        span = int(steps[-1]) + 1
+        shown = clip_frames(length, span, int(rng.integers(max(length - span, 0) + 1)))
+        return Clip(sequence, tuple(shown[step] for step in steps))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:
         """The clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
