@@ -47,13 +47,17 @@ def drawer(name: str, seed: int, frames: int = 3, points: int = 60, **fields) ->
     return CloudSequence.from_frames(name, clouds, part=parts, pose=np.stack(poses), **fields)
 
 
+def drawers(path: Path, count: int) -> Path:
+    """A file of drawers, the last third of them for testing."""
+    with CloudsWriter(path, class_names=["drawer"], fields=["part", "pose"]) as writer:
+        for i in range(count):
+            writer.write(drawer(f"d{i}", i, split="train" if i < count - count // 3 else "test", label=0))
+    return path
+
+
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("parts") / "clouds.h5"
-    with CloudsWriter(path, class_names=["drawer"], fields=["part", "pose"]) as writer:
-        for i in range(6):
-            writer.write(drawer(f"d{i}", i, split="train" if i < 4 else "test", label=0))
-    return path
+    return drawers(tmp_path_factory.mktemp("parts") / "clouds.h5", 6)
 
 
 @pytest.fixture(scope="module")

@@ -34,8 +34,8 @@ def boxes(count: int, points: int, seed: int) -> tuple[torch.Tensor, torch.Tenso
     return torch.from_numpy(np.float32(np.concatenate([body, lid], 1))), label
 
 
-def test_who_gets_it() -> None:
-    assert not wanted(None, CPU) and wanted(None, torch.device("cuda:0"))
+def test_who_gets_it() -> None:  # unasked on a GPU: test_gpu_path
+    assert not wanted(None, CPU)
     assert wanted(True, CPU) and not wanted(False, torch.device("cuda:0"))
 
 

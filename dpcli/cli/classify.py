@@ -62,7 +62,7 @@ def train(
     ] = None,
     amp: Annotated[
         bool | None,
-        typer.Option("--amp/--no-amp", help="Matrix products in bfloat16. Default: on a GPU yes, on a CPU no."),
+        typer.Option("--amp/--no-amp", help="Matrix products in bfloat16. Default: on GPUs that have it (Ampere and later)."),
     ] = None,
     lr: Annotated[float | None, typer.Option(help="Adam's learning rate. Default: the preset's.")] = None,
     lr_dynamic: Annotated[

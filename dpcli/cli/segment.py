@@ -14,7 +14,7 @@ app = typer.Typer(no_args_is_help=True)
 
 Amp = Annotated[
     bool | None,
-    typer.Option("--amp/--no-amp", help="Products in bfloat16, geometry in float32. Default: on CUDA only."),
+    typer.Option("--amp/--no-amp", help="Products in bfloat16, geometry in float32. Default: on GPUs that have it (Ampere and later)."),
 ]
 _FLOW = "First flow: icp (rigid pieces), nearest (point), or a trained estimator's file or folder (dpc segment flow)."
 

@@ -45,5 +45,10 @@ def _widened(value: Any) -> Any:
 
 
 def wanted(amp: bool | None, device: torch.device) -> bool:
-    """What --amp/--no-amp mean: without either, mixed precision on CUDA and none on a CPU, which it slows down."""
-    return device.type == "cuda" if amp is None else amp
+    """What --amp/--no-amp mean. Without either: mixed precision on a GPU that multiplies in bfloat16, none elsewhere.
+
+    A CPU would be slowed down by it, and so would GPUs before Ampere, where torch emulates bfloat16.
+    """
+    if amp is not None:
+        return amp
+    return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
