@@ -297,7 +297,7 @@ def test_runs_by_hand(run, scores):
     assert own["values"] == pytest.approx(values) and own["n"] == 3
     assert own["mean"] == pytest.approx(values.mean()) and own["sd"] == pytest.approx(values.std(ddof=1))
     half = 4.302653 * values.std(ddof=1) / math.sqrt(3)
-    assert own["interval"] == pytest.approx([values.mean() - half, values.mean() + half], abs=1e-6)
+    assert half > 0.7 and own["interval"] == [0, 1]  # which no share leaves
     assert found["runs"] == ["seed 0", "seed 1", "seed 2"]  # of the training, not of the prediction
     assert found["samples"]["number"] == 60 and found["denominators"] == {"runs": 3, "samples": 60}
     text = run("runs", *files, "--markdown", "--metrics", "accuracy")
@@ -313,6 +313,15 @@ def test_spread_equals_scipy():
     assert (found.interval.low, found.interval.high) == pytest.approx(expected, abs=1e-12)
     one = spread([0.5])
     assert one.mean == 0.5 and math.isnan(one.sd) and not one.interval.defined
+
+
+def test_the_interval_of_a_share_ends_where_its_mean_does():
+    two = spread([0.9, 0.98], share=True).interval  # two runs: 12.7 standard errors
+    assert two.low == pytest.approx(0.94 - 12.7062 * 0.04, abs=1e-4) and two.high == 1
+    assert spread([0.02, 0.1], share=True).interval.low == 0
+    for length in ([0.9, 0.98], [0.9, 1.4]):  # a length, or a share of the diameter that isn't one
+        assert spread(length, share=length[1] > 1).interval.high > 1.4
+
 
 
 def test_runs_of_parts_and_of_their_json_are_the_same(run, parts, tmp_path):

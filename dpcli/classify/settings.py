@@ -12,6 +12,7 @@ from dpcli.classify.config import KinetConfig
 from dpcli.classify.presets import find_preset, with_backbone
 from dpcli.classify.schedule import Schedule
 from dpcli.errors import UsageError
+from dpcli.runtime.device import cpu_count
 from dpcli.runtime.precision import wanted
 
 _RELEASE = {key: getattr(KinetConfig.release(), key) for key in
@@ -40,7 +41,7 @@ def training_schedule(preset: str, changes: dict[str, Any], device: torch.device
     epochs = tuple(new if new is not None else old for new, old in zip(changes.pop("epochs"), base.epochs))
     clips = changes.pop("clips_per_video") or None
     workers = changes.pop("workers")
-    workers = workers if workers is not None else (0 if device.type == "cpu" else 4)
+    workers = workers if workers is not None else (0 if device.type == "cpu" else min(4, cpu_count()))
     amp = wanted(changes.pop("amp"), device)
     given = {key: value for key, value in changes.items() if value is not None}
     return replace(base, epochs=epochs, clips_per_video=clips, workers=workers, amp=amp, **given)

@@ -128,7 +128,7 @@ def train(
         str | None, typer.Option(help="A trained model whose both streams to start from, e.g. of another --frames.")
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU, 4 on a GPU.")
+        int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU; with a GPU 4, or as many as there are CPUs.")
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",

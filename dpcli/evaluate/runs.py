@@ -56,12 +56,15 @@ class RunsReport:
     def spreads(self) -> dict[str, Spread]:
         """By metric; undefined where a run has no number."""
         columns = {key: [run.metrics[key] for run in self.runs] for key in self.units}
-        return {key: spread([math.nan if v is None else v for v in column], self.confidence)
+        return {key: spread([math.nan if v is None else v for v in column], self.confidence, self.units[key] == "fraction")
                 for key, column in columns.items()}  # fmt: skip
 
 
-def spread(values: Sequence[float], confidence: float = 0.95) -> Spread:
-    """Mean, sd (ddof 1) and Student's t interval of the mean of independent runs; one run has no sd and no interval."""
+def spread(values: Sequence[float], confidence: float = 0.95, share: bool = False) -> Spread:
+    """Mean, sd (ddof 1) and Student's t interval of the mean of independent runs; one run has no sd and no interval.
+
+    share: the interval of values from 0 to 1 ends there, as their mean does.
+    """
     column = np.asarray(values, np.float64)
     mean = float(column.mean())
     if len(column) < 2:
@@ -70,7 +73,10 @@ def spread(values: Sequence[float], confidence: float = 0.95) -> Spread:
 
     sd = float(column.std(ddof=1))
     half = float(stdtrit(len(column) - 1, (1 + confidence) / 2)) * sd / math.sqrt(len(column))
-    return Spread(mean, sd, Interval(mean - half, mean + half))
+    ends = np.array([mean - half, mean + half])
+    if share and 0 <= column.min() and column.max() <= 1:
+        ends = ends.clip(0, 1)
+    return Spread(mean, sd, Interval(*map(float, ends)))
 
 
 def evaluate_runs(
