@@ -19,7 +19,7 @@ def cpu_count() -> int:
 
 
 def choose_device(name: str = "auto"):
-    """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError when a CUDA device is asked for and absent.
+    """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError for any other, and when a CUDA device is asked for and absent.
 
     For a CPU it also chooses the library that multiplies matrices (`products`).
     """
@@ -30,7 +30,9 @@ def choose_device(name: str = "auto"):
     try:
         device = torch.device(name)
     except RuntimeError:
-        raise UsageError(f"--device {name}: unknown device; use auto, cpu, cuda or cuda:N") from None
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):  # torch knows more, of which none was tried
+        raise UsageError(f"--device {name}: unknown device; use auto, cpu, cuda or cuda:N")
     if device.type == "cuda" and (not torch.cuda.is_available() or (device.index or 0) >= torch.cuda.device_count()):
         raise UsageError(f"--device {name}: {torch.cuda.device_count()} CUDA devices are visible; use --device cpu")
     if device.type == "cpu":
