@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+import torch
 import typer
 from typer.testing import CliRunner
 
@@ -113,3 +114,28 @@ def test_what_every_worker_imports_is_little(reader):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == ""
+
+
+@pytest.mark.parametrize(
+    "error, expected",
+    [
+        (MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)"), "this machine (7.28 TiB more"),
+        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 44"), "the GPU (2.00 GiB more"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes."),
+         "this machine (8.0 GB more"),
+        (MemoryError(), "this machine; take less"),
+    ],
+)  # fmt: skip
+def test_too_little_memory_is_no_bug(error, expected, capsys):
+    assert cli._explain(error) == 1
+    assert f"not enough memory on {expected}" in capsys.readouterr().err
+
+
+def test_another_error_of_torch_s_stays_a_bug():
+    with pytest.raises(RuntimeError):
+        cli._explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"))
+
+
+def test_a_network_too_large_for_this_machine_is_told_so(dpc_here):
+    done = dpc_here("classify", "profile", "--preset", "tiny", "--points", 10**12)
+    assert done.returncode == 1 and b"not enough memory" in done.stderr and b"a bug" not in done.stderr

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import errno
 import os
+import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -140,10 +141,32 @@ def _explain(error: BaseException) -> int:
             f"no space left on the device while writing {error.filename or 'the output'}; free some and run again"
         )
         return 1
+    if _out_of_memory(error):
+        log.error(
+            f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"
+            " at a time: --batch or --accumulate in training, --points, --frames, --size, --jobs"
+        )
+        return 1
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return 1
     raise error
+
+
+def _out_of_memory(error: BaseException) -> bool:
+    """numpy raises MemoryError, torch RuntimeError: on a GPU a kind of its own, on a CPU a plain one."""
+    text = str(error)
+    said = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and said)
+
+
+def _asked_for(said: str) -> str:
+    found = re.search(r"allocate ([\d.]+) ?(\w+)", said)
+    if found is None:
+        return ""
+    from rich.filesize import decimal
+
+    return f" ({decimal(int(found[1])) if found[2] == 'bytes' else ' '.join(found.groups())} more were asked for)"
 
 
 def main(argv: list[str] | None = None) -> None:
