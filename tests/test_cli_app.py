@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import subprocess
 import sys
 
@@ -12,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from dpcli.cli import app as cli
+from dpcli.errors import UsageError
 from dpcli.prepare import head_start
 from dpcli.runtime import worker_server
 
@@ -139,3 +141,25 @@ def test_another_error_of_torch_s_stays_a_bug():
 def test_a_network_too_large_for_this_machine_is_told_so(dpc_here):
     done = dpc_here("classify", "profile", "--preset", "tiny", "--points", 10**12)
     assert done.returncode == 1 and b"not enough memory" in done.stderr and b"a bug" not in done.stderr
+
+
+def leaves(command):
+    below = getattr(command, "commands", {}).values()
+    return [leaf for one in below for leaf in leaves(one)] if below else [command]
+
+
+def test_no_option_takes_what_is_no_number():
+    checked = leaves(cli._refusing_nan(typer.main.get_command(cli.application())))
+    numbers = [(leaf, one) for leaf in checked for one in leaf.params if "float" in str(one.type_descriptor.annotation)]
+    assert len(numbers) > 60
+    for leaf, one in numbers:
+        with pytest.raises(UsageError, match=f"{one.opts[-1]} nan: expected a finite number"):
+            leaf.callback(**{one.name: math.nan})
+        with pytest.raises((TypeError, UsageError)) as refused:  # where it is let through, the other words are missing
+            leaf.callback(**{one.name: math.inf})
+        assert ("inf: expected a finite number" in str(refused.value)) == (one.default != math.inf)
+
+
+def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
+    done = dpc_here("classify", "train", "clouds.h5", "-o", "runs", "--lr", "nan")
+    assert done.returncode == 2 and done.stderr == b"dpc: error: --lr nan: expected a finite number\n"

@@ -14,6 +14,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.discovery import (
     PART_NEIGHBOURS,
     TRACK_NEIGHBOURS,
+    _clusters,
     adjusted_rand_index,
     attach,
     carry,
@@ -176,3 +177,8 @@ def test_fewer_gaussians_than_neighbours() -> None:
     points = scene.frame_mean[0].astype(np.float64)
     assert carry(scene, points, scene.time).shape == (5, 2, 3)
     assert list(surface_parts(scene, points, 0.0)) == [0, 1]
+
+
+def test_any_seed_serves_k_means():
+    points = np.random.default_rng(0).normal(size=(40, 3))
+    assert len(np.unique(_clusters(points, 3, 2**40 + 1))) == 3

@@ -39,6 +39,10 @@ def test_results_come_in_order_and_failures_as_results(jobs):
     assert isinstance(rows[3][1], ValueError) and [r for i, r in rows if i != 3] == [i * i for i in range(8) if i != 3]
 
 
+def test_more_jobs_than_a_pool_can_count_are_no_error():
+    assert [done for _, done in ordered_map(square, [1, 2], 10**12)] == [1, 4]
+
+
 def test_any_executor_serves_and_few_items_are_in_flight():
     taken = []
 

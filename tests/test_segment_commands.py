@@ -375,3 +375,19 @@ def test_a_flow_estimator_is_trained_and_used(dpc, data, tmp_path):
     assert (folder / "curves.png").exists() and done.stdout.decode().strip().endswith("best.safetensors")
     used = dpc("segment", "predict", data, "--method", "ward", "--flow", folder, "-o", tmp_path / "p.h5", OMP_NUM_THREADS="1")
     assert used.returncode == 0, used.stderr.decode()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--group", "foo"), ("--pooling", "foo"), ("--smooth", "-1"), ("--cold-start", "-0.5"), ("--motion-after", "-0.1"),
+     ("--lr", "0"), ("--tau", "0"), ("--loss", "foo"), ("--consensus", "foo")],
+)  # fmt: skip
+def test_a_wrong_choice_is_named_before_anything_is_made(words, dpc_here, data, tmp_path):
+    done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, *words)
+    assert done.returncode == 2 and f"{words[0]} {words[1]}".encode() in done.stderr and b"expected" in done.stderr
+    assert not (tmp_path / "model").exists()
+
+
+def test_a_profile_names_the_groups_it_knows(dpc_here):
+    done = dpc_here("segment", "profile", "--group", "foo")
+    assert done.returncode == 2 and b"--group foo: expected icosahedral or trivial" in done.stderr

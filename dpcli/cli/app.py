@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import copy
 import errno
+import functools
+import math
 import os
 import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 import typer
 
 from dpcli import __version__
-from dpcli.errors import DpcError
+from dpcli.errors import DpcError, UsageError
 
 # Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores, and a large
 # tensor in pages of 4 kB takes longer to get from the system than to fill.
@@ -169,10 +172,31 @@ def _asked_for(said: str) -> str:
     return f" ({decimal(int(found[1])) if found[2] == 'bytes' else ' '.join(found.groups())} more were asked for)"
 
 
+def _refusing_nan(command: Any) -> Any:
+    """The command, or all below it, ending where an option is nan, or is infinite and not so by default."""
+    for below in getattr(command, "commands", {}).values():
+        _refusing_nan(below)
+    run = command.callback
+    if run is None:
+        return command
+    options = {one.name: one for one in command.params}
+
+    @functools.wraps(run)
+    def checked(*args: Any, **values: Any) -> Any:
+        for name, value in values.items():
+            for number in value if isinstance(value, (list, tuple)) else [value]:
+                if isinstance(number, float) and not math.isfinite(number) and number != options[name].default:
+                    raise UsageError(f"{options[name].opts[-1]} {number}: expected a finite number")
+        return run(*args, **values)
+
+    command.callback = checked
+    return command
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = typer.main.get_command(application(arguments))
+    command = _refusing_nan(typer.main.get_command(application(arguments)))
     from dpcli.runtime.progress import log
 
     try:

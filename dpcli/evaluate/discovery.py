@@ -127,7 +127,8 @@ def _clusters(points: np.ndarray, count: int, seed: int) -> np.ndarray:
     from sklearn.cluster import KMeans
 
     count = min(count, len(np.unique(points, axis=0)))
-    return KMeans(count, n_init=10, random_state=seed).fit_predict(points.astype(np.float64))
+    state = seed % 2**32  # all that scikit-learn takes
+    return KMeans(count, n_init=10, random_state=state).fit_predict(points.astype(np.float64))
 
 
 def carry(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.ndarray:

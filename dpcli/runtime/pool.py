@@ -19,6 +19,8 @@ from dpcli.runtime import handover
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 
+_MOST = 1024  # processes; with far more, the counters of a pool's queue overflow
+
 
 def _start_worker() -> None:
     """The parent decides when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
@@ -39,7 +41,7 @@ def _end_with_parent() -> None:
 
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
     ensure_server()
-    return ProcessPoolExecutor(jobs, multiprocessing.get_context("forkserver"), initializer=_start_worker)
+    return ProcessPoolExecutor(min(jobs, _MOST), multiprocessing.get_context("forkserver"), initializer=_start_worker)
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:

@@ -45,6 +45,11 @@ class PartConfig:
     motion_layers: tuple[int, ...] = (32, 16)
     points: int = 512  # per frame in training
 
+    def __post_init__(self) -> None:
+        for option, value, known in (("--group", self.group, ("icosahedral", "trivial")), ("--pooling", self.pooling, ("point", "global"))):
+            if value not in known:
+                raise UsageError(f"{option} {value}: expected {' or '.join(known)}")
+
     def changed(self, **changes: object) -> PartConfig:
         return dataclasses.replace(self, **{key: value for key, value in changes.items() if value is not None})
 

@@ -47,7 +47,7 @@ class Schedule:
         for option, value, least in (("--epochs", self.epochs, 1), ("--batch", self.batch, 1)):
             if value < least:
                 raise UsageError(f"{option} {value}: expected {least} or more")
-        if not self.learning_rate > 0:
+        if not 0 < self.learning_rate < math.inf:
             raise UsageError(f"--lr {self.learning_rate}: expected a number above 0")
 
     def rate(self, step: int, steps: int) -> float:
