@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.ops.splatting import rasterization
 from dpcli.store.gaussians import read_scene
@@ -143,3 +143,19 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
         RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
     done = dpc_here("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
     assert done.returncode == 2 and b"another configuration" in done.stderr
+
+
+def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monkeypatch):
+    views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
+    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--size", 16, "--dense-steps", 1, "--sparse-steps", 1)
+    for name, said in (("no/x.png", b"the folder"), ("x.foo", b"unknown kind '.foo'"), ("", b"unknown kind ''")):
+        done = dpc_here(*words, "--picture", tmp_path / name if name else "")
+        assert done.returncode in (2, 3) and said in done.stderr and not (tmp_path / "scene.fit").exists()
+
+    def full(model, targets, path: Path) -> None:
+        if path.name == "sheet.png":  # not the previews while it learns
+            raise DataError(f"{path}: no space left")
+
+    monkeypatch.setattr("dpcli.generate4d.commands.write_preview", full)
+    done = dpc_here(*words, "--picture", tmp_path / "sheet.png")
+    assert done.returncode == 3 and read_scene(scene).num_frames == FRAMES

@@ -391,3 +391,9 @@ def test_a_wrong_choice_is_named_before_anything_is_made(words, dpc_here, data, 
 def test_a_profile_names_the_groups_it_knows(dpc_here):
     done = dpc_here("segment", "profile", "--group", "foo")
     assert done.returncode == 2 and b"--group foo: expected icosahedral or trivial" in done.stderr
+
+
+@pytest.mark.parametrize("words", [("--picture", "no/x.png"), ("--picture", "x.foo"), ("--turntable", "x.png")])
+def test_pictures_that_cannot_be_written_are_refused_before_the_work(words, dpc_here, data, tmp_path):
+    done = dpc_here("segment", "predict", data, "-o", tmp_path / "parts.h5", words[0], tmp_path / words[1])
+    assert done.returncode in (2, 3) and words[0].encode() in done.stderr and not (tmp_path / "parts.h5").exists()

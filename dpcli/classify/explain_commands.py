@@ -17,7 +17,6 @@ from dpcli.classify.explain_pictures import (
     PICTURES,
     activation_animation,
     activation_sheet,
-    check_target,
     plane_picture,
     view_axes,
 )
@@ -41,6 +40,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.embedding import StreamEmbedding, write_embedding
+from dpcli.store.pipes import check_target
 
 
 def run_pac(

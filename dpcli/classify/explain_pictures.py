@@ -20,14 +20,6 @@ _MARKERS = "osD^vP*X"
 _RATE = 6  # images per second of an animation
 
 
-def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
-    """Say before the work that nothing can be written there: UsageError, DataError."""
-    if path.suffix.lower() not in kinds:
-        raise UsageError(f"{option} {path}: unknown kind {path.suffix!r}; expected {', '.join(kinds)}")
-    if not path.absolute().parent.is_dir():
-        raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
-
-
 def view_axes(text: str | None, length_unit: str) -> np.ndarray:
     """Rows f32 (3,3): the axes that point right, down and away, from names such as `xyz` or `x-zy`.
 

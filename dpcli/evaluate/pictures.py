@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.protocol import ClassificationReport
 from dpcli.evaluate.ratio import divide
 from dpcli.evaluate.tables import percent
+from dpcli.store.pipes import check_target
 
 _SUFFIXES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")
 _INCH_PER_CLASS = 0.30  # a cell holds three digits at this size
@@ -18,11 +18,8 @@ _LONGEST_NAME = 28  # characters of a class name on an axis
 
 
 def check_picture(path: Path) -> None:
-    """Say at once, before the work, that a picture can't be written there: UsageError, DataError."""
-    if path.suffix.lower() not in _SUFFIXES:
-        raise UsageError(f"--picture {path}: unknown kind of picture {path.suffix!r}; expected {', '.join(_SUFFIXES)}")
-    if not path.absolute().parent.is_dir():
-        raise DataError(f"--picture {path}: the folder {path.parent} does not exist; create it first")
+    """`check_target` for the figures of this package."""
+    check_target(path, "--picture", _SUFFIXES)
 
 
 def confusion_picture(report: ClassificationReport, path: Path) -> None:

@@ -27,6 +27,7 @@ from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import scene_origin, write_scene
+from dpcli.store.pipes import check_target
 
 
 def run_fit(
@@ -37,6 +38,8 @@ def run_fit(
     config = preset(preset_name, **changes)
     if prior not in PRIORS:
         raise UsageError(f"--prior {prior}: expected one of {', '.join(PRIORS)}")
+    if picture is not None:
+        check_target(picture, "--picture", (".png", ".jpg", ".jpeg"))
     chosen = choose_device(device)
     where = _run_folder(output, run)
     with input_file(views) as path:
@@ -60,12 +63,12 @@ def run_fit(
             model = fit.run().cpu()
             model.refresh_neighbours()
         scene = to_scene(model, targets, _metrics(model, targets, fit))
-        if picture is not None:
-            write_preview(model, targets, picture)
         history = [*targets.history, provenance.record(record, seed, {"views": path})]
         with output_file(output) as place:
             write_scene(place, scene, seed=seed, source=targets.name, provenance=history,
                         length_unit=targets.length_unit, force=force)  # fmt: skip
+        if picture is not None:
+            write_preview(model, targets, picture)
     log.info(f"reference view {scene.metrics['psnr_reference']:.2f} dB PSNR, {scene.metrics['gaussians']} Gaussians,"
              f" {scene.metrics['seconds']:.0f} s")  # fmt: skip
 

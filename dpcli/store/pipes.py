@@ -7,7 +7,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -45,6 +45,16 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
         if path.stat().st_size == 0:
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
         yield path
+
+
+def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
+    """Say before the work that no file of one of these kinds (`.png` ...) can be written there: UsageError, DataError."""
+    if path.suffix.lower() not in kinds:
+        raise UsageError(f"{option} {path}: unknown kind {path.suffix!r}; expected {', '.join(kinds)}")
+    if not path.absolute().parent.is_dir():
+        raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
+    if path.is_dir():
+        raise DataError(f"{option} {path}: is a folder; name a file in it")
 
 
 def _regular_file(stream: BinaryIO) -> Path | None:
