@@ -20,7 +20,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench lint clean table-4.1 table-4.2 table-5.2
+.PHONY: help venv demo test bench fuzz lint clean table-4.1 table-4.2 table-5.2
 .PHONY: table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
@@ -37,6 +37,7 @@ help:
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
+	@echo "make fuzz                     every option of the commands with odd values: none may end as a bug; half an hour"
 	@echo "make clean                    remove .venv, demo/ and caches"
 	@echo "PYTHON=python3.12 make ...    uses another Python (3.10 to 3.13)"
 
@@ -171,6 +172,9 @@ table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
 	$(BIN)/python -m tests.tables.table_5_2 "$(MESHES)" table/5.2
 
+fuzz: $(READY)
+	$(BIN)/python -m tests.fuzz_options fuzz --only "$(ONLY)"
+
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m tests.bench.bench_ops
@@ -186,5 +190,5 @@ lint: $(READY)
 	$(BIN)/python -m ruff check .
 
 clean:
-	rm -rf $(VENV) demo table build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo table fuzz build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import os
+import signal
 import subprocess
 import sys
 
@@ -16,6 +18,7 @@ from dpcli.cli import app as cli
 from dpcli.errors import UsageError
 from dpcli.prepare import head_start
 from dpcli.runtime import worker_server
+from tests.fuzz_options import forked, is_bug, odd
 
 
 def paths_of(group: typer.Typer) -> list[tuple[str, ...]]:
@@ -163,3 +166,11 @@ def test_no_option_takes_what_is_no_number():
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
     done = dpc_here("classify", "train", "clouds.h5", "-o", "runs", "--lr", "nan")
     assert done.returncode == 2 and done.stderr == b"dpc: error: --lr nan: expected a finite number\n"
+
+
+def test_the_search_for_bugs_tells_one_from_a_refusal():
+    for work in (lambda: 1 // 0, lambda: os.kill(os.getpid(), signal.SIGKILL), lambda: print("dpc: error: KeyError (a bug, or an unus", file=sys.stderr) or 1):
+        assert is_bug(*forked(work))
+    assert not is_bug(*forked(lambda: print("--lr nan: expected a finite number", file=sys.stderr) or 2))
+    tried = list(odd("evaluate runs a.h5 --confidence 0.9".split()))
+    assert ["evaluate", "runs", "a.h5", "--confidence", "nan"] in tried and len(tried) > 20
