@@ -380,7 +380,7 @@ def test_a_flow_estimator_is_trained_and_used(dpc, data, tmp_path):
 @pytest.mark.parametrize(
     "words",
     [("--group", "foo"), ("--pooling", "foo"), ("--smooth", "-1"), ("--cold-start", "-0.5"), ("--motion-after", "-0.1"),
-     ("--lr", "0"), ("--tau", "0"), ("--loss", "foo"), ("--consensus", "foo")],
+     ("--lr", "0"), ("--lr", "1e+300"), ("--tau", "0"), ("--loss", "foo"), ("--consensus", "foo")],
 )  # fmt: skip
 def test_a_wrong_choice_is_named_before_anything_is_made(words, dpc_here, data, tmp_path):
     done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, *words)
