@@ -223,7 +223,6 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
         {"batch": 0},
         {"epochs": (-1, 1)},
         {"learning_rate": -1.0},
-        {"learning_rate": 1e300},  # overflows float32
         {"decay": "foo"},
         {"workers": -1},
         {"clips_per_video": -2},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import math
 import os
@@ -164,8 +165,14 @@ def test_no_option_takes_what_is_no_number():
 
 
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
-    done = dpc_here("classify", "train", "clouds.h5", "-o", "runs", "--lr", "nan")
-    assert done.returncode == 2 and done.stderr == b"dpc: error: --lr nan: expected a finite number\n"
+    for room, number, below in (("classify", "nan", ""), ("classify", "1e+300", " below 1e+30"), ("segment", "1e+300", " below 1e+30")):
+        done = dpc_here(room, "train", "clouds.h5", "-o", "runs", "--lr", number)
+        assert done.returncode == 2 and done.stderr.decode() == f"dpc: error: --lr {number}: expected a finite number{below}\n"
+
+
+@pytest.mark.parametrize("number, said", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "disk quota"), (errno.EFBIG, "too large")])
+def test_a_full_disk_is_no_bug(number, said, capsys):
+    assert cli._explain(OSError(number, "of the system")) == 1 and said in capsys.readouterr().err
 
 
 def test_the_search_for_bugs_tells_one_from_a_refusal():

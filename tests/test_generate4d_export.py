@@ -129,6 +129,10 @@ def test_a_sequence_has_the_names_and_files_that_players_take(scene, tmp_path):
         export_sequence(scene, tmp_path / "clip", "splat")
     export_sequence(scene, tmp_path / "clip", "splat", force=True)
     assert not list((tmp_path / "clip").glob("*.ply"))
+    (tmp_path / "clip" / "mine").mkdir()
+    with pytest.raises(UsageError, match="other things, too, such as mine"):
+        export_sequence(scene, tmp_path / "clip", "ply", force=True)
+    assert list((tmp_path / "clip").glob("*.splat")) and (tmp_path / "clip" / "mine").is_dir()
     assert [path.name for path in tmp_path.iterdir()] == ["clip"]  # nothing half-made stays
 
 

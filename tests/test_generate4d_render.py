@@ -213,6 +213,12 @@ def test_nothing_half_made_stays(tmp_path):
     assert (tmp_path / "a.png").read_bytes() == b"mine"
     with pytest.raises(UsageError, match="ends in .mp4, .gif, .png"):
         output_kind(Path("a.avi"))
+    write_pictures(tmp_path / "frames", iter(_moving()), fps=10)
+    write_pictures(tmp_path / "frames", iter(_moving()), fps=10, force=True)
+    (tmp_path / "frames" / "thesis.tex").write_bytes(b"mine")
+    with pytest.raises(UsageError, match="other things, too, such as thesis.tex"):
+        write_pictures(tmp_path / "frames", iter(_moving()), fps=10, force=True)
+    assert (tmp_path / "frames" / "thesis.tex").read_bytes() == b"mine"
     with pytest.raises(DpcError, match="does not exist"):
         write_pictures(tmp_path / "no" / "a.png", iter(_moving()), fps=10)
 

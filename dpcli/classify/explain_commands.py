@@ -14,7 +14,6 @@ from dpcli.classify.clips import ClipSource
 from dpcli.classify.explain_pac import ActivationCloud, Question, activation_cloud
 from dpcli.classify.explain_pictures import (
     ANIMATIONS,
-    PICTURES,
     activation_animation,
     activation_sheet,
     plane_picture,
@@ -40,7 +39,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.embedding import StreamEmbedding, write_embedding
-from dpcli.store.pipes import check_target
+from dpcli.store.pipes import FIGURES, PICTURES, check_target
 
 
 def run_pac(
@@ -162,7 +161,7 @@ def run_tsne(
     backbone: str | None = None,
 ) -> None:  # fmt: skip
     """`dpc classify explain tsne`."""
-    _check_targets(output, force, (picture, "--picture", (*PICTURES, ".pdf", ".svg")))
+    _check_targets(output, force, (picture, "--picture", FIGURES))
     chosen = choose_device(device)
     model, info = load_model(model_name, backbone)
     streams = _streams(stream, info)

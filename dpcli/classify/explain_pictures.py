@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.classify.explain_pac import ActivationCloud
 from dpcli.errors import DataError, UsageError
 
-PICTURES, ANIMATIONS = (".png", ".jpg", ".jpeg"), (".gif", ".mp4")
+ANIMATIONS = (".gif", ".mp4")
 _CELL, _GAP, _TITLE, _MARGIN = 132, 3, 20, 58  # pixels: of a cell, between cells, of a title's line, left of the rows
 _BACKGROUND, _INK, _FAINT = (17, 20, 26), (226, 230, 236), (130, 138, 150)
 _MARKERS = "osD^vP*X"

@@ -35,6 +35,8 @@ ROOMS = {
 }
 
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
+_LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
+_FULL = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "disk quota exceeded", errno.EFBIG: "file too large"}
 
 
 def _version(wanted: bool) -> None:
@@ -139,10 +141,8 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return 2
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        log.error(
-            f"no space left on the device while writing {error.filename or 'the output'}; free some and run again"
-        )
+    if isinstance(error, OSError) and error.errno in _FULL:
+        log.error(f"{_FULL[error.errno]} while writing {error.filename or 'the output'}; free some and run again")
         return 1
     if _out_of_memory(error):
         log.error(
@@ -173,7 +173,7 @@ def _asked_for(said: str) -> str:
 
 
 def _refusing_nan(command: Any) -> Any:
-    """The command, or all below it, ending where an option is nan, or is infinite and not so by default."""
+    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default."""
     for below in getattr(command, "commands", {}).values():
         _refusing_nan(below)
     run = command.callback
@@ -185,8 +185,9 @@ def _refusing_nan(command: Any) -> Any:
     def checked(*args: Any, **values: Any) -> Any:
         for name, value in values.items():
             for number in value if isinstance(value, (list, tuple)) else [value]:
-                if isinstance(number, float) and not math.isfinite(number) and number != options[name].default:
-                    raise UsageError(f"{options[name].opts[-1]} {number}: expected a finite number")
+                if isinstance(number, float) and not abs(number) < _LARGEST and number != options[name].default:
+                    below = f" below {_LARGEST:g}" if math.isfinite(number) else ""
+                    raise UsageError(f"{options[name].opts[-1]} {number}: expected a finite number{below}")
         return run(*args, **values)
 
     command.callback = checked

@@ -9,9 +9,8 @@ import numpy as np
 from dpcli.evaluate.protocol import ClassificationReport
 from dpcli.evaluate.ratio import divide
 from dpcli.evaluate.tables import percent
-from dpcli.store.pipes import check_target
+from dpcli.store.pipes import FIGURES, check_target
 
-_SUFFIXES = (".png", ".pdf", ".svg", ".jpg", ".jpeg")
 _INCH_PER_CLASS = 0.30  # a cell holds three digits at this size
 _SMALLEST = 3.2  # inches of matrix, however few the classes
 _LONGEST_NAME = 28  # characters of a class name on an axis
@@ -19,7 +18,7 @@ _LONGEST_NAME = 28  # characters of a class name on an axis
 
 def check_picture(path: Path) -> None:
     """`check_target` for the figures of this package."""
-    check_target(path, "--picture", _SUFFIXES)
+    check_target(path, "--picture", FIGURES)
 
 
 def confusion_picture(report: ClassificationReport, path: Path) -> None:

@@ -27,7 +27,7 @@ from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import scene_origin, write_scene
-from dpcli.store.pipes import check_target
+from dpcli.store.pipes import PICTURES, check_target
 
 
 def run_fit(
@@ -39,7 +39,7 @@ def run_fit(
     if prior not in PRIORS:
         raise UsageError(f"--prior {prior}: expected one of {', '.join(PRIORS)}")
     if picture is not None:
-        check_target(picture, "--picture", (".png", ".jpg", ".jpeg"))
+        check_target(picture, "--picture", PICTURES)
     chosen = choose_device(device)
     where = _run_folder(output, run)
     with input_file(views) as path:

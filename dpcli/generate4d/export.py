@@ -15,6 +15,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
+from dpcli.store.pipes import check_replaced
 
 FORMATS = ("ply", "ply-sequence", "splat", "splat-sequence", "clouds", "cameras", "metrics")
 AXES = ("player", "keep")
@@ -60,6 +61,7 @@ def export_sequence(
         raise UsageError(f"{folder}: exists already; --force replaces it")
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
+    check_replaced(folder, ("frame*.ply", "frame*.splat", "cameras.json", "metrics.json"))
     times = scene.time.tolist() if times is None else list(times)
     width = max(4, len(str(len(times))))
     names = [f"frame{number:0{width}d}.{form}" for number in range(1, len(times) + 1)]

@@ -28,6 +28,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.seed import generator
 from dpcli.store import ViewsReader, input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
+from dpcli.store.pipes import check_target
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
 _SHEET_SIDE = 160  # pixels of its pictures
@@ -46,6 +47,8 @@ def run_render(
     look = Look(colour, parse_background(background), trajectories)
     if output is None and picture is None:
         raise UsageError("nothing to write: -o FILE for a video, a picture or a folder, --picture FILE for a sheet")
+    if picture is not None:
+        check_target(picture, "--picture", (".png",))
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
         digest = provenance.record({"cameras": bool(cameras)}, int(root["seed"]), {"gaussians": place})
@@ -92,8 +95,6 @@ def _render_sheet(renderer, look, picture: Path, lens: Lens, columns: int, time:
     """Rows: the reference camera, then around the object; columns: instants of the clip."""
     from dpcli.generate4d.render import sheet
 
-    if picture.suffix.lower() != ".png":
-        raise UsageError(f"--picture {picture}: expected a name that ends in .png")
     look = replace(look, background=look.background or (255, 255, 255))
     scene, small = renderer.scene, replace(lens, size=lens.size or _SHEET_SIDE)
     span = np.linspace(scene.time[0], scene.time[-1], min(columns, scene.num_frames)) if time is None else [time]

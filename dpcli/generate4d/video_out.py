@@ -13,6 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime.progress import log
+from dpcli.store.pipes import check_replaced
 
 KINDS = (".mp4", ".gif", ".png")
 _QUALITY = 18  # x264's constant rate factor: visually lossless
@@ -34,6 +35,7 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, fo
     kind = output_kind(path)
     if path.exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
+    check_replaced(path, ("[0-9]*.png",))
     if not path.parent.is_dir():
         raise DataError(f"{path}: the folder {path.parent} does not exist; create it first")
     hidden = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))

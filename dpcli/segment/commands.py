@@ -32,7 +32,7 @@ from dpcli.segment.predict import Estimate, Refinement, Segmenter, network_segme
 from dpcli.segment.train import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
-from dpcli.store.pipes import check_target
+from dpcli.store.pipes import PICTURES, check_target
 
 _SHOWN = 8  # sequences in a picture
 CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
@@ -156,7 +156,7 @@ def run_prediction(
     picture: Path | None, ply: Path | None, turntable: Path | None, amp: bool | None = None,
 ) -> None:  # fmt: skip
     """`dpc segment predict`."""
-    for path, option, kinds in ((picture, "--picture", (".png", ".jpg", ".jpeg")), (turntable, "--turntable", (".gif",))):
+    for path, option, kinds in ((picture, "--picture", PICTURES), (turntable, "--turntable", (".gif",))):
         if path is not None:
             check_target(path, option, kinds)
     chosen = choose_device(device)

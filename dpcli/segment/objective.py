@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -52,10 +51,10 @@ class Objective:
             f"--consensus {self.consensus}: expected thesis, release or none": self.consensus
             not in ("thesis", "release", "none"),
             f"--flow-decay {self.flow_decay}: expected 0 to 1": not 0 <= self.flow_decay <= 1,
-            f"--tau {self.tau}: expected a number above 0": not 0 < self.tau < math.inf,
+            f"--tau {self.tau}: expected a number above 0": not self.tau > 0,
         }
         for option, weight in (("--smooth", self.smooth), ("--invariance", self.invariance), ("--cold-start", self.cold_start)):
-            problems[f"{option} {weight}: expected a weight, 0 or more"] = not 0 <= weight < math.inf
+            problems[f"{option} {weight}: expected a weight, 0 or more"] = not weight >= 0
         for option, share in (("--cold-until", self.cold_until), ("--motion-after", self.motion_after),
                               ("--update-after", self.update_after), ("--consensus-after", self.consensus_after)):  # fmt: skip
             problems[f"{option} {share}: expected a fraction of the training, 0 or more"] = not share >= 0  # above 1: never

@@ -47,8 +47,8 @@ class Schedule:
         for option, value, least in (("--epochs", self.epochs, 1), ("--batch", self.batch, 1)):
             if value < least:
                 raise UsageError(f"{option} {value}: expected {least} or more")
-        if not 0 < self.learning_rate < 1e30:  # float32 has to hold it
-            raise UsageError(f"--lr {self.learning_rate}: expected a number above 0 and below 1e30")
+        if not self.learning_rate > 0:
+            raise UsageError(f"--lr {self.learning_rate}: expected a number above 0")
 
     def rate(self, step: int, steps: int) -> float:
         """Learning rate of one step of `steps`."""

@@ -9,11 +9,14 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
 
+PICTURES = (".png", ".jpg", ".jpeg")
+FIGURES = (*PICTURES, ".pdf", ".svg")
 _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
 
 
@@ -55,6 +58,14 @@ def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
         raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
     if path.is_dir():
         raise DataError(f"{option} {path}: is a folder; name a file in it")
+
+
+def check_replaced(folder: Path, own: Sequence[str]) -> None:
+    """Before --force replaces a folder whole: UsageError where it holds what no name pattern of the command's own covers."""
+    if folder.is_dir():
+        others = [one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)]
+        if others:
+            raise UsageError(f"{folder}: holds other things, too, such as {min(others)}; name another folder, or empty it yourself")
 
 
 def _regular_file(stream: BinaryIO) -> Path | None:
