@@ -75,7 +75,8 @@ test: $(READY)
 
 # Chapter 3 and appendix A (docs/tables.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
 # PRESET quick or thesis; SEEDS; BUDGET: words for `dpc classify train`, such as "--epochs 40 --batch 16"; CLIPS per video
-# at prediction; PREPARE: words for `dpc prepare`.
+# at prediction; PREPARE: words for `dpc prepare`. Table 3.4: the other lengths go on from the network of FROM frames (none:
+# each on its own), by MORE, words for `dpc classify train`.
 NVGESTURE ?=
 SHREC17   ?=
 NTU60     ?=
@@ -83,6 +84,7 @@ MODELNET  ?=
 PRESET    ?= quick
 SEEDS     ?= 0,1,2
 FRAMES    ?= 4,8,12,16,24
+FROM      ?= 16
 FOLDS     ?= 10
 FLOW      ?= icp
 needs      = $(if $(strip $($(1))),,$(error make $@ needs $(1)=folder, $(2)))
@@ -91,6 +93,7 @@ MSR_IS    := the folder of MSRAction-3D's depth videos
 NV_IS     := the folder of NvGesture's lists and Video_data
 EITHER     = $(if $(strip $(NVGESTURE)),nvgesture "$(NVGESTURE)",msraction3d "$(MSRACTION)")
 PLAN       = --preset $(PRESET) --seeds "$(SEEDS)" $(if $(CLIPS),--clips $(CLIPS)) $(if $(PREPARE),--prepare="$(PREPARE)")
+CHAIN      = --from "$(FROM)" $(if $(MORE),--more="$(MORE)")
 TABLES    := $(BIN)/python -m tests.tables
 
 table-3.1: $(READY)
@@ -108,7 +111,7 @@ table-3.3: $(READY)
 
 table-3.4: $(READY)
 	$(call needs,MSRACTION,$(MSR_IS))
-	$(TABLES).accuracy_tables 3.4 "$(MSRACTION)" table/3.4 --only "$(FRAMES)" $(PLAN) -- $(BUDGET)
+	$(TABLES).accuracy_tables 3.4 "$(MSRACTION)" table/3.4 --only "$(FRAMES)" $(CHAIN) $(PLAN) -- $(BUDGET)
 
 table-3.5: $(READY)
 	$(call needs,NTU60,the folder of nturgb+d_depth_masked or of its ZIPs)

@@ -8,11 +8,14 @@ import json
 import os
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from dpcli.classify.model_file import load_model
 from dpcli.cli.app import main
 from dpcli.store import CloudSequence, CloudsWriter, ScoresReader, ScoresWriter
 from tests.tables import accuracy_tables, figure_3_5, figure_3_8, figure_a_4, runs, table_3_1
@@ -167,15 +170,42 @@ def test_a_stopped_table_keeps_what_is_done_and_goes_on(clouds, tmp_path):
     with pytest.raises(SystemExit) as ended:
         accuracy_tables.main(words, stopped)
     assert ended.value.code == 75 and [call[-1] for call in stopped.trained] == ["0", "0", "1"]  # settings, then seeds
+    assert [call[call.index("--frames") + 1] for call in stopped.trained] == ["16", "4", "16"]
     half = (tmp_path / "table.md").read_text()
     assert "84.30 / 84.18" in half and "83.84 / –" in half
     going_on = Pretended()
     accuracy_tables.main(words, going_on)
     assert len(going_on.trained) == 2 and all(call[call.index("--seed") + 1] == "1" for call in going_on.trained)
-    assert all("--epochs 3" in " ".join(call) for call in going_on.trained)
+    whole, shorter = (" ".join(call) for call in going_on.trained)
+    assert "--validation none --epochs 3 --frames 16" in whole and "--init" not in whole
+    start = tmp_path / "quick-16-seed1" / "model"
+    assert f"--epochs 3 --init {start} --epochs 15 --epochs-dynamic 40 --lr 0.0005 --frames 4" in shorter
+    assert "from whose network of the same seed" in half
     line = next(row for row in (tmp_path / "table.md").read_text().splitlines() if row.startswith("| 16 frames"))
     assert line.split(" | ")[1:6] == ["84.30 / 84.18 ± 0.00", "– / 87.54 ± 0.00", "91.92 / 90.91 ± 0.00", "2", "297"]
     assert list(json.loads((tmp_path / "results.json").read_text())["cells"]["16"]) == ["0", "1"]
+
+
+def test_other_lengths_go_on_from_the_first_one_or_stand_alone(clouds, tmp_path):
+    """A real network of 4 frames learns on from the real one of 16; with `--from none` it starts anew, in another folder."""
+    plan, padded = Plan("tiny", 1, BUDGET, "16", ("--lr", "1e-9")), replace(EXPERIMENTS["3.4"], short=False)
+    found = accuracy_tables.make(padded, {"clouds": clouds}, tmp_path, plan, [0], ["4"], here)
+    assert sorted(key for key, seeds in found.items() if seeds) == ["16", "4"]
+    first, second = (load_model(str(tmp_path / f"tiny-{name}-seed0" / "model"), None)[0] for name in ("16", "4-from16"))
+    assert second.config.num_frames == 4
+    for (name, before), after in zip(first.named_parameters(), second.parameters()):
+        torch.testing.assert_close(before, after, atol=1e-6, rtol=0, msg=name)  # a rate this small changes nothing
+    alone = Pretended()
+    accuracy_tables.main(["3.4", "-", str(tmp_path), "--clouds", str(clouds), "--seeds", "0", "--only", "4", "--from", "none"], alone)
+    assert len(alone.trained) == 1 and "--init" not in alone.trained[0] and (tmp_path / "quick-4-seed0").is_dir()
+
+
+def test_a_length_that_is_not_there_ends_with_a_sentence(clouds, tmp_path, capsys):
+    for words, said in ((["3.4", "--from", "20"], "--from: no setting '20'; there are 4, 8, 12, 16, 24"),
+                        (["3.2", "--from", "kinet"], "--from: the settings of table 3.2 don't go on")):  # fmt: skip
+        with pytest.raises(SystemExit) as ended:
+            accuracy_tables.main([words[0], "-", str(tmp_path), *words[1:], "--clouds", str(clouds)], Pretended())
+        assert ended.value.code == 2 and said in capsys.readouterr().err
 
 
 def test_numbers_of_the_thesis():

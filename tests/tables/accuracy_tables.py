@@ -34,6 +34,7 @@ from tests.tables.runs import (  # fmt: skip
 )
 
 STREAMS = ("static", "dynamic", "fused")
+MORE = "--epochs 15 --epochs-dynamic 40 --lr 0.0005"  # README's networks of 4 to 24 frames were made so
 EVERY_START = ("thesis", "release")  # presets that score every clip of a video by default; the others 8 spread over it
 
 
@@ -58,6 +59,7 @@ class Experiment:
     prepare: Mapping[str, tuple[str, ...]]
     settings: tuple[Setting, ...]
     short: bool = False  # peers leave out videos shorter than a clip: scored that way too
+    first: str = ""  # the setting whose network the others go on from, where a setting only differs in length
 
 
 _GESTURES = ("--frames", "32", "--timing", "uniform", "--normalize", "image")  # facts of the peers' loaders
@@ -70,7 +72,7 @@ EXPERIMENTS = {
         Setting("no-bbox", "bounding box no", "no-bbox", _GESTURES, "bounding box no", {"static": 86.5, "dynamic": 92.6}))),
     "3.4": Experiment("3.4", "MSRAction-3D", {"clouds": ("msraction3d", "--points", "2048")}, tuple(
         Setting(f"{n}", f"{n} frames", "clouds", ("--frames", f"{n}"), f", {n} frames", {"static": 84.30} if n == 16 else {})
-        for n in (4, 8, 12, 16, 24)), short=True),
+        for n in (4, 8, 12, 16, 24)), short=True, first="16"),
     "3.5": Experiment("3.5", "NTU RGB+D 60", {"xsub": ("ntu60", "--protocol", "xsub", "--points", "2048"),
                                               "xview": ("ntu60", "--protocol", "xview", "--points", "2048")}, (
         Setting("xsub", "cross-subject", "xsub", _NTU, "cross-subject"),
@@ -80,16 +82,31 @@ EXPERIMENTS = {
 
 @dataclass(frozen=True)
 class Plan:
-    """How every cell is trained and scored. clips: per video at prediction, 0 = every start."""
+    """How every cell is trained and scored. clips: per video at prediction, 0 = every start.
+
+    first: the setting whose network of the same seed all others go on from, by the words `more` after the budget's own.
+    """
 
     preset: str
     clips: int
     budget: tuple[str, ...]
+    first: str = ""
+    more: tuple[str, ...] = ()
 
     def cell(self, setting: Setting, seed: int, clouds: Path, folder: Path) -> Cell:
-        train = ("--preset", self.preset, "--validation", "none", *self.budget, *setting.words, "--seed", seed)
-        return Cell(folder / f"{self.preset}-{setting.key}-seed{seed}", clouds, train,
-                    ("--clips-per-video", self.clips, "--seed", seed))  # fmt: skip
+        name, budget = f"{self.preset}-{setting.key}", self.budget
+        if self.first and setting.key != self.first:
+            start = folder / f"{self.preset}-{self.first}-seed{seed}" / "model"
+            name, budget = f"{name}-from{self.first}", (*budget, "--init", str(start), *self.more)
+        train = ("--preset", self.preset, "--validation", "none", *budget, *setting.words, "--seed", seed)
+        return Cell(folder / f"{name}-seed{seed}", clouds, train, ("--clips-per-video", self.clips, "--seed", seed))
+
+    def __str__(self) -> str:
+        """What a reader has to type."""
+        said = f"`dpc classify train {' '.join(['--preset', self.preset, '--validation none', *self.budget])}`"
+        return said if not self.first else (
+            f"{said} at {self.first} frames, from whose network of the same seed the other lengths go on "
+            f"(`--init`, `{' '.join(self.more)}`)")  # fmt: skip
 
 
 def too_short(clouds: Path, words: Sequence[str], split: str = "test") -> int:
@@ -152,9 +169,12 @@ def table(experiment: Experiment, cells: Mapping[str, Mapping[int, dict]], about
     return "\n\n".join([title, said, markdown(header, rows), about]) + "\n"
 
 
-def _rounds(experiment: Experiment, only: Sequence[str], seeds: Sequence[int]) -> Iterator[tuple[Setting, int]]:
-    """Every setting once, then again with the next seed: a table that is stopped early has all lines."""
-    return ((one, seed) for seed in seeds for one in experiment.settings if one.key in only)
+def _rounds(
+    experiment: Experiment, only: Sequence[str], seeds: Sequence[int], first: str = ""
+) -> Iterator[tuple[Setting, int]]:
+    """Every setting once, then again with the next seed: a table that is stopped early has all lines. `first` leads."""
+    order = sorted(experiment.settings, key=lambda one: one.key != first)
+    return ((one, seed) for seed in seeds for one in order if one.key in only or one.key == first)
 
 
 def make(
@@ -163,8 +183,7 @@ def make(
 ) -> dict[str, dict[int, dict]]:  # fmt: skip
     """Run what isn't done; table.md and results.json after every cell. clouds: by name, the prepared files."""
     about = (
-        f"Ours: `dpc classify train {' '.join(['--preset', plan.preset, '--validation none', *plan.budget])}` and each "
-        f"line's own {', '.join(word for word in experiment.settings[0].words if word.startswith('--'))}; "
+        f"Ours: {plan} and each line's own {', '.join(word for word in experiment.settings[0].words if word.startswith('--'))}; "
         f"{some(plan.clips, 'clip') if plan.clips else 'every clip'} of a video scored. Thesis: its own data and budget"
         + (", mean of 10 runs." if experiment.short else ".")
     )
@@ -177,7 +196,7 @@ def make(
 
     for setting, seed in _rounds(experiment, [one.key for one in experiment.settings if one.data in clouds], seeds):
         look(setting, seed, train=False)
-    for setting, seed in _rounds(experiment, only, seeds):
+    for setting, seed in _rounds(experiment, only, seeds, plan.first):
         look(setting, seed, train=True)
         write_json(folder / "results.json", {"table": experiment.number, "about": about, "cells": cells})
         write_text(folder / "table.md", table(experiment, cells, about))
@@ -219,20 +238,26 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     parser.add_argument("raw", help="the data set's folder; - with --clouds")
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", default="", help="some of the table's settings: 16, bbox, xsub ...")
+    parser.add_argument("--from", dest="first", help="3.4: the length whose network the others go on from; 16, or none")
+    parser.add_argument("--more", default=MORE, help=f"3.4: how they go on; {MORE}")
     add_plan(parser)
     given = parser.parse_args(own)
     experiment = EXPERIMENTS[given.table]
     known = [one.key for one in experiment.settings]
     only = given.only.replace(" ", ",").split(",") if given.only else known
-    unknown = [key for key in only if key not in known]
-    if unknown:
-        parser.error(f"--only: no setting {unknown[0]!r}; there are {', '.join(known)}")
+    first = {None: experiment.first, "none": ""}.get(given.first, given.first)
+    for option, keys in (("--only", only), ("--from", [first] if first else [])):
+        unknown = [key for key in keys if key not in known]
+        if unknown:
+            parser.error(f"{option}: no setting {unknown[0]!r}; there are {', '.join(known)}")
+    if first and not experiment.first:
+        parser.error(f"--from: the settings of table {experiment.number} don't go on from one another")
     needed = list(dict.fromkeys(one.data for one in experiment.settings if one.key in only))
     if given.clouds:
         clouds = dict.fromkeys(needed, given.clouds)
     else:
         clouds = prepared(experiment, given.raw, given.folder, needed, given.prepare.split(), run)
-    plan = Plan(given.preset, clips_of(given.preset, given.clips), tuple(budget))
+    plan = Plan(given.preset, clips_of(given.preset, given.clips), tuple(budget), first, tuple(given.more.split()))
     make(experiment, clouds, given.folder, plan, numbers(given.seeds), only, run)
     sys.stdout.write((given.folder / "table.md").read_text())
 
