@@ -30,7 +30,7 @@ help:
 	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
 	@echo "make table-3.1 NVGESTURE=folder [MODELNET=folder]  ablations of Kinet; or MSRACTION=folder"
 	@echo "make table-3.2 NVGESTURE=folder, table-3.3 SHREC17=folder, table-3.5 NTU60=folder  accuracy"
-	@echo "make table-3.4 MSRACTION=folder accuracy on 4 to 24 frames, three seeds; 1 1/2 hours on 2 cores"
+	@echo "make table-3.4 MSRACTION=folder accuracy on 4 to 24 frames, three seeds; over an hour on 2 cores"
 	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; days"
 	@echo "make figure-3.8 MSRACTION=folder parameters, FLOPs, accuracy of three backbones (= table-A.1)"
 	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/tables.md says more of all of these"
