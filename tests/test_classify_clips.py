@@ -114,6 +114,34 @@ def test_normalisations():
     assert np.isfinite(normalize(flat, "image")).all()
 
 
+def _body(tall: float, frames: int = 6) -> np.ndarray:
+    """A clip (T,200,3) of one shape, `tall` times its size, that crouches in its last frame and stands off centre."""
+    shape = np.random.default_rng(0).normal(0, (0.1, 0.3, 0.1), (200, 3))
+    clip = np.tile(shape, (frames, 1, 1))
+    clip[-1, :, 1] *= 0.5
+    return (clip * tall + [1, -2, 3]).astype(np.float32)
+
+
+def test_equal_height_makes_bodies_of_any_size_and_unit_the_same_clip():
+    child, adult, millimetres = (normalize(_body(tall), "height") for tall in (0.8, 1.2, 1200))
+    assert np.allclose(child, adult, atol=1e-5) and np.allclose(millimetres, adult, atol=1e-4)
+    assert not np.allclose(normalize(_body(0.8), "center"), normalize(_body(1.2), "center"), atol=1e-2)
+    deviations = adult[..., 1].std(1)
+    assert np.allclose(deviations[:-1], 0.27, atol=1e-5)
+    assert np.isclose(deviations[-1], 0.135, atol=1e-4)  # a factor for each frame would hide the crouching
+    assert adult.dtype == np.float32 and np.allclose(adult.mean((0, 1)), 0, atol=1e-5)
+
+
+def test_equal_height_of_clips_with_empty_frames_or_without_height():
+    clip = _body(1.2)
+    clip[:4] = 0  # what `sample_points` makes of empty frames: most of the clip
+    assert np.isclose(normalize(clip, "height")[4:, :, 1].std(1).max(), 0.27 * 4 / 3, atol=1e-4)  # median of whole and half
+    flat = _body(1.2)
+    flat[..., 1] = 5
+    for points in (flat, np.zeros_like(flat)):
+        assert np.allclose(normalize(points, "height"), points - points.mean((0, 1)), atol=1e-5)
+
+
 def test_augmentation_is_one_rigid_draw_a_clip():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3, 40, 3)).astype(np.float32)

@@ -291,7 +291,7 @@ def test_values_are_carried_from_the_three_nearest_centroids_in_space_and_time()
     assert frame_length(KinetConfig(radii=(0.6, 1.2), temporal_radius=2)) == pytest.approx(0.2)
 
 
-@pytest.mark.parametrize("rule", ["none", "center", "unit", "image"])
+@pytest.mark.parametrize("rule", ["none", "center", "height", "unit", "image"])
 def test_all_points_go_where_normalisation_took_the_drawn_ones(data, rule):
     config = KinetConfig(**{**TINY, "points_per_frame": 40}, normalize=rule)  # all points are drawn
     source = ClipSource(CloudsReader(data), [0], config)

@@ -39,7 +39,7 @@ from dpcli.runtime.signals import StopRequest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 
 ROOT = Path(__file__).resolve().parents[1]
-CONFIG = KinetConfig(num_classes=3, num_frames=4, points_per_frame=24, centroids=(16, 8), neighbors=9, normalize="center",
+CONFIG = KinetConfig(num_classes=3, num_frames=4, points_per_frame=24, centroids=(16, 8), neighbors=9, normalize="height",
                      widths=((8, 8), (8, 16), (16, 32)))  # fmt: skip
 NAMES = ["left", "right", "still"]
 CPU = torch.device("cpu")

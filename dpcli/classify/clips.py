@@ -124,17 +124,26 @@ def sample_points(frame: np.ndarray, count: int, rng: np.random.Generator) -> np
     return frame[np.concatenate(picks)]
 
 
+DEVIATION = 0.27  # length units, of y, under `height`: as of a body 1.1 tall, which the presets' radii are meant for
+
+
 def normalize(points: np.ndarray, rule: str) -> np.ndarray:
     """A clip's coordinates (T,P,3) as the configuration's `normalize` says.
 
-    `image` is the gesture benchmarks' rule for (row, column, depth) in pixels and depth units:
-    rows / 120, columns / 160, depth / its deviation, each about its mean over the clip.
+    `height` makes bodies equally tall, whatever the unit: y, the vertical, deviates by `DEVIATION` in the median frame. One
+    factor a clip, so that who crouches or rises within it still does. `image` is the gesture benchmarks' rule for (row,
+    column, depth) in pixels and depth units: rows / 120, columns / 160, depth / its deviation, each about its mean over the
+    clip.
     """
     if rule == "none":
         return points
     centered = points - points.mean((0, 1))
     if rule == "center":
         return centered
+    if rule == "height":
+        deviations = centered[..., 1].std(1, dtype=np.float64)
+        seen = deviations[deviations > 1e-6]  # an empty frame says nothing about the body
+        return (centered * np.float32(DEVIATION / np.median(seen) if len(seen) else 1)).astype(np.float32)
     if rule == "unit":
         return centered / max(float(np.linalg.norm(centered, axis=-1).max()), 1e-9)
     deviation = float(centered[..., 2].std())

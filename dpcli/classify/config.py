@@ -20,8 +20,8 @@ class KinetConfig:
     num_classes: int = 20
     num_frames: int = 16
     points_per_frame: int = 2048
-    normalize: str = (
-        "none"  # none | center (subtract the clip's mean) | unit (and divide by the largest radius) | image
+    normalize: str = (  # none | center (subtract the clip's mean) | height (and make bodies equally tall)
+        "none"  # | unit (center, and divide by the largest radius) | image
     )
     variant: str = "thesis"
     backbone: str = "pointnet2"  # pointnet2 | dgcnn | spidercnn | module:Class of the user's
@@ -152,7 +152,7 @@ _LEAST = {
 }
 _LEGAL = {
     "variant": VARIANTS,
-    "normalize": ("none", "center", "unit", "image"),
+    "normalize": ("none", "center", "height", "unit", "image"),
     "grouping": ("first", "nearest", "balanced"),
     "weighting": ("deviation", "projection", "none"),
     "merge": ("residual", "cross"),

@@ -88,7 +88,11 @@ def train(
         str | None, typer.Option(help="thesis or release: where text and published code disagree.")
     ] = None,
     normalize: Annotated[
-        str | None, typer.Option(help="Coordinates of a clip: none, center, unit or image. Default: the preset's.")
+        str | None,
+        typer.Option(
+            help="Coordinates of a clip: none; center (its mean at 0); height (and every body equally tall, y upright);"
+            " unit (and within radius 1); image (rows, columns, depth of gestures). Default: the preset's."
+        ),
     ] = None,
     grouping: Annotated[
         str | None, typer.Option(help="Neighbours in the radius: first, nearest or balanced over frames.")
