@@ -203,6 +203,7 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
 def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc_here):
     other = dpc_here("classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5)
     assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
+    assert b"(schedule.learning_rate 0.002, now 0.5)" in other.stderr
 
 
 def test_a_random_speed_is_for_random_clips_of_consecutive_frames(data, tmp_path, dpc_here):

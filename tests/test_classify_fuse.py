@@ -77,6 +77,8 @@ def test_weights(two, tmp_path):
             parse_weights(text, ["a", "b"])
     with pytest.raises(UsageError, match="expected a=NUMBER,b=NUMBER"):
         parse_weights("1,2", ["a", "b"], named=True)
+    with pytest.raises(UsageError, match="1 weights for 2"):  # told before any file is looked at
+        fuse([tmp_path / "absent.h5", two[0]], tmp_path / "none.h5", "0.5")
 
 
 def test_streams_have_names_of_their_own(two, tmp_path):

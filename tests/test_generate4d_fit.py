@@ -141,6 +141,8 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     RunFolder(tmp_path / "scene.fit", {"config": 1}, columns=COLUMNS)
     with pytest.raises(UsageError, match="another configuration"):
         RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
+    with pytest.raises(UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*null, and 1 more\)"):
+        RunFolder(tmp_path / "scene.fit", {"config": {"a": 1, "b": {"c": None, "d": 2}}}, columns=COLUMNS)
     done = dpc_here("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
     assert done.returncode == 2 and b"another configuration" in done.stderr
 

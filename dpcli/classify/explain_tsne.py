@@ -15,6 +15,7 @@ from dpcli.classify.kinet import Kinet
 from dpcli.classify.predict import batches
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.progress import Progress
+from dpcli.runtime.seed import scikit_learn_state
 from dpcli.runtime.signals import stop_requested
 
 NEIGHBOURS = 5
@@ -76,9 +77,8 @@ def plane(features: np.ndarray, perplexity: float, seed: int) -> np.ndarray:
         )
     # scaled as a whole, which changes no neighbour, so that the search for bandwidths starts near its goal
     scaled = (features - features.mean(0)) / features.std()
-    state = seed % 2**32  # all that scikit-learn takes
     fit = TSNE(
-        2, perplexity=perplexity, init="pca", learning_rate="auto", random_state=state, method=_method(len(features))
+        2, perplexity=perplexity, init="pca", learning_rate="auto", random_state=scikit_learn_state(seed), method=_method(len(features))
     )
     return fit.fit_transform(scaled.astype(np.float64)).astype(np.float32)
 

@@ -42,10 +42,12 @@ def run_fusion(
         raise UsageError(f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order")
     _refuse_repeats([*inputs, output])
     _refuse_repeats([*judges, output])
+    called = [str(Path(name)) if name != "-" else "stdin" for name in inputs]
+    if len(called) > 1:  # one file's streams are known only once it is read
+        parse_weights(weights, _file_names(called))
     with ExitStack() as stack:
         paths = [stack.enter_context(input_file(name)) for name in inputs]
         target = stack.enter_context(output_file(output))
-        called = [str(path) if name != "-" else "stdin" for name, path in zip(inputs, paths)]
         readers = [ScoresReader(path) for path in paths]
         streams, sources, rows = _streams(readers, called)
         shares = parse_weights(weights, streams, len(inputs) == 1)
@@ -54,7 +56,7 @@ def run_fusion(
         config = {"fuse": streams, "mean": mean, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
         if judges:
             config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
-        entry = provenance.record(config, 0, dict(zip(stream_names([Path(name).stem for name in called]), paths)))
+        entry = provenance.record(config, 0, dict(zip(_file_names(called), paths)))
         if not force and _already_there(target, entry):
             return
         with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(Path(name).name for name in called),
@@ -71,7 +73,7 @@ def _streams(
 ) -> tuple[list[str], list[ScoresReader], list[np.ndarray]]:
     """What is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
     if len(readers) > 1:
-        return stream_names([Path(name).stem for name in called]), list(readers), matching_rows(readers, called)
+        return _file_names(called), list(readers), matching_rows(readers, called)
     if len(readers[0].streams) < 2:
         raise UsageError(f"{called[0]}: one file without streams to fuse; name two or more files")
     views = []
@@ -185,6 +187,10 @@ def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: Scores
     if mean == "geometric":
         return geometric_weights(scores, labels[known])
     return likelihood_weights(scores[:, np.arange(len(known)), labels[known]])
+
+
+def _file_names(called: Sequence[str]) -> list[str]:
+    return stream_names([Path(name).stem for name in called])
 
 
 def stream_names(stems: Sequence[str]) -> list[str]:

@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.part_matching import overlap
 from dpcli.evaluate.ratio import divide
+from dpcli.runtime.seed import scikit_learn_state
 from dpcli.store.gaussians import GaussianScene
 
 PART_NEIGHBOURS = 8
@@ -127,8 +128,7 @@ def _clusters(points: np.ndarray, count: int, seed: int) -> np.ndarray:
     from sklearn.cluster import KMeans
 
     count = min(count, len(np.unique(points, axis=0)))
-    state = seed % 2**32  # all that scikit-learn takes
-    return KMeans(count, n_init=10, random_state=state).fit_predict(points.astype(np.float64))
+    return KMeans(count, n_init=10, random_state=scikit_learn_state(seed)).fit_predict(points.astype(np.float64))
 
 
 def carry(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.ndarray:

@@ -12,6 +12,8 @@ import torch
 
 from dpcli.errors import DataError, UsageError
 
+_TOLD = 3  # differences named when a run can't be continued
+
 
 class RunFolder:
     """`config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`, `curves.png`.
@@ -35,11 +37,11 @@ class RunFolder:
                 before = json.loads(saved.read_text())
             except ValueError:
                 raise DataError(f"{saved}: not JSON, the run can't be continued; --force starts over") from None
-            differing = sorted(k for k in before.keys() | config.keys() if before.get(k) != config.get(k))
+            differing = _differences(before, config)
             if differing:
-                key = differing[0]
+                more = f", and {len(differing) - _TOLD} more" if len(differing) > _TOLD else ""
                 raise UsageError(
-                    f"{self.path}: holds a run with another configuration ({key}: {before.get(key)!r}, now {config.get(key)!r});"
+                    f"{self.path}: holds a run with another configuration ({'; '.join(differing[:_TOLD])}{more});"
                     " use another -o, or --force to start over"
                 )
         else:
@@ -85,6 +87,20 @@ class RunFolder:
         """The learning curves so far, by the function given."""
         if self.rows and self.curves is not None:
             self.curves(self.rows, self.path / "curves.png")
+
+
+def _differences(before: object, now: object) -> list[str]:
+    """One phrase for each setting that isn't the same, nested ones by their path."""
+    old, new = _settings(before), _settings(now)
+    pairs = {name: (old.get(name, "absent"), new.get(name, "absent")) for name in sorted(old.keys() | new.keys())}
+    return [f"{name} {was}, now {is_now}" for name, (was, is_now) in pairs.items() if was != is_now]
+
+
+def _settings(value: object, path: str = "") -> dict[str, str]:
+    """A nested record as one level, values as JSON: {"network.num_frames": "16"}."""
+    if not isinstance(value, dict):
+        return {path: json.dumps(value, sort_keys=True)}
+    return {name: one for key, item in value.items() for name, one in _settings(item, f"{path}.{key}" if path else key).items()}
 
 
 def _replace(path: Path, text: str) -> None:

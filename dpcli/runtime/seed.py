@@ -12,3 +12,8 @@ def generator(seed: int, *keys: int) -> np.random.Generator:
     """
     # SeedSequence ignores zeros at the end: the number of keys tells (seed, 1) from (seed, 1, 0)
     return np.random.default_rng(np.random.SeedSequence([int(seed), len(keys), *map(int, keys)]))
+
+
+def scikit_learn_state(seed: int) -> int:
+    """The `random_state` for a seed: scikit-learn takes 32 bits of it."""
+    return seed % 2**32
