@@ -27,7 +27,7 @@ from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinet import Kinet
 from dpcli.classify.model_file import ModelInfo, save_model
 from dpcli.classify.predict import batches, predict_videos
-from dpcli.classify.stream import Prediction, StreamPredictor
+from dpcli.classify.stream import Prediction, StreamPredictor, Window
 from dpcli.classify.stream_feed import Feed
 from dpcli.classify.stream_input import open_frames, read_arrays
 from dpcli.classify.stream_run import Lines
@@ -39,7 +39,7 @@ from dpcli.runtime.signals import StopRequest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 
 ROOT = Path(__file__).resolve().parents[1]
-CONFIG = KinetConfig(num_classes=3, num_frames=4, points_per_frame=24, centroids=(16, 8), neighbors=9, normalize="height",
+CONFIG = KinetConfig(num_classes=3, num_frames=4, points_per_frame=24, centroids=(16, 8), neighbors=9, normalize="center",
                      widths=((8, 8), (8, 16), (16, 32)))  # fmt: skip
 NAMES = ["left", "right", "still"]
 CPU = torch.device("cpu")
@@ -102,6 +102,19 @@ def uniform_file(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("uniform") / "m.safetensors"
     save_model(path, *untrained("uniform"))
     return path
+
+
+@pytest.mark.parametrize("rule", ["center", "height", "unit", "image"])
+def test_a_window_gives_the_points_that_the_whole_file_gives(tmp_path, rule):
+    """No rule of normalisation may need frames that have left the window."""
+    frames, config, window = random_frames(9), CONFIG.changed(normalize=rule), Window(4)
+    reader = batch_source(frames, tmp_path).reader
+    for points in frames:
+        window.append(points)
+    clip = Clip(0, (5, 6, 7, 8))
+    whole, last = (ClipSource(source, [0], config, seed=5).load(clip, 0, *clip.frames) for source in (reader, window))
+    np.testing.assert_array_equal(last, whole)
+    assert np.ptp(last) > 0.1
 
 
 @pytest.mark.usefixtures("one_thread")
