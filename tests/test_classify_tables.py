@@ -278,6 +278,28 @@ def test_sweeps_share_the_static_stream_of_a_fold(clouds, tmp_path):
     assert (tmp_path / "figure.png").read_bytes().startswith(PNG)
 
 
+def test_a_job_trains_its_own_folds_and_shows_everyones(clouds, tmp_path):
+    words = ["msraction3d", "-", str(tmp_path), "--clouds", str(clouds), "--folds", "3", "--preset", "tiny"]
+    words += ["--sweep", "group-size=4,8", *(f"--sweep={key}=" for key in ("reduction", "temporal-radius", "radius"))]
+    second, first, everyone = Pretended(), Pretended(), Pretended()
+    figure_3_5.main([*words, "--only", "1"], second)
+    assert {call[call.index("--validation") + 1] for call in second.trained} == {"fold:1/3"}
+    assert "| 4 | 1 |" in (text := (tmp_path / "table.md").read_text()) and "| 8 | 1 |" in text
+    figure_3_5.main([*words, "--only", "0 1"], first)
+    assert {call[call.index("--validation") + 1] for call in first.trained} == {"fold:0/3"}
+    assert "| 4 | 2 |" in (text := (tmp_path / "table.md").read_text()) and "| 8 | 2 |" in text
+    figure_3_5.main(words, everyone)
+    assert {call[call.index("--validation") + 1] for call in everyone.trained} == {"fold:2/3"}
+    assert "| 4 | 3 |" in (text := (tmp_path / "table.md").read_text()) and "| 8 | 3 |" in text
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_fold_that_is_not_there_is_told(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        figure_3_5.main(["msraction3d", "-", str(tmp_path), "--clouds", "-", "--folds", "3", "--only", "3"], Pretended())
+    assert "--only 3: expected folds from 0 to 2 (--folds 3)" in capsys.readouterr().err
+
+
 def test_a_box_is_the_quartiles_of_the_folds():
     text = figure_3_5.table({"radius": {0.5: [10.0, 20.0, 30.0, 40.0, 50.0], 1.0: []}}, "")
     assert (

@@ -1,10 +1,12 @@
 """Figure 3.5 of the thesis: four settings of the dynamic stream, each swept with the others at the thesis's choice.
 
     python -m tests.tables.figure_3_5 nvgesture|msraction3d RAW FOLDER [--folds 10] [--sweep group-size=2,4] [-- words]
+                                                                   [--only 0,1]: these folds now, a job each or several
 
 N-fold cross-validation over the training videos; accuracy is the dynamic stream's alone, after its last epoch. A fold's
 static stream is trained once for all settings that leave it as it is (both radii change its neighbourhoods). Results:
-FOLDER/table.md and results.json after every network, figure.png at the end. Stopped, it goes on where it was.
+FOLDER/table.md and results.json after every network, figure.png at the end. Stopped, it goes on where it was. Jobs may
+share FOLDER once it is prepared, each with folds of its own; what a job writes shows all folds known to it.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import numpy as np
 
 from dpcli.classify.presets import find_preset
 from tests.tables.accuracy_tables import prepared
-from tests.tables.runs import DASH, Dpc, cut, digest, dpc, markdown, once, write_json, write_text
+from tests.tables.runs import DASH, Dpc, cut, digest, dpc, kept, markdown, numbers, once, write_json, write_text
 from tests.tables.table_3_1 import DATA
 
 
@@ -95,21 +97,33 @@ class Fold:
             f"fold:{self.which}/{self.of}",
         )
 
+    def _key(self, words: Sequence[str]) -> list:
+        return [digest(self.clouds), self.words, words]
+
     def _once(self, run: Dpc, out: Path, stage: str, *words: str) -> dict:
         def work() -> dict:
             print(f"figure 3.5: {out}", file=sys.stderr)
             self.train(run, out, *words)
             return last_accuracy(out, stage)
 
-        return once(out / "result.json", [digest(self.clouds), self.words, words], work)
+        return once(out / "result.json", self._key(words), work)
+
+    def _places(self, at: Point) -> tuple[Path, Path, list[str]]:
+        """Folders of the static and of the dynamic stream, and the latter's words."""
+        place = self.folder / f"fold{self.which}-of-{self.of}"
+        static = place / f"static-{at.name(static=True)}"
+        return static, place / at.name(), [*at.words(), "--epochs", "0", "--static-from", str(static / "last.safetensors")]
+
+    def known(self, at: Point) -> dict | None:
+        """What `accuracy` found before, without doing anything."""
+        _, out, words = self._places(at)
+        return kept(out / "result.json", self._key(words))
 
     def accuracy(self, run: Dpc, at: Point) -> dict:
         """Of the dynamic stream at one choice of settings, trained where it isn't, on the fold's static stream."""
-        place = self.folder / f"fold{self.which}-of-{self.of}"
-        static, out = place / f"static-{at.name(static=True)}", place / at.name()
+        static, out, words = self._places(at)
         self._once(run, static, "static", *at.words(static=True), "--epochs-dynamic", "0")
-        start = ("--epochs", "0", "--static-from", str(static / "last.safetensors"))
-        return self._once(run, out, "dynamic", *at.words(), *start)
+        return self._once(run, out, "dynamic", *words)
 
 
 def quartiles(values: Sequence[float]) -> list[float]:
@@ -171,21 +185,34 @@ def make(
     words: Sequence[str],
     values: Mapping[str, Sequence[float]],
     folds: int,
+    only: Sequence[int],
     run: Dpc = dpc,
     note: str = "",
 ) -> dict[str, dict[float, list[float]]]:
-    """Every fold of every value, a fold after the other; a table after each network. words: preset, budget."""
-    found: dict[str, dict[float, list[float]]] = {key: {value: [] for value in own} for key, own in values.items()}
+    """Every value of the folds `only`, a fold after the other; a table after each network.
+
+    words: preset, budget. Shown and returned are the other folds' networks, too, as far as another job has finished them.
+    """
+    everyone = [Fold(which, folds, clouds, folder, tuple(words)) for which in range(folds)]
     about = f"Ours: `dpc classify train {' '.join(words)}`, {folds} folds of the training videos, one seed, the last epoch.{note}"
+
+    def look() -> dict[str, dict[float, list[float]]]:
+        known = {key: {one: [fold.known(point(key, one)) for fold in everyone] for one in own} for key, own in values.items()}
+        return {
+            key: {value: [100 * one["last"] for one in folds if one is not None] for value, folds in columns.items()}
+            for key, columns in known.items()
+        }
+
     try:
-        for fold in (Fold(which, folds, clouds, folder, tuple(words)) for which in range(folds)):
+        for fold in (everyone[which] for which in only):
             for key, value in ((key, value) for key, own in values.items() for value in own):
-                found[key][value].append(100 * fold.accuracy(run, point(key, value))["last"])
+                fold.accuracy(run, point(key, value))
+                found = look()
                 write_json(folder / "results.json", {"figure": "3.5", "about": about, "accuracy": found})
                 write_text(folder / "table.md", table(found, about))
     finally:  # of what is there when stopped, too
-        picture(found, folder / "figure.png")
-    return found
+        picture(look(), folder / "figure.png")
+    return look()
 
 
 def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
@@ -224,6 +251,7 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--folds", type=int, default=10)
+    parser.add_argument("--only", default="", help="some of the folds, from 0: 0,1,2")
     parser.add_argument("--sweep", action="append", default=[], help="NAME=values; NAME= leaves a sweep out; repeat")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--prepare", default="", help="more words for `dpc prepare`")
@@ -231,12 +259,15 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     given = parser.parse_args(own)
     experiment, setting = DATA[given.data]
     values = swept(given.sweep)
+    only = numbers(given.only) if given.only else range(given.folds)
+    if not set(only) <= set(range(given.folds)):
+        parser.error(f"--only {given.only}: expected folds from 0 to {given.folds - 1} (--folds {given.folds}), such as 0,1")
     clouds = (
         given.clouds or prepared(experiment, given.raw, given.folder, ["clouds"], given.prepare.split(), run)["clouds"]
     )
     words = ["--preset", given.preset, *setting.words, *budget, "--seed", str(given.seed)]
     values, note = possible(values, given.preset)
-    make(clouds, given.folder, words, values, given.folds, run, note)
+    make(clouds, given.folder, words, values, given.folds, only, run, note)
     sys.stdout.write((given.folder / "table.md").read_text())
 
 

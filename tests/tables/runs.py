@@ -65,9 +65,9 @@ def attempt(work: Callable[[], object], what: str) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """A file that is there is whole."""
+    """A file that is there is whole, also when two jobs write it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.part")
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     part.write_text(text)
     os.replace(part, path)
 
