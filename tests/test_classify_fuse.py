@@ -84,8 +84,18 @@ def test_weights(two, tmp_path):
 def test_streams_have_names_of_their_own(two, tmp_path):
     assert stream_names(["a", "b", "a", "fused", "a"]) == ["a", "b", "a-2", "fused-2", "a-3"]
     assert stream_names(["a", "a", "a-2"]) == ["a", "a-2", "a-2-2"]
-    again = write(tmp_path / "other" / "points.h5", POINTS)
-    assert set(fuse([two[0], again], tmp_path / "out.h5").streams) == {"points", "points-2"}
+    again, third = (write(tmp_path / name / "points.h5", POINTS) for name in ("other", "one more"))
+    assert set(fuse([again, third, two[1]], tmp_path / "out.h5").streams) == {"other", "one more", "flow"}
+
+
+def test_files_called_scores_are_averaged_like_any(tmp_path):
+    """A stream may have the name of the data set that holds the mean."""
+    inputs = [write(tmp_path / "scores.h5", POINTS), write(tmp_path / "flow.h5", FLOW)]
+    for order in (inputs, inputs[::-1]):
+        found = fuse(order, tmp_path / "out.h5", force=True)
+        for row, name in enumerate(found.names):
+            np.testing.assert_allclose(found.scores[row], MEAN[name], rtol=1e-6)
+            np.testing.assert_allclose(found.streams["scores"][row], POINTS[name][1], rtol=1e-6)
 
 
 @pytest.mark.parametrize(

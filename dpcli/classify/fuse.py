@@ -190,13 +190,16 @@ def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: Scores
 
 
 def _file_names(called: Sequence[str]) -> list[str]:
-    return stream_names([Path(name).stem for name in called])
+    """A name for each file: its stem, where files share one that of their folders (`seed0/scores.h5`: seed0)."""
+    stems = [Path(name).stem for name in called]
+    folders = [Path(name).resolve().parent.name for name in called]
+    return stream_names([folder or stem if stems.count(stem) > 1 else stem for stem, folder in zip(stems, folders)])
 
 
-def stream_names(stems: Sequence[str]) -> list[str]:
-    """A name for each file: its stem, numbered (`scores`, `scores-2`) where another has it already."""
+def stream_names(wanted: Sequence[str]) -> list[str]:
+    """The names wanted, numbered (`points`, `points-2`) where another has it already."""
     names: list[str] = []
-    for stem in stems:
+    for stem in wanted:
         number, name = 1, stem
         while name in (*names, _TAKEN):
             number += 1

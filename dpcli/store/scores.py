@@ -43,15 +43,16 @@ class ScoresWriter:
         streams: dict[str, np.ndarray] | None = None,
     ) -> None:
         """One sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
-        rows = {"scores": scores, **(streams or {})}
-        for key, row in rows.items():
+        own = streams or {}
+        for key, row in (("scores", scores), *own.items()):  # a stream may be called scores, too
             if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():
                 raise DataError(
                     f"sample {name!r}: {key} {np.shape(row)} must be {len(self.class_names)} finite numbers"
                 )
-        if set(self.streams) != set(streams or {}):
-            raise DataError(f"sample {name!r}: streams {sorted(streams or {})}, expected {sorted(self.streams)}")
-        self._rows.append((name, split, int(label), {key: np.asarray(row, np.float32) for key, row in rows.items()}))
+        if set(self.streams) != set(own):
+            raise DataError(f"sample {name!r}: streams {sorted(own)}, expected {sorted(self.streams)}")
+        kept = {key: np.asarray(row, np.float32) for key, row in own.items()}
+        self._rows.append((name, split, int(label), np.asarray(scores, np.float32), kept))
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -77,13 +78,13 @@ class ScoresWriter:
     def _write_all(self) -> None:
         file = self._atomic.file
         write_root(file, "scores", class_names=self.class_names, provenance=self.provenance, **self._root)
-        names, splits, labels, scores = zip(*self._rows)
+        names, splits, labels, scores, streams = zip(*self._rows)
         file.create_dataset("name", data=np.array(names, dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(splits, dtype=object), dtype=STRING)
         file.create_dataset("label", data=np.array(labels, np.int32), **_PACKED)
-        file.create_dataset("scores", data=np.stack([row["scores"] for row in scores]))
+        file.create_dataset("scores", data=np.stack(scores))
         for stream in self.streams:
-            file.create_dataset(f"streams/{stream}", data=np.stack([row[stream] for row in scores]))
+            file.create_dataset(f"streams/{stream}", data=np.stack([row[stream] for row in streams]))
 
 
 class ScoresReader:
@@ -107,7 +108,7 @@ class ScoresReader:
 
     def _check(self) -> None:
         shape = (len(self.names), len(self.class_names))
-        for key, value in {"scores": self.scores, **self.streams}.items():
+        for key, value in (("scores", self.scores), *self.streams.items()):
             if value.shape != shape:
                 raise DataError(f"{self.path}: {key} has shape {value.shape}, expected (samples, classes) = {shape}")
             bad = np.flatnonzero(~np.isfinite(value).all(1))
