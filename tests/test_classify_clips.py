@@ -173,6 +173,22 @@ def test_validation_comes_from_training_subjects_only(reader):
             carve_validation(reader, bad, 0)
 
 
+@pytest.mark.parametrize(
+    ("labels", "splits", "message"),
+    [
+        ((-1, -1), ("train", "train"), "none has a label: prepare them with --labels TABLE or, .* --label-from-folder"),
+        ((0, 1), ("", ""), "none has a split: `dpc prepare split .*own.h5 -o own-split.h5 --fractions 0.8,0,0.2` divides them"),
+        ((0, 1), ("val", "test"), "the file has 'test', 'val'$"),
+    ],
+)
+def test_a_file_without_training_videos_says_how_to_make_them(tmp_path, make_sequence, labels, splits, message):
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b"]) as writer:
+        for k in (0, 1):
+            writer.write(make_sequence(f"v{k}", label=labels[k], split=splits[k]))
+    with pytest.raises(DataError, match=rf"own.h5: no labelled sample of split 'train'; {message}"):
+        carve_validation(CloudsReader(tmp_path / "own.h5"), "none", 0)
+
+
 def test_a_fold_is_held_out_of_the_training_videos(reader):
     held = [carve_validation(reader, f"fold:{k}/5", 0) for k in range(5)]
     assert sorted(i for _, part in held for i in part) == [0, 1, 2, 3, 4]  # never the test video

@@ -117,6 +117,14 @@ def test_folders_of_folders_with_labels_from_their_names(tmp_path):
     assert [(i.name, i.label) for i in reader.items()] == [("run/s1", 0), ("walk/s2", 1), ("walk/s10", 1)]
 
 
+def test_folders_of_splits_above_those_of_classes(tmp_path):
+    for folder in ("train/walk/s1", "train/run/s1", "test/walk/s2"):
+        save(tmp_path / folder / "0.npy")
+    reader = CloudFolders(tmp_path, label_from_folder=True)
+    assert reader.class_names == ["run", "walk"]
+    assert [(i.label, i.split) for i in reader.items()] == [(1, "test"), (0, "train"), (1, "train")]
+
+
 def test_a_label_table_beside_the_data_is_no_cloud(tmp_path):
     save(tmp_path / "a" / "0.npy")
     (tmp_path / "labels.csv").write_text("a,2\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics
 from dpcli.prepare.depth import DepthVideos, background_depth
 from dpcli.prepare.depth_files import read_depth_video, video_frames
-from dpcli.prepare.labels import read_labels
+from dpcli.prepare.labels import labels_of_folders, read_labels
 from dpcli.prepare.pipeline import convert_item
 from dpcli.prepare.thin import Thinning
 from dpcli.runtime.seed import generator
@@ -134,6 +135,37 @@ def test_folders_of_videos_with_labels(tmp_path):
     assert found == [("a b/vidéo 9", 0, 4, "test"), ("a b/vidéo 10", -1, -1, ""), ("c.npy", 1, 3, "train")]
     assert reader.class_names == ["jump", "wave"]
     assert "1 without a label" in reader.summary(reader.items())[-1]
+
+
+def test_labels_from_folders(tmp_path):
+    for name in ("wave/2.npy", "wave/10.npy", "a clap/deep/1.npy"):
+        (tmp_path / "own" / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / "own" / name, depth16())
+    reader = DepthVideos((tmp_path / "own",), label_from_folder=True)
+    assert reader.class_names == ["a clap", "wave"]
+    found = [(i.name, i.label, i.split) for i in reader.items()]
+    assert found == [("a clap/deep/1.npy", 0, ""), ("wave/2.npy", 1, ""), ("wave/10.npy", 1, "")]
+    assert reader.read(reader.items()[1], np.random.default_rng(0)).sequence.label == 1
+    with pytest.raises(DataError, match=r"'2.npy' lies in no folder of its class; --label-from-folder expects CLASS/VIDEO"):
+        DepthVideos((tmp_path / "own" / "wave",), label_from_folder=True).items()
+    with pytest.raises(UsageError, match="use one"):
+        DepthVideos((tmp_path,), label_from_folder=True, labels=tmp_path / "x.csv")
+    assert "label_from_folder" in reader.config and "label_from_folder" not in DepthVideos((tmp_path,)).config
+
+
+@pytest.mark.parametrize(
+    ("names", "layout", "expected"),
+    [
+        (["train/a/1", "val/b/2", "test/a/3"], "CLASS/VIDEO", [(0, "train"), (1, "validation"), (0, "test")]),
+        (["train/a", "test/b"], "CLASS/VIDEO", [(1, ""), (0, "")]),  # two classes of these names
+        (["train/a", "test/b"], "CLASS", [(0, "train"), (1, "test")]),
+        (["train/a/1", "b/a/2"], "CLASS/VIDEO", [(1, ""), (0, "")]),
+        (["a", "b/x"], "CLASS", [(0, ""), (1, "")]),
+    ],
+)
+def test_folders_of_splits_hold_those_of_classes(names, layout, expected):
+    table = labels_of_folders(Path("own"), names, layout)
+    assert [(table.rows[name].label, table.rows[name].split) for name in names] == expected
 
 
 @pytest.mark.parametrize(

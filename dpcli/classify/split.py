@@ -13,9 +13,18 @@ def labelled(reader: CloudsReader, split: str) -> list[int]:
     """Sequences of this split that have a label. DataError when there are none."""
     chosen = [i for i, name in enumerate(reader.splits) if name == split and reader.labels[i] >= 0]
     if not chosen:
-        found = ", ".join(sorted({f"{name!r}" for name in reader.splits}))
-        raise DataError(f"{reader.path}: no labelled sample of split {split!r}; the file has {found}")
+        raise DataError(f"{reader.path}: no labelled sample of split {split!r}; {_instead(reader)}")
     return chosen
+
+
+def _instead(reader: CloudsReader) -> str:
+    """What a file without training samples has, and how it comes by some."""
+    if reader.labels.max(initial=-1) < 0:
+        return "none has a label: prepare them with --labels TABLE or, where a folder is a class, --label-from-folder"
+    if not any(reader.splits):
+        name = f"{reader.path.stem}-split.h5"
+        return f"none has a split: `dpc prepare split {reader.path} -o {name} --fractions 0.8,0,0.2` divides them"
+    return f"the file has {', '.join(sorted({repr(name) for name in reader.splits}))}"
 
 
 def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[int], list[int]]:

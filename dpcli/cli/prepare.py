@@ -234,6 +234,9 @@ def depth(
         float | None, typer.Option("--fps", help="Frames per second. Default: the video's, else 30.")
     ] = None,
     stride: Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")] = 1,
+    label_from_folder: Annotated[
+        bool, typer.Option("--label-from-folder", help="FOLDER/CLASS/VIDEO, or FOLDER/train/CLASS/VIDEO and FOLDER/test/CLASS/VIDEO.")
+    ] = False,
     labels: Annotated[Path | None, typer.Option("--labels", help="CSV: name,label[,subject][,split].")] = None,
 ) -> Any:
     """Any depth video, 8 or 16 bits, to points in metres."""
@@ -249,7 +252,8 @@ def depth(
             raise UsageError("--fx, --cx and --cy belong together (--fy defaults to --fx); or use --fov")
         camera = Intrinsics(*(float(v) for v in pixels if v is not None))
     return DepthVideos(
-        tuple(inputs), camera, fov, depth_scale, invert, near, far, background, margin, fps, stride, labels
+        tuple(inputs), camera, fov, depth_scale, invert, near, far, background, margin, fps, stride, labels,
+        label_from_folder,
     )  # fmt: skip
 
 
@@ -267,7 +271,9 @@ def clouds(
         float | None, typer.Option("--fps", help="Frames per second; writes the time of every frame.")
     ] = None,
     stride: Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")] = 1,
-    label_from_folder: Annotated[bool, typer.Option("--label-from-folder", help="RAW/CLASS/SEQUENCE/frames.")] = False,
+    label_from_folder: Annotated[
+        bool, typer.Option("--label-from-folder", help="RAW/CLASS/SEQUENCE/frames, or RAW/train/CLASS/... and RAW/test/CLASS/...")
+    ] = False,
     labels: Annotated[Path | None, typer.Option("--labels", help="CSV: name,label[,subject][,split].")] = None,
 ) -> Any:
     """Point cloud files: a folder is a sequence, its files are the frames."""

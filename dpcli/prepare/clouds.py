@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.cloud_files import SUFFIXES, Cloud, read_cloud
-from dpcli.prepare.labels import LabelTable, read_labels
+from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
 from dpcli.store import CloudSequence
 
@@ -42,9 +42,7 @@ class CloudFolders:
 
     @property
     def class_names(self) -> list[str]:
-        if self._table:
-            return self._table.class_names
-        return sorted({path.parts[0] for path in self._relative}) if self.label_from_folder else []
+        return self._table.class_names if self._table else []
 
     @property
     def length_unit(self) -> str:
@@ -61,6 +59,8 @@ class CloudFolders:
 
     @cached_property
     def _table(self) -> LabelTable | None:
+        if self.label_from_folder:
+            return labels_of_folders(self.raw, [path.as_posix() for path in self._relative], "CLASS")
         return read_labels(self.labels) if self.labels else None
 
     @cached_property
@@ -90,12 +90,10 @@ class CloudFolders:
         return False
 
     def items(self) -> list[Item]:
-        classes = self.class_names
         items = []
         for relative in self._relative:
             name = relative.as_posix() if relative.parts else self.raw.resolve().name
-            label = classes.index(relative.parts[0]) if self.label_from_folder else -1
-            items.append(Item(name, self.raw / relative, label=label, extra={"color": self._has_color}))
+            items.append(Item(name, self.raw / relative, extra={"color": self._has_color}))
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:

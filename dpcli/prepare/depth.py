@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics, back_project
 from dpcli.prepare.depth_files import VIDEO_SUFFIXES, has_images, read_depth_video
-from dpcli.prepare.labels import LabelTable, read_labels
+from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
 
@@ -54,6 +54,7 @@ class DepthVideos:
     fps: float | None = None
     stride: int = 1
     labels: Path | None = None
+    label_from_folder: bool = False
     chooses: ClassVar[bool] = True
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("time",)
@@ -69,6 +70,8 @@ class DepthVideos:
             raise UsageError(f"--fps {self.fps:g}: expected more than 0")
         if self.intrinsics and self.fov is not None:
             raise UsageError("--fov and intrinsics were both given; use one")
+        if self.labels and self.label_from_folder:
+            raise UsageError("--labels and --label-from-folder were both given; use one")
 
     @property
     def class_names(self) -> list[str]:
@@ -76,14 +79,18 @@ class DepthVideos:
 
     @property
     def config(self) -> dict[str, Any]:
-        values = {k: v for k, v in asdict(self).items() if k not in ("inputs", "labels", "far")}
-        return {**values, "far": self.far if np.isfinite(self.far) else None}
+        values = {k: v for k, v in asdict(self).items() if k not in ("inputs", "labels", "label_from_folder", "far")}
+        folders = {"label_from_folder": True} if self.label_from_folder else {}
+        return {**values, "far": self.far if np.isfinite(self.far) else None, **folders}
 
     @cached_property
     def _table(self) -> LabelTable | None:
+        if self.label_from_folder:
+            return labels_of_folders(self.inputs[0], [item.name for item in self._found], "CLASS/VIDEO")
         return read_labels(self.labels) if self.labels else None
 
-    def items(self) -> list[Item]:
+    @cached_property
+    def _found(self) -> list[Item]:
         paths = [(found, given) for given in self.inputs for found in find_videos(given)]
         items: dict[str, Item] = {}
         for path, given in paths:
@@ -91,8 +98,10 @@ class DepthVideos:
             if name in items:
                 raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
             items[name] = Item(name, path)
-        found = list(items.values())
-        return self._table.apply(found) if self._table else found
+        return list(items.values())
+
+    def items(self) -> list[Item]:
+        return self._table.apply(self._found) if self._table else self._found
 
     def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
         video = read_depth_video(item.path, self.stride)

@@ -1,13 +1,15 @@
-"""A CSV table that says the label, and perhaps the subject and split, of samples that have no names to tell."""
+"""Labels of samples that don't tell them: from a CSV table, with subject and split, or from the folders they lie in."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.prepare.reader import Item
+from dpcli.prepare.splits import SPLIT_FOLDERS
 
 _COLUMNS = ("name", "label", "subject", "split")
 
@@ -67,6 +69,27 @@ def read_labels(path: Path) -> LabelTable:
     if not records:
         raise DataError(f"{path}: no rows; expected {','.join(header)}")
     return _number_labels(path, records)
+
+
+def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTable:
+    """The first folder of a name is its class; where all begin with train, val(idation) or test, that is the split and the
+    next one the class. Classes are numbered in alphabetical order.
+
+    names: relative to `root`, parts with `/`. layout: what a name holds at least, such as `CLASS/VIDEO`. DataError when one
+    holds less.
+    """
+    least = len(layout.split("/"))
+    parts = {name: name.split("/") for name in names}
+    short = [name for name, own in parts.items() if len(own) < least]
+    if short:
+        raise DataError(f"{root}: {short[0]!r} lies in no folder of its class; --label-from-folder expects {layout}, or"
+                        f" train/{layout} and test/{layout}, below what is given")  # fmt: skip
+    divided = all(own[0] in SPLIT_FOLDERS and len(own) > least for own in parts.values())
+    classes = {name: own[1 if divided else 0] for name, own in parts.items()}
+    class_names = sorted(set(classes.values()))
+    splits = {name: SPLIT_FOLDERS[own[0]] if divided else "" for name, own in parts.items()}
+    rows = {name: Row(class_names.index(own), -1, splits[name]) for name, own in classes.items()}
+    return LabelTable(root, rows, class_names)
 
 
 def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:

@@ -13,6 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.merge import Source, copied_before, read_source
 from dpcli.prepare.pipeline import already_complete
+from dpcli.prepare.splits import SPLITS
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seed import generator
@@ -20,7 +21,6 @@ from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.journal import sweep
 
-SPLITS = ("train", "validation", "test")
 _DRAW = 5005  # the key of this draw among all that a seed gives
 
 

@@ -8,6 +8,7 @@ from dpcli.errors import UsageError
 from dpcli.runtime.seed import generator
 
 SPLITS = ("train", "validation", "test")
+SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # what people call them
 _SPLIT_KEY = 1 << 28  # keeps the generator of the splits apart from those of items
 
 
