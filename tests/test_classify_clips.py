@@ -168,9 +168,20 @@ def test_validation_comes_from_training_subjects_only(reader):
     train, held = carve_validation(reader, "0.4", 0)
     assert sorted(train + held) == [0, 1, 2, 3, 4] and 5 not in train + held and len(held) == 2
     assert carve_validation(reader, "none", 0) == ([0, 1, 2, 3, 4], [])
+    with pytest.raises(DataError, match="no labelled sample of split 'validation'; the file has 'test', 'train'"):
+        carve_validation(reader, "split", 0)
     for bad in ("subjects:9", "subjects:0,1,2,3,4", "1.5", "some", "subjects:x"):
         with pytest.raises(UsageError):
             carve_validation(reader, bad, 0)
+
+
+def test_the_files_own_validation_videos_validate(tmp_path, make_sequence):
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b"]) as writer:
+        for k, (split, label) in enumerate([("train", 0), ("validation", 1), ("test", 0), ("validation", -1), ("train", 1)]):
+            writer.write(make_sequence(f"v{k}", label=label, split=split, subject=k))
+    reader = CloudsReader(tmp_path / "own.h5")
+    assert default_rule(reader) == "split" and carve_validation(reader, "split", 0) == ([0, 4], [1])
+    assert carve_validation(reader, "subject", 0) == ([0], [4])  # other rules leave them out
 
 
 @pytest.mark.parametrize(

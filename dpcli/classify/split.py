@@ -1,4 +1,5 @@
-"""Which videos train and which choose: the validation part is carved from the training videos, never from the test ones."""
+"""Which videos train and which choose: validation is what the file says it is, or carved from the training videos; never
+the test ones."""
 
 from __future__ import annotations
 
@@ -28,14 +29,16 @@ def _instead(reader: CloudsReader) -> str:
 
 
 def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[int], list[int]]:
-    """(training, validation) sequences from the split `train`.
+    """(training, validation) sequences, from the split `train` but for the rule `split`.
 
-    `rule`: `none`; `subject` (the training subject with the highest number, the default where there are several);
+    `rule`: `none`; `split` (the file's own split `validation`); `subject` (the training subject with the highest number);
     `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
     """
     chosen = labelled(reader, "train")
     if rule == "none":
         return chosen, []
+    if rule == "split":
+        return chosen, labelled(reader, "validation")
     if rule.startswith("fold"):
         return _one_fold(reader, chosen, rule, seed)
     if rule.startswith("subject"):
@@ -48,7 +51,7 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
         share = -1
     if not 0 < share < 1:
         raise UsageError(
-            f"--validation {rule}: expected none, subject, subjects:3,5, fold:3/10 or a fraction such as 0.15"
+            f"--validation {rule}: expected none, split, subject, subjects:3,5, fold:3/10 or a fraction such as 0.15"
         )
     return _stratified(reader, chosen, share, seed)
 
@@ -113,7 +116,10 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
 
 
 def default_rule(reader: CloudsReader) -> str:
-    """`subject` when the training videos have several known subjects, else 15 % of each class."""
+    """`split` when the file has labelled validation videos, `subject` when the training videos have several known subjects,
+    else 15 % of each class."""
+    if any(name == "validation" and label >= 0 for name, label in zip(reader.splits, reader.labels)):
+        return "split"
     subjects = {int(reader.subjects[i]) for i in labelled(reader, "train")}
     return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
 

@@ -50,8 +50,8 @@ def train(
     validation: Annotated[
         str | None,
         typer.Option(
-            help="Carved from the training videos: subject, subjects:3,5, fold:3/10 (counted from 0), a fraction, or none."
-            " Default: subject, or 0.15 without subjects."
+            help="split: the file's own validation videos; or carved from the training videos: subject, subjects:3,5, fold:3/10"
+            " (counted from 0), a fraction; or none. Default: split where the file has one, else subject, or 0.15 without subjects."
         ),
     ] = None,
     batch: Annotated[
