@@ -129,7 +129,8 @@ def train(
         str | None, typer.Option(help="A trained model whose static stream to start from (ablations ii, iv).")
     ] = None,
     init: Annotated[
-        str | None, typer.Option(help="A trained model whose both streams to start from, e.g. of another --frames.")
+        str | None, typer.Option(help="A trained or shipped model whose both streams to start from, e.g. of another --frames,"
+                              " or of other classes (the last layers are fresh then).")
     ] = None,
     workers: Annotated[
         int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU; with a GPU 4, or as many as there are CPUs.")
