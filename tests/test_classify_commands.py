@@ -110,6 +110,54 @@ def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_fo
     assert other.returncode == 2 and b"--force" in other.stderr and (tmp_path / "s.h5").read_bytes() == before
 
 
+ENDS_EARLY = """
+import os, signal, sys
+from dpcli.classify import commands
+from dpcli.cli.app import main
+number, after, whole = int(sys.argv.pop(1)), int(sys.argv.pop(1)), commands.predict_videos
+def ending(*words):
+    for count, video in enumerate(whole(*words)):
+        if count == after:
+            os.kill(os.getpid(), number)
+        print("scored", video.sequence, file=sys.stderr)
+        yield video
+commands.predict_videos = ending
+main()
+"""
+
+
+@pytest.mark.parametrize(("number", "kept"), [(signal.SIGTERM, 4), (signal.SIGKILL, 3)])
+def test_a_stopped_and_a_killed_prediction_go_on(data, run_folder, dpc_here, tmp_path, number, kept):
+    words = ["classify", "predict", data, "--model", run_folder, "--split", "all", "-o"]
+    assert dpc_here(*words, tmp_path / "whole.h5").returncode == 0
+
+    def started(output: Path, signal_number: int, after: int) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-c", ENDS_EARLY, signal_number, after, *words, output]
+        return subprocess.run([str(word) for word in command], capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+
+    first = started(tmp_path / "s.h5", number, 3)
+    assert first.returncode == (75 if number == signal.SIGTERM else -9) and not (tmp_path / "s.h5").exists()
+    if number == signal.SIGTERM:
+        assert b"4 of 12 videos are kept; run the same command again to continue" in first.stderr
+    second = started(tmp_path / "s.h5", number, 99)
+    assert second.returncode == 0 and second.stderr.count(b"scored ") == 12 - kept + 1  # and the sentence
+    assert f"continuing: {kept} of 12 videos were scored before".encode() in second.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"whole.h5", "s.h5"}
+    ours, whole = ScoresReader(tmp_path / "s.h5"), ScoresReader(tmp_path / "whole.h5")
+    assert ours.names == whole.names and ours.splits == whole.splits and ours.labels.tolist() == whole.labels.tolist()
+    for name, own in (("scores", ours.scores), *ours.streams.items()):  # clips share batches otherwise: rounding
+        np.testing.assert_allclose(own, whole.scores if name == "scores" else whole.streams[name], atol=1e-5)
+
+
+def test_another_prediction_does_not_go_on_with_what_is_kept(data, run_folder, dpc_here, tmp_path):
+    words = ["classify", "predict", str(data), "--model", str(run_folder), "-o", str(tmp_path / "s.h5")]
+    command = [sys.executable, "-c", ENDS_EARLY, str(int(signal.SIGTERM)), "1", *words, "--split", "all"]
+    assert subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 75
+    other = dpc_here(*words, "--split", "test")
+    assert other.returncode == 0 and b"continuing" not in other.stderr
+    assert set(ScoresReader(tmp_path / "s.h5").splits) == {"test"}
+
+
 def test_the_videos_held_out_of_training_choose_the_streams_weights(data, run_folder, dpc_here, tmp_path):
     reader = CloudsReader(data)
     held = {reader.names[i] for i in carve_validation(reader, "0.34", 3)[1]}

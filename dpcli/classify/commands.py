@@ -21,6 +21,7 @@ from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
+from dpcli.store.journal import sweep
 
 
 def run_prediction(
@@ -44,7 +45,7 @@ def run_prediction(
             return
         keep_freed_memory()
         with ScoresWriter(target, class_names=info.class_names, seed=seed, source=reader.path.name if data != "-" else "stdin",
-                          provenance=history, streams=streams, force=force) as writer:  # fmt: skip
+                          provenance=history, streams=streams, force=force, resume=output != "-") as writer:  # fmt: skip
             _score(model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if split == "validation" else None)
     if output != "-":
         print(f"{output}: scores of {len(writer)} videos in {len(info.class_names)} classes")
@@ -62,6 +63,7 @@ def _already_scored(target: Path, entry: dict) -> bool:
         raise UsageError(
             f"{target}: holds scores of another model, data or choice; use another -o, or --force to replace it"
         )
+    sweep(target)
     log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
     print(f"{target}: complete")
     return True
@@ -72,15 +74,22 @@ def _score(
     device: torch.device, split: str | None,
 ) -> None:  # fmt: skip
     """split: what to call the videos' split; None: as their file does."""
-    reader = source.reader
+    reader, before = source.reader, set(writer.written_names)
+    done = {i for i in source.sequences if reader.names[i] in before}
+    if done:
+        log.info(f"continuing: {len(done)} of {len(source.sequences)} videos were scored before")
     with stop_requested() as stop, Progress("classify predict", len(source.sequences), "video") as bar:
-        for video in predict_videos(model, source, count, batch, device, streams):
+        bar.skip(len(done))
+        for video in predict_videos(model, source, count, batch, device, streams, done):
             i = video.sequence
             writer.write(
                 reader.names[i], video.fused, label=int(reader.labels[i]), split=split or reader.splits[i], streams=video.streams
             )
             bar.advance(1, clips=video.clips)
-            stop.check(f"{len(writer)} videos were scored, none kept")
+            if writer.resume:
+                stop.check(f"{len(writer)} of {len(source.sequences)} videos are kept")
+            else:  # a pipe
+                stop.check("nothing was kept", again="to start over")
 
 
 def run_profile(

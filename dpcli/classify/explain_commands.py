@@ -71,7 +71,7 @@ def run_pac(
             for clip in clips:
                 clouds.append(activation_cloud(model, source, clip, streams, question, chosen))
                 bar.advance(1)
-                stop.check("nothing was kept")
+                stop.check("nothing was kept", again="to start over")
         write_clouds(place, clouds, class_names=info.class_names, length_unit=reader.length_unit, seed=seed, rule=rule,
                      source=_source(data), provenance=history, force=force)  # fmt: skip
         if picture:

@@ -44,7 +44,7 @@ def video_features(
             for stream, vectors in look.vectors(points).items():
                 total = sums.setdefault(stream, np.zeros((len(place), vectors.shape[1])))
                 np.add.at(total, rows, vectors.double().cpu().numpy())
-            stop.check("nothing was kept")
+            stop.check("nothing was kept", again="to start over")
     return {stream: (total / counts[:, None]).astype(np.float32) for stream, total in sums.items()}
 
 

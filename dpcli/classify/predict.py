@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,14 +33,15 @@ def batches(source: ClipSource, clips: list[Clip], size: int) -> Iterator[tuple[
 @torch.inference_mode()
 def predict_videos(
     model: Kinet, source: ClipSource, clips_per_video: int | None, batch: int, device: torch.device,
-    streams: Sequence[str] = STREAMS,
+    streams: Sequence[str] = STREAMS, done: Container[int] = (),
 ) -> Iterator[VideoScores]:  # fmt: skip
-    """Scores of every video of `source`, in order, one video in memory at a time.
+    """Scores of every video of `source` that isn't `done`, in order, one video in memory at a time.
 
-    streams: those that were trained; with the static one alone, its scores are the fused ones.
+    streams: those that were trained; with the static one alone, its scores are the fused ones. done: numbers of sequences.
     """
     current, kept = -1, []
-    for clips, points in batches(source, source.clips(clips_per_video), batch):
+    left = [clip for clip in source.clips(clips_per_video) if clip.sequence not in done]
+    for clips, points in batches(source, left, batch):
         rows = clip_scores(model, points.to(device), streams).cpu().unbind(1)
         for clip, probabilities in zip(clips, rows):
             if clip.sequence != current and kept:

@@ -53,7 +53,7 @@ def convert_clip(
         for view, frame, rgba in clip.pictures():
             writer.add(view, frame, rgba)
             bar.advance()
-            stop.check("the unfinished file was removed")
+            stop.check("the unfinished file was removed", again="to start over")
     return header
 
 

@@ -21,10 +21,10 @@ class StopRequest:
     requested: bool = False
     name: str = ""
 
-    def check(self, what: str) -> None:
-        """Raise Stopped when a stop was asked for; `what` says what is already safe."""
+    def check(self, what: str, again: str = "to continue") -> None:
+        """Raise Stopped when a stop was asked for; `what` says what is already safe, `again` what for to run once more."""
         if self.requested:
-            raise Stopped(f"stopped by {self.name}; {what}; run the same command again to continue")
+            raise Stopped(f"stopped by {self.name}; {what}; run the same command again {again}")
 
 
 @contextmanager

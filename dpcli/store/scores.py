@@ -4,34 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.errors import DataError
+from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.resumable import ResumableWriter
 
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
-class ScoresWriter:
+class ScoresWriter(ResumableWriter):
     """Context manager; `write` one sample after the other, the file appears whole when the block ends.
 
-    A score row is small (C floats), so rows are kept until the end. `streams` names extra score arrays
-    (such as static, dynamic) stored beside the final one.
+    A score row is small (C floats), so rows are kept in memory until the end, and with `resume=True` in the journal, too:
+    see `ResumableWriter`. `streams` names extra score arrays (such as static, dynamic) stored beside the final one.
     """
+
+    kind = "scores"
 
     def __init__(
         self, path: str | Path, *, class_names: Sequence[str], seed: int = 0, source: str = "",
-        provenance: dict | Sequence[dict] | None = None, streams: Sequence[str] = (), force: bool = False,
+        provenance: dict | Sequence[dict] | None = None, streams: Sequence[str] = (), force: bool = False, resume: bool = False,
     ) -> None:  # fmt: skip
-        if Path(path).exists() and not force:
-            raise UsageError(f"{path}: exists already; --force replaces it")
+        super().__init__(path, provenance=provenance, force=force, resume=resume)
         self.class_names, self.streams = list(class_names), tuple(streams)
         self._root = {"length_unit": "", "source": source, "seed": seed}
-        self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self._rows: list[tuple] = []
-        self._atomic = AtomicFile(path)
+        self._open(force)
 
     def write(
         self,
@@ -51,8 +52,9 @@ class ScoresWriter:
                 )
         if set(self.streams) != set(own):
             raise DataError(f"sample {name!r}: streams {sorted(own)}, expected {sorted(self.streams)}")
-        kept = {key: np.asarray(row, np.float32) for key, row in own.items()}
-        self._rows.append((name, split, int(label), np.asarray(scores, np.float32), kept))
+        main, *single = (np.asarray(row, np.float32) for row in (scores, *(own[key] for key in self.streams)))
+        self._rows.append((name, split, int(label), main, single))
+        self._record([name, split, int(label), main, single])
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -60,31 +62,26 @@ class ScoresWriter:
     def __enter__(self) -> ScoresWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None or not self._rows:
-            self._atomic.failed(kind, error, trace)
-            if kind is None:
-                raise DataError(f"{self._atomic.target}: not one sample was scored; nothing was written")
-            return
-        try:
-            self._write_all()
-        except (OSError, RuntimeError) as problem:
-            self._atomic.failed(type(problem), problem, None)
-            raise
-        self._atomic.commit()
+    def _about(self) -> dict[str, Any]:
+        return super()._about() | {"streams": list(self.streams)}
 
-    def _write_all(self) -> None:
-        file = self._atomic.file
+    def _write_again(self, given: list[Any]) -> str:
+        name, split, label, scores, single = given
+        self.write(name, scores, label=label, split=split, streams=dict(zip(self.streams, single)))
+        return name
+
+    def _complete(self) -> None:
+        if not self._rows:
+            raise DataError(f"{self.path}: not one sample was scored; nothing was written")
+        file = self._file
         write_root(file, "scores", class_names=self.class_names, provenance=self.provenance, **self._root)
         names, splits, labels, scores, streams = zip(*self._rows)
         file.create_dataset("name", data=np.array(names, dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(splits, dtype=object), dtype=STRING)
         file.create_dataset("label", data=np.array(labels, np.int32), **_PACKED)
         file.create_dataset("scores", data=np.stack(scores))
-        for stream in self.streams:
-            file.create_dataset(f"streams/{stream}", data=np.stack([row[stream] for row in streams]))
+        for stream, rows in zip(self.streams, zip(*streams)):
+            file.create_dataset(f"streams/{stream}", data=np.stack(rows))
 
 
 class ScoresReader:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError, DpcError, Stopped, UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.store.chunks import WholeChunks
-from dpcli.store.file import STRING, AtomicFile, write_positions, write_root, write_skipped
-from dpcli.store.journal import Journal, Placed, data_suffix, journal_path, second_path
+from dpcli.store.file import STRING, write_positions, write_root, write_skipped
+from dpcli.store.journal import Placed
+from dpcli.store.resumable import ResumableWriter
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
 COMPRESSIONS = ("none", "lzf", "gzip")
@@ -25,17 +25,14 @@ _FIELDS = ("time", *POINT_FIELDS, "pose")  # the order in which they are made, w
 _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
 
 
-class CloudsWriter:
-    """Context manager that writes sequences to `path`, through a file beside it renamed when whole.
+class CloudsWriter(ResumableWriter):
+    """Context manager that writes sequences to `path`; `ResumableWriter` says what it leaves when it is stopped.
 
-    Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
-    written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
-    the next writer with the same provenance continues, `written_names` lists what is already there, and the file gets
-    the bytes it would have had. Until the file is whole that takes a journal (`.NAME.part`), small beside uncompressed
-    points, as large as the samples of a compressed file.
+    A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
+    the samples of a compressed file.
     `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose). Set before the
     block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
-    kept in the file; a shard may be empty. Raises UsageError when `path` exists and `force` is off.
+    kept in the file; a shard may be empty.
     """
 
     kind = "clouds"
@@ -54,73 +51,24 @@ class CloudsWriter:
         force: bool = False,
         resume: bool = False,
     ) -> None:
-        if Path(path).exists() and not force:
-            raise UsageError(f"{path}: exists already; --force replaces it")
+        super().__init__(path, provenance=provenance, force=force, resume=resume)
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
-        self.path, self.class_names, self.resume = Path(path), list(class_names), resume
+        self.class_names = list(class_names)
         unknown = set(fields) - set(_FIELDS)
         if unknown:
             raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
         self.fields, self.compression = tuple(name for name in _FIELDS if name in fields), compression
-        self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self._root = {"length_unit": length_unit, "source": source, "seed": seed}
         self.skipped: list[tuple[str, str]] = []
         self.positions: tuple[list[int], list[int]] | None = None
-        self.keep = False
         self._names: set[str] = set()
         self._frames = self._points = self._unflushed = 0
         self._index: dict[str, list] = {name: [] for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
-        self._journal: Journal | None = None
         self._chunks: WholeChunks | None = None
         self._placed: Placed | None = None
-        self.written_names: list[str] = []
         self._open(force)
-
-    def _open(self, force: bool) -> None:
-        folder, before = self.path.parent, None
-        if self.resume and folder.is_dir() and not self.path.is_dir():  # AtomicFile explains what is wrong otherwise
-            before = Journal(journal_path(self.path), self._about())
-        try:
-            self._atomic = AtomicFile(self.path, suffix=data_suffix(before.data_name) if before else ".part")
-            self._file = self._atomic.file
-            self._create()
-            if before:
-                self._continue(before, force)
-        except BaseException as error:
-            self._give_up(before)
-            self._leave(type(error), error, None)
-            raise
-
-    def _about(self) -> dict[str, Any]:
-        """What decides whether a journal is of this very work."""
-        return {"kind": self.kind, "provenance": self.provenance}
-
-    def _continue(self, before: Journal, force: bool) -> None:
-        """Write what an earlier run had written, if it was the same work."""
-        if force or not before.data_name:
-            self._journal = before
-            before.begin(self._atomic.part, self._atomic.handle)
-            before.remove_others(self._atomic.part.name)
-            return
-        self._journal = Journal(second_path(before.path), self._about())
-        self._journal.begin(self._atomic.part, self._atomic.handle)
-        for given in before.samples():
-            self.write(*given)
-            self.written_names.append(given[0].name)
-        self._journal.replace(before)
-
-    def _give_up(self, before: Journal | None) -> None:
-        """Opening failed: nothing of the earlier run may be lost."""
-        if self._journal not in (None, before):
-            self._journal.path.unlink(missing_ok=True)
-            self._journal.close()
-        self._journal = None
-        if before and before.was_there:
-            before.keep()
-        elif before:
-            before.discard()
 
     def _create(self) -> None:
         file = self._file
@@ -158,10 +106,13 @@ class CloudsWriter:
 
     def _note(self, sequence: CloudSequence, *said: Any) -> None:
         """From here on the sample counts as written; `said`: what else `write` was given."""
-        if self._journal:
-            self._journal.append([sequence, *said], self._placed)
+        self._record([sequence, *said], self._placed)
         self._placed = None
         self._names.add(sequence.name)
+
+    def _write_again(self, given: list[Any]) -> str:
+        self.write(*given)
+        return given[0].name
 
     def _check(self, sequence: CloudSequence) -> None:
         sequence.validate(len(self.class_names))
@@ -224,50 +175,14 @@ class CloudsWriter:
     def __enter__(self) -> CloudsWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self._finish()
-        else:
-            self._leave(kind, error, trace)
-
-    def _leave(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Nothing stays but, after a stop, the journal."""
-        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
-        kept = bool(self._journal and stopped and len(self))
-        if hasattr(self, "_atomic"):
-            try:
-                self._atomic.failed(kind, error, trace, keep=kept)
-            finally:
-                self._leave_journal(kept)
-
-    def _leave_journal(self, kept: bool) -> None:
-        if self._journal and kept:
-            self._journal.keep()
-        elif self._journal:
-            self._journal.discard()
-
-    def _finish(self) -> None:
-        try:
-            if not len(self) and self.positions is None:
-                raise DataError(f"{self.path}: not one good sample to write; nothing was written")
-            if self._chunks:
-                self._chunks.finish()
-            for name, values in self._index.items():
-                if values:
-                    self._extend(name, values)
-            write_skipped(self._file, self.skipped)
-            write_positions(self._file, self.positions)
-            self._file.flush()
-        except BaseException as error:
-            self._leave(type(error), error, None)
-            raise
-        try:
-            self._atomic.commit()
-        except DpcError:  # the HDF5 file is gone, and with it what the journal points to
-            self._leave_journal(kept=False)
-            raise
-        self._leave_journal(kept=False)
+    def _complete(self) -> None:
+        if not len(self) and self.positions is None:
+            raise DataError(f"{self.path}: not one good sample to write; nothing was written")
+        if self._chunks:
+            self._chunks.finish()
+        for name, values in self._index.items():
+            if values:
+                self._extend(name, values)
+        write_skipped(self._file, self.skipped)
+        write_positions(self._file, self.positions)
+        self._file.flush()
