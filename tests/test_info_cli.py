@@ -158,3 +158,35 @@ def test_what_the_system_refuses_is_said_in_words(capsys) -> None:
         assert said.startswith("dpc: error: there: ") and "Errno" not in said and "bug" not in said
     with pytest.raises(OSError):
         _explain(OSError(5, "Input/output error"))
+
+
+def test_a_shipped_model_tells_its_classes_and_training(dpc_here):
+    done = dpc_here("info", "msraction3d-24")
+    assert done.returncode == 0, done.stderr.decode()
+    text = " ".join(done.stdout.decode().split())
+    for said in ("model, dpc-kinet-1", "classes 20: high arm wave", "config num_frames 24", "notes trained_on 266 videos",
+                 "timing clips", "msraction3d-24.md", "notes command dpc classify train"):  # fmt: skip
+        assert said in text, said
+    told = json.loads(dpc_here("info", "articulated-compact", "--json").stdout)
+    assert told["kind"] == "model" and told["format"] == "dpc-parts-1" and told["config"]["slots"] == 8
+
+
+def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
+    """Counted by hand; another program's file has no configuration, and a cut one is told."""
+    from safetensors.numpy import save_file
+
+    (tmp_path / "run").mkdir()
+    weights = tmp_path / "run" / "best.safetensors"
+    save_file({"a": np.zeros((3, 4), np.float16), "b": np.zeros(5, np.float32)}, weights, {"note": "[not json"})
+    for name in (weights, weights.parent):
+        told = json.loads(dpc_here("info", name, "--json").stdout)
+        assert (told["weights"], told["tensors"], told["types"], told["note"]) == (17, 2, ["F16", "F32"], "[not json")
+        assert told["format"] is None and told["card"] is None and told["file"] == str(weights)
+    assert b"model, of another program" in dpc_here("info", weights).stdout
+    refused = dpc_here("info", weights, "--picture", tmp_path / "x.png")
+    assert refused.returncode == 2 and b"holds weights" in refused.stderr
+    weights.write_bytes(weights.read_bytes()[:-9])
+    cut = dpc_here("info", weights)
+    assert cut.returncode == 3 and b"not a complete safetensors file" in cut.stderr
+    for other in (tmp_path, "msraction3d", "no/msraction3d-24", "*"):
+        assert dpc_here("info", other).returncode == 3

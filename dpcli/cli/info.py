@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -13,10 +14,13 @@ from dpcli.errors import UsageError
 
 _PIPE_WIDTH = 120
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
+_MODEL_LINES = ("file", "kind", "format", "version", "bytes", "weights", "tensors", "types", "card")
 
 
 def info(
-    file: Annotated[str, typer.Argument(help="File of any kind, or - for a pipe.")],
+    file: Annotated[
+        str, typer.Argument(help="File of any kind, or - for a pipe; or a model: .safetensors, a training folder, a shipped name.")
+    ],
     as_object: Json = False,
     picture: Picture = None,
     samples: Annotated[int, typer.Option("--samples", min=1, max=100, help="Rows of the picture.")] = 8,
@@ -26,18 +30,32 @@ def info(
         typer.Option("--view", help="Axes that point right, down and away in the picture, such as xyz or x-zy (z up)."),
     ] = None,
 ) -> None:
-    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames."""
+    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.
+
+    Of a model: its classes, configuration and training.
+    """
+    from dpcli.runtime.model_summary import find_model_file, model_summary
     from dpcli.store import input_file
     from dpcli.store.info import summary
 
+    model = find_model_file(file)
+    if model is not None:
+        if picture is not None:
+            raise UsageError(f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png")
+        _tell({"file": str(model), **model_summary(model)}, as_object, _show_model)
+        return
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
         if picture is not None:
             _draw(path, found["kind"], picture, samples=samples, frames=frames, view=view)
+    _tell(found, as_object, _show)
+
+
+def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]], None]) -> None:
     if as_object:
         typer.echo(json.dumps(found, allow_nan=False))
     else:
-        _show(found)
+        show(found)
 
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
@@ -81,6 +99,31 @@ def _show(found: dict[str, Any]) -> None:
         command = str(entry.get("command", ""))
         short = command if len(command) <= _COMMAND_SHOWN else command[:_COMMAND_SHOWN] + " ..."
         console.print(f"{'provenance' if number == 1 else '':<20} {number}. {short}", markup=False)
+
+
+def _show_model(told: dict[str, Any]) -> None:
+    from rich.console import Console
+
+    console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+    rest = {key: value for key, value in told.items() if key not in _MODEL_LINES}
+    made = f"dpc {told['version']}, " if told["version"] else ""
+    lines = [("file", told["file"]), ("kind", f"model, {told['format'] or 'of another program'}, {made}{told['bytes'] / 1e6:.3g} MB"),
+             ("weights", f"{told['weights']:,} numbers in {told['tensors']} tensors, {', '.join(told['types'])}")]  # fmt: skip
+    if told["card"]:
+        lines.append(("card", told["card"]))
+    names = rest.pop("class_names", [])
+    if names:
+        shown = ", ".join(names[:_CLASSES_SHOWN]) + (", ..." if len(names) > _CLASSES_SHOWN else "")
+        lines.append(("classes", f"{len(names)}: {shown}"))
+    for key, value in rest.items():
+        lines += [(f"{key} {name}", _short(one)) for name, one in value.items()] if isinstance(value, dict) else [(key, _short(value))]
+    for name, value in lines:
+        console.print(f"{name:<24} {value}", markup=False)
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= _COMMAND_SHOWN else text[:_COMMAND_SHOWN] + " ..."
 
 
 def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
