@@ -136,6 +136,24 @@ def test_classical_methods_write_the_same_kind_of_file(dpc_here, data, tmp_path,
         assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
 
 
+def test_too_little_memory_keeps_what_was_predicted(dpc_here, data, tmp_path, monkeypatch):
+    from dpcli.segment import commands
+
+    predict, asked = commands.predict_parts, []
+
+    def scarce(sequence, *rest):
+        asked.append(sequence.name)
+        if len(asked) == 3:
+            raise MemoryError
+        return predict(sequence, *rest)
+
+    monkeypatch.setattr(commands, "predict_parts", scarce)
+    words = ("segment", "predict", data, "--method", "ward", "--flow", "nearest", "--parts", 2, "--split", "all")
+    assert dpc_here(*words, "-o", tmp_path / "whole.h5").returncode == 1 and len(asked) == 3
+    assert dpc_here(*words, "-o", tmp_path / "whole.h5").returncode == 0
+    assert len(asked) == 3 + len(PartsReader(tmp_path / "whole.h5")) - 2 and not list(tmp_path.glob(".*"))
+
+
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [

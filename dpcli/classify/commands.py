@@ -46,7 +46,13 @@ def run_prediction(
         keep_freed_memory()
         with ScoresWriter(target, class_names=info.class_names, seed=seed, source=reader.path.name if data != "-" else "stdin",
                           provenance=history, streams=streams, force=force, resume=output != "-") as writer:  # fmt: skip
-            _score(model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if split == "validation" else None)
+            try:
+                _score(
+                    model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if split == "validation" else None
+                )
+            except Exception as error:
+                writer.keep = not isinstance(error, DataError)  # too little memory says nothing about what was scored
+                raise
     if output != "-":
         print(f"{output}: scores of {len(writer)} videos in {len(info.class_names)} classes")
 

@@ -245,7 +245,11 @@ def _predict_all(
             if reader.names[index] in done:
                 continue
             sequence = reader.read(index, fields=fields)
-            labels, sample = predict_parts(sequence, index, segmenter, estimate, options, seed)
+            try:
+                labels, sample = predict_parts(sequence, index, segmenter, estimate, options, seed)
+            except Exception as error:
+                writer.keep = not isinstance(error, DataError)  # too little memory says nothing about the others
+                raise
             sequence.part = labels
             writer.write(sequence, sample.probability, sample.pairs, sample.motion, sample.flow)
             bar.advance(1, frames=sequence.num_frames)
