@@ -164,11 +164,11 @@ def test_a_shipped_model_tells_its_classes_and_training(dpc_here):
     done = dpc_here("info", "msraction3d-24")
     assert done.returncode == 0, done.stderr.decode()
     text = " ".join(done.stdout.decode().split())
-    for said in ("model, dpc-kinet-1", "classes 20: high arm wave", "config num_frames 24", "notes trained_on 266 videos",
+    for said in ("model, dpc-kinet-1", "class names 20: high arm wave", "config num frames 24", "notes trained on 266 videos",
                  "timing clips", "msraction3d-24.md", "notes command dpc classify train"):  # fmt: skip
         assert said in text, said
     told = json.loads(dpc_here("info", "articulated-compact", "--json").stdout)
-    assert told["kind"] == "model" and told["format"] == "dpc-parts-1" and told["config"]["slots"] == 8
+    assert told["kind"] == "model" and told["format"] == "dpc-parts-1" and told["header"]["config"]["slots"] == 8
 
 
 def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
@@ -177,10 +177,12 @@ def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
 
     (tmp_path / "run").mkdir()
     weights = tmp_path / "run" / "best.safetensors"
-    save_file({"a": np.zeros((3, 4), np.float16), "b": np.zeros(5, np.float32)}, weights, {"note": "[not json"})
+    save_file({"a": np.zeros((3, 4), np.float16), "b": np.zeros(5, np.float32)}, weights,
+              {"note": "[not json", "weights": "x", "kind": "7", "class_names": "5", "loss": "NaN"})  # fmt: skip
     for name in (weights, weights.parent):
         told = json.loads(dpc_here("info", name, "--json").stdout)
-        assert (told["weights"], told["tensors"], told["types"], told["note"]) == (17, 2, ["F16", "F32"], "[not json")
+        assert (told["kind"], told["weights"], told["tensors"], told["types"]) == ("model", 17, 2, ["F16", "F32"])
+        assert told["header"] == {"note": "[not json", "weights": "x", "kind": 7, "class_names": 5, "loss": "NaN"}
         assert told["format"] is None and told["card"] is None and told["file"] == str(weights)
     assert b"model, of another program" in dpc_here("info", weights).stdout
     refused = dpc_here("info", weights, "--picture", tmp_path / "x.png")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -14,7 +15,6 @@ from dpcli.errors import UsageError
 
 _PIPE_WIDTH = 120
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
-_MODEL_LINES = ("file", "kind", "format", "version", "bytes", "weights", "tensors", "types", "card")
 
 
 def info(
@@ -34,15 +34,15 @@ def info(
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.model_summary import find_model_file, model_summary
+    from dpcli.runtime.weights_files import SUFFIX, locate_weights, weights_summary
     from dpcli.store import input_file
     from dpcli.store.info import summary
 
-    model = find_model_file(file)
-    if model is not None:
+    model = locate_weights(file, sorted(Path(__file__).parents[1].glob("*/weights")))
+    if model is not None and model.suffix == SUFFIX:
         if picture is not None:
             raise UsageError(f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png")
-        _tell({"file": str(model), **model_summary(model)}, as_object, _show_model)
+        _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
         return
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
@@ -96,8 +96,7 @@ def _show(found: dict[str, Any]) -> None:
         console.print()
         console.print(_class_table(found))
     for number, entry in enumerate(found["provenance"], 1):
-        command = str(entry.get("command", ""))
-        short = command if len(command) <= _COMMAND_SHOWN else command[:_COMMAND_SHOWN] + " ..."
+        short = _shortened(str(entry.get("command", "")))
         console.print(f"{'provenance' if number == 1 else '':<20} {number}. {short}", markup=False)
 
 
@@ -105,24 +104,26 @@ def _show_model(told: dict[str, Any]) -> None:
     from rich.console import Console
 
     console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH)
-    rest = {key: value for key, value in told.items() if key not in _MODEL_LINES}
     made = f"dpc {told['version']}, " if told["version"] else ""
     lines = [("file", told["file"]), ("kind", f"model, {told['format'] or 'of another program'}, {made}{told['bytes'] / 1e6:.3g} MB"),
              ("weights", f"{told['weights']:,} numbers in {told['tensors']} tensors, {', '.join(told['types'])}")]  # fmt: skip
     if told["card"]:
         lines.append(("card", told["card"]))
-    names = rest.pop("class_names", [])
-    if names:
-        shown = ", ".join(names[:_CLASSES_SHOWN]) + (", ..." if len(names) > _CLASSES_SHOWN else "")
-        lines.append(("classes", f"{len(names)}: {shown}"))
-    for key, value in rest.items():
-        lines += [(f"{key} {name}", _short(one)) for name, one in value.items()] if isinstance(value, dict) else [(key, _short(value))]
+    for key, value in told["header"].items():
+        within = value.items() if isinstance(value, dict) else [("", value)]
+        lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
     for name, value in lines:
         console.print(f"{name:<24} {value}", markup=False)
 
 
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else json.dumps(value)
+def _model_value(value: Any) -> str:
+    if isinstance(value, list) and value and all(isinstance(one, str) for one in value):  # names of classes
+        shown = ", ".join(value[:_CLASSES_SHOWN])
+        return f"{len(value)}: {shown}, ..." if len(value) > _CLASSES_SHOWN else f"{len(value)}: {shown}"
+    return _shortened(value if isinstance(value, str) else json.dumps(value))
+
+
+def _shortened(text: str) -> str:
     return text if len(text) <= _COMMAND_SHOWN else text[:_COMMAND_SHOWN] + " ..."
 
 

@@ -9,6 +9,7 @@ import torch
 
 from dpcli import __version__
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.weights_files import locate_weights, shipped_models
 
 
 def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, str]) -> None:
@@ -49,20 +50,11 @@ def load_state(model: torch.nn.Module, tensors: dict[str, torch.Tensor], path: P
         raise DataError(f"{path}: weights don't fit the configuration: {str(error).splitlines()[1].strip()}") from None
 
 
-def shipped_models(folder: Path) -> list[str]:
-    """Names of the models that come with the package; each has a card `NAME.md` beside it."""
-    return sorted(path.stem for path in folder.glob("*.safetensors"))
-
-
 def find_weights(name: str, shipped: Path, maker: str, option: str = "--model") -> Path:
     """A model's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
-    path = Path(name)
-    if path.is_dir():
-        path = path / "best.safetensors"
-    if path.is_file():
+    path = locate_weights(name, [shipped])
+    if path is not None:
         return path
-    if name in shipped_models(shipped):
-        return shipped / f"{name}.safetensors"
     raise UsageError(
         f"{option} {name}: no such file; give a .safetensors file, a folder made by `{maker}`"
         f" or a shipped model ({', '.join(shipped_models(shipped)) or 'none in this installation'})"

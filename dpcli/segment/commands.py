@@ -277,7 +277,7 @@ def _show(target: Path, picture: Path | None, ply: Path | None, turntable: Path 
 
 def default_model() -> str:
     """The shipped model used when none is named. UsageError when this installation has none."""
-    from dpcli.runtime.weights import shipped_models
+    from dpcli.runtime.weights_files import shipped_models
 
     names = shipped_models(SHIPPED)
     if not names:

@@ -6,17 +6,18 @@ early. What a sample is and where it goes is its subclass's.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from dpcli.errors import DpcError, Stopped, UsageError
-from dpcli.store.file import AtomicFile
+from dpcli.store.file import AtomicFile, write_root
 from dpcli.store.journal import Journal, Placed, data_suffix, journal_path, second_path
 
 
-class ResumableWriter:
+class ResumableWriter(ABC):
     """Context manager that writes `path` through a file beside it renamed when whole.
 
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
@@ -30,10 +31,14 @@ class ResumableWriter:
 
     kind = ""
 
-    def __init__(self, path: str | Path, *, provenance: dict | Sequence[dict] | None, force: bool, resume: bool) -> None:
+    def __init__(
+        self, path: str | Path, *, class_names: Sequence[str], length_unit: str, source: str, seed: int,
+        provenance: dict | Sequence[dict] | None, force: bool, resume: bool,
+    ) -> None:  # fmt: skip
         if Path(path).exists() and not force:
             raise UsageError(f"{path}: exists already; --force replaces it")
         self.path, self.resume, self.keep = Path(path), resume, False
+        self.class_names, self._root = list(class_names), {"length_unit": length_unit, "source": source, "seed": seed}
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self.written_names: list[str] = []
         self._journal: Journal | None = None
@@ -43,18 +48,20 @@ class ResumableWriter:
         return {"kind": self.kind, "provenance": self.provenance}
 
     def _create(self) -> None:
-        """What the new HDF5 file holds from the start."""
+        """What the new HDF5 file holds from the start: its attributes; a subclass adds data sets to fill."""
+        write_root(self._file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
 
+    @abstractmethod
     def _write_again(self, given: list[Any]) -> str:
         """Write a sample as `_record` was told of it; its name."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _complete(self) -> None:
         """Write into the HDF5 file what is still missing."""
-        raise NotImplementedError
 
+    @abstractmethod
     def __len__(self) -> int:
-        raise NotImplementedError
+        """Samples written so far."""
 
     def _open(self, force: bool) -> None:
         before = None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes
 from dpcli.store.resumable import ResumableWriter
 
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
@@ -28,9 +28,11 @@ class ScoresWriter(ResumableWriter):
         self, path: str | Path, *, class_names: Sequence[str], seed: int = 0, source: str = "",
         provenance: dict | Sequence[dict] | None = None, streams: Sequence[str] = (), force: bool = False, resume: bool = False,
     ) -> None:  # fmt: skip
-        super().__init__(path, provenance=provenance, force=force, resume=resume)
-        self.class_names, self.streams = list(class_names), tuple(streams)
-        self._root = {"length_unit": "", "source": source, "seed": seed}
+        super().__init__(
+            path, class_names=class_names, length_unit="", source=source, seed=seed,
+            provenance=provenance, force=force, resume=resume,
+        )  # fmt: skip
+        self.streams = tuple(streams)
         self._rows: list[tuple] = []
         self._open(force)
 
@@ -76,7 +78,6 @@ class ScoresWriter(ResumableWriter):
         if not self._rows:
             raise DataError(f"{self.path}: not one sample was scored; nothing was written")
         file = self._file
-        write_root(file, "scores", class_names=self.class_names, provenance=self.provenance, **self._root)
         names, splits, labels, scores, streams = zip(*self._rows)
         file.create_dataset("name", data=np.array(names, dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(splits, dtype=object), dtype=STRING)

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.chunks import WholeChunks
-from dpcli.store.file import STRING, write_positions, write_root, write_skipped
+from dpcli.store.file import STRING, write_positions, write_skipped
 from dpcli.store.journal import Placed
 from dpcli.store.resumable import ResumableWriter
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
@@ -51,15 +51,16 @@ class CloudsWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
-        super().__init__(path, provenance=provenance, force=force, resume=resume)
+        super().__init__(
+            path, class_names=class_names, length_unit=length_unit, source=source, seed=seed,
+            provenance=provenance, force=force, resume=resume,
+        )  # fmt: skip
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
-        self.class_names = list(class_names)
         unknown = set(fields) - set(_FIELDS)
         if unknown:
             raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
         self.fields, self.compression = tuple(name for name in _FIELDS if name in fields), compression
-        self._root = {"length_unit": length_unit, "source": source, "seed": seed}
         self.skipped: list[tuple[str, str]] = []
         self.positions: tuple[list[int], list[int]] | None = None
         self._names: set[str] = set()
@@ -71,8 +72,8 @@ class CloudsWriter(ResumableWriter):
         self._open(force)
 
     def _create(self) -> None:
+        super()._create()
         file = self._file
-        write_root(file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
         self._create_floats("points", 3)
         for name in ("frame_offsets", "sequence_offsets"):
             file.create_dataset(name, data=np.zeros(1, np.int64), maxshape=(None,), chunks=(4096,), **PACKED)
