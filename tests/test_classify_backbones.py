@@ -14,13 +14,13 @@ from torch.nn.functional import cross_entropy
 
 from dpcli.classify.backbone import build_backbone, clip_points, resolve_backbone
 from dpcli.classify.config import KinetConfig
-from dpcli.classify.dgcnn import DGCNN, EdgeConv, edge_statistics
+from dpcli.classify.dgcnn import DGCNN, Dense, EdgeConv, edge_statistics, image_statistics
 from dpcli.classify.frame_graph import frame_graph, frame_shares, pool_edges
 from dpcli.classify.kinet import Kinet
 from dpcli.classify.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.presets import BACKBONE_CHANGES, find_preset, with_backbone
 from dpcli.classify.profile import body_like_clip, count_parameters, paper_parameters
-from dpcli.classify.spidercnn import SpiderCNN, SpiderConv, _RankedProducts, monomials
+from dpcli.classify.spidercnn import SpiderCNN, SpiderConv, _RankedProducts, _terms, monomials
 from dpcli.classify.sync_norm import synchronise_norms
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.precision import reduced_products
@@ -123,12 +123,44 @@ def test_the_graph_is_the_nearest_by_brute_force(channels, shared, k, reach, siz
         assert torch.equal(graph_by_hand(cloud, size, k, reach, shared), expected)
 
 
-def test_features_far_from_the_origin_and_in_pieces_give_the_same_graph(monkeypatch):
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_features_far_from_the_origin_and_in_pieces_give_the_same_graph(backend, monkeypatch):
+    monkeypatch.setenv("DPC_BACKEND", backend)
     features = torch.randn(2, 40, 6, generator=torch.Generator().manual_seed(1))
     times = torch.arange(4.0).repeat_interleave(10).expand(2, -1)
     near = frame_graph(features, times, 6, 1, True)
     monkeypatch.setattr("dpcli.classify.frame_graph._DISTANCES", 1)
+    monkeypatch.setattr("dpcli.classify.frame_graph._PAIRS", 700)  # two frames, then the rest
     assert torch.equal(frame_graph(features + 300, times, 6, 1, True), near)
+
+
+@pytest.mark.parametrize("channels", [3, 16])
+@pytest.mark.parametrize(("k", "reach", "shared"), [(20, 1, True), (12, 3, False), (20, 0, True)])
+def test_the_kernel_s_graph_is_torch_s(channels, k, reach, shared, monkeypatch):
+    """Frames of 70 points, more than a row of the kernel's vectors, and, in coordinates, many equal distances."""
+    features = torch.randn(2, 5 * 70, channels, generator=torch.Generator().manual_seed(k))
+    features = (2 * features).round() if channels == 3 else features
+    times = torch.arange(5.0).repeat_interleave(70).expand(2, -1)
+    found = frame_graph(features, times, k, reach, shared)
+    with monkeypatch.context() as patch:
+        patch.setattr("dpcli.classify.frame_graph._ALL_PAIRS", 69)
+        searched = frame_graph(features, times, k, reach, shared)
+    monkeypatch.setenv("DPC_BACKEND", "torch")
+    expected = frame_graph(features, times, k, reach, shared)
+    assert torch.equal(found, expected) and torch.equal(searched, expected)
+
+
+def test_values_that_are_no_numbers_end_in_a_graph_still():
+    """A diverging network is told by its loss; until then no index may leave the cloud, nor a good point lose its own."""
+    features = torch.randn(1, 12, 5, generator=torch.Generator().manual_seed(0))
+    features[0, 4] = float("nan")
+    found = frame_graph(features, torch.arange(3.0).repeat_interleave(4)[None], 5, 1, True)
+    assert found.min() >= 0 and found.max() < 12
+    points = features[..., :3].clone()
+    points[0, 4] = 1e30  # its squares are infinite
+    found = frame_graph(points, torch.arange(3.0).repeat_interleave(4)[None], 5, 1, True)[0]
+    good = torch.arange(12) != 4
+    assert torch.equal(found[good, 0], torch.arange(12)[good]) and found.max() < 12
 
 
 def test_points_that_stand_still_find_themselves_first():
@@ -209,7 +241,9 @@ def test_statistics_of_edges_far_from_the_origin_keep_their_digits():
     torch.testing.assert_close(found[1].double(), var, rtol=1e-3, atol=0)
 
 
-def test_pooling_in_pieces_is_gather_and_amax_ties_included(monkeypatch):
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_pooling_in_pieces_is_gather_and_amax_ties_included(backend, monkeypatch):
+    monkeypatch.setenv("DPC_BACKEND", backend)
     values = (
         torch.randn(2, 7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).round().requires_grad_()
     )
@@ -256,11 +290,57 @@ def test_spider_conv_is_a_loop_over_points_and_neighbours():
     torch.testing.assert_close(terms.sum(2)[0] + layer.bias, summed, rtol=1e-5, atol=1e-6)
 
 
-def test_ranked_products_have_the_gradients_of_finite_differences():
+@pytest.mark.parametrize("piece", [1 << 18, 7])
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_ranked_products_have_the_gradients_of_finite_differences(backend, piece, monkeypatch):
+    monkeypatch.setenv("DPC_BACKEND", backend)
+    monkeypatch.setattr("dpcli.classify.spidercnn._PIECE", piece)
     generator = torch.Generator().manual_seed(0)
     shapes = (1, 3, 4, 2), (1, 3, 4, 3), (4, 6, 5)
     inputs = [torch.randn(*s, dtype=torch.float64, generator=generator).requires_grad_() for s in shapes]
     assert torch.autograd.gradcheck(_RankedProducts.apply, inputs)
+    gathered, taylor, kernel = (value.detach() for value in inputs)
+    products = (gathered[..., :, None] * taylor[..., None, :]).flatten(-2)
+    expected = torch.einsum("bnki,kiw->bnkw", products, kernel)
+    torch.testing.assert_close(_terms(gathered, taylor, kernel), expected)
+    with torch.no_grad():
+        torch.testing.assert_close(_terms(gathered, taylor, kernel), expected)
+    torch.testing.assert_close(_RankedProducts.apply(gathered, taylor, kernel), expected.sum(2))
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_a_pooled_dense_layer_is_its_definition(training):
+    """Values, gradients of everything and running statistics, with norms of both signs, far from the origin."""
+    torch.manual_seed(0)
+    layer = trained_norms(Dense(6, 12).double()).train(training)
+    assert (layer.norm.weight < 0).any() and (layer.norm.weight > 0).any()
+    plain = copy.deepcopy(layer)
+    values = (torch.randn(3, 11, 6, dtype=torch.float64) + 40).requires_grad_()
+    weight = torch.randn(3, 12, dtype=torch.float64)
+    ours, theirs = layer.pool(values), plain(values).amax(1)
+    assert (theirs > 0).any()
+    torch.testing.assert_close(ours, theirs)
+    grads = [torch.autograd.grad((out * weight).sum(), [values, *module.parameters()])
+             for out, module in ((ours, layer), (theirs, plain))]  # fmt: skip
+    for one, other in zip(*grads):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+    for one, other in zip(layer.buffers(), plain.buffers()):
+        torch.testing.assert_close(one, other)
+
+
+def test_a_pooled_dense_layer_of_one_row_has_the_running_statistics():
+    layer = trained_norms(Dense(4, 5)).train()
+    row = torch.randn(1, 1, 4)
+    torch.testing.assert_close(layer.pool(row), layer(row)[:, 0])
+
+
+def test_statistics_of_an_image_far_from_the_origin_keep_their_digits():
+    generator = torch.Generator().manual_seed(0)
+    rows, weight = torch.randn(500, 6, generator=generator) + 1000, torch.randn(9, 6, generator=generator)
+    mean, var = image_statistics(rows, weight)
+    image = rows.double() @ weight.double().T
+    torch.testing.assert_close(mean.double(), image.mean(0), rtol=1e-5, atol=1e-3)
+    torch.testing.assert_close(var.double(), image.var(0, correction=0), rtol=1e-4, atol=0)
 
 
 # ---- networks

@@ -41,6 +41,50 @@ class Dense(nn.Module):
             rows = batch_norm(rows, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
         return torch.relu(rows).view(*values.shape[:-1], -1)
 
+    def pool(self, values: Tensor) -> Tensor:
+        """`forward(values).amax(1)`, (B,N,C) -> (B,width), keeping no array of size (B,N,width) for the gradient.
+
+        The norm's statistics are those of a linear image, W m and W S W^T of the mean and covariance of `values`, and norm
+        and ReLU keep the order of rows (turn it where the norm's scale is negative). So the gradient passes through the
+        rows that win and through S, and through no (B,N,width). Of equal rows the first one gets it.
+        """
+        if values.shape[0] * values.shape[1] == 1 or (self.training and isinstance(self.norm, SyncNorm)):
+            return self.forward(values).amax(1)
+        weight, norm = self.linear.weight, self.norm
+        with torch.no_grad():
+            sign = torch.where(norm.weight < 0, -1.0, 1.0).to(weight)
+            place = linear(values, weight * sign[:, None]).argmax(1)
+        return self._normed(values, place)
+
+    @full_precision
+    def _normed(self, values: Tensor, place: Tensor) -> Tensor:
+        """The rows `place` (B,width) of values (B,N,C), each times its channel's weights, norm and ReLU."""
+        linear, norm = self.linear, self.norm
+        largest = (gather_points(values, place) * linear.weight).sum(-1) + linear.bias
+        if self.training:
+            mean, var = image_statistics(values.flatten(0, 1), linear.weight)
+            mean = mean + linear.bias
+            _remember(norm, mean, var, values.shape[0] * values.shape[1])
+        else:
+            mean, var = norm.running_mean, norm.running_var
+        return torch.relu((largest - mean) * (norm.weight * torch.rsqrt(var + norm.eps)) + norm.bias)
+
+
+def image_statistics(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and biased variance (width) of rows (R,C) @ weight.T (C,width), without making it; differentiable."""
+    mean = rows.mean(0)
+    centred = rows - mean.detach()  # they sum to zero: no gradient of the covariance passes through the mean
+    covariance = centred.T @ centred / len(rows)
+    return weight @ mean, ((weight @ covariance) * weight).sum(1).clamp(min=0)
+
+
+@torch.no_grad()
+def _remember(norm: nn.BatchNorm1d, mean: Tensor, var: Tensor, rows: int) -> None:
+    """Running statistics as BatchNorm1d keeps them, from the mean and biased variance of so many rows."""
+    norm.num_batches_tracked += 1
+    norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
+    norm.running_var.lerp_((var * (rows / max(rows - 1, 1))).to(norm.running_var), norm.momentum)
+
 
 class DenseHead(nn.Module):
     """Hidden layers with dropout behind each, then class logits: what ends both published networks."""
@@ -85,7 +129,7 @@ class EdgeConv(nn.Module):
         neighbor, own = _products(features, self.linear.weight * sign[:, None], self.linear.bias * sign)
         largest, total = pool_edges(neighbor, idx)
         mean, var = edge_statistics(neighbor, own, idx, total)
-        self._update(mean * sign, var, idx.numel())
+        _remember(self.norm, mean * sign, var, idx.numel())
         scale = self.norm.weight * sign * torch.rsqrt(var + self.norm.eps)
         return torch.relu((largest + own - mean) * scale + self.norm.bias)
 
@@ -98,20 +142,15 @@ class EdgeConv(nn.Module):
     def activations(self, features: Tensor, idx: Tensor) -> Tensor:
         """After norm (by its running statistics) and ReLU, before pooling: (B,N,K,width)."""
         neighbor, own = _products(features, *self._folded())
-        edges = gather_points(neighbor, idx) + own[:, :, None]
-        return torch.relu(edges) if edges.requires_grad else edges.relu_()
+        edges = gather_points(neighbor, idx)
+        if edges.requires_grad or own.requires_grad:
+            return torch.relu(edges + own[:, :, None])
+        return edges.add_(own[:, :, None]).relu_()  # the largest array of the network: made once
 
     def _folded(self) -> tuple[Tensor, Tensor]:
         norm = self.norm
         scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
         return self.linear.weight * scale[:, None], (self.linear.bias - norm.running_mean) * scale + norm.bias
-
-    @torch.no_grad()
-    def _update(self, mean: Tensor, var: Tensor, edges: int) -> None:
-        norm = self.norm
-        norm.num_batches_tracked += 1
-        norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
-        norm.running_var.lerp_((var * (edges / max(edges - 1, 1))).to(norm.running_var), norm.momentum)
 
 
 @full_precision
@@ -153,7 +192,7 @@ class InputTransform(nn.Module):
 
     def forward(self, points: Tensor, idx: Tensor) -> Tensor:
         """Points (B,N,3), neighbours (B,N,K) -> points (B,N,3) times the matrix."""
-        pooled = self.point(self.edges.pool(points, points, idx, points)).amax(1)
+        pooled = self.point.pool(self.edges.pool(points, points, idx, points))
         matrix = self.matrix(self.hidden(pooled)).view(-1, 3, 3)
         return full_precision(torch.matmul)(points, matrix + torch.eye(3).to(matrix))
 
@@ -209,7 +248,7 @@ class DGCNN(Backbone):
         return frame_graph(features, times, config.neighbors, config.temporal_radius, config.grouping == "balanced")
 
     def _classified(self, levels: list[Tensor]) -> Tensor:
-        return self.head(self.aggregate(torch.cat(levels, -1)).amax(1))
+        return self.head(self.aggregate.pool(torch.cat(levels, -1)))
 
     def macs_as_written(self) -> int:
         """Multiply-adds of one clip as papers count them: each layer on every gathered edge, without the search."""

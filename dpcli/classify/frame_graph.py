@@ -7,13 +7,18 @@ equal shares, which keep one dense frame from filling all slots. Distances are t
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from dpcli.ops import knn
+from dpcli.ops.backend import chosen_backend, run_in_threads, squared_distances
 from dpcli.runtime.precision import full_precision
 
 _DISTANCES = 1 << 24  # distances held at once between features, 64 MiB
+_ALL_PAIRS = 512  # points a frame up to which the kernel looks at every pair; beyond, `knn`'s buckets look at fewer
+_PAIRS = 1 << 20  # distances that it is given at once: 4 MiB
+_PAIR_NS, _POOL_NS = 1.0, 0.1  # per pair of points, and per gathered number
 _PIECE = 1 << 18  # gathered numbers between two poolings, which then stay in the cache
 
 
@@ -43,6 +48,47 @@ def frame_graph(features: Tensor, times: Tensor, k: int, reach: int, shared: boo
     shares = (
         frame_shares(k, frames, reach) if shared else [{d: k for d in row} for row in frame_shares(k, frames, reach)]
     )
+    if features.dtype == torch.float32 and size <= _ALL_PAIRS and chosen_backend(features.device) == "numba":
+        return _among_all_pairs(blocks, shares, k)
+    return _among_nearest(blocks, shares, k)
+
+
+def _among_all_pairs(blocks: Tensor, shares: list[dict[int, int]], k: int) -> Tensor:
+    """`frame_graph` of blocks (B,T,P,C) by a kernel, which looks through the distances of a few frames at a time."""
+    from dpcli.ops.kernels_graph import nearest_kernel
+
+    batch, frames, size, channels = blocks.shape
+    offsets = sorted({d for row in shares for d in row}, key=_own_first)
+    taken = np.array([[row.get(d, 0) for d in offsets] for row in shares])
+    starts = (np.arange(frames)[:, None] + offsets) * size
+    out = torch.empty(batch, frames, size, k, dtype=torch.int64)
+    step = max(1, _PAIRS // (len(offsets) * size * size))
+    distance = torch.empty(len(offsets), min(step, frames), size, size)
+    for cloud, found in zip(blocks, out):
+        if channels != 3:
+            cloud = cloud - cloud.mean((0, 1))  # |a|^2 - 2ab + |b|^2 loses fewer digits near the origin
+        for first in range(0, frames, step):
+            last = min(first + step, frames)
+            for offset, into in zip(offsets, distance):
+                low, high = max(first, -offset), min(last, frames - offset)
+                if low < high:
+                    _measure(cloud[low:high], cloud[low + offset : high + offset], into[low - first : high - first])
+            arrays = (distance.numpy(), taken[first:last], starts[first:last], found[first:last].flatten(0, 1).numpy())
+            run_in_threads(nearest_kernel, arrays, (last - first) * size, len(offsets) * size * _PAIR_NS)
+    return out.view(batch, frames * size, k)
+
+
+def _measure(query: Tensor, points: Tensor, out: Tensor) -> None:
+    """Squared distances (R,P,P) of query and points (R,P,C); for C = 3 as every search of `dpcli.ops` rounds them."""
+    if query.shape[-1] == 3:
+        out.copy_(squared_distances(query, points))
+        return
+    torch.baddbmm(points.square().sum(-1)[:, None], query, points.transpose(1, 2), alpha=-2, out=out)
+    out.add_(query.square().sum(-1, keepdim=True)).clamp_(min=0)
+
+
+def _among_nearest(blocks: Tensor, shares: list[dict[int, int]], k: int) -> Tensor:
+    """`frame_graph` of blocks (B,T,P,C) in torch, a search a frame and offset."""
     found = [_between(blocks, offset, shares) for offset in sorted({d for row in shares for d in row}, key=_own_first)]
     distance, index = (torch.cat(parts, -1) for parts in zip(*found))
     distance, order = distance.sort(dim=-1, stable=True)
@@ -50,7 +96,7 @@ def frame_graph(features: Tensor, times: Tensor, k: int, reach: int, shared: boo
     index = torch.where(distance[..., :k].isinf(), index[..., :1], index)
     if index.shape[-1] < k:
         index = torch.cat([index, index[..., :1].expand(-1, -1, -1, k - index.shape[-1])], -1)
-    return index.reshape(batch, count, k)
+    return index.flatten(1, 2)
 
 
 def frame_shares(k: int, frames: int, reach: int) -> list[dict[int, int]]:
@@ -107,13 +153,41 @@ def _nearest(query: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 def pool_edges(values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
     """Maximum and sum over each point's neighbours, both (B,N,C), of values (B,N,C) at idx (B,N,K); differentiable.
 
-    The gathered (B,N,K,C) are made and pooled piece by piece and never all held. Equally large neighbours share the
-    maximum's gradient, as in torch.amax.
+    The gathered (B,N,K,C) are never all held: a kernel makes none, torch makes and pools them piece by piece on a CPU.
+    Equally large neighbours share the maximum's gradient, as in torch.amax.
     """
+    if values.dtype in (torch.float32, torch.float64) and idx.numel() and chosen_backend(values.device) == "numba":
+        return _PooledByKernel.apply(values.contiguous(), idx.contiguous())
     batch, count, channels = values.shape
     rows = idx + torch.arange(batch, device=idx.device)[:, None, None] * count
     pooled = _PooledEdges.apply(values.reshape(batch * count, channels), rows.flatten(0, 1))
     return tuple(part.view(batch, idx.shape[1], channels) for part in pooled)
+
+
+class _PooledByKernel(torch.autograd.Function):
+    """values (B,N,C), idx (B,M,K) -> maximum and sum over K, (B,M,C) each."""
+
+    @staticmethod
+    def forward(ctx, values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
+        from dpcli.ops.kernels_graph import pool_kernel
+
+        shape, cost = (*idx.shape[:2], values.shape[2]), idx.shape[2] * values.shape[2] * _POOL_NS
+        largest, total = (torch.empty(shape, dtype=values.dtype) for _ in range(2))
+        arrays = (values.detach().numpy(), idx.numpy(), largest.flatten(0, 1).numpy(), total.flatten(0, 1).numpy())
+        run_in_threads(pool_kernel, arrays, len(arrays[2]), cost)
+        ctx.save_for_backward(values, idx, largest)
+        return largest, total
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, to_largest: Tensor, to_total: Tensor) -> tuple[Tensor, None]:
+        from dpcli.ops.kernels_graph import pool_back_kernel
+
+        values, idx, largest = ctx.saved_tensors
+        out, cost = torch.zeros_like(values), 3 * idx[0].numel() * values.shape[2] * _POOL_NS
+        arrays = (values.detach(), idx, largest, to_largest.contiguous(), to_total.contiguous(), out)
+        run_in_threads(pool_back_kernel, tuple(array.numpy() for array in arrays), len(out), cost)
+        return out, None
 
 
 class _PooledEdges(torch.autograd.Function):

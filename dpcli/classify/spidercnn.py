@@ -8,6 +8,7 @@ variant has. Ours: neighbours come from the frames within the temporal radius (`
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from math import gcd
 
 import torch
@@ -18,8 +19,10 @@ from dpcli.classify.config import KinetConfig
 from dpcli.classify.dgcnn import DenseHead, expect_widths, xavier_init
 from dpcli.classify.frame_graph import frame_graph
 from dpcli.ops import gather_points
+from dpcli.ops.backend import chosen_backend, run_in_threads
 
 PUBLISHED = ((32, 64, 128, 256), (5,), (1024, 512))  # convolutions, Taylor channels, hidden layers
+_PIECE, _ENTRY_NS = 1 << 18, 0.2  # modulated numbers held at once, and the time of one
 _NORM_GROUPS, _NORM_EPS, _TOP = 16, 1e-6, 2
 _POWERS = [(a, b, c) for a in range(4) for b in range(4) for c in range(4) if 1 <= a + b + c <= 3]
 
@@ -58,8 +61,7 @@ class SpiderConv(nn.Module):
     def contributions(self, features: Tensor, idx: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
         """Each neighbour's term of the sum (B,N,K,width), and the layer's output (B,N,width)."""
         gathered, taylor = self._factors(features, idx, offsets)
-        terms = [_modulated(gathered, taylor, k) @ kernel for k, kernel in enumerate(self.kernel)]
-        terms = torch.stack(terms, 2)
+        terms = _terms(gathered, taylor, self.kernel)
         return terms, self._normed(terms.sum(2))
 
     def _factors(self, features: Tensor, idx: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,13 +78,26 @@ def _modulated(gathered: Tensor, taylor: Tensor, k: int) -> Tensor:
 
 
 class _RankedProducts(torch.autograd.Function):
-    """sum_k modulated_k @ kernel_k, rank after rank, so that the modulated features, T times larger, are never all held."""
+    """sum_k modulated_k @ kernel_k, rank after rank, so that the modulated features, T times larger, are never all held.
+
+    gathered (B,N,K,C), taylor (B,N,K,T), kernel (K,C*T,width) -> (B,N,width). On a CPU some rows at a time, whose modulated
+    features a kernel makes Taylor channel by Taylor channel: then they stay in the cache, and so do their gradients.
+    """
 
     @staticmethod
     def forward(ctx, gathered: Tensor, taylor: Tensor, kernel: Tensor) -> Tensor:
         ctx.save_for_backward(gathered, taylor, kernel)
         batch, count = gathered.shape[:2]
         out = gathered.new_zeros(batch * count, kernel.shape[-1])
+        if _by_kernel(gathered):
+            from dpcli.ops.kernels_ranked import modulate_kernel
+
+            weights = _by_taylor_channel(kernel, taylor)
+            for rows, line, factor, buffer in _pieces(gathered, taylor):
+                for k, weight in enumerate(weights):
+                    _run(modulate_kernel, buffer, line, factor, k, buffer)
+                    out[rows].addmm_(buffer.flatten(1), weight)
+            return out.view(batch, count, -1)
         for k, weight in enumerate(kernel):
             out.addmm_(_modulated(gathered, taylor, k).flatten(0, 1), weight)
         return out.view(batch, count, -1)
@@ -91,14 +106,70 @@ class _RankedProducts(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         gathered, taylor, kernel = ctx.saved_tensors
-        to_gathered, to_taylor, to_kernel = (torch.empty_like(value) for value in (gathered, taylor, kernel))
+        to_gathered, to_taylor = (torch.empty_like(value) for value in (gathered, taylor))
         grad = grad.reshape(-1, grad.shape[-1])
+        if _by_kernel(gathered):
+            from dpcli.ops.kernels_ranked import modulate_back_kernel, modulate_kernel
+
+            weights = _by_taylor_channel(kernel, taylor)
+            to_weights = torch.zeros_like(weights)
+            targets = (to_gathered.flatten(0, 1), to_taylor.flatten(0, 1))
+            for rows, line, factor, buffer in _pieces(gathered, taylor):
+                given, into = grad[rows], [target[rows] for target in targets]
+                for k, weight in enumerate(weights):
+                    _run(modulate_kernel, buffer, line, factor, k, buffer)
+                    to_weights[k].addmm_(buffer.flatten(1).T, given)
+                    torch.mm(given, weight.T, out=buffer.flatten(1))
+                    _run(modulate_back_kernel, buffer, buffer, line, factor, k, *into)
+            taylors = taylor.shape[-1]
+            to_kernel = to_weights.unflatten(1, (taylors, -1)).transpose(1, 2).flatten(1, 2)
+            return to_gathered, to_taylor, to_kernel
+        to_kernel = torch.empty_like(kernel)
         for k, weight in enumerate(kernel):
             to_kernel[k] = _modulated(gathered, taylor, k).flatten(0, 1).T @ grad
             pairs = (grad @ weight.T).view(*gathered.shape[:2], gathered.shape[-1], -1)
             to_gathered[:, :, k] = (pairs @ taylor[:, :, k, :, None])[..., 0]
             to_taylor[:, :, k] = (gathered[:, :, k, None] @ pairs)[:, :, 0]
         return to_gathered, to_taylor, to_kernel
+
+
+def _terms(gathered: Tensor, taylor: Tensor, kernel: Tensor) -> Tensor:
+    """modulated_k @ kernel_k for every rank k, (B,N,K,width): what `_RankedProducts` sums."""
+    if torch.is_grad_enabled() or not _by_kernel(gathered):
+        return torch.stack([_modulated(gathered, taylor, k) @ weight for k, weight in enumerate(kernel)], 2)
+    from dpcli.ops.kernels_ranked import modulate_kernel
+
+    terms, weights = gathered.new_empty(*gathered.shape[:3], kernel.shape[-1]), _by_taylor_channel(kernel, taylor)
+    for rows, line, factor, buffer in _pieces(gathered, taylor):
+        for k, weight in enumerate(weights):
+            _run(modulate_kernel, buffer, line, factor, k, buffer)
+            torch.mm(buffer.flatten(1), weight, out=terms.flatten(0, 1)[rows, k])
+    return terms
+
+
+def _by_kernel(values: Tensor) -> bool:
+    return values.dtype in (torch.float32, torch.float64) and chosen_backend(values.device) == "numba"
+
+
+def _by_taylor_channel(kernel: Tensor, taylor: Tensor) -> Tensor:
+    """The rows (C,T) of each rank's weights as (T,C)."""
+    return kernel.unflatten(1, (-1, taylor.shape[-1])).transpose(1, 2).flatten(1, 2)
+
+
+def _pieces(gathered: Tensor, taylor: Tensor) -> Iterator[tuple[slice, Tensor, Tensor, Tensor]]:
+    """Rows of all clips, a cacheful at a time: which, their features, their Taylor channels, and room for their product."""
+    gathered, taylor = gathered.flatten(0, 1), taylor.flatten(0, 1)
+    width = (taylor.shape[-1], gathered.shape[-1])
+    step = max(1, _PIECE // (width[0] * width[1]))
+    room = gathered.new_empty(min(step, len(gathered)), *width)
+    for first in range(0, len(gathered), step):
+        rows = slice(first, min(first + step, len(gathered)))
+        yield rows, gathered[rows], taylor[rows], room[: rows.stop - first]
+
+
+def _run(kernel: Callable[..., None], product: Tensor, *arguments: Tensor | int) -> None:
+    arrays = tuple(value.numpy() if isinstance(value, Tensor) else value for value in arguments)
+    run_in_threads(kernel, arrays, len(product), product[0].numel() * _ENTRY_NS)
 
 
 class SpiderCNN(Backbone):
