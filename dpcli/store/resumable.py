@@ -47,9 +47,8 @@ class ResumableWriter(ABC):
         """What decides whether a journal is of this very work."""
         return {"kind": self.kind, "provenance": self.provenance}
 
-    def _create(self) -> None:
-        """What the new HDF5 file holds from the start: its attributes; a subclass adds data sets to fill."""
-        write_root(self._file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
+    def _create(self) -> None:  # noqa: B027 (not every subclass has any)
+        """The data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
 
     @abstractmethod
     def _write_again(self, given: list[Any]) -> str:
@@ -136,6 +135,8 @@ class ResumableWriter(ABC):
     def _finish(self) -> None:
         try:
             self._complete()
+            # last, since a stream knows only at its end how many frames its provenance has to name
+            write_root(self._file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
         except BaseException as error:
             self._leave(type(error), error, None)
             raise

@@ -72,7 +72,6 @@ class CloudsWriter(ResumableWriter):
         self._open(force)
 
     def _create(self) -> None:
-        super()._create()
         file = self._file
         self._create_floats("points", 3)
         for name in ("frame_offsets", "sequence_offsets"):
