@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.paths import utf8_path
 from dpcli.store import file_kind
 from dpcli.store.views import ViewsHeader, ViewsReader
 
@@ -270,7 +271,7 @@ class VideoSource(Source):
         os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         import cv2
 
-        return cv2.VideoCapture(str(self.path))
+        return cv2.VideoCapture(utf8_path(self.path, "OpenCV"))
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
         capture, wanted = self._open(), set(frames)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.paths import utf8_path
 from dpcli.runtime.progress import log
 from dpcli.store.pipes import check_replaced
 
@@ -79,9 +80,9 @@ def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> No
     import cv2
 
     log.warn("mp4 without H.264, so browsers may not play it; pip install imageio-ffmpeg")
-    writer = None
+    writer, name = None, utf8_path(path, "OpenCV")
     for picture in map(_even, pictures):
-        writer = writer or cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), fps, picture.shape[1::-1])
+        writer = writer or cv2.VideoWriter(name, cv2.VideoWriter_fourcc(*"mp4v"), fps, picture.shape[1::-1])
         writer.write(picture[..., ::-1])
     if writer is not None:
         writer.release()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.paths import as_utf8
 from dpcli.prepare.cloud_files import SUFFIXES, Cloud, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
@@ -60,7 +61,7 @@ class CloudFolders:
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
-            return labels_of_folders(self.raw, [path.as_posix() for path in self._relative], "CLASS")
+            return labels_of_folders(self.raw, [as_utf8(path.as_posix()) for path in self._relative], "CLASS")
         return read_labels(self.labels) if self.labels else None
 
     @cached_property
@@ -92,7 +93,7 @@ class CloudFolders:
     def items(self) -> list[Item]:
         items = []
         for relative in self._relative:
-            name = relative.as_posix() if relative.parts else self.raw.resolve().name
+            name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
             items.append(Item(name, self.raw / relative, extra={"color": self._has_color}))
         return self._table.apply(items) if self._table else items
 

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.paths import as_utf8
 from dpcli.prepare.camera import Intrinsics, back_project
 from dpcli.prepare.depth_files import VIDEO_SUFFIXES, has_images, read_depth_video
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
@@ -94,7 +95,7 @@ class DepthVideos:
         paths = [(found, given) for given in self.inputs for found in find_videos(given)]
         items: dict[str, Item] = {}
         for path, given in paths:
-            name = path.relative_to(given).as_posix() if path != given else path.name
+            name = as_utf8(path.relative_to(given).as_posix() if path != given else path.name)
             if name in items:
                 raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
             items[name] = Item(name, path)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.paths import utf8_path
 from dpcli.prepare.gray_png import decode_gray_png
 from dpcli.prepare.reader import natural_key
 
@@ -40,14 +41,14 @@ def open_video(path: Path):  # -> cv2.VideoCapture
     """An OpenCV capture that yields 16-bit gray frames unharmed and 8-bit ones expanded to the full range."""
     if not path.is_file():
         raise DataError(f"{path}: no such video")
-    cv2 = load_cv2()
+    cv2, name = load_cv2(), utf8_path(path, "OpenCV")
     # frame threads cost a quarter more processor time, and the cores are busy with other videos
     single = [cv2.CAP_PROP_N_THREADS, 1]
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, single)
+    capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, single)
     # the default conversion of 16-bit frames to 8-bit BGR would cut the lower byte off
     if capture.isOpened() and int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _GRAY16:
         if not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0):  # an OpenCV that takes it at the opening only
-            capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [*single, cv2.CAP_PROP_CONVERT_RGB, 0])
+            capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, [*single, cv2.CAP_PROP_CONVERT_RGB, 0])
     if not capture.isOpened():
         raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
     return capture

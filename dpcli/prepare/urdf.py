@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.paths import utf8_path
 from dpcli.prepare.articulated import ArticulatedObject, Joint, drop_degenerate, joint_motion
 from dpcli.prepare.urdf_meshes import geometry_triangles, resolve
 
@@ -66,11 +67,12 @@ def _parse(path: Path) -> Any:
     from yourdfpy import URDF
 
     logging.getLogger("yourdfpy.urdf").setLevel(logging.CRITICAL)
+    name = utf8_path(path, "yourdfpy")
     try:
-        root = etree.parse(str(path)).getroot()
+        root = etree.parse(name).getroot()
         if root.tag != "robot":
             raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
-        return URDF.load(str(path), build_scene_graph=False, load_meshes=False).robot
+        return URDF.load(name, build_scene_graph=False, load_meshes=False).robot
     except etree.XMLSyntaxError as error:
         raise DataError(f"{path}: not well-formed XML ({error.msg}); expected a URDF") from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:  # an element or attribute that is absent or odd

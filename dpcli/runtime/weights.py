@@ -9,6 +9,7 @@ import torch
 
 from dpcli import __version__
 from dpcli.errors import DataError, UsageError
+from dpcli.paths import utf8_path
 from dpcli.runtime.weights_files import locate_weights, shipped_models
 
 
@@ -30,7 +31,7 @@ def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str
     from safetensors import SafetensorError, safe_open
 
     try:
-        with safe_open(path, "pt") as file:
+        with safe_open(utf8_path(path, "safetensors"), "pt") as file:
             header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}
     except (SafetensorError, OSError) as error:

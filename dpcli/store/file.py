@@ -15,6 +15,7 @@ import numpy as np
 
 from dpcli import __version__
 from dpcli.errors import DataError, DpcError
+from dpcli.paths import as_utf8
 
 SCHEMA = 1
 KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
@@ -258,8 +259,8 @@ def write_root(file: h5py.File, kind: str, *, length_unit: str, source: str, see
     """Root attributes, class names and provenance, as design.md section 3 lists them. No clock time, so bytes repeat."""
     last = provenance[-1] if provenance else {}
     file.attrs.update({
-        "dpc_kind": kind, "dpc_schema": SCHEMA, "dpc_version": __version__, "command": str(last.get("command", "")),
-        "seed": int(seed), "source": source, "length_unit": length_unit,
+        "dpc_kind": kind, "dpc_schema": SCHEMA, "dpc_version": __version__, "seed": int(seed),
+        "command": as_utf8(str(last.get("command", ""))), "source": as_utf8(source), "length_unit": length_unit,
     })  # fmt: skip
     file.create_dataset("class_names", data=np.array(list(class_names), dtype=object), dtype=STRING)
     entries = [json.dumps(entry, sort_keys=True) for entry in provenance]
