@@ -34,7 +34,7 @@ from tests.tables.runs import (  # fmt: skip
 )
 
 STREAMS = ("static", "dynamic", "fused")
-MORE = "--epochs 15 --epochs-dynamic 40 --lr 0.0005"  # README's networks of 4 to 24 frames were made so
+MORE = "--epochs 15 --epochs-dynamic 40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
 EVERY_START = ("thesis", "release")  # presets that score every clip of a video by default; the others 8 spread over it
 
 
