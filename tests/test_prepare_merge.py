@@ -116,6 +116,14 @@ def test_what_does_not_fit_is_refused(two, tmp_path):
         merge([two[0], again], tmp_path / "all.h5")
     assert merge([two[0], again], tmp_path / "all.h5", prefix=True).written == 5
     assert {"a/a1", "c/a1"} < joined(tmp_path / "all.h5").keys()
+    (tmp_path / "more").mkdir()
+    same = write(tmp_path / "more" / "a.h5", ["a1"], ["hand wave", "push", "bend"])
+    merge([two[0], again, same], tmp_path / "named.h5", prefix=True)
+    assert {f"{tmp_path.name}/a1", "c/a1", "more/a1"} < joined(tmp_path / "named.h5").keys()
+    (tmp_path / "other" / "more").mkdir(parents=True)
+    (tmp_path / "other" / "more" / "a.h5").write_bytes(same.read_bytes())
+    with pytest.raises(DataError, match="sample 'more/a1' is in .*files and folders of one name"):
+        merge([tmp_path / "other" / "more" / "a.h5", same], tmp_path / "no.h5", prefix=True)
     metres = write(tmp_path / "mm.h5", ["m"], ["hand wave", "push", "bend"], length_unit="mm")
     with pytest.raises(DataError, match="its length unit is 'mm', of .*a.h5 it is 'm'"):
         merge([two[0], metres], tmp_path / "all.h5", force=True)

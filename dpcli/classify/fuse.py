@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.paths import short_names
 from dpcli.runtime import provenance
 from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 
@@ -44,7 +45,7 @@ def run_fusion(
     _refuse_repeats([*judges, output])
     called = [str(Path(name)) if name != "-" else "stdin" for name in inputs]
     if len(called) > 1:  # one file's streams are known only once it is read
-        parse_weights(weights, _file_names(called))
+        parse_weights(weights, stream_names(short_names(called)))
     with ExitStack() as stack:
         paths = [stack.enter_context(input_file(name)) for name in inputs]
         target = stack.enter_context(output_file(output))
@@ -56,7 +57,7 @@ def run_fusion(
         config = {"fuse": streams, "mean": mean, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
         if judges:
             config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
-        entry = provenance.record(config, 0, dict(zip(_file_names(called), paths)))
+        entry = provenance.record(config, 0, dict(zip(stream_names(short_names(called)), paths)))
         if not force and _already_there(target, entry):
             return
         with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(Path(name).name for name in called),
@@ -73,7 +74,7 @@ def _streams(
 ) -> tuple[list[str], list[ScoresReader], list[np.ndarray]]:
     """What is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
     if len(readers) > 1:
-        return _file_names(called), list(readers), matching_rows(readers, called)
+        return stream_names(short_names(called)), list(readers), matching_rows(readers, called)
     if len(readers[0].streams) < 2:
         raise UsageError(f"{called[0]}: one file without streams to fuse; name two or more files")
     views = []
@@ -187,13 +188,6 @@ def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: Scores
     if mean == "geometric":
         return geometric_weights(scores, labels[known])
     return likelihood_weights(scores[:, np.arange(len(known)), labels[known]])
-
-
-def _file_names(called: Sequence[str]) -> list[str]:
-    """A name for each file: its stem, where files share one that of their folders (`seed0/scores.h5`: seed0)."""
-    stems = [Path(name).stem for name in called]
-    folders = [Path(name).resolve().parent.name for name in called]
-    return stream_names([folder or stem if stems.count(stem) > 1 else stem for stem, folder in zip(stems, folders)])
 
 
 def stream_names(wanted: Sequence[str]) -> list[str]:

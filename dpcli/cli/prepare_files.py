@@ -25,7 +25,9 @@ def merge(
     labels: Annotated[
         Path | None, typer.Option("--labels", help="TOML or JSON: which class of which file becomes which.")
     ] = None,
-    prefix: Annotated[bool, typer.Option("--prefix", help="Samples are named FILE/NAME: names may repeat.")] = False,
+    prefix: Annotated[
+        bool, typer.Option("--prefix", help="Samples are named FILE/NAME (FOLDER/NAME of files called alike): names may repeat.")
+    ] = False,
     compression: Annotated[
         str, typer.Option("--compression", help="Of the coordinates: none, lzf or gzip. Shards: as they were made.")
     ] = "none",

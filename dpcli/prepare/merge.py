@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, UsageError
+from dpcli.paths import short_names
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Report, already_complete, count_samples
 from dpcli.prepare.shards import Shard, shard_of
@@ -38,6 +39,10 @@ class Source:
     skipped: list[tuple[str, str]]
     positions: tuple[list[int], list[int]] | None
     shard: Shard | None = field(default=None)
+    prefix: str = ""  # what goes before its samples' names
+
+    def sample_name(self, index: int) -> str:
+        return self.prefix + self.names[index]
 
 
 def read_source(path: Path) -> Source:
@@ -84,9 +89,10 @@ def merge(
 
     All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
     whole's. Other files follow one another as given; their class lists must agree unless `labels` maps them.
-    prefix: names become FILE/NAME. resume: off where nobody could run it again (a pipe); saves the journal's disk
-    space. UsageError: missing, repeated or mixed shards, `output` or what a stopped run left of it is there and
-    another; DataError: classes, units or fields that disagree, a name twice; Stopped after a stop signal.
+    prefix: names become FILE/NAME, FOLDER/NAME for files of one name. resume: off where nobody could run it again
+    (a pipe); saves the journal's disk space. UsageError: missing, repeated or mixed shards, `output` or what a stopped
+    run left of it is there and another; DataError: classes, units or fields that disagree, a name twice; Stopped after
+    a stop signal.
     """
     _refuse_repeats([*inputs, output])
     sources = [read_source(path) for path in inputs]
@@ -97,7 +103,10 @@ def merge(
             log.warn(
                 f"{source.path}: is shard {source.shard} of a conversion; joined as any other file, in its own order"
             )
-    return _merge_unlike(sources, output, labels or LabelMap(), prefix, compression, force, resume)
+    if prefix:
+        for source, name in zip(sources, short_names(inputs)):
+            source.prefix = f"{name}/"
+    return _merge_unlike(sources, output, labels or LabelMap(), compression, force, resume)
 
 
 def _refuse_repeats(paths: Sequence[Path]) -> None:
@@ -161,7 +170,7 @@ def _difference(one: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _merge_unlike(
-    sources: list[Source], output: Path, labels: LabelMap, prefix: bool, compression: str, force: bool, resume: bool
+    sources: list[Source], output: Path, labels: LabelMap, compression: str, force: bool, resume: bool
 ) -> Report:
     units = {source.length_unit: source.path for source in sources}
     if len(units) > 1:
@@ -171,45 +180,41 @@ def _merge_unlike(
     fields = tuple(name for name in sources[0].fields if all(name in source.fields for source in sources))
     for name in sorted({name for source in sources for name in source.fields} - set(fields)):
         log.warn(f"{name}: left out, not all of the files have it")
-    _refuse_equal_names(sources, prefix)
+    _refuse_equal_names(sources)
     chosen: list[tuple[Source, int, int | None]] = []
     skipped: list[tuple[str, str]] = []
     for source, table in zip(sources, tables):
-        skipped += [(_name(source, name, prefix), why) for name, why in source.skipped]
+        skipped += [(source.prefix + name, why) for name, why in source.skipped]
         for index, label in enumerate(source.labels):
             if label >= 0 and table[label] is None:
                 why = f"class {source.class_names[label]!r} is left out by the label map"
-                skipped.append((_name(source, source.names[index], prefix), why))
+                skipped.append((source.sample_name(index), why))
             else:
                 chosen.append((source, index, table[label] if label >= 0 else -1))
-    config = {"merge": [source.path.name for source in sources], "labels": labels.config, "prefix": prefix,
+    config = {"merge": [source.path.name for source in sources], "labels": labels.config,
+              "prefix": any(source.prefix for source in sources),
               "compression": compression, "sources": [source.provenance for source in sources]}  # fmt: skip
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
     pattern = Source(output, class_names, sources[0].length_unit, 0, "merge", [], [], fields, [], [], None)
-    return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume,
-                  prefix=prefix)  # fmt: skip
+    return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
 
 
-def _refuse_equal_names(sources: list[Source], prefix: bool) -> None:
+def _refuse_equal_names(sources: list[Source]) -> None:
     seen: dict[str, Path] = {}
     for source in sources:
-        for name in source.names:
-            own = _name(source, name, prefix)
+        for index in range(len(source.names)):
+            own = source.sample_name(index)
             if own in seen:
-                advice = "two files of one name" if prefix else "--prefix puts the file's name before it"
+                advice = "files and folders of one name" if source.prefix else "--prefix puts the file's name before it"
                 raise DataError(
                     f"{source.path}: sample {own!r} is in {seen[own]} as well; names identify samples ({advice})"
                 )
             seen[own] = source.path
 
 
-def _name(source: Source, name: str, prefix: bool) -> str:
-    return f"{source.path.stem}/{name}" if prefix else name
-
-
 def _write(
     output: Path, entry: dict[str, Any], pattern: Source, samples: list[tuple[Source, int, int | None]],
-    skipped: list[tuple[str, str]], *, compression: str, force: bool, resume: bool, prefix: bool = False,
+    skipped: list[tuple[str, str]], *, compression: str, force: bool, resume: bool,
 ) -> Report:  # fmt: skip
     """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
     report = Report(skipped=skipped)
@@ -224,10 +229,10 @@ def _write(
             output, class_names=pattern.class_names, length_unit=pattern.length_unit, source=pattern.made_by,
             seed=pattern.seed, fields=pattern.fields, compression=compression, provenance=entry, force=force, resume=resume,
         ) as writer, Progress("prepare merge", total=len(samples), unit="video") as bar:  # fmt: skip
-            done = copied_before(writer, [_name(source, source.names[index], prefix) for source, index, _ in samples])
+            done = copied_before(writer, [source.sample_name(index) for source, index, _ in samples])
             bar.skip(done)
             for source, index, label in samples[done:]:
-                sequence = _relabelled(files.read(source.path, index), source, pattern, label, prefix)
+                sequence = _relabelled(files.read(source.path, index), source, pattern, label)
                 writer.write(sequence)
                 bar.advance(1, frames=sequence.num_frames)
                 stop.check(f"{len(writer)} of {len(samples)} samples are kept")
@@ -249,13 +254,11 @@ def copied_before(writer: CloudsWriter, names: list[str]) -> int:
     return done
 
 
-def _relabelled(
-    sequence: CloudSequence, source: Source, pattern: Source, label: int | None, prefix: bool
-) -> CloudSequence:
+def _relabelled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
     """The sample as the joined file has it: its label, its name, and no field that others lack."""
     if label is not None:
         sequence.label = label
-    sequence.name = _name(source, sequence.name, prefix)
+    sequence.name = source.prefix + sequence.name
     for name in set(source.fields) - set(pattern.fields):
         setattr(sequence, name, None)
     return sequence
