@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from dpcli.classify.config import KinetConfig
+from dpcli.classify.kinematic import KinematicUnit
 from dpcli.classify.kinet import Kinet, fuse
 from dpcli.classify.layers import GlobalHead, he_init
 from dpcli.classify.profile import body_like_clip, count_parameters, macs, measure, paper_parameters, render
@@ -122,6 +123,19 @@ def test_reversed_time_is_another_input_to_the_dynamic_stream_only_in_its_normal
         _, forward = model(clip)
         _, backward = model(clip.flip(1))
     assert (forward - backward).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("solver", ["inverse", "ridge"])
+@pytest.mark.parametrize("variant", ["thesis", "release"])
+def test_surfaces_don_t_depend_on_when_a_clip_begins(variant, solver):
+    """A ridge holds the offset b down, too: of absolute frame numbers it would make other normals later in a video."""
+    torch.manual_seed(0)
+    config = KinetConfig(**TINY).changed(variant=variant, solver=solver, time_input=False)
+    unit = KinematicUnit(config, 16, 0).double()
+    activation, relative = 4 * torch.rand(1, 6, 40, 16).double(), torch.randn(1, 6, 40, 3).double()
+    times = torch.randint(-1, 2, (1, 6, 40)).double()
+    normals = [unit(activation, relative, times + start, torch.full((1, 6), start).double(), None).normals for start in (1.0, 20.0)]
+    torch.testing.assert_close(normals[0], normals[1], rtol=1e-6, atol=1e-6)
 
 
 def test_balanced_grouping_shares_the_slots_between_frames():

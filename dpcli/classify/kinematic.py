@@ -90,8 +90,10 @@ class KinematicUnit(nn.Module):
         if not config.normals:
             return self._pooled(values, relative)
         logits = self.weigh(previous) if self.weigh is not None and previous is not None else None
-        # Measuring time from the centroid's frame only shifts b, so normals and deviations stay; float32 keeps more digits.
-        target = times if config.variant == "release" else times - center_times[..., None]
+        # Measuring time from the centroid's frame only shifts b, so normals and deviations stay; float32 keeps more digits. A
+        # ridge holds b down, too, so that with one the absolute frame number would count: the release has none.
+        absolute = config.variant == "release" and config.solver == "inverse"
+        target = times if absolute else times - center_times[..., None]
         fit = Fit(config.group_size, config.solver, config.guard, not last and config.weighting != "none")
         near = relative if config.xyz_group else None
         surface, away = fit_reduced(values, (self.reduce.weight, self.reduce.bias), near, target, logits, fit)
