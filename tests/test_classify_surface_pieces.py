@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.classify import st_surface
 from dpcli.classify import surface_pieces as module
 from dpcli.classify.backbone import Grouping
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.kinet import Kinet
+from dpcli.classify.st_surface import surface_normal
 from dpcli.classify.surface_pieces import Fit, _Layout, fit_reduced, fit_reduced_reference
 from dpcli.ops.kernels_linalg import solve_planes, solve_planes_back
-from dpcli.ops.linalg import GUARDS, small_inverse_reference
+from dpcli.ops.linalg import GUARDS, small_inverse, small_inverse_reference
 
 
 def unit(size, learned, coordinates, weighted, dtype, neighbors=24, dead=False):
@@ -66,6 +68,47 @@ CASES = [
 def test_pieces_give_the_reference(size, learned, coordinates, weighted, solver, deviations, monkeypatch):
     monkeypatch.setattr(module, "_PIECE", 1 << 14)  # several pieces a task, the last not full
     compare(size, learned, coordinates, weighted, Fit(size, solver, deviations=deviations))
+
+
+def repeated(size, distinct, dtype, twin):
+    """Normals and a weight's gradient of fits whose 32 neighbours are `distinct` points again and again."""
+    g = torch.Generator().manual_seed(10 * size + distinct)
+    pick = torch.arange(32) % distinct
+    activation = torch.rand(1, 500, distinct, size, generator=g)[:, :, pick].to(dtype)
+    times = torch.randint(-1, 2, (1, 500, distinct), generator=g)[:, :, pick].to(dtype)
+    logits = torch.randn(1, 500, 32, 1, generator=g).to(dtype)
+    weight = torch.eye(size, dtype=dtype).requires_grad_()
+    planes, _ = twin(activation, (weight, torch.zeros(size, dtype=dtype)), None, times, logits, Fit(size, "ridge"))
+    normals = surface_normal(planes)
+    return normals.detach().double(), torch.autograd.grad(normals[..., 0].sum(), weight)[0].double()
+
+
+@pytest.mark.parametrize("twin", [fit_reduced, fit_reduced_reference])
+def test_no_clouds_give_no_surfaces(twin):
+    (activation, linear, relative, times, logits), _ = unit(4, 5, True, True, torch.float32)
+    planes, away = twin(activation[:0], linear, relative[:0], times[:0], logits[:0], Fit(4, "ridge"))
+    assert planes.shape == (0, 37, 6, 5) and away.shape == (0, 37, 24, 6)
+
+
+def check_repeated(size, distinct, twin):
+    exact, exact_gradient = repeated(size, distinct, torch.float64, fit_reduced_reference)
+    normals, gradient = repeated(size, distinct, torch.float32, twin)
+    assert (normals - exact).norm(dim=-1).max() < 2e-3
+    assert (gradient - exact_gradient).abs().max() < 1e-2 * exact_gradient.abs().max()
+
+
+@pytest.mark.parametrize("twin", [fit_reduced, fit_reduced_reference])
+@pytest.mark.parametrize("distinct", [1, 2, 3])
+@pytest.mark.parametrize("size", [1, 3, 4, 7])
+def test_a_ridge_is_right_where_neighbours_repeat(size, distinct, twin):
+    """Rank-deficient fits, as sparse clouds have them: the ridge alone holds the determinant, at 1e-3 to the power of the rank missing."""
+    check_repeated(size, distinct, twin)
+
+
+def test_an_inverse_by_the_determinant_is_not(monkeypatch):
+    monkeypatch.setattr(st_surface, "small_solve", lambda m, r: (small_inverse(m, guard="none") * r[..., None, :]).sum(-1))
+    with pytest.raises(AssertionError):
+        check_repeated(4, 1, fit_reduced_reference)
 
 
 @pytest.mark.parametrize("broken", ["floor", "places", "weights"])

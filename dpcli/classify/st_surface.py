@@ -9,11 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpcli.ops import small_inverse
+from dpcli.ops import small_inverse, small_solve
 from dpcli.ops.linalg import GUARDS, MIN_DET
 from dpcli.runtime.precision import full_precision
 
-_RIDGE = 1e-3  # of the mean diagonal; large enough for float32 at rank-deficient neighbourhoods, small beside the data
+_RIDGE = 1e-3  # of the mean diagonal; large enough for float32's elimination at rank-deficient neighbourhoods, small beside the data
 
 
 @full_precision
@@ -28,7 +28,7 @@ def fit_surface(
 
     `inverse` inverts the normal matrix by thesis A.1.1, where a small determinant is replaced as `guard` says;
     `ridge` adds 1e-3 of the mean diagonal to it, which bounds the result where the neighbours don't span the space
-    (repeated points, dead features). `weights=None` means 1.
+    (repeated points, dead features), and solves by elimination. `weights=None` means 1.
     """
     design = torch.cat([features, torch.ones_like(features[..., :1])], -1).transpose(-3, -2)
     weighted = design if weights is None else design * weights.transpose(-1, -2)[..., None]
@@ -36,7 +36,7 @@ def fit_surface(
     if solver == "ridge":
         mean = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None]
         matrix = matrix + (_RIDGE * mean + 1e-9) * torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-        guard = "none"
+        return small_solve(matrix, right)
     return (small_inverse(matrix, guard=guard) * right[..., None, :]).sum(-1)
 
 

@@ -61,8 +61,8 @@ def fit_reduced(
     logits = None if logits is None else logits.reshape(-1, layout.groups)
     flat = (activation.detach().reshape(-1, activation.shape[3]), weight, bias, near, times.reshape(-1), logits)
     planes, away = _SurfaceFit.apply(*flat, shape[2], layout, fit)
-    coefficients = planes.view(*shape[:2], fit.size + 1, -1)[..., : layout.used].transpose(2, 3)
-    return coefficients, away.view(*shape, -1)[..., : layout.used] if fit.deviations else None
+    coefficients = planes.view(*shape[:2], fit.size + 1, layout.groups)[..., : layout.used].transpose(2, 3)
+    return coefficients, away.view(*shape, layout.groups)[..., : layout.used] if fit.deviations else None
 
 
 def fit_reduced_reference(
@@ -74,7 +74,7 @@ def fit_reduced_reference(
     if relative is not None:
         padding = relative.new_zeros(*relative.shape[:-1], fit.size - 3)
         features = torch.cat([features, relative, padding], -1)
-    grouped = features.view(*features.shape[:3], -1, fit.size)
+    grouped = features.view(*features.shape[:3], features.shape[3] // fit.size, fit.size)
     weights = None if logits is None else torch.sigmoid(logits)
     coefficients = fit_surface(grouped, times, weights, fit.solver, fit.guard)
     return coefficients, deviations(coefficients, grouped, times) if fit.deviations else None

@@ -22,6 +22,7 @@ _HOME = {
     "gather_points": "gather",
     "small_inverse": "linalg",
     "small_inverse_reference": "linalg",
+    "small_solve": "linalg",
     "weighted_kabsch": "rigid",
     "apply_motions": "rigid",
     "rigid_flow": "rigid",

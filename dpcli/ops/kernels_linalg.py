@@ -411,25 +411,62 @@ def _load_planes(moments, places, first, size, groups, tile, right, ridge):
 
 
 @arithmetic_kernel
+def _eliminate(m, sides):
+    """Solve m x = y for a tile (n,n,W) of symmetric positive definite matrices and sides (s,n,W), both overwritten: x where y was.
+
+    Without pivoting, which such matrices don't need. What a ridge makes of a rank-deficient matrix has a determinant far
+    below float32's rounding of its terms, so no adjugate of it is right; each pivot of this is at least the ridge.
+    """
+    n = m.shape[0]
+    for k in range(n):
+        for w in range(TILE):
+            m[k, k, w] = 1 / m[k, k, w]
+        for i in range(k + 1, n):
+            for w in range(TILE):
+                m[i, k, w] = m[k, i, w] * m[k, k, w]
+            for j in range(i, n):
+                for w in range(TILE):
+                    m[i, j, w] -= m[i, k, w] * m[k, j, w]
+            for s in range(sides.shape[0]):
+                for w in range(TILE):
+                    sides[s, i, w] -= m[i, k, w] * sides[s, k, w]
+    for s in range(sides.shape[0]):
+        for back in range(n):
+            k = n - 1 - back
+            for j in range(k + 1, n):
+                for w in range(TILE):
+                    sides[s, k, w] -= m[k, j, w] * sides[s, j, w]
+            for w in range(TILE):
+                sides[s, k, w] *= m[k, k, w]
+
+
+@arithmetic_kernel
 def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
     """Coefficients of fits from their moments (centroids*entries*groups), flat, in `kernels_surface`'s order: planes
-    (centroids*n*groups) = inverse of the normal matrix times the right side, n <= 8."""
+    (centroids*n*groups) solve the normal equations, n <= 8; with a ridge by elimination, else by the guarded inverse."""
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2
     tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
     left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
-    det, acted, side = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((n, TILE), np.float32)
-    value, count = np.empty(TILE, np.float32), planes.size // n
+    det, acted, sides = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((1, n, TILE), np.float32)
+    side, value, count = sides[0], np.empty(TILE, np.float32), planes.size // n
     for low in range(0, count, TILE):
         size = min(TILE, count - low)
         _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
-        acted[:] = False
-        _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
+        if ridge > 0:
+            _eliminate(tile, sides)
+        else:
+            acted[:] = False
+            _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
         for i in range(n):
             value[:] = 0
-            for j in range(n):
+            if ridge > 0:
                 for w in range(TILE):
-                    value[w] += out[i, j, w] * side[j, w]
+                    value[w] = side[i, w]
+            else:
+                for j in range(n):
+                    for w in range(TILE):
+                        value[w] += out[i, j, w] * side[j, w]
             for w in range(size):
                 planes[((low + w) // groups * n + i) * groups + (low + w) % groups] = value[w]
 
@@ -443,29 +480,36 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
     tile, kept, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
     left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
     det, acted, side = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((n, TILE), np.float32)
-    given, x, u = np.empty((n, TILE), np.float32), np.empty((n, TILE), np.float32), np.empty((n, TILE), np.float32)
+    given, both_sides = np.empty((n, TILE), np.float32), np.empty((2, n, TILE), np.float32)
+    x, u = both_sides[0], both_sides[1]
     one, one_grad, one_out, both = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(2)
     scratch, count = np.empty((SCRATCH, 4, 4)), grad.size // n
     for low in range(0, count, TILE):
         size = min(TILE, count - low)
         _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
         for i in range(n):
-            for j in range(n):
-                for w in range(TILE):  # a slice assignment would compile an error message for 4 s
-                    kept[i, j, w] = tile[i, j, w]
-        acted[:] = False
-        _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
-        for i in range(n):
             given[i] = 0
             for w in range(size):
                 given[i, w] = grad[((low + w) // groups * n + i) * groups + (low + w) % groups]
-        x[:] = 0
-        u[:] = 0
-        for i in range(n):
-            for j in range(n):
+        acted[:] = False
+        if ridge > 0:
+            for i in range(n):
                 for w in range(TILE):
-                    x[i, w] += out[i, j, w] * side[j, w]
-                    u[i, w] += out[j, i, w] * given[j, w]
+                    x[i, w], u[i, w] = side[i, w], given[i, w]
+            _eliminate(tile, both_sides)
+        else:
+            for i in range(n):
+                for j in range(n):
+                    for w in range(TILE):  # a slice assignment would compile an error message for 4 s
+                        kept[i, j, w] = tile[i, j, w]
+            _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
+            x[:] = 0
+            u[:] = 0
+            for i in range(n):
+                for j in range(n):
+                    for w in range(TILE):
+                        x[i, w] += out[i, j, w] * side[j, w]
+                        u[i, w] += out[j, i, w] * given[j, w]
         for w in range(size):
             p, k = (low + w) // groups, (low + w) % groups
             trace, asked = np.float32(0), False
