@@ -150,10 +150,14 @@ def test_augmentation_is_one_rigid_draw_a_clip():
         np.linalg.norm(p.reshape(-1, 3)[:, None] - p.reshape(-1, 3)[None], axis=-1) for p in (points, turned)
     )
     assert np.allclose(before, after, atol=1e-4) and not np.allclose(points, turned, atol=1e-2)
-    scaled = PEERS(points, rng)
-    ratio = (scaled - scaled.mean((0, 1))) / (points - points.mean((0, 1)))
-    assert np.allclose(ratio, ratio[0, 0], rtol=1e-2) and len(np.unique(ratio[0, 0].round(4))) == 3
-    assert np.all((ratio[0, 0] > 0.89) & (ratio[0, 0] < 1.11))
+    for where, axes in ((0, PEERS), (points.mean((0, 1)), find_augmentation("peers,origin=0"))):
+        scaled = axes(points, rng)
+        ratio = (scaled - where) / (points - where)
+        assert np.allclose(ratio, ratio[0, 0], rtol=1e-2) and len(np.unique(ratio[0, 0].round(4))) == 3
+        assert np.all((ratio[0, 0] > 0.89) & (ratio[0, 0] < 1.11))
+    far = points + np.float32([0, 0, 3.5])  # a body before the camera comes nearer and goes, as in the published loaders
+    depths = [PEERS(far, np.random.default_rng(seed))[..., 2].mean() for seed in range(50)]
+    assert 0.15 < np.std(depths) < 0.25
     thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9, 0)(points, np.random.default_rng(3))
     assert len(np.unique(thinned[0], axis=0)) < 40 and np.isin(thinned[..., 0].round(4), points[..., 0].round(4)).all()
     assert NONE == Augmentation(0, False, 0, 0, 0, 0, 0, 0)
@@ -271,7 +275,7 @@ def test_without_a_speed_clips_are_drawn_as_ever(reader):
 def test_an_augmentation_is_a_preset_and_changes():
     assert find_augmentation("ours") == Augmentation() and find_augmentation("none") == NONE
     changed = find_augmentation("peers,turn=0.4,speed=0.3,per_axis=0")
-    assert changed == Augmentation(0.1, False, 0.4, 0, 0, 0, 0, 0, 0.3)
+    assert changed == Augmentation(0.1, False, 0.4, 0, 0, 0, 0, 0, 0.3, True)
     wrong = ("sped=1", "turn", "turn=x", "turn=-1", "turn=nan", "dropout=1", "")
     for bad in ("", "mine", "turn=1", *(f"ours,{change}" for change in wrong)):
         with pytest.raises(UsageError, match="--augment"):

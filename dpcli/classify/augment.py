@@ -15,8 +15,8 @@ _LIMITS = {"scale": 1, "dropout": 1, "crop": 1, "speed": 10}  # what a range mus
 class Augmentation:
     """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays as it is.
 
-    The defaults are ours (chosen on a validation subject: docs/experiments.md). `PEERS` scales the axes only,
-    `RELEASE` is what the published Kinet does (facts section 3).
+    The defaults are ours (chosen on a validation subject: docs/experiments.md). `PEERS` scales the axes only, from the
+    camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does.
     """
 
     scale: float = 0.2  # factor U(1-s, 1+s)
@@ -28,6 +28,7 @@ class Augmentation:
     dropout: float = 0.2  # largest share of points replaced by their predecessor
     crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
     speed: float = 0.0  # with --timing clips, random clips: up to 1+s times as fast or slow (frames left out or repeated)
+    origin: bool = False  # scale and turn about the camera, so that a far body moves by metres; else about the clip's mean
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -41,7 +42,7 @@ class Augmentation:
         linear = np.diag(rng.uniform(1 - self.scale, 1 + self.scale, 3 if self.per_axis else 1) * np.ones(3))
         angles = np.clip(rng.normal(0, 1, 3), -3, 3) * self.tilt
         angles[1] += rng.uniform(-self.turn, self.turn)
-        center = points.mean((0, 1))
+        center = np.zeros(3, np.float32) if self.origin else points.mean((0, 1))
         moved = (points - center) @ (linear @ _rotation(angles).T).astype(np.float32)
         moved += center + rng.uniform(-self.shift, self.shift, 3).astype(np.float32)
         if self.jitter:
@@ -68,7 +69,7 @@ class Augmentation:
 
 
 NONE = Augmentation(0, False, 0, 0, 0, 0, 0, 0)
-PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0, 0)
+PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0, 0, origin=True)
 RELEASE = Augmentation(0.1, False, 0, 0.06, 0, 0, 0.2, 0)
 PRESETS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
 
@@ -88,8 +89,9 @@ def find_augmentation(text: str) -> Augmentation:
             raise UsageError(f"--augment {change}: expected NAME=NUMBER, with a name of {', '.join(known)}") from None
         if name not in known:
             raise UsageError(f"--augment {change}: expected one of {', '.join(known)}")
-    if "per_axis" in values:
-        values["per_axis"] = bool(values["per_axis"])
+    for name in ("per_axis", "origin"):
+        if name in values:
+            values[name] = bool(values[name])
     return replace(PRESETS[preset], **values)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.paths import short_names
 from dpcli.runtime import provenance
+from dpcli.runtime.progress import log
 from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
@@ -53,6 +54,7 @@ def run_fusion(
         streams, sources, rows = _streams(readers, called)
         shares = parse_weights(weights, streams, len(inputs) == 1)
         if judges:
+            _tell_other_models(judges, readers, called)
             shares = _chosen_weights(judges, streams, sources[0], mean)
         config = {"fuse": streams, "mean": mean, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
         if judges:
@@ -168,6 +170,20 @@ def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
             break
         weights = new
     return new
+
+
+def _tell_other_models(judges: Sequence[str], readers: Sequence[ScoresReader], called: Sequence[str]) -> None:
+    """A warning where weights come from another model's scores: fair for a twin trained on fewer videos, else an accident."""
+    for judge, reader, name in zip(judges, readers, called):
+        one, other = (_model_digest(scores) for scores in (ScoresReader(judge), reader))
+        if one and other and one != other:
+            log.warn(f"{judge}: scores of another model than {name}'s; its weights are right only for a model like that one")
+
+
+def _model_digest(reader: ScoresReader) -> str | None:
+    """Of the model that made the scores, where their last record says it."""
+    config = reader.provenance[-1].get("config") if reader.provenance else None
+    return config.get("weights") if isinstance(config, dict) and "model" in config else None
 
 
 def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str) -> np.ndarray:
