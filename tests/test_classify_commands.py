@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from dpcli.classify.config import KinetConfig
 from dpcli.classify.model_file import ModelInfo
@@ -19,6 +20,7 @@ from dpcli.classify.split import carve_validation
 from dpcli.classify.videos import held_out
 from dpcli.errors import UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
+from tests.commands import exit_code
 
 ROOT = Path(__file__).resolve().parents[1]
 TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "0.34")
@@ -202,6 +204,43 @@ def last_weights(folder: Path) -> dict:
     from safetensors.torch import load_file
 
     return load_file(folder / "best.safetensors")
+
+
+def test_a_stopped_step_drops_what_it_would_have_dropped(data, tmp_path, monkeypatch):
+    """Dropout's masks come from the step, not from how often the run was begun; stopped in both stages and after an epoch."""
+    from dpcli.classify.train import Trainer
+
+    def run(name, *stops):
+        for stop in (*stops, None):
+            taken, take = [], Trainer._take
+
+            def stopping(self, *words, taken=taken, take=take, stop=stop):
+                if len(taken) == stop:
+                    self.stop.requested, self.stop.name = True, "a test"
+                taken.append(None)
+                return take(self, *words)
+
+            with monkeypatch.context() as patch:
+                patch.setattr(Trainer, "_take", stopping)
+                words = (*TRAIN, "--epochs", "2", "--epochs-dynamic", "2", "--dropout", "0.5", "--validation", "none")
+                assert exit_code("classify", "train", data, "-o", tmp_path / name, *words) == (0 if stop is None else 75)
+        return last_weights(tmp_path / name)
+
+    whole, parts = run("whole"), run("parts", 1, 0, 3)
+    logs = [json.loads((tmp_path / name / "log.json").read_text()) for name in ("whole", "parts")]
+    assert [{**row, "seconds": 0} for row in logs[0]] == [{**row, "seconds": 0} for row in logs[1]]
+    assert all(torch.equal(whole[key], parts[key]) for key in whole)
+
+
+def test_weights_of_another_model_are_told(data, run_folder, dpc_here, tmp_path):
+    other = tmp_path / "other"
+    words = (*TRAIN, "--epochs", 1, "--epochs-dynamic", 1, "--seed", 4, "--validation", "none")
+    assert dpc_here("classify", "train", data, "-o", other, *words).returncode == 0
+    for name, model, split in (("s", run_folder, "test"), ("own", run_folder, "train"), ("theirs", other, "train")):
+        assert dpc_here("classify", "predict", data, "--model", model, "--split", split, "-o", tmp_path / f"{name}.h5").returncode == 0
+    for judge, told in (("own", False), ("theirs", True)):
+        done = dpc_here("classify", "fuse", tmp_path / "s.h5", "-o", tmp_path / f"f-{judge}.h5", "--weights-from", tmp_path / f"{judge}.h5")
+        assert done.returncode == 0 and (b"another model" in done.stderr) == told, done.stderr
 
 
 def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folder, dpc, tmp_path):

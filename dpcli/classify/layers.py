@@ -47,8 +47,8 @@ class SharedLayers(nn.Module):
         with torch.no_grad():
             for norm, mean, var in zip((self.norm1, self.norm2), statistics[::2], statistics[1::2]):
                 norm.num_batches_tracked += 1
-                norm.running_mean.lerp_(mean.float(), norm.momentum)
-                norm.running_var.lerp_(var.float() * (rows / max(rows - 1, 1)), norm.momentum)
+                norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
+                norm.running_var.lerp_(var.to(norm.running_var) * (rows / max(rows - 1, 1)), norm.momentum)
 
 
 class GlobalHead(SharedLayers):

@@ -24,7 +24,7 @@ class Schedule:
     clips_per_video: int | None = 1  # per epoch; None: every start
     validate_every: int = 1  # epochs
     validation_clips: int = 4  # per video
-    accumulate: int = 1  # parts a batch is computed in, one after the other: less memory, the same step
+    accumulate: int = 1  # parts a batch is computed in, one after the other: less memory; batch norm sees one part at a time
     amp: bool = False  # matrix products in bfloat16
     workers: int = 0  # processes that load clips; 0: this one
 

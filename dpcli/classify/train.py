@@ -1,7 +1,8 @@
 """Training in two stages: the static stream, then the dynamic stream on its frozen activations; then their fusion.
 
 Thesis section 3.4.2.3 and A.1.3. A run can be stopped at any step and continued to the same result: every clip's
-randomness comes from (seed, epoch, position), and the state holds weights, optimiser and the step. Several processes
+randomness comes from (seed, epoch, position), what a step drops from (seed, stage, epoch, step), and the state holds weights,
+optimiser and the step. Several processes
 (torchrun) share each batch and take the steps that one process would take.
 """
 
@@ -19,7 +20,7 @@ from dpcli.classify.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.predict import batches
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.step import LossWatch, StageStep
-from dpcli.errors import DpcError
+from dpcli.errors import DpcError, UsageError
 from dpcli.runtime.processes import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
@@ -66,6 +67,12 @@ class Trainer:
         state = self.folder.load_state()
         if state is not None:
             self._restore(state)
+        clips = len(self.training.epoch(0, self.schedule.clips_per_video))
+        if self.processes.count > 1 and clips < self.schedule.batch:
+            raise UsageError(
+                f"--batch {self.schedule.batch}: an epoch has {clips} clips, which {self.processes.count} processes can't share"
+                " evenly; take a smaller batch, more --clips-per-video or one process"
+            )
         for stage in range(self.stage, 2):
             if stage > self.stage:
                 self.stage, self.epoch, self.step, self.optimize = stage, 0, 0, None
@@ -100,7 +107,8 @@ class Trainer:
         started = time.monotonic()
         clips = self.training.epoch(self.stage * 100_000 + self.epoch, self.schedule.clips_per_video)
         per_epoch = self._per_epoch(clips)
-        rate = 0.0  # a run stopped after an epoch's last step has none left to do
+        # a run stopped after an epoch's last step has none left to do, and logs that one's rate
+        rate = self.schedule.rate(self.stage, self.epoch * per_epoch + max(self.step - 1, 0), epochs * per_epoch)
         for points, labels in self._batches(clips[: per_epoch * self.schedule.batch]):
             rate = self.schedule.rate(self.stage, self.epoch * per_epoch + self.step, epochs * per_epoch)
             stopping = self._take(points, labels, rate)
@@ -117,6 +125,8 @@ class Trainer:
     def _take(self, points: torch.Tensor, labels: torch.Tensor, rate: float) -> bool:
         """One step of all processes together; whether one of them was asked to stop."""
         assert self.optimize is not None
+        where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
+        torch.manual_seed(int(np.random.SeedSequence(where).generate_state(1)[0]))  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate)
         shares = (loss, float(correct), float(len(labels)), float(self.stop.requested))
         loss, correct, count, stopping = self.processes.sums(shares, self.device)
@@ -211,13 +221,13 @@ class Trainer:
 
     @torch.inference_mode()
     def validate(self) -> dict[str, float]:
-        """Share of validation videos classified rightly (scores averaged over clips), by stream; fused in the second stage."""
+        """Share of validation videos classified rightly (scores averaged over clips), by stream; fused once both are trained."""
         assert self.validation is not None
         self.model.eval()
         mine = set(self.validation.sequences[self.processes.rank :: self.processes.count])
         clips = [clip for clip in self.validation.clips(self.schedule.validation_clips) if clip.sequence in mine]
         totals: dict[str, dict[int, torch.Tensor]] = {
-            name: {} for name in (STREAMS[:1] if self.stage == 0 else (*STREAMS, "fused"))
+            name: {} for name in (STREAMS[:1] if self._static_only() else (*STREAMS, "fused"))
         }
         for chosen, points in batches(self.validation, clips, self.schedule.batch):
             for key, scores in self._scores(points.to(self.device)).items():
@@ -230,11 +240,15 @@ class Trainer:
 
     def _scores(self, points: torch.Tensor) -> dict[str, torch.Tensor]:
         """Class probabilities of a batch by stream."""
-        if self.stage == 0:
+        if self._static_only():
             return {"static": torch.softmax(self.model.static_logits(points), -1)}
         static, dynamic = self.model(points)
         fused = fuse(static, dynamic, self.model.config.fusion)
         return {"static": torch.softmax(static, -1), "dynamic": torch.softmax(dynamic, -1), "fused": fused}
+
+    def _static_only(self) -> bool:
+        """Whether the dynamic stream is still untrained, or will stay so."""
+        return self.stage == 0 or not self.schedule.epochs[1]
 
     def _save_model(self, name: str) -> None:
         if self.processes.first:

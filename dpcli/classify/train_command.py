@@ -70,7 +70,6 @@ def run_training(
         report_short(training, config.num_frames)
         torch.manual_seed(seed)
         model = _new_model(config, static_from, init, backbone)
-        torch.manual_seed(seed + processes.rank)  # what is dropped differs between processes
         notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "validation": rule,
                  "trained_on": f"{len(parts[0])} videos"}  # fmt: skip
         info = ModelInfo(config, class_table(reader), timing, notes)

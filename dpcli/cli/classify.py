@@ -58,7 +58,10 @@ def train(
         int | None, typer.Option(help="Clips per step, of all processes together. Default: the preset's.")
     ] = None,
     accumulate: Annotated[
-        int | None, typer.Option(help="Compute a batch in so many parts, one after the other: less memory. Default: 1.")
+        int | None,
+        typer.Option(
+            help="Compute a batch in so many parts, one after the other: less memory, but batch norm sees one part at a time. Default: 1."
+        ),
     ] = None,
     amp: Annotated[
         bool | None,
@@ -79,9 +82,9 @@ def train(
     augment: Annotated[
         str | None,
         typer.Option(
-            help="ours, peers (axis scales), release or none; then changes, as in ours,speed=0.3: scale, dropout, crop"
+            help="ours, peers (axis scales from the camera), release or none; then changes, as in ours,speed=0.3: scale, dropout, crop"
             " (shares), turn, tilt (rad), shift, jitter (length units), per_axis (0, 1), speed (0.3: consecutive frames up to"
-            " 1.3 times as fast or slow). Default: the preset's."
+            " 1.3 times as fast or slow), origin (0, 1: about the camera, else the clip's mean). Default: the preset's."
         ),
     ] = None,
     variant: Annotated[

@@ -20,7 +20,7 @@ def gather_points(features: Tensor, idx: Tensor) -> Tensor:
     _check(features, idx)
     batch, count, channels = features.shape
     shift = torch.arange(batch, device=idx.device).mul_(count).view(-1, *[1] * (idx.ndim - 1))
-    rows = (idx + shift).view(-1)
+    rows = (idx + shift).reshape(-1)
     flat = features.reshape(batch * count, channels)
     if features.dtype in (torch.float32, torch.float64) and chosen_backend(features.device) == "numba":
         gathered = _GatherRows.apply(flat, rows, batch)
