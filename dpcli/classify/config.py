@@ -113,7 +113,7 @@ class KinetConfig:
         return replace(self, **changes)
 
     def radius_table(self, stage: int) -> tuple[float, ...]:
-        """Radius per |dt| = 0..temporal_radius: r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (facts of the release)."""
+        """Radius per |dt| = 0..temporal_radius: r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (as the release)."""
         growth = 0.2 * self.radii[stage] / max(self.num_frames - 1, 1)
         return tuple(self.radii[stage] + growth * d for d in range(self.temporal_radius + 1))
 

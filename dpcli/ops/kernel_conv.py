@@ -12,7 +12,7 @@ _CENTRES = 64  # whose sums are held at a time: a few MiB, which stay in the cac
 
 
 def kernel_convolution(features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix: Tensor) -> Tensor:
-    """out[b,p,g] = sum_k sum_j weight[b,p,j, slot[g,k]] * features[b, index[b,p,j], g] @ matrix[k]   (facts 1.3)
+    """out[b,p,g] = sum_k sum_j weight[b,p,j, slot[g,k]] * features[b, index[b,p,j], g] @ matrix[k]   (as EPN has it)
 
     features (B,N,G,C); index (B,P,n) i64, the neighbours of every centre; weight (B,P,n,D), what each counts at D kernel
     positions that the group permutes; slot (G,D) i64, the position that rotation g makes of kernel point k;

@@ -76,7 +76,7 @@ def compact() -> PartConfig:
 
 
 def release() -> PartConfig:
-    """The released SAPIEN network: 1,432,365 parameters (facts 1.6, 2)."""
+    """The released SAPIEN network: 1,432,365 parameters."""
     rows = (
         (32, 2, 0.2, 0.02, 96), (32, 1, 0.08**0.5, 0.04, 48), (64, 1, 0.08**0.5, 0.04, 48),
         (64, 2, 0.4, 0.08, 96), (64, 1, 0.4, 0.08, 48), (128, 1, 0.4, 0.08, 48),

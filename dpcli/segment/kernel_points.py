@@ -30,7 +30,7 @@ class KernelPoints:
 @lru_cache
 def kernel_points(name: str, group: str) -> KernelPoints:
     """`vertices`: the centre and an icosahedron's 12 vertices, closed under its rotations. `uniform`: the centre and 23
-    points spread over the sphere, as EPN and the release use them (facts 1.2)."""
+    points spread over the sphere, as EPN and the release use them."""
     points = np.concatenate([np.zeros((1, 3)), vertices() if name == "vertices" else _spread(23)])
     rotated = np.einsum("gij,kj->gki", GROUPS[group]().rotations, points)
     orbit = list(points)

@@ -2,7 +2,7 @@
 
 Features obey f2(T x, T R_a) = f1(x, R_a) for a part that moves by T. So rotation a of frame 1 looks like that rotation l
 of frame 2 whose R_l is nearest to T R_a, and T = R_l r^T R_a^T with a small residual r. The release feeds its label rule
-T instead of T^T and so pairs rotations that don't look alike (facts 1.7).
+T instead of T^T and so pairs rotations that don't look alike (as the release has it).
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class MotionHead(nn.Module):
 
 
 def rotation_loss(confidence: Tensor, residual: Tensor, rotation: Tensor, weight: Tensor, group: RotationGroup) -> Tensor:
-    """Squared error of the residual at the labelled pair (facts 1.7) plus 0.1 of the confidences' cross-entropy.
+    """Squared error of the residual at the labelled pair (as the release has it) plus 0.1 of the confidences' cross-entropy.
 
     rotation (B,S,3,3): each part's from frame 1 to 2. weight (B,S): how much each counts, e.g. its share of the points.
     """

@@ -45,7 +45,7 @@ def nearest_neighbourhood(points: Tensor, centres: Tensor, radius: float, count:
 def first_neighbourhood(points: Tensor, centres: Tensor, radius: float, count: int) -> Neighbourhood:
     """The release's rule: the first `count` points in index order with d < radius, repeated in turn when there are fewer.
 
-    Its quirk is kept: with exactly count - 1 hits, the last slot is point 0 (facts 1.3). window is 1.
+    Its quirk is kept: with exactly count - 1 hits, the last slot is point 0. window is 1.
     """
     squared = (centres[:, :, None] - points[:, None]).square().sum(-1)
     hit = squared < radius**2

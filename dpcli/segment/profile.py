@@ -24,7 +24,7 @@ def count_parameters(module: nn.Module) -> int:
 
 
 def paper_parameters(module: nn.Module) -> int:
-    """As the counting tool saw them that gives the thesis's 0.25 M and 0.31 M (facts 2): plain 1x1 layers and layer norms;
+    """As the counting tool saw them that gives the thesis's 0.25 M and 0.31 M: plain 1x1 layers and layer norms;
     no convolution over space or group, no attention, no group norm, no queries."""
     inside_attention = {id(m) for a in module.modules() if isinstance(a, nn.MultiheadAttention) for m in a.modules()}
     counted = (nn.Linear, nn.LayerNorm)
@@ -98,7 +98,7 @@ def measure(config: PartConfig, device: torch.device) -> dict[str, Any]:
     return {
         "group": config.group, "points": config.points, "slots": config.slots,
         "parameters": {"total": count_parameters(model), **parts, "attention": linear},
-        "paper_style_parameters": {"total": paper_parameters(model), "rule": "1x1 layers and layer norms only (facts 2)"},
+        "paper_style_parameters": {"total": paper_parameters(model), "rule": "1x1 layers and layer norms only"},
         "macs_per_frame": counts,
         "uncounted": "neighbour search, norms, activations, softmax, interpolation between levels",
         "latency_ms": {"four_frames": latency(model, frames)},

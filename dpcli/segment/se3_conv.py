@@ -18,7 +18,7 @@ from dpcli.segment.neighbourhood import Neighbourhood, kernel_weights
 
 
 class SpatialConv(nn.Module):
-    """out[p,a,c'] = sum_{c,k} W[c,k,c'] sum_n w(x_n - x_p - R_a k) f[n,a,c]   (facts 1.3), no bias.
+    """out[p,a,c'] = sum_{c,k} W[c,k,c'] sum_n w(x_n - x_p - R_a k) f[n,a,c]   (as EPN has it), no bias.
 
     features (B,N,G,C) or None for the constant 1 of a first layer -> (B,P,G,C').
     """
@@ -63,7 +63,7 @@ class SpatialConv(nn.Module):
 
 
 class GroupConv(nn.Module):
-    """out[p,a,c'] = sum_{c,q} W[q,c,c'] f[p, a q, c] over the nearby elements q (facts 1.4), no bias. (B,P,G,C) -> (B,P,G,C')."""
+    """out[p,a,c'] = sum_{c,q} W[q,c,c'] f[p, a q, c] over the nearby elements q (as EPN has it), no bias. (B,P,G,C) -> (B,P,G,C')."""
 
     def __init__(self, channels: int, out_channels: int, config: PartConfig) -> None:
         super().__init__()
@@ -146,7 +146,7 @@ _NORM_NS = 0.3  # measured: the kernel's, per number
 
 
 class SeparableConv(nn.Module):
-    """Spatial then group convolution, each with norm and leaky ReLU, plus a 1x1 shortcut (facts 1.5)."""
+    """Spatial then group convolution, each with norm and leaky ReLU, plus a 1x1 shortcut (as the release has it)."""
 
     def __init__(self, channels: int, layer: Layer, config: PartConfig) -> None:
         super().__init__()
