@@ -154,3 +154,9 @@ def test_wrong_settings_are_named():
     with pytest.raises(UsageError, match="unknown setting 'speed'"):
         preset("quick", speed=3)
     assert preset("quick", size=None) == PRESETS["quick"]
+
+
+def test_a_limit_on_gaussians_holds_from_the_start():
+    assert preset("quick", most_gaussians=800).gaussians == 800 and preset("quick", most_gaussians=9000).gaussians == 6000
+    with pytest.raises(UsageError, match="--most-gaussians 800: expected at least the 900"):
+        preset("quick", most_gaussians=800, gaussians=900)

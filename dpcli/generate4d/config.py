@@ -79,6 +79,8 @@ class FitConfig:
                           ("control_points", 1), ("neighbours", 1), ("gaussians", 16)):  # fmt: skip
             if getattr(self, name) < low:
                 raise UsageError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected {low} or more")
+        if self.most_gaussians < self.gaussians:
+            raise UsageError(f"--most-gaussians {self.most_gaussians}: expected at least the {self.gaussians} of the start (--gaussians)")
         if self.start not in STARTS:
             raise UsageError(f"--start {self.start}: expected one of {', '.join(STARTS)}")
         if self.partition not in ("static", "time"):
@@ -115,4 +117,7 @@ def preset(name: str, **changes: object) -> FitConfig:
     unknown = sorted(changes.keys() - known)
     if unknown:
         raise UsageError(f"unknown setting {unknown[0]!r} of a fit; expected one of {', '.join(sorted(known))}")
-    return replace(PRESETS[name], **{key: value for key, value in changes.items() if value is not None})
+    given = {key: value for key, value in changes.items() if value is not None}
+    if "most_gaussians" in given and "gaussians" not in given:  # the preset's start may be more than what is allowed now
+        given["gaussians"] = min(PRESETS[name].gaussians, int(given["most_gaussians"]))
+    return replace(PRESETS[name], **given)
