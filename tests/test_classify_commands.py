@@ -321,6 +321,10 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
     ):
         with pytest.raises(UsageError, match="expected"):
             Schedule(**wrong)
+    for option, wrong in (("--lr -1.0:", {"learning_rate": -1.0}), ("--lr-dynamic 0:", {"learning_rate_dynamic": 0}),
+                          ("--epochs -1:", {"epochs": (-1, 1)}), ("--epochs-dynamic -2:", {"epochs": (1, -2)})):  # fmt: skip
+        with pytest.raises(UsageError, match=option):
+            Schedule(**wrong)
     (tmp_path / "file").write_text("")
     with pytest.raises(UsageError, match="names a folder"):
         RunFolder(tmp_path / "file", {}, columns=["loss"])

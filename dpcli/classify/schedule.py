@@ -29,11 +29,13 @@ class Schedule:
     workers: int = 0  # processes that load clips; 0: this one
 
     def __post_init__(self) -> None:
-        rates = (self.learning_rate, self.learning_rate_dynamic)
+        dynamic = self.learning_rate_dynamic
         problem = {
             f"--batch {self.batch}: expected at least 1": self.batch < 1,
-            f"--epochs {self.epochs}: expected 0 or more": min(self.epochs) < 0,
-            f"--lr {rates}: expected numbers above 0": any(rate is not None and not rate > 0 for rate in rates),
+            f"--epochs {self.epochs[0]}: expected 0 or more": self.epochs[0] < 0,
+            f"--epochs-dynamic {self.epochs[1]}: expected 0 or more": self.epochs[1] < 0,
+            f"--lr {self.learning_rate}: expected a number above 0": not self.learning_rate > 0,
+            f"--lr-dynamic {dynamic}: expected a number above 0": dynamic is not None and not dynamic > 0,
             f"--label-smoothing {self.label_smoothing}: expected 0 to below 1": not 0 <= self.label_smoothing < 1,
             f"--decay {self.decay}: expected cosine, staircase or constant": self.decay not in DECAYS,
             f"--accumulate {self.accumulate}: expected at least 1": self.accumulate < 1,
