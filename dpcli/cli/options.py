@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness.")]
+_LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
+Seed = Annotated[int, typer.Option("--seed", min=0, max=_LARGEST_SEED, help="Seed of all randomness.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. Default: the CPUs this process may use.")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
 OnError = Annotated[str, typer.Option("--on-error", help="A bad sample: skip (list it at the end) or stop.")]
