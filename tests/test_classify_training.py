@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -16,15 +15,13 @@ import torch
 
 from dpcli.classify.clips import ClipSource
 from dpcli.classify.kinet import Kinet
-from dpcli.classify.model_file import ModelInfo, load_model
+from dpcli.classify.model_file import load_model
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.settings import network_config
 from dpcli.classify.step import LossWatch, StageStep
-from dpcli.classify.train import Trainer
+from dpcli.classify.train_command import check_shares
 from dpcli.errors import UsageError
 from dpcli.runtime.processes import Processes
-from dpcli.runtime.run_folder import RunFolder
-from dpcli.runtime.signals import StopRequest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from tests.commands import exit_code as dpc
 from tests.test_classify_commands import gestures
@@ -113,17 +110,11 @@ def test_a_batch_in_parts_has_the_gradient_of_the_batch():
         Schedule(batch=4).share(3)
 
 
-def test_processes_that_can_t_share_a_batch_evenly_are_refused(data, tmp_path):
-    """Each would divide by its own clips, and the mean over processes would no longer be the gradient of the whole."""
-    config = network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3)
-    source = ClipSource(CloudsReader(data), [0, 1, 3], config)
-    folder = RunFolder(tmp_path / "run", {}, columns=("loss",))
-    for count, refused in ((2, True), (1, False)):
-        trainer = Trainer(Kinet(config), ModelInfo(config, ["a", "b", "c"], "clips", {}), folder, Schedule((0, 0), batch=4), source,
-                          None, torch.device("cpu"), StopRequest(), Processes(0, count))  # fmt: skip
-        trainer._save_model = trainer._save = lambda *_: None
-        with pytest.raises(UsageError, match="--batch 4: an epoch has 3 clips") if refused else contextlib.nullcontext():
-            trainer.run()
+def test_processes_that_can_t_share_a_batch_evenly_are_refused():
+    check_shares(3, Schedule(batch=4), 1)
+    check_shares(4, Schedule(batch=4), 2)
+    with pytest.raises(UsageError, match="--batch 4: an epoch has 3 clips"):
+        check_shares(3, Schedule(batch=4), 2)
 
 
 def test_label_smoothing_is_the_loss_against_a_share_of_every_class(alone):
@@ -347,7 +338,7 @@ def test_a_pipe_can_t_be_shared(monkeypatch, capfd):
 
 def test_validation_is_shared_out_among_processes(data, alone):
     """Each process judges its part of the videos: together they are all of them, once."""
-    from dpcli.classify.train import Trainer
+    from dpcli.classify.train_command import check_shares
     from dpcli.runtime.run_folder import RunFolder
     from dpcli.runtime.signals import StopRequest
 

@@ -138,7 +138,8 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     from dpcli.generate4d.fit import COLUMNS
     from dpcli.runtime.run_folder import RunFolder
 
-    RunFolder(tmp_path / "scene.fit", {"config": 1}, columns=COLUMNS)
+    with RunFolder(tmp_path / "scene.fit", {"config": 1}, columns=COLUMNS):
+        pass
     with pytest.raises(UsageError, match="another configuration"):
         RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
     with pytest.raises(UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*null, and 1 more\)"):

@@ -38,17 +38,17 @@ def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def find_model(name: str) -> Path:
+def find_model(name: str, option: str = "--model") -> Path:
     """A model's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
-    return find_weights(name, SHIPPED, _MAKER)
+    return find_weights(name, SHIPPED, _MAKER, option)
 
 
-def load_model(name: str, backbone: str | None = None) -> tuple[Kinet, ModelInfo]:
+def load_model(name: str, backbone: str | None = None, option: str = "--model") -> tuple[Kinet, ModelInfo]:
     """A Kinet in eval mode. DataError when the file is not one of ours or its weights don't fit its configuration.
 
     A model on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
     """
-    path = find_model(name)
+    path = find_model(name, option)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     config = KinetConfig.from_json(header["config"])
     if config.backbone not in BACKBONES and config.backbone != backbone:

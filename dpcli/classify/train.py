@@ -20,7 +20,7 @@ from dpcli.classify.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.predict import batches
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.step import LossWatch, StageStep
-from dpcli.errors import DpcError, UsageError
+from dpcli.errors import DpcError
 from dpcli.runtime.processes import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
@@ -63,16 +63,12 @@ class Trainer:
         self.watch = LossWatch(info.config.num_classes)
 
     def run(self) -> None:
-        """From wherever the folder's state says to the end of the dynamic stage."""
+        """From wherever the folder's state says to the end of the dynamic stage; nothing when it is there."""
         state = self.folder.load_state()
         if state is not None:
             self._restore(state)
-        clips = len(self.training.epoch(0, self.schedule.clips_per_video))
-        if self.processes.count > 1 and clips < self.schedule.batch:
-            raise UsageError(
-                f"--batch {self.schedule.batch}: an epoch has {clips} clips, which {self.processes.count} processes can't share"
-                " evenly; take a smaller batch, more --clips-per-video or one process"
-            )
+        if self.stage == 2:
+            return
         for stage in range(self.stage, 2):
             if stage > self.stage:
                 self.stage, self.epoch, self.step, self.optimize = stage, 0, 0, None
@@ -279,4 +275,5 @@ class Trainer:
                 self.model.freeze_static()
             self.optimize = self._new_step()
             self.optimize.optimizer.load_state_dict(state["optimizer"])
-        log.info(f"continuing {self.folder.path} at stage {self.stage + 1} of 2, epoch {self.epoch + 1}")
+        where = None if self.stage == 2 else f"stage {self.stage + 1} of 2, epoch {self.epoch + 1}"
+        self.folder.tell_continuing(where)

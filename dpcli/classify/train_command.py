@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from dataclasses import asdict
 
 import numpy as np
@@ -10,9 +11,10 @@ import torch
 
 from dpcli.classify.augment import find_augmentation
 from dpcli.classify.clips import ClipSource
+from dpcli.classify.config import KinetConfig
 from dpcli.classify.curves import COLUMNS, draw_curves
 from dpcli.classify.kinet import Kinet
-from dpcli.classify.model_file import ModelInfo, load_model
+from dpcli.classify.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.presets import find_preset
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.settings import network_config, training_schedule
@@ -63,19 +65,22 @@ def run_training(
         record = {"network": json.loads(config.to_json()), "schedule": _content(plan), "augmentation": asdict(augmentation),
                   "timing": timing, "validation": rule, "drop_short": drop_short, "seed": seed, "static_from": static_from,
                   "init": init, "data": provenance.file_digest(path)}  # fmt: skip
-        folder = _open_folder(output, json.loads(json.dumps(record)), force, processes)
+        plan.share(processes.count)
+        folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         options = {"timing": timing, "drop_short": drop_short, "seed": seed}
         training = ClipSource(reader, parts[0], config, augmentation=augmentation, **options)
         held = ClipSource(reader, parts[1], config, **options) if parts[1] else None
+        check_shares(len(training.epoch(0, plan.clips_per_video)), plan, processes.count)
         report_short(training, config.num_frames)
         torch.manual_seed(seed)
-        model = _new_model(config, static_from, init, backbone)
+        model = _new_model(config, static_from, init, backbone, folder).to(chosen)
         notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "validation": rule,
                  "trained_on": f"{len(parts[0])} videos"}  # fmt: skip
         info = ModelInfo(config, class_table(reader), timing, notes)
         _announce(chosen, processes, len(parts[0]), len(parts[1]), rule, plan)
         keep_freed_memory()
-        with stop_requested() as stop:
+        with folder if processes.first else nullcontext(), stop_requested() as stop:  # last: --force deletes an earlier model
+            processes.wait()  # the others find the folder as it is to be
             trainer = Trainer(model, info, folder, plan, training, held, chosen, stop, processes)
             trainer.run()
         summary = trainer.validate() if held is not None else {}
@@ -108,14 +113,13 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
         )
 
 
-def _open_folder(output: str, record: dict, force: bool, processes: Processes) -> RunFolder:
-    """The run's folder; the first process makes it, the others find it made."""
-    if not processes.first:
-        processes.wait()
-        return RunFolder(output, record, columns=COLUMNS)
-    folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_curves)
-    processes.wait()
-    return folder
+def check_shares(clips: int, plan: Schedule, processes: int) -> None:
+    """Each process divides its gradient by its own clips: their mean is the whole batch's only where shares are equal."""
+    if processes > 1 and clips < plan.batch:
+        raise UsageError(
+            f"--batch {plan.batch}: an epoch has {clips} clips, which {processes} processes can't share evenly; take a smaller batch,"
+            " more --clips-per-video or one process"
+        )
 
 
 def _content(plan: Schedule) -> dict:
@@ -123,13 +127,16 @@ def _content(plan: Schedule) -> dict:
     return {key: value for key, value in asdict(plan).items() if key != "workers"}
 
 
-def _new_model(config, static_from: str | None, init: str | None, backbone: str | None) -> Kinet:
+def _new_model(
+    config: KinetConfig, static_from: str | None, init: str | None, backbone: str | None, folder: RunFolder
+) -> Kinet:
     """A fresh network, or one that starts from a trained one's static stream or from all of it, as far as shapes agree."""
     model = Kinet(config)
     for name, option, mine in ((static_from, "--static-from", model.static), (init, "--init", model)):
         if not name:
             continue
-        other, _ = load_model(name, backbone)
+        folder.refuse_inside(option, find_model(name, option))
+        other, _ = load_model(name, backbone, option)
         theirs = other.static if option == "--static-from" else other
         _copy_fitting(mine, theirs, f"{option} {name}")
     return model

@@ -58,7 +58,7 @@ def run_fit(
             f" {targets.size[0]} x {targets.size[1]}, {config.dense_steps} dense + {config.sparse_steps} sparse steps"
         )
         keep_freed_memory()
-        with stop_requested() as stop:
+        with folder, stop_requested() as stop:
             fit = Fit(targets, config, folder, stop, seed, judge, chosen, _previews(folder, targets), regularise)
             model = fit.run().cpu()
             model.refresh_neighbours()

@@ -7,19 +7,30 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import TracebackType
 
 import torch
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.lock import open_alone
+from dpcli.runtime.progress import log
+from dpcli.runtime.whole_file import DiskFull, disk_full, whole_file
 
 _TOLD = 3  # differences named when a run can't be continued
+_LOCK = ".lock"
+# What --force removes; the flows are those of `segment train`, the preview that of `generate4d fit`.
+_FILES = ("state.pt", "last.safetensors", "best.safetensors", "log.csv", "log.json", "curves.png", "flows_first.npy",
+          "flows.npy", "flows_known.npy", "preview.png")  # fmt: skip
 
 
 class RunFolder:
     """`config.json`, `state.pt` (to continue), `last.safetensors`, `best.safetensors`, `log.csv`, `log.json`, `curves.png`.
 
-    columns: what a row of the log holds. curves: draws the rows into a picture file. Raises UsageError when the folder
-    holds a run of another configuration and `force` is off.
+    columns: what a row of the log holds. curves: draws the rows into a picture file. Only looks until it is entered (`with`):
+    that makes the folder, with `force` empties it of an earlier run, and keeps other processes from writing into it by
+    a lock on the file `.lock`, which is gone at the end; a killed run may leave that file, which then locks nothing.
+    Raises UsageError when the folder holds a run of another configuration, or files of a run without one, and `force`
+    is off; DpcError on entering when another process is there.
     """
 
     def __init__(
@@ -27,28 +38,74 @@ class RunFolder:
         curves: Callable[[list[dict], Path], None] | None = None,
     ) -> None:  # fmt: skip
         self.columns, self.curves = tuple(columns), curves
-        self.path = Path(path)
+        self.path, self.config, self.force = Path(path), config, force
+        self.rows: list[dict] = []
+        self._lock = -1
         if self.path.exists() and not self.path.is_dir():
             raise UsageError(f"{self.path}: is a file; -o of train names a folder")
+        self._continues()
+
+    def __enter__(self) -> RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
+        try:
+            self._lock = open_alone(self.path / _LOCK)
+        except DpcError:
+            raise DpcError(
+                f"{self.path}: cannot write (another dpc is writing it); wait until it is done, or use another -o"
+            ) from None
+        try:
+            if not self._continues():  # again: another run may have been here since
+                for name in _FILES:
+                    (self.path / name).unlink(missing_ok=True)
+                _replace(self.path / "config.json", json.dumps(self.config, indent=1, sort_keys=True))
+        except BaseException:
+            self._release()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._release()
+        full = disk_full(Path(error.filename or self.path), error) if isinstance(error, OSError) else error
+        if isinstance(full, DiskFull):
+            saved = ": it continues from the last saved state" if (self.path / "state.pt").exists() else ""
+            raise DiskFull(f"{full}{saved}") from None
+
+    def _release(self) -> None:
+        (self.path / _LOCK).unlink(missing_ok=True)
+        os.close(self._lock)
+
+    def _continues(self) -> bool:
+        """Whether an earlier run of this configuration is there, to go on with; UsageError when it is anything else."""
         saved = self.path / "config.json"
-        if saved.exists() and not force:
-            try:
-                before = json.loads(saved.read_text())
-            except ValueError:
-                raise DataError(f"{saved}: not JSON, the run can't be continued; --force starts over") from None
-            differing = _differences(before, config)
-            if differing:
-                more = f", and {len(differing) - _TOLD} more" if len(differing) > _TOLD else ""
+        if self.force:
+            return False
+        if not saved.exists():
+            left = [name for name in _FILES if (self.path / name).exists()]
+            if left:
                 raise UsageError(
-                    f"{self.path}: holds a run with another configuration ({'; '.join(differing[:_TOLD])}{more});"
-                    " use another -o, or --force to start over"
+                    f"{self.path}: holds {', '.join(left)}, but no config.json that says of which run;"
+                    " use another -o, or --force to replace them"
                 )
-        else:
-            for name in ("state.pt", "last.safetensors", "best.safetensors", "log.csv", "log.json", "curves.png"):
-                (self.path / name).unlink(missing_ok=True)
-            _replace(saved, json.dumps(config, indent=1, sort_keys=True))
-        self.rows: list[dict] = []
+            return False
+        try:
+            before = json.loads(saved.read_text())
+        except ValueError:
+            raise DataError(f"{saved}: not JSON, the run can't be continued; --force starts over") from None
+        differing = _differences(before, self.config)
+        if differing:
+            more = f", and {len(differing) - _TOLD} more" if len(differing) > _TOLD else ""
+            raise UsageError(
+                f"{self.path}: holds a run with another configuration ({'; '.join(differing[:_TOLD])}{more});"
+                " use another -o, or --force to start over"
+            )
+        return True
+
+    def refuse_inside(self, option: str, file: Path) -> None:
+        """UsageError when `file`, named by an option to start from, is among those that the run replaces."""
+        if self.path.resolve() in (file.parent.resolve(), file.resolve().parent):
+            raise UsageError(f"{option} {file}: lies in the folder of -o, whose files this run replaces; use another -o")
 
     def file(self, name: str) -> Path:
         return self.path / name
@@ -67,21 +124,22 @@ class RunFolder:
         self.rows = state["rows"]
         return state
 
+    def tell_continuing(self, where: str | None) -> None:
+        """Say where an earlier run goes on; None: at its end."""
+        log.info(f"continuing {self.path} at {where}" if where else f"{self.path}: is finished already; --force starts over")
+
     def save_state(self, state: dict) -> None:
-        part = self.path / ".state.pt.part"
-        torch.save({**state, "rows": self.rows}, part)
-        os.replace(part, self.path / "state.pt")
+        with whole_file(self.path / "state.pt") as part, open(part, "wb") as file:  # given a name, torch says no reason
+            torch.save({**state, "rows": self.rows}, file)
 
     def log(self, row: dict) -> None:
         """Append one epoch and rewrite the small log files whole, so that a reader never sees half a line."""
         self.rows.append({key: row.get(key) for key in self.columns})
         _replace(self.path / "log.json", json.dumps(self.rows, indent=1))
-        part = self.path / ".log.csv.part"
-        with open(part, "w", newline="") as file:
+        with whole_file(self.path / "log.csv") as part, open(part, "w", newline="") as file:
             writer = csv.DictWriter(file, self.columns)
             writer.writeheader()
             writer.writerows(self.rows)
-        os.replace(part, self.path / "log.csv")
 
     def draw_curves(self) -> None:
         """The learning curves so far, by the function given."""
@@ -104,6 +162,5 @@ def _settings(value: object, path: str = "") -> dict[str, str]:
 
 
 def _replace(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text)
-    os.replace(part, path)
+    with whole_file(path) as part:
+        part.write_text(text)

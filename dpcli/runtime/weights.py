@@ -11,19 +11,19 @@ from dpcli import __version__
 from dpcli.errors import DataError, UsageError
 from dpcli.paths import utf8_path
 from dpcli.runtime.weights_files import locate_weights, shipped_models
+from dpcli.runtime.whole_file import whole_file
 
 
 def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, str]) -> None:
     """Write beside the target, then rename. header: text by name; `format` tells readers what it is."""
     from safetensors.torch import save_file
 
-    part = path.with_name(f".{path.name}.part")
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    save_file(whole, part, {"version": __version__, **header})
-    umask = os.umask(0)
-    os.umask(umask)
-    part.chmod(0o666 & ~umask)  # the library writes files that only their owner can read
-    os.replace(part, path)
+    with whole_file(path) as part:
+        save_file(whole, part, {"version": __version__, **header})
+        umask = os.umask(0)
+        os.umask(umask)
+        part.chmod(0o666 & ~umask)  # the library writes files that only their owner can read
 
 
 def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
@@ -56,6 +56,12 @@ def find_weights(name: str, shipped: Path, maker: str, option: str = "--model") 
     path = locate_weights(name, [shipped])
     if path is not None:
         return path
+    if Path(name, "config.json").is_file():
+        last = Path(name, "last.safetensors")
+        now = f"{last} has the weights of its last epoch; " if last.is_file() else ""
+        raise UsageError(
+            f"{option} {name}: this training has no best.safetensors yet; {now}run its `{maker}` again to continue it"
+        )
     raise UsageError(
         f"{option} {name}: no such file; give a .safetensors file, a folder made by `{maker}`"
         f" or a shipped model ({', '.join(shipped_models(shipped)) or 'none in this installation'})"

@@ -23,7 +23,9 @@ from dpcli.runtime.signals import stop_requested
 from dpcli.segment.classical import classical_labels, classical_options
 from dpcli.segment.config import PartConfig, find_config
 from dpcli.segment.curves import COLUMNS, draw_curves
-from dpcli.segment.model_file import SHIPPED, load_model
+from dpcli.segment.estimate_command import flow_weights
+from dpcli.segment.flow_store import first_flows
+from dpcli.segment.model_file import SHIPPED, find_model, load_model
 from dpcli.segment.network import PartNetwork
 from dpcli.segment.objective import Objective
 from dpcli.segment.pair_flow import pair_flow
@@ -55,12 +57,12 @@ def run_training(
                   "validation": validation, "start_from": start_from, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
         mixed = wanted(amp, chosen)
         record |= {"amp": True} if mixed else {}
-        _check_flows_of(flows_of, record)
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         training = PairSource(reader, train_part, shape.points, seed)
+        _check_flows(flow, flows_of, record, folder, training, aims.supervised)
         checking = PairSource(reader, held, shape.points, seed) if held else None
         torch.manual_seed(seed)
-        model = _new_model(shape, start_from)
+        model = _new_model(shape, start_from, folder).to(chosen)
         model.mixed = mixed
         notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "supervised": aims.supervised,
                  "flow": flow, "trained_on": f"{len(train_part)} sequences, {len(training.pairs)} pairs"}  # fmt: skip
@@ -68,7 +70,7 @@ def run_training(
             f"training on {chosen}: {notes['trained_on']}, {len(held)} sequences for validation; {plan.epochs} epochs"
         )
         keep_freed_memory()
-        with stop_requested() as stop:
+        with folder, stop_requested() as stop:  # last: with --force this deletes an earlier model
             estimate = (
                 None if aims.supervised else partial(pair_flow, method=flow)
             )  # supervised: the true flow is at hand
@@ -76,10 +78,16 @@ def run_training(
     print(folder.file("best.safetensors"))
 
 
-def _check_flows_of(folder: Path | None, record: dict) -> None:
-    """Another run's flows are of the same pairs only if data, points, seed, validation and method are the same."""
+def _check_flows(
+    flow: str, folder: Path | None, record: dict, run: RunFolder, training: PairSource, supervised: bool
+) -> None:
+    """The estimator is there; another run's flows are of the same pairs, which only the same data, seed, ... give."""
+    weights = None if supervised else flow_weights(flow)
+    if weights is not None:
+        run.refuse_inside("--flow", weights)
     if folder is None:
         return
+    run.refuse_inside("--flows-of", folder / "flows_first.npy")
     try:
         other = json.loads((folder / "config.json").read_text())
     except (OSError, ValueError):
@@ -88,16 +96,18 @@ def _check_flows_of(folder: Path | None, record: dict) -> None:
     for key in ("data", "seed", "validation", "flow"):
         if other.get(key) != mine[key]:
             raise UsageError(f"--flows-of {folder}: its {key} is {other.get(key)!r}, here {mine[key]!r}; flows don't fit")
+    first_flows(folder, len(training.pairs), training.points)
 
 
 def _given(options: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in options.items() if value is not None}
 
 
-def _new_model(shape: PartConfig, start_from: str | None) -> PartNetwork:
+def _new_model(shape: PartConfig, start_from: str | None, folder: RunFolder) -> PartNetwork:
     model = PartNetwork(shape)
     if start_from:
-        other, _ = load_model(start_from)
+        folder.refuse_inside("--start-from", find_model(start_from, "--start-from"))
+        other, _ = load_model(start_from, "--start-from")
         if other.config != shape:
             raise UsageError(
                 f"--start-from {start_from}: its network has another configuration; give the same --config and switches"

@@ -114,7 +114,7 @@ def run_flow_estimate(
     jobs: int | None, force: bool,
 ) -> None:  # fmt: skip
     """`dpc segment estimate-flow`; running again continues where a stopped or killed run ended."""
-    weights = _weights(flow)
+    weights = flow_weights(flow)
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         chosen = [i for i, name in enumerate(reader.splits) if split == "all" or name == split]
@@ -136,7 +136,7 @@ def run_flow_estimate(
         print(f"{output}: flow of {len(chosen)} sequences, {int(reader.frame_counts[chosen].sum())} frames")
 
 
-def _weights(flow: str) -> Path | None:
+def flow_weights(flow: str) -> Path | None:
     """The file of a trained estimator, checked before any work; None for a method that needs none."""
     if flow in METHODS:
         return None

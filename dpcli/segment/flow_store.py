@@ -32,13 +32,7 @@ class FlowStore:
             self._take(take_from)
 
     def _take(self, folder: Path) -> None:
-        """Copy what is already estimated there. UsageError when it is of other pairs."""
-        try:
-            first, known = (np.load(folder / name, mmap_mode="r") for name in (_FIRST, _KNOWN))
-        except (OSError, ValueError) as error:
-            raise UsageError(f"--flows-of {folder}: no flows of a `dpc segment train` run there ({error})") from None
-        if first.shape != self._first.shape:
-            raise UsageError(f"--flows-of {folder}: flows of {first.shape} pairs, frames, points; here {self._first.shape}")
+        first, known = first_flows(folder, len(self._known), self._first.shape[2])
         for pair in np.flatnonzero(known):
             self._first[pair] = first[pair]
         self._known[:] = known & (_THERE | _TELLING)
@@ -91,6 +85,19 @@ class FlowStore:
         for array in (self._first, self._now, self._known):
             array.flush()
         self.estimated, self.corrected = {}, {}
+
+
+def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """What is already estimated in another run's folder: `flows_first.npy` and `flows_known.npy`. UsageError when it is of
+    other pairs."""
+    try:
+        first, known = (np.load(folder / name, mmap_mode="r") for name in (_FIRST, _KNOWN))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--flows-of {folder}: no flows of a `dpc segment train` run there ({error})") from None
+    shape = (pairs, 2, points, 3)
+    if first.shape != shape:
+        raise UsageError(f"--flows-of {folder}: flows of {first.shape} pairs, frames, points; here {shape}")
+    return first, known
 
 
 def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:

@@ -19,9 +19,14 @@ def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def load_model(name: str) -> tuple[PartNetwork, dict]:
+def find_model(name: str, option: str = "--model") -> Path:
+    """A network's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
+    return find_weights(name, SHIPPED, _MAKER, option)
+
+
+def load_model(name: str, option: str = "--model") -> tuple[PartNetwork, dict]:
     """A part network in eval mode and its notes; name: a path, a training folder or a shipped model."""
-    path = find_weights(name, SHIPPED, _MAKER)
+    path = find_model(name, option)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = PartNetwork(PartConfig.from_json(header["config"]))
     load_state(model, tensors, path)

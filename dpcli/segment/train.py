@@ -266,7 +266,8 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.flows.restore(state["flows"])
-        log.info(f"continuing {self.folder.path} at epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}")
+        where = f"epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}"
+        self.folder.tell_continuing(where if self.epoch < self.schedule.epochs else None)
 
 
 def rand_index(labels: torch.Tensor, truth: torch.Tensor) -> float:

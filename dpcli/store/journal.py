@@ -9,8 +9,6 @@ run. Meanwhile the old journal and the old HDF5 file stay, in case that is kille
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
 import struct
@@ -24,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DpcError
+from dpcli.lock import open_alone
 from dpcli.store.sequence import CloudSequence
 
 Placed = tuple[np.ndarray, list[tuple[int, int]]]  # an array, (offset in the HDF5 file, bytes) of its first bytes
@@ -33,7 +32,6 @@ _LENGTHS, _CHECK = struct.Struct("<QI"), struct.Struct("<I")  # bytes of content
 _PAGE = 4096
 _SYNC_SECONDS = 10.0  # a kill loses nothing that was written; only a power cut could, and then this much
 _DATA_SUFFIXES = (".new", ".alt")  # of one length, as it is said in the journal
-_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 class Journal:
@@ -49,7 +47,7 @@ class Journal:
     def __init__(self, path: Path, about: dict[str, Any]) -> None:
         self.path = path
         self.about = json.loads(json.dumps(about, sort_keys=True))
-        self._file, self._data = _open_alone(path), -1
+        self._file, self._data = open_alone(path), -1
         self.was_there = os.fstat(self._file).st_size > 0
         self._synced = time.monotonic()
         self.data_name = self._read_head()
@@ -160,24 +158,6 @@ def second_path(path: Path) -> Path:
 def _beside(path: Path) -> list[Path]:
     """What the writer with the journal `path` may have left."""
     return [second_path(path), *(path.with_suffix(suffix) for suffix in _DATA_SUFFIXES)]
-
-
-def _open_alone(path: Path) -> int:
-    """Open and lock; again if another process finished and removed the file in between."""
-    while True:
-        number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-        try:
-            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno in (errno.EAGAIN, errno.EACCES):
-                os.close(number)
-                raise DpcError(f"{path}: cannot write (another dpc is writing it)") from None
-            if error.errno not in _NO_LOCKS:
-                os.close(number)
-                raise
-        if path.exists() and os.path.samestat(os.fstat(number), os.stat(path)):
-            return number
-        os.close(number)
 
 
 def _write_all(number: int, data: bytes | memoryview) -> None:

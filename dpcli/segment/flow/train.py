@@ -65,7 +65,9 @@ def train_flow(
     same loss, and shows the true end point error where the file has poses. Raises DataError without pairs, Stopped when
     a stop was asked for, after saving.
     """
-    return _Trainer(reader, folder, steps, batch, seed, torch.device(device), stop, config, points, log_every).run()
+    trainer = _Trainer(reader, folder, steps, batch, seed, torch.device(device), stop, config, points, log_every)
+    with folder:  # last: it may delete an earlier model
+        return trainer.run()
 
 
 class _Trainer:
@@ -181,4 +183,4 @@ class _Trainer:
             setattr(self, key, state[key])
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
-        log.info(f"continuing {self.folder.path} at step {self.step + 1} of {self.steps}")
+        self.folder.tell_continuing(f"step {self.step + 1} of {self.steps}" if self.step < self.steps else None)
