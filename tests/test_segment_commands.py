@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -78,9 +79,27 @@ def test_training_leaves_what_people_look_for(run_folder):
 
 def test_running_again_continues_and_another_configuration_is_refused(dpc_here, data, run_folder):
     again = dpc_here("segment", "train", data, "-o", run_folder, *TRAIN)
-    assert again.returncode == 0 and b"continuing" in again.stderr
+    assert again.returncode == 0 and b"is finished already" in again.stderr and b"continuing" not in again.stderr
     other = dpc_here("segment", "train", data, "-o", run_folder, *TRAIN[:-1], 4)
     assert other.returncode == 2 and b"another configuration" in other.stderr
+
+
+def test_a_command_that_fails_deletes_no_network(dpc_here, data, run_folder, tmp_path):
+    """--force empties the folder only once everything else is there, checked and read."""
+    folder, other = shutil.copytree(run_folder, tmp_path / "run"), shutil.copytree(run_folder, tmp_path / "other")
+    (other / "flows_first.npy").unlink()
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert {"best.safetensors", "flows_first.npy", "state.pt"} <= before.keys()
+    for more, said in (
+        (("--start-from", folder), "--start-from"),
+        (("--start-from", "nosuch"), "--start-from nosuch: no such file"),
+        (("--flows-of", folder), "lies in the folder of -o"),
+        (("--flows-of", other), "no flows of a `dpc segment train` run"),
+        (("--flow", "nosuch"), "--flow nosuch: expected icp"),
+    ):
+        done = dpc_here("segment", "train", data, "-o", folder, *TRAIN, "--force", *more)
+        assert done.returncode == 2 and said in done.stderr.decode() and b"--model" not in done.stderr, (more, done.stderr)
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before, more
 
 
 def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, tmp_path):
