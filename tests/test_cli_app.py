@@ -9,7 +9,9 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import typer
@@ -19,6 +21,7 @@ from dpcli.cli import app as cli
 from dpcli.errors import UsageError
 from dpcli.prepare import head_start
 from dpcli.runtime import worker_server
+from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.fuzz_options import forked, is_bug, odd
 
 
@@ -173,6 +176,71 @@ def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
 @pytest.mark.parametrize("number, said", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "disk quota"), (errno.EFBIG, "too large")])
 def test_a_full_disk_is_no_bug(number, said, capsys):
     assert cli._explain(OSError(number, "of the system")) == 1 and said in capsys.readouterr().err
+
+
+REPLACING = [
+    "classify predict good.h5 --model run -o", "classify explain pac good.h5 --model run -o",
+    "classify explain tsne good.h5 --model run -o", "classify fuse good.h5 other.h5 -o",
+    "classify fuse other.h5 third.h5 --weights-from fourth.h5,good.h5 -o", "prepare split good.h5 -o",
+    "prepare split other.h5 --list good.h5 -o", "prepare merge good.h5 other.h5 -o", "prepare video good.h5 -o",
+    "segment predict good.h5 -o", "segment estimate-flow good.h5 -o", "generate4d fit good.h5 -o", "generate4d render good.h5 -o",
+    "generate4d export good.h5 --as clouds -o", "evaluate report good.h5 -o", "info other.h5 --picture",
+]  # fmt: skip
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """good.h5 under three names, a folder of a trained model, and a pipe: one that was opened would hang."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("good.h5", "other.h5", "third.h5", "fourth.h5"):
+        (tmp_path / name).write_text(name)
+    (tmp_path / "link.h5").symlink_to("good.h5")
+    (tmp_path / "twin.h5").hardlink_to("good.h5")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "best.safetensors").write_text("weights")
+    os.mkfifo(tmp_path / "pipe")
+    return tmp_path
+
+
+@pytest.mark.parametrize("words", REPLACING[:-1])
+@pytest.mark.parametrize("output", ["good.h5", "./good.h5", "link.h5", "twin.h5"])
+def test_force_replaces_no_input(words, output, files, dpc_here):
+    done = dpc_here(*words.split(), output, "--force")
+    assert done.returncode == 2 and f"{Path(output)}: is an input, too" in done.stderr.decode()
+    assert (files / output).read_text() == "good.h5" and sorted(os.listdir()) == sorted(path.name for path in files.iterdir())
+
+
+def test_force_replaces_no_file_of_an_input_folder(files, dpc_here):
+    done = dpc_here("classify", "predict", "good.h5", "--model", "run", "-o", "run/best.safetensors", "--force")
+    assert done.returncode == 2 and "best.safetensors: belongs to the input run" in done.stderr.decode()
+    assert (files / "run" / "best.safetensors").read_text() == "weights"
+    with ScoresWriter(files / "run" / "s.h5", class_names=["a"]) as writer:  # a result in that folder may go
+        writer.write("v", np.ones(1))
+    done = dpc_here("classify", "predict", "good.h5", "--model", "run", "-o", "run/s.h5", "--force")
+    assert "input" not in done.stderr.decode()
+
+
+@pytest.mark.parametrize("words", REPLACING)
+@pytest.mark.parametrize("output", ["pipe", "/dev/null", "/dev/stdout"])
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_what_is_no_regular_file_is_not_replaced(words, output, force, files, dpc_here):
+    done = dpc_here(*words.split(), output, *([] if "info" in words else force))
+    assert done.returncode == 2 and f"{output}: is not a regular file; to write into a pipe use `-o -" in done.stderr.decode()
+    assert (files / "pipe").is_fifo() and Path("/dev/null").is_char_device()
+
+
+def test_a_writer_refuses_what_is_no_regular_file(files):
+    with pytest.raises(UsageError, match="pipe: is not a regular file"):
+        ScoresWriter(files / "pipe", class_names=["a"], force=True)
+
+
+def test_a_split_in_a_folder_replaces_no_input(files, dpc_here):
+    with CloudsWriter(files / "train.h5") as writer:
+        writer.write(CloudSequence("v", np.zeros((1, 3), np.float32), np.array([0, 1]), split="train"))
+    before = (files / "train.h5").read_bytes()
+    done = dpc_here("prepare", "split", "train.h5", "-o", ".", "--force")
+    assert done.returncode == 2 and "train.h5: is an input, too" in done.stderr.decode()
+    assert (files / "train.h5").read_bytes() == before
 
 
 def test_the_search_for_bugs_tells_one_from_a_refusal():

@@ -17,6 +17,7 @@ from dpcli.paths import short_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
+from dpcli.store.pipes import refuse_repeats
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
 MEANS = ("arithmetic", "geometric")
@@ -42,8 +43,10 @@ def run_fusion(
     judges = weights_from.split(",") if weights_from is not None else []
     if weights_from is not None and len(judges) != len(inputs):
         raise UsageError(f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order")
-    _refuse_repeats([*inputs, output])
-    _refuse_repeats([*judges, output])
+    if list(inputs).count("-") > 1:
+        raise UsageError("-: stdin is one file; name the others")
+    refuse_repeats([*inputs, output])
+    refuse_repeats([*judges, output])
     called = [str(Path(name)) if name != "-" else "stdin" for name in inputs]
     if len(called) > 1:  # one file's streams are known only once it is read
         parse_weights(weights, stream_names(short_names(called)))
@@ -267,15 +270,6 @@ def _same_truth(
         if a and b and a != b:
             raise DataError(f"{other}: {one.names[row]!r} is of split {b!r}, in {first} of {a!r}; "
                             "these are scores of different data")  # fmt: skip
-
-
-def _refuse_repeats(names: Sequence[str]) -> None:
-    if list(names[:-1]).count("-") > 1:
-        raise UsageError("-: stdin is one file; name the others")
-    paths = [Path(name).resolve() for name in names if name != "-"]
-    for path in paths:
-        if paths.count(path) > 1:
-            raise UsageError(f"{path}: is named twice; every file once, and the output is another one")
 
 
 def _already_there(target: Path, entry: dict) -> bool:

@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -34,6 +35,7 @@ ROOMS = {
     "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.",
 }
 
+_WRITTEN = ("output", "picture", "animation", "ply", "turntable")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 _FULL = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "disk quota exceeded", errno.EFBIG: "file too large"}
@@ -194,10 +196,37 @@ def _refusing_nan(command: Any) -> Any:
     return command
 
 
+def _keeping_inputs(command: Any) -> Any:
+    """The command, or all below it, ending where a file that it would write is one that it reads, or no regular file."""
+    for below in getattr(command, "commands", {}).values():
+        _keeping_inputs(below)
+    run = command.callback
+    written = {one.name: one.opts[0] for one in command.params if one.name in _WRITTEN}
+    if run is None or not written:
+        return command
+
+    @functools.wraps(run)
+    def checked(*args: Any, **values: Any) -> Any:
+        from dpcli.store.pipes import check_output
+
+        inputs: list[str] = []
+        for name, value in values.items():
+            if name not in written:
+                for one in value if isinstance(value, (list, tuple)) else [value]:
+                    inputs += [str(one), *one.split(",")] if isinstance(one, str) else [str(one)] if isinstance(one, Path) else []
+        for name, option in written.items():
+            if values.get(name) and str(values[name]) != "-":
+                check_output(Path(values[name]), option, inputs)
+        return run(*args, **values)
+
+    command.callback = checked
+    return command
+
+
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _refusing_nan(typer.main.get_command(application(arguments)))
+    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(arguments))))
     from dpcli.runtime.progress import log
 
     try:

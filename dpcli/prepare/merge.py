@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +19,7 @@ from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.file import file_kind, read_positions
 from dpcli.store.journal import sweep
+from dpcli.store.pipes import refuse_repeats
 
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
 
@@ -94,7 +95,7 @@ def merge(
     run left of it is there and another; DataError: classes, units or fields that disagree, a name twice; Stopped after
     a stop signal.
     """
-    _refuse_repeats([*inputs, output])
+    refuse_repeats([*inputs, output])
     sources = [read_source(path) for path in inputs]
     if all(source.shard for source in sources) and labels is None and not prefix:
         return _merge_shards(sources, output, force, resume)
@@ -107,12 +108,6 @@ def merge(
         for source, name in zip(sources, short_names(inputs)):
             source.prefix = f"{name}/"
     return _merge_unlike(sources, output, labels or LabelMap(), compression, force, resume)
-
-
-def _refuse_repeats(paths: Sequence[Path]) -> None:
-    for path, count in Counter(path.resolve() for path in paths).items():
-        if count > 1:
-            raise UsageError(f"{path}: is named twice; every file once, and the output is another one")
 
 
 def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool) -> Report:

@@ -20,6 +20,7 @@ from dpcli.runtime.seed import generator
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.journal import sweep
+from dpcli.store.pipes import check_output
 
 _DRAW = 5005  # the key of this draw among all that a seed gives
 
@@ -163,6 +164,7 @@ def _copy(
     reader: CloudsReader, source: Source, splits: list[str], output: Path, wanted: list[str], entry: dict, compression: str,
     force: bool,
 ) -> None:  # fmt: skip
+    check_output(output, "-o", [source.path])
     history = [*source.provenance, entry]
     if not force and already_complete(output, entry):
         sweep(output)

@@ -16,6 +16,7 @@ import numpy as np
 from dpcli import __version__
 from dpcli.errors import DataError, DpcError
 from dpcli.paths import as_utf8
+from dpcli.store.pipes import check_regular
 
 SCHEMA = 1
 KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
@@ -175,6 +176,7 @@ class AtomicFile:
             raise DataError(f"{self.target}: the folder {self.target.parent} does not exist; create it first")
         if self.target.is_dir():
             raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
+        check_regular(self.target)
         try:
             self.file = h5py.File(self.part, mode)
             self.handle, self._written_out = self.file.id.get_vfd_handle(), 0

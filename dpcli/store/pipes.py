@@ -7,7 +7,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
 
+_PAGES = (".html", ".htm", ".md", ".tex")
 PICTURES = (".png", ".jpg", ".jpeg")
 FIGURES = (*PICTURES, ".pdf", ".svg")
 _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
@@ -58,6 +59,53 @@ def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
         raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
     if path.is_dir():
         raise DataError(f"{option} {path}: is a folder; name a file in it")
+
+
+def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
+    """Say before anything is opened that what is there must not be replaced, --force or not: UsageError.
+
+    An input under whatever name (links, `-` for a redirected file); what lies in an input folder (a model, raw data) and is
+    no result of dpc's own; whatever is no regular file: renaming a file over a device would put an end to the device.
+    """
+    if path.is_dir() or not os.path.lexists(path):
+        return
+    check_regular(path, option)
+    for given in map(str, inputs):
+        name = _regular_file(sys.stdin.buffer) if given == "-" and sys.stdin else Path(given)
+        if name is None or not (os.path.exists(name) and path.exists()):
+            continue
+        if os.path.samefile(name, path):
+            raise UsageError(f"{option} {path}: is an input, too ({given}), and would be replaced; name another file")
+        if option == "-o" and name.is_dir() and path.resolve().is_relative_to(name.resolve()) and not _is_result(path):
+            raise UsageError(f"{option} {path}: belongs to the input {given}, and would be replaced; name another file")
+
+
+def check_regular(path: Path, option: str = "-o") -> None:
+    """UsageError where a device, pipe or socket is, or a handle such as /dev/stdout."""
+    target = os.readlink(path) if path.is_symlink() else ""
+    handle = target.startswith("/proc/") or os.path.realpath(path.parent).startswith("/proc/")
+    if handle or (path.exists() and not path.is_file() and not path.is_dir()):
+        raise UsageError(f"{option} {path}: is not a regular file; to write into a pipe use `-o - | ...`")
+
+
+def refuse_repeats(names: Iterable[str | Path]) -> None:
+    """UsageError where two of the names, inputs and the output, are of one file."""
+    seen: list[Path] = []
+    for name in names:
+        path = Path(name).resolve()
+        if str(name) != "-" and any(path == one or (path.exists() and one.exists() and path.samefile(one)) for one in seen):
+            raise UsageError(f"{path}: is named twice; every file once, and the output is another one")
+        seen.append(path)
+
+
+def _is_result(path: Path) -> bool:
+    """Whether a command of dpc's may have written it as its -o."""
+    from dpcli.store.file import file_kind
+
+    try:
+        return path.suffix.lower() in _PAGES or bool(file_kind(path))
+    except DataError:
+        return False
 
 
 def check_replaced(folder: Path, own: Sequence[str]) -> None:
