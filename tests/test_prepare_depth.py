@@ -168,6 +168,25 @@ def test_folders_of_splits_hold_those_of_classes(names, layout, expected):
     assert [(table.rows[name].label, table.rows[name].split) for name in names] == expected
 
 
+@pytest.mark.parametrize("odd", ["test/a", "train/b", "other/a/2"])
+def test_a_stray_sample_does_not_make_classes_of_the_splits(odd):
+    with pytest.raises(DataError, match=rf"own: '{odd}': not SPLIT/CLASS/VIDEO, as 'train/a/1' and 2 in all are"):
+        labels_of_folders(Path("own"), ["train/a/1", "test/a/3", odd], "CLASS/VIDEO")
+    with pytest.raises(DataError, match="own: 'train': not SPLIT/CLASS"):
+        labels_of_folders(Path("own"), ["train/a", "train"], "CLASS")
+
+
+def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
+    for name in ("train/a/1.npy", "train/b/1.npy", "test/a/1.npy", "test/b/1.npy"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / name, depth16())
+    reader = DepthVideos((tmp_path,), label_from_folder=True)
+    assert reader.class_names == ["a", "b"] and {item.split for item in reader.items()} == {"train", "test"}
+    cv2.imwrite(str(tmp_path / "test" / "b" / "thumb.png"), depth16()[0])
+    with pytest.raises(DataError, match="'test/b': not SPLIT/CLASS/VIDEO"):
+        DepthVideos((tmp_path,), label_from_folder=True).items()
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
