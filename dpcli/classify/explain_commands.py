@@ -128,14 +128,14 @@ def chosen_samples(reader: CloudsReader, wanted: str, pool: Sequence[int]) -> li
 
 
 class _Writer(CloudsWriter):
-    """A CloudsWriter with `more`: data sets written with the index, when all samples are there."""
+    """A CloudsWriter with `more`: data sets written before the index, when all samples are there."""
 
     more: dict[str, np.ndarray] = {}
 
-    def _finish(self) -> None:
+    def _complete(self) -> None:
         for name, values in self.more.items():
             self._file.create_dataset(name, data=values, compression="gzip", compression_opts=4, shuffle=True)
-        super()._finish()
+        super()._complete()
 
 
 def write_clouds(path: Path, clouds: Sequence[ActivationCloud], *, rule: str, **options: Any) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import h5py
 import numpy as np
@@ -162,6 +163,19 @@ def read_strings(file: h5py.File, name: str) -> list[str]:
     return list(file[name].asstr()[:])
 
 
+class _HeldOpen(h5py.File):
+    """Keeps every data set that it made open until it is closed.
+
+    HDF5 writes what it buffers when the last reference to a data set goes, where h5py can't raise: a full disk would then
+    be a trace on stderr and a crash as the process ends. With all of them open, `flush` writes it and raises.
+    """
+
+    def create_dataset(self, *args: Any, **options: Any) -> h5py.Dataset:
+        made = super().create_dataset(*args, **options)
+        self.__dict__.setdefault("made", []).append(made)
+        return made
+
+
 class AtomicFile:
     """An HDF5 file written beside its target (`.NAME.part`, or another suffix) and renamed when whole.
 
@@ -178,10 +192,13 @@ class AtomicFile:
             raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
         check_regular(self.target)
         try:
-            self.file = h5py.File(self.part, mode)
+            self.file = _HeldOpen(self.part, mode)
             self.handle, self._written_out = self.file.id.get_vfd_handle(), 0
         except OSError as error:
             busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
+            if not busy:
+                with suppress(OSError):  # the first byte did not fit: an empty file would stay
+                    self.part.unlink(missing_ok=True)
             why = "another dpc is writing it" if busy else str(error).splitlines()[0]
             raise DpcError(f"{self.target}: cannot write ({why})") from None
 
@@ -207,6 +224,7 @@ class AtomicFile:
     def commit(self) -> None:
         """Close, flush to the disk, rename."""
         try:
+            self.file.flush()
             self.file.close()
             with open(self.part, "rb") as whole:
                 os.fsync(whole.fileno())
