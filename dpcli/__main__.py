@@ -8,6 +8,9 @@ def main() -> None:
     import sys
 
     try:
+        from dpcli.streams import ready_streams
+
+        ready_streams()
         from dpcli.prepare.head_start import head_start
 
         head_start(sys.argv[1:])

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
-from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.file import read_skipped, write_skipped
 from tests.prepare_helpers import ROOT, write_msr
 
@@ -268,3 +268,52 @@ def test_many_and_odd_reasons_survive(tmp_path):
     with h5py.File(tmp_path / "odd.h5", "w") as file:
         write_skipped(file, [("a\0b", "c")])
         assert read_skipped(file) == [("a b", "c")]
+
+
+@pytest.fixture(scope="module")
+def named(tmp_path_factory) -> Path:
+    """Scores whose classes have names that ASCII can't spell, and that would colour a terminal and clear it."""
+    path = tmp_path_factory.mktemp("named") / "scores.h5"
+    with ScoresWriter(path, class_names=["p\u00fcnch", "\x1b[31mred\x9b2J"]) as writer:
+        for k in range(4):
+            writer.write(f"v{k}", np.float32([0.25, 0.75]), label=k % 2, split="test")
+    return path
+
+
+def shell(line: str, path: Path, **env: str) -> subprocess.CompletedProcess:
+    """A line of bash in which DPC is the command and F the file."""
+    return subprocess.run(
+        ["bash", "-c", line.replace("DPC", f'"{sys.executable}" -m dpcli').replace("F", f"'{path}'")], capture_output=True,
+        text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(ROOT), **env},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "said"),
+    [
+        ("DPC info F >&-", 0, ""),
+        ("DPC evaluate classification F >&-", 0, ""),
+        ("DPC info F >&- 2>&- <&-", 0, ""),
+        ("DPC info absent 2>&-", 3, ""),
+        ("DPC classify fuse F F.copy -o - --force >&-", 2, "-o -: standard output is closed"),
+        ("DPC info - <&-", 2, "-: standard input is closed; pipe a command"),
+        ("DPC evaluate report - --markdown <&-", 2, "-: standard input is closed; pipe a command"),
+        ("DPC evaluate classification <(cat F)", 2, "a pipe or device, expected a file; to read from a pipe give `-`"),
+        ("DPC prepare split <(cat F) -o x.h5", 2, "a pipe or device, expected a file; to read from a pipe give `-`"),
+    ],
+)
+def test_closed_streams_and_pipes_in_the_place_of_files(named, line, code, said):
+    shutil.copy(named, f"{named}.copy")
+    before = named.read_bytes()
+    done = shell(line, named)
+    assert (done.returncode, done.stdout) == (code, "") and said in done.stderr and "a bug" not in done.stderr
+    assert bool(said) == bool(done.stderr) and named.read_bytes() == before and "Exception" not in done.stderr
+
+
+def test_what_a_terminal_can_not_show_is_spelled(named):
+    ascii_only = {"PYTHONUTF8": "0", "LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0"}
+    for line in ("DPC info F", "DPC evaluate classification F", "DPC evaluate classification F --markdown"):
+        done = shell(line, named, **ascii_only)
+        assert done.returncode == 0 and ("p\\xfcnch" in done.stdout or "--markdown" in line), done.stderr  # markdown is UTF-8
+        done = shell(line, named, PYTHONUTF8="1")
+        assert "p\u00fcnch" in done.stdout and "\\x1b[31mred\\x9b2J" in done.stdout and not {"\x1b", "\x9b"} & set(done.stdout)

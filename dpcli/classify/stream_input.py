@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import stat
-import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.progress import log
+from dpcli.store.pipes import standard_input
 
 _POLL = 0.02  # seconds between looks at a file or folder that may grow
 _SETTLED = 0.1  # seconds a folder's newest file must stay unchanged to count as whole
@@ -39,11 +39,12 @@ def open_frames(argument: str, follow: float, files: CloudFiles) -> Iterator[np.
     UsageError or DataError at once for what can't be read, DataError from the iterator for a bad frame.
     """
     if argument == "-":
-        if sys.stdin.isatty():
+        stream = standard_input()
+        if stream.isatty():
             raise UsageError("- reads frames from a pipe, but stdin is a terminal; pipe a program into this one")
         if follow:
             raise UsageError("--follow is for files and folders; a pipe ends when its writer closes it")
-        return read_arrays(sys.stdin.fileno(), "stdin")
+        return read_arrays(stream.fileno(), "stdin")
     path = Path(argument)
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")

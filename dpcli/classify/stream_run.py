@@ -23,6 +23,7 @@ from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store import ScoresWriter
+from dpcli.streams import printable
 
 _CTRL_C = "SIGINT"
 
@@ -69,7 +70,7 @@ class Lines:
         return {**self._top(scores[0]), **{name: self._top(row) for name, row in zip(self.streams, scores[1:])}}
 
     def _name(self, scores: np.ndarray) -> str:
-        return f"{self.class_names[int(scores.argmax())]} {scores.max():.2f}"
+        return f"{printable(self.class_names[int(scores.argmax())])} {scores.max():.2f}"
 
     def _text(self, scores: np.ndarray) -> str:
         single = ", ".join(f"{name} {self._name(row)}" for name, row in zip(self.streams, scores[1:]))

@@ -12,6 +12,7 @@ import typer
 
 from dpcli.cli.options import Json, Picture
 from dpcli.errors import UsageError
+from dpcli.streams import printable
 
 _PIPE_WIDTH = 120
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
@@ -91,13 +92,13 @@ def _show(found: dict[str, Any]) -> None:
     width = None if sys.stdout.isatty() else _PIPE_WIDTH
     console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)
     for name, value in _lines(found):
-        console.print(f"{name:<20} {value}", markup=False)
+        console.print(printable(f"{name:<20} {value}"), markup=False)
     if found.get("classes"):
         console.print()
         console.print(_class_table(found))
     for number, entry in enumerate(found["provenance"], 1):
         short = _shortened(str(entry.get("command", "")))
-        console.print(f"{'provenance' if number == 1 else '':<20} {number}. {short}", markup=False)
+        console.print(f"{'provenance' if number == 1 else '':<20} {number}. {printable(short)}", markup=False)
 
 
 def _show_model(told: dict[str, Any]) -> None:
@@ -113,7 +114,7 @@ def _show_model(told: dict[str, Any]) -> None:
         within = value.items() if isinstance(value, dict) else [("", value)]
         lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
     for name, value in lines:
-        console.print(f"{name:<24} {value}", markup=False)
+        console.print(printable(f"{name:<24} {value}"), markup=False)
 
 
 def _model_value(value: Any) -> str:
@@ -194,11 +195,11 @@ def _class_table(found: dict[str, Any]) -> Any:
     splits = list(found["splits"])
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
     for name in ("label", "class", "samples", *(split or "no split" for split in splits)):
-        table.add_column(Text(name), justify="left" if name == "class" else "right", no_wrap=True)
+        table.add_column(Text(printable(name)), justify="left" if name == "class" else "right", no_wrap=True)
     rows = found["classes"]
     for row in rows[:_CLASSES_SHOWN]:
         counts = [str(row["splits"].get(split, 0)) for split in splits]
-        table.add_row(str(row["label"]), Text(row["name"]), str(row["samples"]), *counts)
+        table.add_row(str(row["label"]), Text(printable(row["name"])), str(row["samples"]), *counts)
     if len(rows) > _CLASSES_SHOWN:
         table.add_row("...", Text(f"and {len(rows) - _CLASSES_SHOWN} more classes; --json lists all"))
     return table

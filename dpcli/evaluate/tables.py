@@ -10,6 +10,7 @@ import numpy as np
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.classification import ClassificationMetrics
 from dpcli.evaluate.protocol import ClassificationReport
+from dpcli.streams import printable
 
 MOST_CLASSES = 30  # a confusion matrix of more classes is no longer read as text
 _UNDEFINED = "-"
@@ -24,6 +25,10 @@ class TextTable:
     title: str
     header: list[str]
     rows: list[list[str]]
+
+    def __post_init__(self) -> None:  # names of classes and files are among them
+        self.header = [printable(cell) for cell in self.header]
+        self.rows = [[printable(cell) for cell in row] for row in self.rows]
 
     @property
     def width(self) -> int:
@@ -140,7 +145,7 @@ def print_tables(made: list[TextTable], lines: list[str], stream: TextIO) -> Non
         else:
             console.print(_rich(table), "")
     for line in lines:
-        console.print(line, markup=False)
+        console.print(printable(line), markup=False)
 
 
 def _rich(table: TextTable):
@@ -164,7 +169,7 @@ def markdown(report: ClassificationReport) -> str:
 
 def markdown_tables(made: list[TextTable], lines: list[str]) -> str:
     """Tables, then lines of text, for a document."""
-    return "\n\n".join([*(f"**{table.title}**\n\n{_markdown_table(table)}" for table in made), *lines])
+    return "\n\n".join([*(f"**{table.title}**\n\n{_markdown_table(table)}" for table in made), *map(printable, lines)])
 
 
 def _markdown_table(table: TextTable) -> str:

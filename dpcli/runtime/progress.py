@@ -7,6 +7,8 @@ import sys
 import time
 from typing import TextIO
 
+from dpcli.streams import printable
+
 _PLAIN_INTERVAL = 5.0  # seconds between lines in a log that is not a terminal
 
 
@@ -18,7 +20,7 @@ class _Log:
         self.debug = False
 
     def _write(self, text: str) -> None:
-        sys.stderr.write(f"dpc: {text}\n")
+        sys.stderr.write("dpc: " + printable(text, kept="\n\t") + "\n")
         sys.stderr.flush()
 
     def detail(self, text: str) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from dpcli import __version__
 from dpcli.errors import DataError, DpcError
 from dpcli.paths import as_utf8
-from dpcli.store.pipes import check_regular
+from dpcli.store.pipes import check_regular, refuse_pipe
 
 SCHEMA = 1
 KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
@@ -34,6 +34,7 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
     path = Path(path)
     if path.is_dir():
         raise DataError(f"{path}: a folder, expected an HDF5 file; `dpc prepare` turns raw folders into one")
+    refuse_pipe(path)
     with open(path, "rb") as raw:
         magic = raw.read(8)
     if not magic:

@@ -31,9 +31,10 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
         path = Path(argument)
         if not path.exists():
             raise DataError(f"{path}: no such file")
+        refuse_pipe(path)
         yield path
         return
-    stream = stdin or sys.stdin.buffer
+    stream = stdin or standard_input()
     if stream.isatty():
         raise UsageError(
             "- reads from a pipe, but stdin is a terminal; pipe a dpc command into this one or name a file"
@@ -49,6 +50,19 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
         if path.stat().st_size == 0:
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
         yield path
+
+
+def standard_input() -> BinaryIO:
+    """stdin; UsageError when it is closed."""
+    if sys.stdin is None:
+        raise UsageError("-: standard input is closed; pipe a command into this one or name a file")
+    return sys.stdin.buffer
+
+
+def refuse_pipe(path: Path) -> None:
+    """UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise UsageError(f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -")
 
 
 def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
@@ -71,7 +85,7 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
         return
     check_regular(path, option)
     for given in map(str, inputs):
-        name = _regular_file(sys.stdin.buffer) if given == "-" and sys.stdin else Path(given)
+        name = _regular_file(sys.stdin.buffer) if given == "-" and sys.stdin is not None else Path(given)
         if name is None or not (os.path.exists(name) and path.exists()):
             continue
         if os.path.samefile(name, path):
@@ -136,6 +150,8 @@ def output_file(argument: str | Path, stdout: BinaryIO | None = None) -> Iterato
     if str(argument) != "-":
         yield Path(argument)
         return
+    if stdout is None and sys.__stdout__ is None:
+        raise UsageError("-o -: standard output is closed; use -o FILE, or pipe into another dpc command")
     stream = stdout or sys.stdout.buffer
     if stream.isatty():
         raise UsageError("refusing to write HDF5 to a terminal; use -o FILE, or pipe into another dpc command")

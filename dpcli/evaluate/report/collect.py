@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +13,7 @@ from dpcli.evaluate.report.blocks import Figure, Table
 from dpcli.evaluate.report.clouds import part_blocks
 from dpcli.evaluate.report.strips import strip_figure
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
+from dpcli.store.pipes import standard_input
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _EXPECTED = ("expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
@@ -62,7 +62,7 @@ def _results(
     argument: str, truth: Path | None, split: str | None, pictures: bool, stdin: BinaryIO | None
 ) -> list[Result]:  # fmt: skip
     if argument == "-":
-        return _objects((stdin or sys.stdin.buffer).read(), "stdin", pictures)
+        return _objects((stdin or standard_input()).read(), "stdin", pictures)
     path, own = _named(argument)
     if path.is_file() and not _is_store(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
         return _objects(path.read_bytes(), str(path), pictures)
