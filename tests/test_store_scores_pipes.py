@@ -58,14 +58,36 @@ def test_bad_rows_are_refused(tmp_path):
         ),
         ("label", np.array([0, 1, 2, 0], np.int32), "label 2 of 'v2'"),
         ("name", ["v0", "v0", "v2", "v3"], "names repeat"),
+        ("class_names", ["a", "a"], "1 class names repeat, such as 'a'"),
+        ("class_names", np.arange(2), "'class_names' holds something else, expected a data set of strings"),
+        ("class_names", [b"a", b"\xff"], "'class_names' is not UTF-8"),
+        ("label", ["0", "1", "0", "1"], "'label' holds something else, expected a data set of whole numbers"),
+        ("label", np.float32([0, 1, 0, 0.5]), "'label' holds something else, expected a data set of whole numbers"),
+        ("label", np.int32(3), "'label' holds something else"),
+        ("scores", None, "'scores' holds something else, expected a data set of numbers"),
+        ("streams/static", None, "'streams' holds something else, expected data sets of numbers below it"),
+        ("streams", np.ones(3), "'streams' holds something else, expected data sets of numbers below it"),
+        ("provenance", ["[1, 2]"], r"provenance holds \[1, 2\], expected a command's JSON object"),
     ],
 )
 def test_bad_files_are_refused(tmp_path, name, value, message):
     path = write(tmp_path / "s.h5")
     with h5py.File(path, "r+") as file:
         del file[name]
-        file[name] = value
+        if value is None:
+            file.create_group(name)
+        else:
+            file[name] = value
     with pytest.raises(DataError, match=message):
+        ScoresReader(path)
+
+
+@pytest.mark.parametrize(("key", "value"), [("dpc_schema", "a"), ("dpc_schema", [1, 1]), ("dpc_kind", [1, 2]), ("dpc_kind", 3)])
+def test_bad_root_attributes_are_refused(tmp_path, key, value):
+    path = write(tmp_path / "s.h5")
+    with h5py.File(path, "r+") as file:
+        file.attrs[key] = value
+    with pytest.raises(DataError, match="schema" if key == "dpc_schema" else "expected 'scores'"):
         ScoresReader(path)
 
 

@@ -23,6 +23,14 @@ SCHEMA = 1
 KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 STRING = h5py.string_dtype("utf-8")
+_SORTS = {
+    "strings": ("class_names", "provenance", "name", "split", "role", "skipped"),
+    "whole numbers": ("label", "subject", "camera", "frame_offsets", "sequence_offsets", "color", "part", "pair",
+                      "pair_offsets", "flow_offsets", "position", "skipped_position"),
+    "numbers": ("scores", "points", "time", "track", "scene_flow", "pose", "flow", "part_motion", "part_probability", "rgba", "intrinsics",
+                "world_to_camera"),
+    "group": ("streams", "features", "coordinates", "activation"),
+}  # fmt: skip
 
 
 def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
@@ -48,6 +56,7 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
     try:
         _check_root(file, path, kinds)
         _refuse_outside(file, path)
+        _check_types(file, path)
     except BaseException:
         file.close()
         raise
@@ -67,9 +76,9 @@ def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:
     kind, schema = file.attrs.get("dpc_kind"), file.attrs.get("dpc_schema")
     if kind is None or schema is None:
         raise DataError(f"{path}: an HDF5 file, but not one of dpc's (no dpc_kind attribute); see `dpc prepare --help`")
-    if int(schema) != SCHEMA:
+    if not isinstance(schema, (int, np.integer)) or schema != SCHEMA:
         raise DataError(f"{path}: schema {schema}, this dpc {__version__} reads schema {SCHEMA}")
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise DataError(
             f"{path}: holds {kind!r}, expected {' or '.join(repr(k) for k in kinds)}; `dpc info {path}` shows more"
         )
@@ -98,6 +107,25 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
     visit(file)
 
 
+def _check_types(file: h5py.File, path: Path) -> None:
+    """What a file of the contract has under a name is of the sort that the readers expect; other names are not looked at."""
+    for name, item in file.items():
+        sort = next((sort for sort, names in _SORTS.items() if name in names), "")
+        if sort == "group":
+            good = isinstance(item, h5py.Group) and all(_is_numbers(one, "fiub") for one in item.values())
+        else:
+            good = not sort or _is_numbers(item, "iu" if sort == "whole numbers" else "fiub")
+        if sort == "strings":
+            good = isinstance(item, h5py.Dataset) and item.ndim > 0 and h5py.check_string_dtype(item.dtype) is not None
+        if not good:
+            expected = "data sets of numbers below it" if sort == "group" else f"a data set of {sort}"
+            raise DataError(f"{path}: {name!r} holds something else, expected {expected}; another program changed it, make it again")
+
+
+def _is_numbers(item: h5py.Group | h5py.Dataset, kinds: str) -> bool:
+    return isinstance(item, h5py.Dataset) and item.ndim > 0 and item.dtype.kind in kinds
+
+
 def file_kind(path: str | Path) -> str:
     """The kind of a file of the contract, such as `clouds`; DataError as `open_store`."""
     with open_store(path) as file:
@@ -114,9 +142,14 @@ def read_provenance(file: h5py.File) -> list[dict]:
     if "provenance" not in file:
         return []
     try:
-        return [json.loads(entry) for entry in file["provenance"].asstr()[:]]
-    except ValueError:
+        found = [json.loads(entry) for entry in file["provenance"].asstr()[:]]
+    except (ValueError, TypeError):
         raise DataError(f"{file.filename}: provenance is not JSON; the file was changed by another program") from None
+    for entry in found:
+        if not isinstance(entry, dict):
+            raise DataError(f"{file.filename}: provenance holds {entry!r:.80}, expected a command's JSON object;"
+                            " the file was changed by another program")  # fmt: skip
+    return found
 
 
 def write_skipped(file: h5py.File, skipped: Sequence[tuple[str, str]]) -> None:
@@ -161,7 +194,10 @@ def read_strings(file: h5py.File, name: str) -> list[str]:
     """A string data set as a list; DataError when it is absent."""
     if name not in file:
         raise DataError(f"{file.filename}: data set {name!r} is missing; the file is incomplete, make it again")
-    return list(file[name].asstr()[:])
+    try:
+        return list(file[name].asstr()[:])
+    except UnicodeDecodeError:
+        raise DataError(f"{file.filename}: {name!r} is not UTF-8; the file was changed by another program") from None
 
 
 class _HeldOpen(h5py.File):

@@ -117,6 +117,9 @@ class ScoresReader:
                                 f"{self.names[bad[0]]!r}; predict again")  # fmt: skip
         if self.labels.shape != shape[:1] or len(self.splits) != shape[0]:
             raise DataError(f"{self.path}: {len(self.labels)} labels for {shape[0]} names")
+        twice = sorted({name for name in self.class_names if name and self.class_names.count(name) > 1})
+        if twice:
+            raise DataError(f"{self.path}: {len(twice)} class names repeat, such as {twice[0]!r}; each class needs a name of its own")
         if len(set(self.names)) != len(self.names):
             raise DataError(f"{self.path}: sample names repeat; names identify samples")
         if len(self.labels) and (self.labels.min() < -1 or self.labels.max() >= shape[1]):
