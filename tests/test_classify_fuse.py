@@ -288,3 +288,11 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
     assert judge.read_bytes() == kept
     with pytest.raises(UsageError, match="one of the two"):
         run_fusion([str(one)], str(tmp_path / "x.h5"), weights="static=1,dynamic=1", force=False, weights_from=str(judge))
+
+
+@pytest.mark.parametrize("row", [[-1.0, 1.0, 1.0], [30.0, 15.0, 5.0], [0.3, 0.3, 0.3], [0.0, 0.0, 0.0]])
+def test_scores_that_are_no_probabilities_are_refused(row, two, tmp_path):
+    odd = write(tmp_path / "odd.h5", {**POINTS, "v1": (1, row)})
+    with pytest.raises(DataError, match=r"odd.h5: scores of 'v1' are no probabilities \(1 such samples\)"):
+        fuse([two[0], odd], tmp_path / "out.h5")
+    assert not (tmp_path / "out.h5").exists()

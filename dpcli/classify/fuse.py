@@ -23,6 +23,7 @@ _TAKEN = "fused"  # what evaluations call the main scores: no stream may
 MEANS = ("arithmetic", "geometric")
 _STEPS = 10_000  # of expectation-maximisation; some hundred are usual
 _POWER = 100.0  # scores are taken to no higher power: where every model is right, none would be high enough
+_OFF = 1e-2  # how far from 1 the sum of a sample's probabilities may be: 16-bit numbers of another program
 _LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
 
 
@@ -78,6 +79,12 @@ def _streams(
     readers: Sequence[ScoresReader], called: Sequence[str]
 ) -> tuple[list[str], list[ScoresReader], list[np.ndarray]]:
     """What is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
+    for reader, name in zip(readers, called):
+        for stream, scores in (("scores", reader.scores), *reader.streams.items()):
+            bad = np.flatnonzero((scores < 0).any(1) | (np.abs(scores.sum(1, dtype=np.float64) - 1) > _OFF))
+            if len(bad):
+                raise DataError(f"{name}: {stream} of {reader.names[bad[0]]!r} are no probabilities ({len(bad)} such samples); "
+                                "expected numbers from 0 up whose sum is 1, as softmax makes of logits")  # fmt: skip
     if len(readers) > 1:
         return stream_names(short_names(called)), list(readers), matching_rows(readers, called)
     if len(readers[0].streams) < 2:
