@@ -338,7 +338,7 @@ def test_a_pipe_can_t_be_shared(monkeypatch, capfd):
 
 def test_validation_is_shared_out_among_processes(data, alone):
     """Each process judges its part of the videos: together they are all of them, once."""
-    from dpcli.classify.train_command import check_shares
+    from dpcli.classify.train import Trainer
     from dpcli.runtime.run_folder import RunFolder
     from dpcli.runtime.signals import StopRequest
 
@@ -356,7 +356,7 @@ def test_validation_is_shared_out_among_processes(data, alone):
     for count in (1, 2):
         collected: list[list[float]] = []
         for rank in range(count):
-            trainer = Trainer(model, info, folder, Schedule((0, 0), batch=4), source, source, torch.device("cpu"),
+            trainer = Trainer(model, info, folder, Schedule((0, 1), batch=4), source, source, torch.device("cpu"),
                               StopRequest(), Counting(rank, count))  # fmt: skip
             trainer.stage = 1
             trainer.validate()
