@@ -258,13 +258,17 @@ def test_the_dynamic_stream_lights_up_what_moves_and_time_gone_it_does_not(tmp_p
         layer = stage_layer(model, points, "dynamic", 0, None)
         moving = layer.centers[:, 0] < 2.5
         value = centroid_activation(layer)
+        exact = stage_layer(copy.deepcopy(model).double(), points.double(), "dynamic", 0, None)
+        torch.testing.assert_close(value, centroid_activation(exact).float(), rtol=1e-3, atol=1e-4)
         found[speed] = float(value[moving].mean()), float(value[~moving].mean())
         if speed:
             cloud = activation_cloud(model, source, source.clips(1)[0], ("dynamic",), Question(), CPU)
             own = cloud.sequence.part == 0
             assert cloud.activation["dynamic"][own].mean() > 10 * cloud.activation["dynamic"][~own].mean()
-    assert found[0.15][0] > 0.7 and found[0.15][1] < 0.05  # n_x of an exact fit: 1 / sqrt(1 + speed^2)
-    assert found[0.0][0] < 0.05  # the same blob, standing still
+    # n_x of an exact fit: 1 / sqrt(1 + speed^2). The ridge spreads the mean time of one-sided neighbourhoods, at the clip's ends,
+    # over a blob's nearly constant features: 0.08 is what float64 has for a still one.
+    assert found[0.15][0] > 0.7 and found[0.15][1] < 0.1
+    assert found[0.0][0] < 0.1  # the same blob, standing still
 
 
 # --- from centroids to points

@@ -19,7 +19,6 @@ from dpcli.ops.backend import chosen_backend
 from dpcli.ops.gather import gather_points
 from dpcli.ops.parallel import parallel_kernels
 from dpcli.ops.pieces import TASKS, ranges, share_tasks, steps
-from dpcli.runtime.precision import is_reduced
 
 # Bytes of activations between two matrix products, which then stay in the cache.
 _PIECE = 1 << 21
@@ -56,7 +55,7 @@ def grouped_mlp(
     C2 of 8 or more.
     """
     fast = chosen_backend(points.device) == "numba" and norm1.mean is None and points.dtype == torch.float32
-    fast = fast and len(norm1.weight) % _LANES == 0 and len(norm2.weight) >= _LANES and not is_reduced(points)
+    fast = fast and len(norm1.weight) % _LANES == 0 and len(norm2.weight) >= _LANES and not torch.is_autocast_enabled(points.device.type)
     if fast:
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
     if norm1.mean is not None and norm2.mean is not None and not torch.is_grad_enabled():
@@ -89,7 +88,7 @@ def frozen_activations(
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
     """As `grouped_activations` with given statistics, but without gradients, and pooled: the two activations, (B,M,C2)."""
     with torch.no_grad():
-        plain = points.dtype != torch.float32 or chosen_backend(points.device) != "numba" or is_reduced(points)
+        plain = points.dtype != torch.float32 or chosen_backend(points.device) != "numba" or torch.is_autocast_enabled("cpu")
         if plain or len(norm2.weight) % _LANES:
             taps, _ = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
             return taps, taps[1].amax(2)
