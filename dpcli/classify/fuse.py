@@ -58,8 +58,9 @@ def run_fusion(
         streams, sources, rows = _streams(readers, called)
         shares = parse_weights(weights, streams, len(inputs) == 1)
         if judges:
-            _tell_other_models(judges, readers, called)
-            shares = _chosen_weights(judges, streams, sources[0], mean)
+            held = [ScoresReader(name) for name in judges]
+            _tell_other_models(held, judges, readers, called)
+            shares = _chosen_weights(held, judges, streams, sources[0], mean)
         config = {"fuse": streams, "mean": mean, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
         if judges:
             config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
@@ -182,10 +183,12 @@ def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
     return new
 
 
-def _tell_other_models(judges: Sequence[str], readers: Sequence[ScoresReader], called: Sequence[str]) -> None:
+def _tell_other_models(
+    held: Sequence[ScoresReader], judges: Sequence[str], readers: Sequence[ScoresReader], called: Sequence[str]
+) -> None:
     """A warning where weights come from another model's scores: fair for a twin trained on fewer videos, else an accident."""
-    for judge, reader, name in zip(judges, readers, called):
-        one, other = (_model_digest(scores) for scores in (ScoresReader(judge), reader))
+    for theirs, judge, reader, name in zip(held, judges, readers, called):
+        one, other = _model_digest(theirs), _model_digest(reader)
         if one and other and one != other:
             log.warn(f"{judge}: scores of another model than {name}'s; its weights are right only for a model like that one")
 
@@ -196,9 +199,11 @@ def _model_digest(reader: ScoresReader) -> str | None:
     return config.get("weights") if isinstance(config, dict) and "model" in config else None
 
 
-def _chosen_weights(judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str) -> np.ndarray:
+def _chosen_weights(
+    held: Sequence[ScoresReader], judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str
+) -> np.ndarray:
     """Weights chosen on labelled videos that are not among the fused ones. DataError when they don't fit."""
-    names, sources, rows = _streams([ScoresReader(name) for name in judges], judges)
+    names, sources, rows = _streams(held, judges)
     if len(judges) == 1 and names != list(streams):
         raise DataError(f"{judges[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
     _same_classes(fused.class_names, sources[0].class_names, "what is fused", judges[0])

@@ -449,26 +449,24 @@ def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
     tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
     left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
     det, acted, sides = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((1, n, TILE), np.float32)
-    side, value, count = sides[0], np.empty(TILE, np.float32), planes.size // n
+    side, solved, count = sides[0], np.empty((n, TILE), np.float32), planes.size // n
     for low in range(0, count, TILE):
         size = min(TILE, count - low)
         _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
         if ridge > 0:
             _eliminate(tile, sides)
+            solved = side
         else:
             acted[:] = False
             _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
-        for i in range(n):
-            value[:] = 0
-            if ridge > 0:
-                for w in range(TILE):
-                    value[w] = side[i, w]
-            else:
+            solved[:] = 0
+            for i in range(n):
                 for j in range(n):
                     for w in range(TILE):
-                        value[w] += out[i, j, w] * side[j, w]
+                        solved[i, w] += out[i, j, w] * side[j, w]
+        for i in range(n):
             for w in range(size):
-                planes[((low + w) // groups * n + i) * groups + (low + w) % groups] = value[w]
+                planes[((low + w) // groups * n + i) * groups + (low + w) % groups] = solved[i, w]
 
 
 @arithmetic_kernel

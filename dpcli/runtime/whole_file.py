@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dpcli.errors import DpcError
-
-_FULL = {errno.ENOSPC: "no space left on the device", errno.EFBIG: "the file size limit is reached",
-         errno.EDQUOT: "the disk quota is used up"}  # fmt: skip
+from dpcli.errors import NO_ROOM, DpcError
 
 
 class DiskFull(DpcError):
@@ -24,8 +20,8 @@ def disk_full(path: Path, error: BaseException | None) -> DiskFull | None:
     while error is not None:
         said = re.search(r"\(os error (\d+)\)", str(error))  # safetensors has the number in its text only
         number = int(said[1]) if said else getattr(error, "errno", None)
-        if number in _FULL:
-            return DiskFull(f"{path}: {_FULL[number]}; make room, then run the same command again")
+        if number in NO_ROOM:
+            return DiskFull(f"{path}: {NO_ROOM[number]}; make room, then run the same command again")
         error = error.__context__  # torch.save hides it behind an error of its own
     return None
 

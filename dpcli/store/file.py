@@ -15,7 +15,7 @@ import h5py
 import numpy as np
 
 from dpcli import __version__
-from dpcli.errors import DataError, DpcError
+from dpcli.errors import NO_ROOM, DataError, DpcError
 from dpcli.paths import as_utf8
 from dpcli.store.pipes import check_regular, refuse_pipe
 
@@ -242,8 +242,7 @@ class AtomicFile:
     def problem(self, error: BaseException) -> DpcError | None:
         """A DpcError for a failed write, or None when `error` is something else."""
         text = str(error).lower()
-        for number, words in ((errno.ENOSPC, "no space left on the device"), (errno.EFBIG, "the file size limit is reached"),
-                              (errno.EDQUOT, "the disk quota is used up")):  # fmt: skip
+        for number, words in NO_ROOM.items():
             if getattr(error, "errno", None) == number or f"errno = {number}," in text:
                 return DpcError(f"{self.target}: {words}; nothing was left under that name. Free space, then run again")
         return None
