@@ -78,6 +78,23 @@ def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc):
     assert "no space left on the device" in done.stderr and "Traceback" not in done.stderr
 
 
+def test_flows_that_the_disk_has_no_room_for_are_told_before_a_training_begins(tmp_path):
+    """Mapped files get their room when they are made: a page without room, later, would end the process by SIGBUS."""
+    if not can_mount(tmp_path):
+        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
+    code = (
+        "import os; from pathlib import Path; from dpcli.errors import DpcError; from dpcli.segment.flow_store import FlowStore\n"
+        "try: store = FlowStore(Path(os.environ['D']), 40, 2048, fresh=True)\n"
+        "except DpcError as error: print(error)\n"
+        "else: store._first[:] = store._now[:] = 1; print('written')\n"
+    )
+    script = 'mount -t tmpfs -o size={} none "$D"; "$PYTHON" -c "$CODE"; echo "code $?"'
+    env = {"D": str(tmp_path), "CODE": code, "PYTHON": sys.executable}
+    for size, said in (("1m", "flows_first.npy: no space left"), ("3m", "flows.npy: no space left"), ("9m", "written")):
+        done = namespace(script.format(size), **env)  # two files of 1.9 MiB
+        assert said in done.stdout and done.stdout.endswith("code 0\n"), done.stdout + done.stderr
+
+
 WRITES = """
 import resource, signal, sys
 from pathlib import Path

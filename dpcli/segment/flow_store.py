@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from dpcli.errors import UsageError
+from dpcli.runtime.whole_file import disk_full
 
 _FIRST, _NOW, _KNOWN = "flows_first.npy", "flows.npy", "flows_known.npy"
 _THERE, _TELLING, _CORRECTED = 1, 2, 4  # bits of `flows_known.npy`
@@ -101,8 +104,29 @@ def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.n
 
 
 def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+    try:
+        array = _mapped(path, shape, dtype, fresh)
+        _reserve(path)
+    except OSError as error:
+        raise disk_full(path, error) or error from None
+    return array
+
+
+def _mapped(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
     if not fresh and path.exists():
         array = np.lib.format.open_memmap(path, "r+")
         if array.shape == shape:
             return array
     return np.lib.format.open_memmap(path, "w+", dtype, shape)
+
+
+def _reserve(path: Path) -> None:
+    """Take the file's room on the disk now: a mapped page that finds none later ends the process by SIGBUS, unheard."""
+    if not hasattr(os, "posix_fallocate"):  # macOS, Windows
+        return
+    with path.open("r+b") as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # a file system that can't reserve
+                raise
