@@ -155,13 +155,17 @@ def test_a_stopped_and_a_killed_prediction_go_on(data, run_folder, dpc_here, tmp
         np.testing.assert_allclose(own, whole.scores if name == "scores" else whole.streams[name], atol=1e-5)
 
 
-def test_another_prediction_does_not_go_on_with_what_is_kept(data, run_folder, dpc_here, tmp_path):
+def test_another_prediction_leaves_what_is_kept(data, run_folder, dpc_here, tmp_path):
     words = ["classify", "predict", str(data), "--model", str(run_folder), "-o", str(tmp_path / "s.h5")]
     command = [sys.executable, "-c", ENDS_EARLY, str(int(signal.SIGTERM)), "1", *words, "--split", "all"]
     assert subprocess.run(command, capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}).returncode == 75
+    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     other = dpc_here(*words, "--split", "test")
-    assert other.returncode == 0 and b"continuing" not in other.stderr
-    assert set(ScoresReader(tmp_path / "s.h5").splits) == {"test"}
+    assert other.returncode == 2 and b'config.split "all", now "test"' in other.stderr and b"--force" in other.stderr
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
+    forced = dpc_here(*words, "--split", "test", "--force")
+    assert forced.returncode == 0 and b"continuing" not in forced.stderr
+    assert set(ScoresReader(tmp_path / "s.h5").splits) == {"test"} and [path.name for path in tmp_path.iterdir()] == ["s.h5"]
 
 
 def test_the_videos_held_out_of_training_choose_the_streams_weights(data, run_folder, dpc_here, tmp_path):

@@ -151,6 +151,14 @@ def test_scale_stride_and_columns(tmp_path):
     np.testing.assert_allclose(sequence.time, [0, 0.2, 0.4])
 
 
+def test_a_recording_in_millimetres_keeps_its_sensor(tmp_path):
+    """What counts as far away is metres: 12 m of a scan in millimetres are not."""
+    np.save(tmp_path / "0.npy", np.float32([[0, 0, 2000], [1000, 1000, 3000], [0, 1000, 12_000]]))
+    sample = read(tmp_path, scale=1000.0)
+    assert sample.notes == {}
+    np.testing.assert_allclose(sample.sequence.points, [[0, 0, 2], [1, 1, 3], [0, 1, 12]], rtol=1e-6)
+
+
 def test_kitti_scans(shared_data):
     folder = shared_data / "lidar" / "kitti_consecutive"
     sample = read(folder)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.camera import Intrinsics
 from dpcli.prepare.depth import DepthVideos, background_depth
-from dpcli.prepare.depth_files import read_depth_video, video_frames
+from dpcli.prepare.depth_files import read_depth_video, read_image, video_frames
 from dpcli.prepare.labels import labels_of_folders, read_labels
 from dpcli.prepare.pipeline import convert_item
 from dpcli.prepare.thin import Thinning
@@ -98,6 +98,42 @@ def test_float_depths_are_metres_and_their_nan_is_nothing(tmp_path):
     sequence = read(tmp_path / "v.npy")
     assert np.diff(sequence.frame_offsets).tolist() == [11, 11]
     assert (sequence.points[:, 2] == 1.5).all()
+
+
+@pytest.mark.parametrize("kind, metres", [("<u2", 1.5), ("<i2", 1.5), ("<i4", 1.5), ("<u4", 1.5), ("<f4", 1500.0), ("<f8", 1500.0)])
+def test_whole_numbers_are_millimetres_whatever_their_width(tmp_path, kind, metres):
+    np.save(tmp_path / "v.npy", np.full((2, 8, 8), 1500, kind))
+    np.testing.assert_allclose(read(tmp_path / "v.npy").points[:, 2], metres, rtol=1e-6)
+
+
+def test_a_video_of_a_colour_map_is_no_depth_and_gray_ones_are(tmp_path):
+    rng = np.random.default_rng(0)
+    gray = cv2.GaussianBlur(rng.integers(0, 255, (6, 48, 64)).astype(np.uint8).transpose(1, 2, 0), (7, 7), 0).transpose(2, 0, 1)
+    for codec, name in (("mp4v", "lossy.mp4"), ("FFV1", "exact.avi"), ("MJPG", "jpeg.avi")):
+        for coloured in (False, True):
+            writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter_fourcc(*codec), 10.0, (64, 48))
+            for frame in gray:
+                writer.write(cv2.applyColorMap(frame, cv2.COLORMAP_JET) if coloured else np.dstack([frame] * 3))
+            writer.release()
+            if coloured:
+                with pytest.raises(DataError, match=f"{name}: frame 0 is coloured"):
+                    list(video_frames(tmp_path / name))
+            else:
+                assert len(list(video_frames(tmp_path / name))) == 6
+
+
+def test_a_tiff_of_several_pages_is_refused(tmp_path):
+    frames = depth16(frames=3)
+    cv2.imwrite(str(tmp_path / "one.tiff"), frames[0])
+    np.testing.assert_array_equal(read_image(tmp_path / "one.tiff"), frames[0])
+    cv2.imwritemulti(str(tmp_path / "many.tiff"), list(frames))
+    with pytest.raises(DataError, match="many.tiff: holds 3 pages; expected one depth image a file"):
+        read_image(tmp_path / "many.tiff")
+
+
+def test_val_in_a_table_is_validation_as_the_folder_is(tmp_path):
+    (tmp_path / "labels.csv").write_text("name,label,split\na,0,val\nb,1,train\nc,1,mine\n")
+    assert [row.split for row in read_labels(tmp_path / "labels.csv").rows.values()] == ["validation", "train", "mine"]
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9))

@@ -17,7 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.errors import DpcError, Stopped
+from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.prepare import pipeline
 from dpcli.prepare.pipeline import convert, convert_item
 from dpcli.runtime import pool
@@ -202,14 +202,36 @@ def test_of_two_writers_of_one_file_the_second_is_refused(tmp_path):
         assert len(reader) == 2
 
 
-def test_a_journal_of_other_work_is_not_continued_and_force_starts_over(killed, tmp_path):
-    for more in ({"provenance": {"config": 2}}, {"force": True}):
-        (tmp_path / ".a.h5.part").write_bytes(killed[0])
-        (tmp_path / ".a.h5.new").write_bytes(killed[2])
-        with CloudsWriter(tmp_path / "a.h5", **{**options(), **more}) as writer:
-            assert writer.written_names == []
-            writer.write(sequence(0))
-        (tmp_path / "a.h5").unlink()
+def test_a_journal_of_other_work_stays_and_force_starts_over(killed, tmp_path):
+    left = {".a.h5.part": killed[0], ".a.h5.new": killed[2]}
+    for name, content in left.items():
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(UsageError, match="kept for it is of other work .config .*, now 2.*--force"):
+        CloudsWriter(tmp_path / "a.h5", **{**options(), "provenance": {"config": 2}})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == left
+    with CloudsWriter(tmp_path / "a.h5", **{**options(), "force": True}) as writer:
+        assert writer.written_names == []
+        writer.write(sequence(0))
+    assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
+
+
+def test_a_command_spelt_otherwise_goes_on_and_another_one_is_refused(tmp_path, monkeypatch):
+    """As `dpc` is called with another --on-error, or RAW/ instead of RAW."""
+    def run(words: list[str], **more):
+        monkeypatch.setattr("sys.argv", ["dpc", "prepare", *words])
+        return convert(ToyReader(), tmp_path / "a.h5", **more)
+
+    with monkeypatch.context() as patch, pytest.raises(DpcError, match="died"):
+        patch.setattr(pipeline, "ordered_map", dies_after_three)
+        run(["toy", "RAW"])
+    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(UsageError, match="of other work .config.points 0, now 1; config.sampling"):
+        run(["toy", "RAW", "--points", "1"], points=1)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
+    read = []
+    monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
+    run(["toy", "RAW/", "--on-error", "stop"], on_error="stop")
+    assert read == [3, 4]
 
 
 def test_what_a_kill_after_the_renaming_left_is_swept(tmp_path):
@@ -219,17 +241,18 @@ def test_what_a_kill_after_the_renaming_left_is_swept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
+def dies_after_three(work, items, jobs, executor):
+    for number, result in enumerate(pool.ordered_map(work, items, jobs, executor)):
+        if number == 3:
+            raise DpcError("a worker process died")
+        yield result
+
+
 def test_a_lost_worker_keeps_what_is_done(tmp_path, monkeypatch):
     whole = convert(ToyReader(), tmp_path / "whole.h5")
 
-    def dies(work, items, jobs, executor):
-        for number, result in enumerate(pool.ordered_map(work, items, jobs, executor)):
-            if number == 3:
-                raise DpcError("a worker process died")
-            yield result
-
     with monkeypatch.context() as patch, pytest.raises(DpcError, match="died"):
-        patch.setattr(pipeline, "ordered_map", dies)
+        patch.setattr(pipeline, "ordered_map", dies_after_three)
         convert(ToyReader(), tmp_path / "a.h5")
     read = []
     monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))

@@ -253,15 +253,42 @@ def test_a_repaired_sample_does_not_break_the_order(tmp_path, monkeypatch):
 original_read = ToyReader.read
 
 
-def test_a_part_of_another_configuration_is_not_continued(tmp_path, monkeypatch):
+def test_a_part_of_another_configuration_is_refused_and_force_starts_over(tmp_path, monkeypatch):
     path = tmp_path / "a.h5"
     with monkeypatch.context() as patch:
         Stopper(patch, 2, signal.SIGTERM)
         with pytest.raises(Stopped):
             convert(ToyReader(), path, points=20)
-    convert(ToyReader(), path, points=10)
+    with pytest.raises(UsageError, match="config.points 20, now 10"):
+        convert(ToyReader(), path, points=10)
+    convert(ToyReader(), path, points=10, force=True)
     convert(ToyReader(), tmp_path / "fresh.h5", points=10)
     assert digest(path) == digest(tmp_path / "fresh.h5")
+
+
+def test_other_data_labels_or_classes_under_the_same_names_are_not_already_complete(tmp_path):
+    from dpcli.prepare.clouds import CloudFolders
+
+    def write(folder: Path, frames: int) -> Path:
+        for name in ("a", "b"):
+            (folder / name).mkdir(parents=True)
+            for t in range(frames):
+                np.save(folder / name / f"{t}.npy", np.full((5, 3), t, np.float32))
+        return folder
+
+    table, other = tmp_path / "one.csv", tmp_path / "other.csv"
+    table.write_text("name,label,subject,split\na,wave,1,train\nb,zoom,2,test\n")
+    first, copied, longer = write(tmp_path / "x/clouds", 2), write(tmp_path / "y/clouds", 2), write(tmp_path / "z/clouds", 3)
+    output = first / "out.h5"  # beside the data, as some have it
+    convert(CloudFolders(first, labels=table), output)
+    for same in (first, copied):
+        assert convert(CloudFolders(same, labels=table), output).was_complete
+    for text in ("walk,1", "wave,7"):  # a class, a subject
+        other.write_text(table.read_text().replace("wave,1", text))
+        with pytest.raises(UsageError, match="exists, made with items_digest"):
+            convert(CloudFolders(first, labels=other), output)
+    with pytest.raises(UsageError, match="exists, made with items_digest"):
+        convert(CloudFolders(longer, labels=table), output)
 
 
 def test_reader_helpers():

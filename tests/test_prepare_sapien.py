@@ -98,6 +98,8 @@ def test_mimic_joints_follow(tmp_path):
         load(two(tmp_path, *ring))
     still = load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("nobody"))))
     assert (still.joints[1].lower, still.joints[1].upper) == (0.1, 0.1)
+    fixed = load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("j")), limits="0.5 0.5"))
+    assert [(own.lower, own.upper) for own in fixed.joints] == [pytest.approx((-0.9, -0.9))]  # -2 x the leader's value + 0.1
 
 
 @pytest.mark.parametrize("elements, words", [

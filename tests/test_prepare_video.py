@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.prepare import matting
-from dpcli.prepare.frame_files import frame_numbers, open_frames
+from dpcli.prepare.frame_files import _frame_times, _lasts, frame_numbers, open_frames
 from dpcli.prepare.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.transforms import is_transforms, transforms_clip
 from dpcli.prepare.video import VideoOptions, spread, video_clip
@@ -82,6 +83,57 @@ def test_every_naming_is_ordered_by_its_number(tmp_path, pattern):
 @given(st.lists(st.integers(0, 10**6), unique=True, min_size=2, max_size=30), st.sampled_from(["", "7_", "a3b"]))
 def test_numbers_survive_any_prefix_and_suffix(numbers, prefix):
     assert frame_numbers([f"{prefix}{number}_rgba" for number in numbers]) == numbers
+
+
+@pytest.mark.parametrize("stems", [
+    [f"1305031102.{675304 + 77 * k:06d}" for k in range(4)] + [f"1305031103.{1000 + 77 * k:06d}" for k in range(4)],
+    [f"{h:02d}-{m:02d}-{s:02d}" for h, m, s in ((9, 59, 58), (9, 59, 59), (10, 0, 0), (10, 0, 1), (10, 1, 0))],
+    [f"{k:03d}_{noise}" for k, noise in enumerate((77, 3, 500, 41))],
+])  # fmt: skip
+def test_names_of_several_numbers_are_read_from_left_to_right(tmp_path, stems):
+    pictures = [disc((20 + 2 * k, 24), 8) for k in range(len(stems))]
+    (tmp_path / "clip").mkdir()
+    for k in np.random.default_rng(0).permutation(len(stems)):
+        Image.fromarray(pictures[k]).save(tmp_path / "clip" / f"{stems[k]}.png")
+    frames = open_frames(tmp_path / "clip")
+    assert [name[:-4] for name in frames.names] == stems and frames.numbers == tuple(range(len(stems)))
+    assert frame_numbers(stems[::-1]) == list(range(len(stems)))[::-1]
+
+
+def test_frame_times_follow_the_stamps_where_a_rate_cannot():
+    steady = np.arange(12) / 29.97
+    np.testing.assert_array_equal(_frame_times(np.round(steady, 3), 29.97), steady)  # milliseconds only
+    np.testing.assert_array_equal(_frame_times(np.zeros(12), 29.97), steady)  # a container without stamps
+    assert _frame_times(np.zeros(12), None) is None
+    uneven = np.array([0.5, 0.55, 0.6, 0.9, 1.2, 1.5])
+    np.testing.assert_allclose(_frame_times(uneven, 4.0), uneven - 0.5)
+    np.testing.assert_allclose(_frame_times(uneven, None), uneven - 0.5)
+    assert _lasts(uneven - 0.5, 1.3) and not _lasts(uneven - 0.5, 3.0) and not _lasts(np.zeros(1), 3.0)
+
+
+def uneven_video(path: Path, kept: str = "lt(n,10)+not(mod(n,6))") -> Path:
+    """Two seconds at 20 frames a second of which ffmpeg drops some: the first half second whole, then every sixth."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=20:duration=2"]
+    subprocess.run([*command, "-vf", f"select='{kept}'", "-fps_mode", "vfr", str(path)], check=True, timeout=60)
+    return path
+
+
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.webm", "clip.mp4"])
+def test_a_recording_of_uneven_rate_keeps_its_times(tmp_path, name):
+    frames = open_frames(uneven_video(tmp_path / name))
+    expected = [n / 20 for n in range(40) if n < 10 or n % 6 == 0]
+    np.testing.assert_allclose(frames.times, expected, atol=2e-3)
+    assert len(list(frames.read(range(len(expected))))) == len(expected)
+
+
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.webm"])
+def test_half_a_recording_is_told(tmp_path, name):
+    path = uneven_video(tmp_path / name, "1")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(DataError, match="frames can be decoded; it is truncated or damaged|not a readable video"):
+        open_frames(path)
 
 
 def test_gif_and_video_give_the_same_frames_as_the_folder(tmp_path):
@@ -421,6 +473,8 @@ def test_known_cameras_are_turned_into_our_world_exactly(tmp_path):
     clip = transforms_clip(folder, VideoOptions(size=64, fps=10))
     header = clip.header
     np.testing.assert_allclose(header.time, [0, 0.1, 0.2])
+    fewer = transforms_clip(folder, VideoOptions(size=64, fps=10, frames=2)).header
+    np.testing.assert_allclose(fewer.time, [0, 0.2])  # as long a clip, of fewer pictures
     azimuths = np.rad2deg([orbit_of(pose)[0] for pose in header.world_to_camera])
     assert abs(azimuths[0]) < 1e-6
     assert all(orbit_of(pose)[1] > 0 for pose in header.world_to_camera)  # Blender's up became ours

@@ -219,7 +219,7 @@ def depth(
     fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view, degrees. Default: 60.")] = None,
     depth_scale: Annotated[
         float | None,
-        typer.Option("--depth-scale", help="Raw units per metre. Default: 1000 (16-bit), 100 (8-bit), 1 (float)."),
+        typer.Option("--depth-scale", help="Raw units per metre. Default: 1000 (integers; 8-bit 100), 1 (floats)."),
     ] = None,
     invert: Annotated[bool, typer.Option("--invert", help="Larger values are nearer.")] = False,
     near: Annotated[float, typer.Option("--near", help="Drop what is nearer, metres.")] = 0.0,

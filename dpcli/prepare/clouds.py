@@ -105,14 +105,15 @@ class CloudFolders:
         kept, dropped = drop_empty_frames(str(item.path), counts)
         notes = {what: count for what, count in {**notes, **dropped}.items() if count}
         points = np.concatenate([clouds[t].points for t in kept])
+        if self.scale != 1:
+            points = points.astype(np.float64) / self.scale
         if np.abs(points).max() > _FAR_AWAY:
-            points -= np.floor(clouds[kept[0]].points.min(0))
+            points = points - np.floor(points[: counts[kept[0]]].min(0))
             notes["sequences shifted to their first frame's corner for precision"] = 1
         color = self._colors(item, paths, clouds) if item.extra["color"] else None
         time = kept * self.stride / self.fps if self.fps else None
-        points = (points / self.scale).astype(np.float32)
         return Sample(
-            CloudSequence(item.name, points, offsets(counts[kept]), time=time, color=color, **describe(item)), notes
+            CloudSequence(item.name, points.astype(np.float32), offsets(counts[kept]), time=time, color=color, **describe(item)), notes
         )
 
     def _colors(self, item: Item, paths: list[Path], clouds: list[Cloud]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from dpcli.prepare.reader import natural_key
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm")
+_GRAY_NOISE, _COLOURED_SHARE = 24, 0.02  # levels between channels, and share of pixels beyond: a colour map has most of them
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 
 
@@ -88,8 +90,26 @@ def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> 
             ok, frame = capture.retrieve()
             if not ok:
                 raise DataError(f"{path}: frame {index} cannot be decoded")
+            if frame.ndim == 3 and _coloured(frame):
+                raise DataError(f"{path}: frame {index} is coloured; expected a depth video whose gray is the depth, not a picture of it")
             yield np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
         index += 1
+
+
+def _coloured(frame: np.ndarray) -> bool:
+    """Whether a decoded frame (H,W,3) u8 has colours, beyond what lossy codecs make of gray; looks at some of its pixels."""
+    some = frame[::8, ::8].astype(np.int16)
+    return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLOURED_SHARE)
+
+
+def _refuse_pages(path: Path, data: bytes) -> None:
+    """A TIFF of several pages: which of them is the frame?"""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(data)) as image:
+        pages = getattr(image, "n_frames", 1)
+    if pages > 1:
+        raise DataError(f"{path}: holds {pages} pages; expected one depth image a file: save each page as its own, frame_0001.tiff ...")
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -102,6 +122,8 @@ def read_image(path: Path) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
+    if path.suffix.lower() in (".tif", ".tiff"):
+        _refuse_pages(path, data)
     if image.ndim == 3:
         if image.shape[2] != 3 or (image != image[..., :1]).any():
             raise DataError(f"{path}: a colour image of shape {image.shape}; expected one gray channel of depth")

@@ -16,6 +16,8 @@ from dpcli.prepare.reader import natural_key
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".webm", ".mkv", ".m4v")
 ANIMATION_SUFFIXES = (".gif", ".apng")
+_BY_DURATION = (".mkv", ".webm")  # OpenCV's count of frames is made up of the clip's duration and mean rate
+_STAMP_STEP = 2e-3  # s: what rounding does to time stamps
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
 
@@ -62,26 +64,41 @@ def open_frames(path: Path) -> Frames:
 
 
 def image_paths(folder: Path) -> list[Path]:
-    """Images directly in a folder, by the integer in their names: the last one that differs between them."""
+    """Images directly in a folder, by the integers in their names that aren't the same in all, from left to right."""
     found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     found.sort(key=natural_key)
-    numbers = frame_numbers([path.stem for path in found])
-    if len(set(numbers)) == len(found):
-        return [path for _, path in sorted(zip(numbers, found))]
+    columns = _telling_columns([path.stem for path in found])
+    order = [tuple(numbers) for numbers in zip(*columns)]
+    if found and len(set(order)) == len(found):
+        return [path for _, path in sorted(zip(order, found))]
     return found
 
 
 def frame_numbers(stems: Sequence[str]) -> list[int]:
-    """The integer of each name that tells frames apart: the last column of numbers that isn't the same everywhere.
+    """The integer of each name that tells frames apart: the last one that differs between them and counts as they follow.
 
-    `frame_0001`, `1_rgba`, `cam2_000_v1` all work; 0, 1, 2, ... where names hold no numbers, or not equally many.
+    `frame_0001`, `1_rgba`, `cam2_000_v1` all work; 0, 1, 2, ... where no integer alone does: names without any, or not
+    equally many, or such as `1305031102.675304` (seconds, microseconds) and `12-59-58`, where the last one starts again.
     """
-    columns = [[int(word) for word in re.findall(r"\d+", stem)] for stem in stems]
-    if not columns or len({len(numbers) for numbers in columns}) != 1 or not columns[0]:
-        return list(range(len(stems)))
-    different = [place for place, values in enumerate(zip(*columns)) if len(set(values)) > 1]
-    place = different[-1] if different else -1
-    return [numbers[place] for numbers in columns]
+    columns = _telling_columns(stems)
+    if len(columns) == 1:
+        return columns[0]
+    places = sorted(range(len(stems)), key=lambda k: tuple(column[k] for column in columns))
+    for column in reversed(columns):
+        if all(column[a] < column[b] for a, b in zip(places, places[1:])):
+            return column
+    ranks = {place: rank for rank, place in enumerate(places)}
+    return [ranks[k] for k in range(len(stems))]
+
+
+def _telling_columns(stems: Sequence[str]) -> list[list[int]]:
+    """The columns of integers in the names that aren't the same everywhere, or the last one if all are; [] where names
+    hold none, or not equally many."""
+    rows = [[int(word) for word in re.findall(r"\d+", stem)] for stem in stems]
+    if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
+        return []
+    columns = [list(column) for column in zip(*rows)]
+    return [column for column in columns if len(set(column)) > 1] or columns[-1:]
 
 
 def _open_folder(folder: Path) -> Frames:
@@ -147,20 +164,42 @@ def _open_video(path: Path) -> Frames:
     capture = open_video(path)
     try:
         rate, declared = float(capture.get(cv2.CAP_PROP_FPS)), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        count = 0
+        stamps = []
         while capture.grab():
-            count += 1
+            stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
     finally:
         capture.release()
+    count, steady = len(stamps), bool(np.isfinite(rate)) and 0 < rate < 10_000
     if count == 0:
         raise DataError(f"{path}: no frame can be decoded; the video is empty, truncated, or of an unknown codec")
-    if declared > count + 1:
+    times = _frame_times(np.array(stamps), rate if steady else None)
+    whole = path.suffix.lower() in _BY_DURATION and times is not None and _lasts(times, declared / rate)
+    if declared > count + 1 and not whole:
         raise DataError(
             f"{path}: only {count} of its {declared} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
-    times = tuple(index / rate for index in range(count)) if np.isfinite(rate) and 0 < rate < 10_000 else None
-    return Frames(path, _numbered(count), tuple(range(count)), (path,), times)
+    return Frames(path, _numbered(count), tuple(range(count)), (path,), None if times is None else tuple(times.tolist()))
+
+
+def _frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
+    """Seconds of a video's frames from its first: by its rate where that is what their time stamps say, else the stamps.
+
+    Recordings of screens and phones have frames when something happens; their rate is a mean. Stamps are rounded to
+    milliseconds in some containers and missing (0) in others.
+    """
+    steady = np.arange(len(stamps)) / rate if rate else None
+    since = stamps - stamps[0]
+    rising = len(stamps) > 1 and bool((np.diff(stamps) > 0).all()) and bool(np.isfinite(stamps).all())
+    if not rising or (steady is not None and np.abs(since - steady).max() <= _STAMP_STEP):
+        return steady
+    return since
+
+
+def _lasts(times: np.ndarray, duration: float) -> bool:
+    """Whether frames at these times fill a clip that is said to last so long: the last one may stay for a while."""
+    steps = np.diff(times)
+    return len(steps) > 0 and duration - times[-1] <= max(2 * float(steps.max()), 0.1 * duration)
 
 
 def _video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:

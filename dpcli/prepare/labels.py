@@ -115,7 +115,8 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         subject = record.get("subject", "") or "-1"
         if not _is_number(subject):
             raise DataError(f"{where}: subject {subject!r}; expected a whole number")
-        rows[name] = Row(label, int(subject), record.get("split", ""))
+        split = record.get("split", "")
+        rows[name] = Row(label, int(subject), SPLIT_FOLDERS.get(split, split))
     return LabelTable(path, rows, class_names)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import os
 import signal
 import sys
 import threading
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -57,14 +58,28 @@ class Report:
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
     """Everything that decides the file's content, except the seed: equal configurations may continue each other."""
-    digest = hashlib.sha256()
+    digest, looks = hashlib.sha256("\n".join(reader.class_names).encode()), cache(_looks)  # items may share a folder
     for item in items:
-        digest.update(f"{item.name}\n{item.split}\n{item.label}\n".encode())
+        said = (item.name, item.split, item.label, item.subject, item.camera, looks(item.path))
+        digest.update("\n".join(map(str, said)).encode())
     thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
     reader_config = {"reader": type(reader).__name__, **reader.config}
     index = {"items": len(items), "items_digest": digest.hexdigest()[:16]}
     # through JSON, because it is compared with what a file's attribute gives back: tuples become lists
     return json.loads(json.dumps({**reader_config, **thin, "compression": compression, **index}))
+
+
+def _looks(path: Path) -> str:
+    """What tells an item's data from others of that name without reading them: a file's size; of a folder what lies in it
+    and the size of its last file. Not its place or date, which copying changes; not what we may be writing there."""
+    try:
+        if not path.is_dir():
+            return str(path.stat().st_size)
+        names = sorted(name for name in os.listdir(path) if not name.startswith(".") and not name.endswith((".h5", ".hdf5")))
+        last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
+        return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"
+    except OSError:  # an item that is made, or of a file beside others, or not there: reading it tells
+        return ""
 
 
 def convert(

@@ -67,7 +67,8 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     """
     _check(options)
     views, times = _grid(path)
-    times = [times[index] for index in spread(len(times), options.frames)]
+    seconds, chosen = _seconds(times, options.fps), spread(len(times), options.frames)
+    times = [times[index] for index in chosen]
     boxes, sizes = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([_intrinsics(view, *size) for view, size in zip(views, sizes, strict=True)])
     poses = np.stack([view.pose for view in views])
@@ -77,7 +78,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     header = ViewsHeader(
         options.name or path.resolve().name,
         np.stack([crop.intrinsics(camera, options.size) for crop, camera in zip(crops, intrinsics, strict=True)]),
-        poses, _seconds(times, options.fps), ["reference", *(view.role for view in views[1:])], 0,
+        poses, seconds[chosen] - seconds[chosen[0]], ["reference", *(view.role for view in views[1:])], 0,
         (options.size, options.size),
     )  # fmt: skip
     azimuths = ", ".join(f"{np.rad2deg(orbit_of(pose)[0]):.0f}" for pose in poses[:12])
@@ -207,6 +208,6 @@ def _look(view: _View, times: list[float], options: VideoOptions) -> tuple[Box, 
 
 
 def _seconds(times: list[float], fps: float | None) -> np.ndarray:
-    """The files' times, which run from 0 to 1, stretched to as many frames per second as --fps says."""
+    """The files' times, all of them, which run from 0 to 1, stretched to as many frames per second as --fps says."""
     values = np.array(times) - times[0]
     return values / values[-1] * (len(values) - 1) / (fps or FOLDER_FPS) if len(values) > 1 else values

@@ -184,6 +184,7 @@ def _followers(path: Path, robot: Any, joints: list[Joint], sources: list[Any]) 
     """Mimic joints follow the joint of their own that their chain of leaders ends at."""
     index = {source.name: i for i, source in enumerate(sources)}
     mimics = {joint.name: joint.mimic for joint in robot.joints if joint.mimic is not None}
+    values = {joint.name: _limits(joint)[0] for joint in robot.joints if joint.type in MOVABLE and not _moves(joint)}
     result = list(joints)
     for i, source in enumerate(sources):
         name, multiplier, offset, seen = source.name, 1.0, 0.0, set()
@@ -196,8 +197,9 @@ def _followers(path: Path, robot: Any, joints: list[Joint], sources: list[Any]) 
             name = mimic.joint
         if seen and name in index:
             result[i] = replace(joints[i], follows=index[name], multiplier=multiplier, offset=offset)
-        elif seen:  # its leader never moves
-            result[i] = replace(joints[i], lower=offset, upper=offset)
+        elif seen:  # its leader never moves: it has the one value of its limits
+            value = multiplier * values.get(name, 0.0) + offset
+            result[i] = replace(joints[i], lower=value, upper=value)
     return result
 
 

@@ -11,6 +11,7 @@ from types import TracebackType
 
 import torch
 
+from dpcli.differences import differences
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.lock import open_alone
 from dpcli.runtime.progress import log
@@ -93,7 +94,7 @@ class RunFolder:
             before = json.loads(saved.read_text())
         except ValueError:
             raise DataError(f"{saved}: not JSON, the run can't be continued; --force starts over") from None
-        differing = _differences(before, self.config)
+        differing = differences(before, self.config)
         if differing:
             more = f", and {len(differing) - _TOLD} more" if len(differing) > _TOLD else ""
             raise UsageError(
@@ -145,20 +146,6 @@ class RunFolder:
         """The learning curves so far, by the function given."""
         if self.rows and self.curves is not None:
             self.curves(self.rows, self.path / "curves.png")
-
-
-def _differences(before: object, now: object) -> list[str]:
-    """One phrase for each setting that isn't the same, nested ones by their path."""
-    old, new = _settings(before), _settings(now)
-    pairs = {name: (old.get(name, "absent"), new.get(name, "absent")) for name in sorted(old.keys() | new.keys())}
-    return [f"{name} {was}, now {is_now}" for name, (was, is_now) in pairs.items() if was != is_now]
-
-
-def _settings(value: object, path: str = "") -> dict[str, str]:
-    """A nested record as one level, values as JSON: {"network.num_frames": "16"}."""
-    if not isinstance(value, dict):
-        return {path: json.dumps(value, sort_keys=True)}
-    return {name: one for key, item in value.items() for name, one in _settings(item, f"{path}.{key}" if path else key).items()}
 
 
 def _replace(path: Path, text: str) -> None:

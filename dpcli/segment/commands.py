@@ -196,7 +196,8 @@ def _segmenter(
     if method is None:
         model, notes = load_model(model_name)
         model.mixed = mixed
-        said = {"model": notes, **({"amp": True} if mixed else {})}
+        weights = provenance.file_digest(find_model(model_name))
+        said = {"model": notes, "weights": weights, **({"amp": True} if mixed else {})}
         return network_segmenter(model.to(device), device), model.config.slots, said
     if method not in CLASSICAL:
         raise UsageError(f"--method {method}: expected one of {', '.join(CLASSICAL)}; without it the network is used")

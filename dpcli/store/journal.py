@@ -38,8 +38,9 @@ class Journal:
     """The samples given to one writer, in the file `path`, which this process alone may hold.
 
     `about` describes the writer: what another one left is not continued. `data_name` is the HDF5 file beside it that
-    what an earlier run left points into, "" when there is nothing of this very work. To continue: `samples()`, given
-    to a writer with a journal of its own, which then takes the place of this one (`replace`). Else `begin` empties it.
+    what an earlier run left points into, "" when there is nothing of this very work; `other` is the `about` of samples
+    of other work, None when there are none. To continue: `samples()`, given to a writer with a journal of its own, which
+    then takes the place of this one (`replace`). Else `begin` empties it.
     DpcError when another process holds the file. Layout: a magic line, then records of length, checksum, JSON and
     arrays; the first is `about` and `data_name`.
     """
@@ -50,13 +51,20 @@ class Journal:
         self._file, self._data = open_alone(path), -1
         self.was_there = os.fstat(self._file).st_size > 0
         self._synced = time.monotonic()
+        self.other: dict[str, Any] | None = None
         self.data_name = self._read_head()
 
     def _read_head(self) -> str:
-        first = None
+        first, size = None, os.fstat(self._file).st_size
         if os.read(self._file, len(_MAGIC)) == _MAGIC:
-            first = _read_record(self._file, os.fstat(self._file).st_size, -1)
-        return str(first[1]) if first and len(first) == 2 and first[0] == self.about else ""
+            first = _read_record(self._file, size, -1)
+        if not first or len(first) != 2:
+            return ""
+        if first[0] == self.about:
+            return str(first[1])
+        if os.lseek(self._file, 0, os.SEEK_CUR) < size and isinstance(first[0], dict):
+            self.other = first[0]
+        return ""
 
     def samples(self) -> Iterator[list[Any]]:
         """What was appended before, in order, up to what is not whole or not as it was written; once."""

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from dpcli.differences import differences
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.store.file import AtomicFile, write_root
 from dpcli.store.journal import Journal, Placed, data_suffix, journal_path, second_path
@@ -22,7 +23,8 @@ class ResumableWriter(ABC):
 
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
     written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
-    the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
+    the next writer with the same provenance continues, and `written_names` lists what is already there; one with another
+    provenance is refused (UsageError) unless `force` is on. Until the file
     is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists and `force` is off.
 
     A subclass calls `_open` at the end of its constructor and `_record` for each sample that is written, and says in
@@ -44,8 +46,9 @@ class ResumableWriter(ABC):
         self._journal: Journal | None = None
 
     def _about(self) -> dict[str, Any]:
-        """What decides whether a journal is of this very work."""
-        return {"kind": self.kind, "provenance": self.provenance}
+        """What decides whether a journal is of this very work: not the words of the command, which may be spelt otherwise."""
+        work = [{key: value for key, value in entry.items() if key != "command"} for entry in self.provenance]
+        return {"kind": self.kind, "provenance": work}
 
     def _create(self) -> None:  # noqa: B027 (not every subclass has any)
         """The data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
@@ -67,6 +70,8 @@ class ResumableWriter(ABC):
         if self.resume and self.path.parent.is_dir() and not self.path.is_dir():  # AtomicFile explains what is wrong otherwise
             before = Journal(journal_path(self.path), self._about())
         try:
+            if before and before.other and not force:
+                raise self._kept_of(before.other, before.about)
             self._atomic = AtomicFile(self.path, suffix=data_suffix(before.data_name) if before else ".part")
             self._file = self._atomic.file
             self._create()
@@ -76,6 +81,15 @@ class ResumableWriter(ABC):
             self._give_up(before)
             self._leave(type(error), error, None)
             raise
+
+    def _kept_of(self, other: dict[str, Any], mine: dict[str, Any]) -> UsageError:
+        """What was kept is of other work; it stays."""
+        old, new = ({**about, **(about.get("provenance") or [{}])[-1], "provenance": None} for about in (other, mine))
+        said = "; ".join(differences(old, new)[:3]) or "an earlier step of its files differs"
+        return UsageError(
+            f"{self.path}: what a stopped run kept for it is of other work ({said}); run that command again to go on with it,"
+            " write to another file, or --force to start over"
+        )
 
     def _continue(self, before: Journal, force: bool) -> None:
         """Write what an earlier run had written, if it was the same work."""

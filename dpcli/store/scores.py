@@ -65,9 +65,7 @@ class ScoresWriter(ResumableWriter):
         return self
 
     def _about(self) -> dict[str, Any]:
-        """Not the words of the command: after too little memory it is another --batch that goes on."""
-        work = [{key: value for key, value in entry.items() if key != "command"} for entry in self.provenance]
-        return super()._about() | {"provenance": work, "streams": list(self.streams)}
+        return super()._about() | {"streams": list(self.streams)}
 
     def _write_again(self, given: list[Any]) -> str:
         name, split, label, scores, single = given
