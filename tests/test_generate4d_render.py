@@ -55,6 +55,21 @@ def test_a_turntable_loops_in_space_and_time(scene):
     np.testing.assert_allclose(instants(scene, 31, 24)[-1], scene.time[0], atol=1e-6)  # begins again after 1.25 s
 
 
+@pytest.mark.parametrize(("rate", "shown"), [(1, 1), (60, 60), (25, 25), (240, 60), (1e5, 60), (0.25, 1), (1e-4, 1)])
+def test_a_slow_or_fast_clip_shows_every_frame(rate, shown):
+    """Once around, at the rate `shown`; only below 1 and above 60 that is not real time."""
+    clip = toy_scene(per_part=5, frames=8)
+    clip = replace(clip, time=3 + np.arange(8) / rate)
+    assert clip_rate(clip) == pytest.approx(shown)
+    assert [clip.time.searchsorted(shot.time, "right") - 1 for shot in plan(clip, "reference")] == list(range(8))
+    np.testing.assert_allclose([shot.time for shot in plan(clip, "fixed")], clip.time, atol=1e-6 / rate)
+    step = round(default_rate(clip, "turntable") / shown)  # pictures a frame
+    times = np.array([shot.time for shot in plan(clip, "turntable")])
+    assert len(times) % (8 * step) == 0  # whole loops
+    np.testing.assert_allclose(times[: 7 * step], 3 + np.arange(7 * step) / step / rate, atol=1e-6 / rate)
+    assert len(plan(clip, "fixed", fps=120)) == round(8 * 120 / shown)
+
+
 @pytest.mark.parametrize(("path", "azimuth", "elevation"), [("swing", 70, 0), ("orbit", 360, 40), ("fixed", 0, 0)])
 def test_paths_reach_as_far_as_they_should(scene, path, azimuth, elevation):
     places = np.rad2deg([orbit_of(shot.world_to_camera)[:2] for shot in plan(scene, path, Lens(radius=3.0), frames=72)])
