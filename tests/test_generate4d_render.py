@@ -252,6 +252,35 @@ def test_a_views_file_has_the_pictures_of_its_cameras(scene, renderer, tmp_path)
         np.testing.assert_array_equal(reader.rgba(1, 1), renderer.picture(shot, Look(background=None)))
 
 
+def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path):
+    from typer.testing import CliRunner
+
+    app = typer.Typer()
+    app.command()(render)
+    write_scene(tmp_path / "s.h5", scene)
+    header = ViewsHeader("toy", scene.camera_intrinsics, scene.camera_world_to_camera, np.array([1.0]), ["reference", "test"],
+                         0, (48, 48))  # fmt: skip
+    render_views(renderer, header, tmp_path / "v.h5")
+    words = [str(tmp_path / "s.h5"), "--device", "cpu", "--cameras", str(tmp_path / "v.h5"), "-o"]
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "p.h5"), "--colour", "part", "--trajectories"])
+    assert done.exit_code == 0, done.exception
+    shot = plan(scene, "reference", time=1.0)[0]
+    with ViewsReader(tmp_path / "p.h5") as reader:
+        np.testing.assert_array_equal(reader.rgba(0, 0), renderer.picture(shot, Look("part", None, True)))
+        assert reader.provenance[-1]["config"] == {"cameras": True, "colour": "part", "trajectories": True}
+    for more, says in (
+        (["--background", "black"], "--background: not with --cameras"), (["--path", "swing"], "--path: not with"),
+        (["--frames", "3", "--fps", "9"], "--frames, --fps: not with"), (["--azimuth", "0", "--time", "0"], "--azimuth, --time:"),
+        (["--size", "32"], "--size: not with"),
+    ):  # fmt: skip
+        refused = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *more])
+        assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
+    assert not (tmp_path / "q.h5").exists()
+    sheet_words = ["--picture", str(tmp_path / "sheet.png"), "--columns", "1", "--size", "16", "--time", "0", "--background", "black"]
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *sheet_words])  # what a sheet has use for is its own
+    assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
+
+
 def test_a_sheet_has_its_pictures_in_rows(renderer):
     pictures = _moving(3)
     page = sheet([("front", pictures), ("back", pictures[::-1])], ["0 s", "1 s", "2 s"])
