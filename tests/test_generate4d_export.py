@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scenes import HINGE, SWING, toy_scene
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.export import as_sequence, export_sequence, thinned
 from dpcli.generate4d.output import run_export
 from dpcli.generate4d.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
@@ -175,10 +175,43 @@ def test_the_command_says_what_it_cannot_do(scene_file, tmp_path):
         ("ply", "-", {}, "only --as clouds"),
         ("ply", tmp_path / "clip", {"time": 0.5}, "--time is of one file"),
         ("ply", tmp_path / "a.ply", {"axes": "up"}, "expected one of player, keep"),
+        ("splat-sequence", tmp_path / "clip", {"time": 0.5}, "name it with --as splat -o FILE.splat"),
+        ("clouds", tmp_path / "a.h5", {"time": 0.5}, "--time is of one file: name it with --as ply -o FILE.ply"),
+        ("cameras", tmp_path / "a.json", {"time": 0.0}, "--time is of one file"),
+        ("ply", tmp_path / "a.ply", {"points": 9}, "--points is of --as clouds"),
+        ("metrics", tmp_path / "a.h5", {"force": True}, "ends in .json"),
+        ("cameras", tmp_path / "notes.txt", {}, "ends in .json"),
     ):
         with pytest.raises(UsageError, match=says):
             run_export(str(scene_file), str(output), form=form, **{**usual, **changes})
     assert not list(tmp_path.iterdir())
+
+
+def test_cameras_and_metrics_replace_nothing_unasked(scene_file, tmp_path, monkeypatch):
+    usual = {"time": None, "axes": "player", "least": None, "points": None, "seed": 0}
+    for form, name in (("cameras", "notes.txt"), ("metrics", "scene.h5"), ("cameras", "mine.json"), ("metrics", "mine.json")):
+        (tmp_path / name).write_bytes(b"mine")
+        with pytest.raises(UsageError, match="--force replaces it" if name == "mine.json" else "ends in .json"):
+            run_export(str(scene_file), str(tmp_path / name), form=form, force=False, **usual)
+        assert (tmp_path / name).read_bytes() == b"mine"
+    written = Path.write_bytes
+
+    def half(path: Path, content: bytes) -> int:
+        written(path, content[:5])
+        raise OSError(28, "No space left on device")
+
+    (tmp_path / "mine.ply").write_bytes(b"mine")
+    monkeypatch.setattr(Path, "write_bytes", half)
+    for form, name in (("metrics", "mine.json"), ("ply", "mine.ply")):
+        with pytest.raises(DpcError, match=f"{name}: no space left"):
+            run_export(str(scene_file), str(tmp_path / name), form=form, force=True, **usual)
+        assert (tmp_path / name).read_bytes() == b"mine"
+    monkeypatch.undo()
+    run_export(str(scene_file), str(tmp_path / "mine.json"), form="metrics", force=True, **usual)
+    assert json.loads((tmp_path / "mine.json").read_text()) == {"psnr": 31.5}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.json", "mine.ply", "notes.txt", "scene.h5"]
+    with pytest.raises(DataError, match="cannot be written"):
+        run_export(str(scene_file), str(tmp_path / "no" / "a.json"), form="cameras", force=False, **usual)
 
 
 def test_single_files_and_an_instant(scene_file, tmp_path):

@@ -148,6 +148,20 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     assert done.returncode == 2 and b"another configuration" in done.stderr
 
 
+def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
+    import imageio.v3 as imageio
+
+    views, scene = toy_views(tmp_path / "views.h5", train=1), tmp_path / "scene.h5"
+    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", "views", "--dense-steps", 20,
+             "--sparse-steps", 20)  # fmt: skip
+    assert dpc_here(*words, "--picture", tmp_path / "first.png").returncode == 0
+    before = scene.read_bytes()
+    done = dpc_here(*words, "--picture", tmp_path / "later.png")
+    assert done.returncode == 0 and b"finished" in done.stderr and scene.read_bytes() == before
+    first, later = (imageio.imread(tmp_path / name).astype(int) for name in ("first.png", "later.png"))
+    assert first.shape == (5 * SIZE, 5 * SIZE, 3) and np.abs(first - later).max() <= 1
+
+
 def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monkeypatch):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
     words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--size", 16, "--dense-steps", 1, "--sparse-steps", 1)

@@ -55,6 +55,21 @@ def test_a_turntable_loops_in_space_and_time(scene):
     np.testing.assert_allclose(instants(scene, 31, 24)[-1], scene.time[0], atol=1e-6)  # begins again after 1.25 s
 
 
+@pytest.mark.parametrize(("rate", "shown"), [(1, 1), (60, 60), (25, 25), (240, 60), (1e5, 60), (0.25, 1), (1e-4, 1)])
+def test_a_slow_or_fast_clip_shows_every_frame(rate, shown):
+    """Once around, at the rate `shown`; only below 1 and above 60 that is not real time."""
+    clip = toy_scene(per_part=5, frames=8)
+    clip = replace(clip, time=3 + np.arange(8) / rate)
+    assert clip_rate(clip) == pytest.approx(shown)
+    assert [clip.time.searchsorted(shot.time, "right") - 1 for shot in plan(clip, "reference")] == list(range(8))
+    np.testing.assert_allclose([shot.time for shot in plan(clip, "fixed")], clip.time, atol=1e-6 / rate)
+    step = round(default_rate(clip, "turntable") / shown)  # pictures a frame
+    times = np.array([shot.time for shot in plan(clip, "turntable")])
+    assert len(times) % (8 * step) == 0  # whole loops
+    np.testing.assert_allclose(times[: 7 * step], 3 + np.arange(7 * step) / step / rate, atol=1e-6 / rate)
+    assert len(plan(clip, "fixed", fps=120)) == round(8 * 120 / shown)
+
+
 @pytest.mark.parametrize(("path", "azimuth", "elevation"), [("swing", 70, 0), ("orbit", 360, 40), ("fixed", 0, 0)])
 def test_paths_reach_as_far_as_they_should(scene, path, azimuth, elevation):
     places = np.rad2deg([orbit_of(shot.world_to_camera)[:2] for shot in plan(scene, path, Lens(radius=3.0), frames=72)])
@@ -235,6 +250,35 @@ def test_a_views_file_has_the_pictures_of_its_cameras(scene, renderer, tmp_path)
             plan(scene, "fixed", time=0.4)[0], world_to_camera=poses[1], intrinsics=scene.camera_intrinsics[1]
         )
         np.testing.assert_array_equal(reader.rgba(1, 1), renderer.picture(shot, Look(background=None)))
+
+
+def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path):
+    from typer.testing import CliRunner
+
+    app = typer.Typer()
+    app.command()(render)
+    write_scene(tmp_path / "s.h5", scene)
+    header = ViewsHeader("toy", scene.camera_intrinsics, scene.camera_world_to_camera, np.array([1.0]), ["reference", "test"],
+                         0, (48, 48))  # fmt: skip
+    render_views(renderer, header, tmp_path / "v.h5")
+    words = [str(tmp_path / "s.h5"), "--device", "cpu", "--cameras", str(tmp_path / "v.h5"), "-o"]
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "p.h5"), "--colour", "part", "--trajectories"])
+    assert done.exit_code == 0, done.exception
+    shot = plan(scene, "reference", time=1.0)[0]
+    with ViewsReader(tmp_path / "p.h5") as reader:
+        np.testing.assert_array_equal(reader.rgba(0, 0), renderer.picture(shot, Look("part", None, True)))
+        assert reader.provenance[-1]["config"] == {"cameras": True, "colour": "part", "trajectories": True}
+    for more, says in (
+        (["--background", "black"], "--background: not with --cameras"), (["--path", "swing"], "--path: not with"),
+        (["--frames", "3", "--fps", "9"], "--frames, --fps: not with"), (["--azimuth", "0", "--time", "0"], "--azimuth, --time:"),
+        (["--size", "32"], "--size: not with"),
+    ):  # fmt: skip
+        refused = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *more])
+        assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
+    assert not (tmp_path / "q.h5").exists()
+    sheet_words = ["--picture", str(tmp_path / "sheet.png"), "--columns", "1", "--size", "16", "--time", "0", "--background", "black"]
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *sheet_words])  # what a sheet has use for is its own
+    assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
 
 
 def test_a_sheet_has_its_pictures_in_rows(renderer):

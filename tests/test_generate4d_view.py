@@ -135,6 +135,16 @@ def test_equal_scenes_give_equal_pages(scene, page, tmp_path):
     assert (tmp_path / "b.html").read_bytes() == page.read_bytes()
 
 
+@pytest.mark.parametrize(("rate", "speed"), [(25, 1), (240, 0.25), (0.25, 4)])
+def test_the_last_frame_is_shown_as_long_as_the_others(rate, speed, tmp_path):
+    """`rate` of the header: seconds of the clip per second, as videos play it; `tail`: seconds of the clip after its last frame."""
+    clip = replace(toy_scene(per_part=5, frames=8), time=np.arange(8) / rate)
+    for fps, expected in ((None, speed), (50, 50 / rate)):
+        write_page(clip, tmp_path / "a.html", title="toy", fps=fps)
+        header = json.loads(re.search(r'id="header">(.*?)</script>', (tmp_path / "a.html").read_text(encoding="utf-8"), re.S)[1])
+        assert (header["rate"], header["tail"]) == pytest.approx((expected, 1 / rate))
+
+
 def test_what_is_packed_is_the_scene_up_to_rounding(scene, page):
     """Unpacked as the page does: sums over frames, modulo the types."""
     flipped = replace(scene, frame_quaternion=scene.frame_quaternion * np.float32([1, -1, 1, -1, 1])[:, None, None])

@@ -26,7 +26,7 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import input_file, output_file
-from dpcli.store.gaussians import scene_origin, write_scene
+from dpcli.store.gaussians import read_scene, scene_origin, write_scene
 from dpcli.store.pipes import PICTURES, check_target
 
 
@@ -45,9 +45,13 @@ def run_fit(
     with input_file(views) as path:
         record = {"config": json.loads(json.dumps(asdict(config))), "prior": prior, "prior_model": prior_model,
                   "regularise": regularise, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
+        roles = ("train",) if prior == "views" else ()
         if output != "-" and Path(output).exists() and not force:
-            return _finished_before(Path(output), record)
-        targets = load_targets(path, config.size, ("train",) if prior == "views" else ())
+            _finished_before(Path(output), record)
+            if picture is not None:
+                write_preview(read_scene(Path(output)), load_targets(path, config.size, roles), picture)
+            return
+        targets = load_targets(path, config.size, roles)
         if prior == "views" and targets.num_views < 2:
             raise DataError(f"{path}: --prior views needs views of the role 'train', but there is none; give them to"
                             " `dpc prepare video --views`, or use --prior none")  # fmt: skip
@@ -74,7 +78,7 @@ def run_fit(
 
 
 def _finished_before(output: Path, record: dict) -> None:
-    """Nothing to do when the file there is this very fit; UsageError when it is anything else."""
+    """Nothing to fit when the file there is this very fit; UsageError when it is anything else."""
     try:
         history = scene_origin(output)[1]
     except DataError:

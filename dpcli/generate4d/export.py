@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.generate4d.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
+from dpcli.generate4d.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply, write_whole
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 from dpcli.store.pipes import check_replaced
@@ -86,11 +86,8 @@ def export_sequence(
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Readable JSON, the same bytes for the same content."""
-    try:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+    """Readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
+    write_whole(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
 
 def as_sequence(

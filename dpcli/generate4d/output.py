@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from dpcli.generate4d.export import (
     write_clouds,
     write_json,
 )
-from dpcli.generate4d.paths import Lens, Shot, default_rate, plan
+from dpcli.generate4d.paths import PATHS, Lens, Shot, default_rate, plan
 from dpcli.generate4d.splat_files import camera_list
 from dpcli.generate4d.video_out import output_kind, write_pictures
 from dpcli.generate4d.viewer import write_page
@@ -32,6 +33,7 @@ from dpcli.store.pipes import check_target
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
 _SHEET_SIDE = 160  # pixels of its pictures
+_SPLATS = ("ply", "splat")  # one file for a file's name, one a frame for a folder's
 
 
 def run_render(
@@ -49,12 +51,18 @@ def run_render(
         raise UsageError("nothing to write: -o FILE for a video, a picture or a folder, --picture FILE for a sheet")
     if picture is not None:
         check_target(picture, "--picture", (".png",))
+    if cameras is not None:
+        _check_views(output, {"--path": path != PATHS[0], "--frames": frames, "--fps": fps})
+        if picture is None:  # a sheet has use for these
+            own = {f"--{name}": value for name, value in vars(lens).items()}
+            _check_views(output, {**own, "--time": time, "--background": look.background not in (None, (255, 255, 255))})
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
-        digest = provenance.record({"cameras": bool(cameras)}, int(root["seed"]), {"gaussians": place})
+        config = {"cameras": bool(cameras), "colour": colour, "trajectories": trajectories}
+        digest = provenance.record(config, int(root["seed"]), {"gaussians": place})
     renderer = Renderer(scene, choose_device(device))
     if cameras is not None:
-        _render_views(renderer, cameras, output, [*history, digest], root, force)
+        _render_views(renderer, look, cameras, str(output), [*history, digest], root, force)
     elif output is not None:
         _render_path(renderer, look, Path(output), plan(scene, path, lens, frames=frames, fps=fps, time=time),
                      fps or default_rate(scene, path), force)  # fmt: skip
@@ -78,16 +86,24 @@ def _render_path(renderer, look, output: Path, shots: list[Shot], fps: float, fo
     log.info(f"{output}: {len(shots)} picture(s) of {shots[0].size[0]} x {shots[0].size[1]}")
 
 
-def _render_views(renderer, cameras: Path, output: str | None, history: list[dict], root: dict, force: bool) -> None:
-    from dpcli.generate4d.render import render_views
-
+def _check_views(output: str | None, options: dict[str, Any]) -> None:
+    """UsageError where `output` can't be the views file of --cameras, or it has no use for an option that was given."""
     if output is None or (output != "-" and Path(output).suffix not in (".h5", ".hdf5")):
         raise UsageError("--cameras renders a views file: name it with -o FILE.h5, or - for a pipe")
+    unused = [name for name, value in options.items() if value is not None and value is not False]
+    if unused:
+        raise UsageError(f"{', '.join(unused)}: not with --cameras, whose file says from where, how large and when every picture"
+                         " is, with a transparent background; leave out one or the other")  # fmt: skip
+
+
+def _render_views(renderer, look, cameras: Path, output: str, history: list[dict], root: dict, force: bool) -> None:
+    from dpcli.generate4d.render import render_views
+
     with ViewsReader(cameras) as reader:
         header = reader.header
     with output_file(output) as place:
-        render_views(renderer, header, place, provenance=history, source=str(root["source"]), seed=int(root["seed"]),
-                     force=force)  # fmt: skip
+        render_views(renderer, header, place, look, provenance=history, source=str(root["source"]),
+                     seed=int(root["seed"]), force=force)  # fmt: skip
     log.info(f"{output}: {header.num_views} views x {header.num_frames} frames")
 
 
@@ -118,6 +134,11 @@ def run_export(
         raise UsageError(f"--axes {axes}: expected one of {', '.join(AXES)}")
     if output == "-" and form != "clouds":
         raise UsageError(f"-o -: only --as clouds goes through a pipe; name a file or folder for {form}")
+    if time is not None and not _one_splat(form, Path(output)):
+        kind = form.partition("-")[0] if form.startswith(_SPLATS) else _SPLATS[0]
+        raise UsageError(f"--time is of one file: name it with --as {kind} -o FILE.{kind}")
+    if points is not None and form != "clouds":
+        raise UsageError(f"--points is of --as clouds; leave it out for {form}")
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
         if form == "clouds":
@@ -133,19 +154,23 @@ def run_export(
     _export_others(thinned(scene, least or 0.0), Path(output), form, time, axes, force)
 
 
+def _one_splat(form: str, output: Path) -> bool:
+    """Whether that is one .ply or .splat, or was meant to be: such a suffix makes no folder."""
+    return form in _SPLATS and output.suffix.lower() in (".ply", ".splat", ".json")
+
+
 def _export_others(scene: GaussianScene, output: Path, form: str, time: float | None, axes: str, force: bool) -> None:
-    kind, _, many = form.partition("-")
-    single = not many and output.suffix.lower() in (".ply", ".splat", ".json")
-    if single and output.exists() and not force:
+    kind, single, table = form.partition("-")[0], _one_splat(form, output), form in ("cameras", "metrics")
+    if table and output.suffix.lower() != ".json":
+        raise UsageError(f"-o {output}: expected a name that ends in .json")
+    if single and output.suffix.lower() != f".{kind}":
+        raise UsageError(f"-o {output}: expected a name that ends in .{kind}, or a folder for one file a frame")
+    if (table or single) and output.exists() and not force:
         raise UsageError(f"{output}: exists already; --force replaces it")
-    if form in ("cameras", "metrics"):
+    if table:
         write_json(output, camera_list(scene, axes) if form == "cameras" else scene.metrics)
     elif single:
-        if output.suffix.lower() != f".{kind}":
-            raise UsageError(f"-o {output}: expected a name that ends in .{kind}, or a folder for one file a frame")
         export_file(scene, output, kind, time=time, axes=axes)
-    elif time is not None:
-        raise UsageError(f"--time is of one file: name it with -o FILE.{kind}")
     else:
         paths = export_sequence(scene, output, kind, axes=axes, force=force)
         log.info(f"{output}: {paths[0].name} to {paths[-1].name}, cameras.json, metrics.json")

@@ -66,11 +66,17 @@ class Lens:
         return scaled, size
 
 
-def clip_rate(scene: GaussianScene) -> float:
-    """Pictures per second of the clip itself, 1..60; a usual one for a scene of one frame."""
+def own_rate(scene: GaussianScene) -> float:
+    """Frames per second of the clip as it was filmed; a usual one for a scene of one frame."""
     if scene.num_frames < 2:
         return _STILL_RATE
-    return float(np.clip((scene.num_frames - 1) / (scene.time[-1] - scene.time[0]), 1, 60))
+    return float((scene.num_frames - 1) / (scene.time[-1] - scene.time[0]))
+
+
+def clip_rate(scene: GaussianScene) -> float:
+    """Frames of the clip per second of a video: its own rate, but 1..60. A faster clip plays slower than real time, a
+    slower one faster: no screen shows more, and nobody waits longer."""
+    return float(np.clip(own_rate(scene), 1, 60))
 
 
 def default_rate(scene: GaussianScene, path: str) -> float:
@@ -83,7 +89,8 @@ def plan(
     scene: GaussianScene, path: str = "turntable", lens: Lens = Lens(), *, frames: int | None = None,
     fps: float | None = None, time: float | None = None,
 ) -> list[Shot]:  # fmt: skip
-    """The pictures of a clip: the scene plays in real time, over and over, or stands still at `time`.
+    """The pictures of a clip: the scene plays over and over, or stands still at `time`. It plays in real time where the
+    clip has 1 to 60 frames per second, else at `clip_rate`: a loop has every frame, whatever the clip's own rate.
 
     turntable: once around; orbit: once around, up and down; swing: to and fro; fixed: a still camera; reference: the
     input's own camera (of `lens` only the size counts). UsageError for an unknown path or empty clip.
@@ -99,7 +106,7 @@ def plan(
 
 
 def _loop(scene: GaussianScene) -> float:
-    """Seconds of the clip with its last frame's own interval."""
+    """Seconds of a video for the clip, with its last frame's own interval."""
     return scene.num_frames / clip_rate(scene)
 
 
@@ -112,7 +119,8 @@ def _usual_count(scene: GaussianScene, path: str, rate: float, still: bool) -> i
 
 def instants(scene: GaussianScene, count: int, rate: float) -> np.ndarray:
     """Times f64 (count) of a video of `rate` pictures per second; after the last frame the clip begins again."""
-    return scene.time[0] + np.mod(np.arange(count) / rate + 1e-9, _loop(scene))
+    pace = clip_rate(scene) / own_rate(scene)  # seconds of the clip per second of the video
+    return scene.time[0] + pace * np.mod(np.arange(count) / rate + 1e-9, _loop(scene))
 
 
 def _poses(scene: GaussianScene, path: str, lens: Lens, count: int) -> list[np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -139,13 +139,15 @@ def _bytes(image: np.ndarray) -> np.ndarray:
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def render_views(renderer: Renderer, header: ViewsHeader, path: Path, **root: Any) -> None:
-    """A `views` file: the scene seen by the header's cameras at its times, RGBA. `root`: options of ViewsWriter."""
+def render_views(renderer: Renderer, header: ViewsHeader, path: Path, look: Look = Look(), **root: Any) -> None:
+    """A `views` file: the scene seen by the header's cameras at its times, RGBA, as `look` says but for its background.
+    `root`: options of ViewsWriter."""
+    look = replace(look, background=None)
     with ViewsWriter(path, header, **root) as writer:
         for view, (lens, pose) in enumerate(zip(header.intrinsics, header.world_to_camera, strict=True)):
             for frame, time in enumerate(header.time.tolist()):
                 shot = Shot(time, pose, lens, tuple(header.size))
-                writer.add(view, frame, renderer.picture(shot, Look(background=None)))
+                writer.add(view, frame, renderer.picture(shot, look))
 
 
 def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]) -> np.ndarray:

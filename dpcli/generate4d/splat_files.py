@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.runtime.whole_file import whole_file
 from dpcli.store.gaussians import GaussianScene, color_of, opacity_of
 
 # Half a turn about x: our world (y up, the reference camera at +z) to the players' (x right, y down, z forward)
@@ -63,7 +64,7 @@ def write_splat_ply(path: Path, splats: Splats) -> None:
     rows = np.stack([np.float32(values) for values in columns.values()], axis=1).astype("<f4")
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}",
              *(f"property float {name}" for name in columns), "end_header"]  # fmt: skip
-    _write(path, ("\n".join(lines) + "\n").encode("ascii") + rows.tobytes())
+    write_whole(path, ("\n".join(lines) + "\n").encode("ascii") + rows.tobytes())
 
 
 def write_splat(path: Path, splats: Splats) -> None:
@@ -77,7 +78,7 @@ def write_splat(path: Path, splats: Splats) -> None:
     rows["rgba"][:, :3], rows["rgba"][:, 3] = color_of(splats.sh), np.rint(opacity * 255)
     rows["quaternion"] = np.clip(np.rint(splats.quaternion * 128 + 128), 0, 255)
     weight = splats.log_scale.sum(1, dtype=np.float64) + np.log(np.maximum(opacity, 1e-30))
-    _write(path, rows[np.argsort(-weight, kind="stable")].tobytes())
+    write_whole(path, rows[np.argsort(-weight, kind="stable")].tobytes())
 
 
 def camera_list(scene: GaussianScene, axes: str = "player") -> list[dict[str, Any]]:
@@ -96,8 +97,10 @@ def camera_list(scene: GaussianScene, axes: str = "player") -> list[dict[str, An
     return cameras
 
 
-def _write(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes) -> None:
+    """The file, whole or not at all. DataError when it can't be written."""
     try:
-        path.write_bytes(content)
+        with whole_file(path) as part:
+            part.write_bytes(content)
     except OSError as error:
         raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None

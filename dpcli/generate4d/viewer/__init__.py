@@ -17,7 +17,7 @@ import numpy as np
 from dpcli import __version__
 from dpcli.errors import DataError
 from dpcli.generate4d.colours import WEIGHTS
-from dpcli.generate4d.paths import clip_rate
+from dpcli.generate4d.paths import clip_rate, own_rate
 from dpcli.ops.cameras import orbit_of
 from dpcli.runtime.palette import part_colours
 from dpcli.store.gaussians import GaussianScene
@@ -29,7 +29,8 @@ _POSITIONS, _TURNS, _BYTE = 65535, 127, 255  # steps of a coordinate in the box,
 def write_page(
     scene: GaussianScene, path: Path, *, title: str, history: Sequence[dict] = (), fps: float | None = None
 ) -> int:
-    """Write the page; returns its size in bytes. DataError when it can't be written.
+    """Write the page; returns its size in bytes. DataError when it can't be written. fps: frames of the clip per second,
+    None = as videos play it (`clip_rate`).
 
     Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colours, opacities and weights
     to 1/255; colour terms that depend on the direction are left out. Equal scenes give equal bytes.
@@ -104,7 +105,7 @@ def describe(
     ids, counts = np.unique(scene.part, return_counts=True)
     return {
         "title": title, "version": __version__, "count": scene.num_gaussians, "frames": scene.num_frames,
-        "time": scene.time.tolist(), "rate": fps / clip_rate(scene), "tail": 1 / clip_rate(scene),
+        "time": scene.time.tolist(), "rate": fps / own_rate(scene), "tail": 1 / own_rate(scene),
         "low": low.tolist(), "extent": extent.tolist(), "starts": dict(zip(arrays, starts)), "bytes": starts[-1],
         "camera": {"azimuth": azimuth, "elevation": elevation, "radius": radius,
                    "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1]))},
