@@ -246,6 +246,57 @@ def test_motions_are_the_true_ones_in_the_inputs_own_coordinates(pairs):
         assert np.abs(flow - (moved - points)).max() < 1e-2  # of 7 units an object
 
 
+@pytest.mark.parametrize("pairs", ["adjacent", "all"])
+@pytest.mark.parametrize("empty", [(0,), (2,), (1, 3), (0, 5, 6)])
+def test_frames_without_points_change_nothing_for_the_others(empty, pairs):
+    whole = drawer("d", 5, frames=4)
+    clouds, rest = [whole.frame(t) for t in range(4)], list(range(4))
+    for t in empty:
+        clouds.insert(t, np.zeros((0, 3), np.float32))
+        rest = [k + (k >= t) for k in rest]
+    holed = CloudSequence.from_frames("d", clouds)
+
+    def halves_and_flow(found: list):
+        """Masks from the points; flow from nearest neighbours; and what was asked for."""
+        def estimate(first, second):
+            found.append((len(first), len(second)))
+            return torch.full_like(first, 0.01 * len(found)), torch.full_like(second, -0.01)
+        return estimate
+
+    asked, same = [], []
+    options = Refinement(pairs=pairs, icp=0)
+    labels, sample = predict_parts(whole, 0, two_halves, halves_and_flow(asked), options, 0)
+    found, holes = predict_parts(holed, 0, two_halves, halves_and_flow(same), options, 0)
+    np.testing.assert_array_equal(found, labels)
+    np.testing.assert_array_equal(holes.probability, sample.probability)
+    known = {tuple(pair): number for number, pair in enumerate(sample.pairs.tolist())}
+    assert len(holes.pairs) == (len(clouds) - 1 if pairs == "adjacent" else len(clouds) * (len(clouds) - 1))
+    for (i, j), motion, flow in zip(holes.pairs.tolist(), holes.motion, holes.flow):
+        assert flow.shape == (len(clouds[i]), 3)
+        if i in rest and j in rest:
+            own = known[rest.index(i), rest.index(j)]
+            np.testing.assert_array_equal(motion, sample.motion[own])
+            np.testing.assert_array_equal(flow, sample.flow[own])
+        else:
+            assert (motion == np.eye(4)).all() and not flow.any()
+
+
+def test_training_leaves_pairs_without_points_out(tmp_path, capsys):
+    clouds = [drawer("d", 0, frames=5).frame(t) for t in range(5)]
+    clouds[2] = np.zeros((0, 3), np.float32)
+    with CloudsWriter(tmp_path / "a.h5") as writer:
+        writer.write(CloudSequence.from_frames("a", clouds))
+        writer.write(drawer("b", 1))
+        writer.write(CloudSequence.from_frames("c", [clouds[0], clouds[2]]))
+    reader = CloudsReader(tmp_path / "a.h5")
+    source = PairSource(reader, [0, 1, 2], 20, 0)
+    assert [(p.number, p.sequence, p.first) for p in source.pairs] == [(0, 0, 0), (1, 0, 3), (2, 1, 0), (3, 1, 1)]
+    assert "3 of 7 pairs of frames left out" in capsys.readouterr().err
+    assert all(np.isfinite(source.load(pair).points).all() for pair in source.pairs)
+    with pytest.raises(DataError, match="all with a frame without points"):
+        PairSource(reader, [2], 20, 0)
+
+
 def test_poor_sequences_get_an_answer():
     def anything(frames, flows):
         return [torch.softmax(torch.randn(len(f), 4, generator=torch.Generator().manual_seed(0)), 1) for f in frames]
@@ -410,8 +461,20 @@ def test_a_flow_estimator_is_trained_and_used(dpc, data, tmp_path):
     done = dpc("segment", "flow", data, "-o", folder, "--steps", 3, "--batch", 2, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr.decode()
     assert (folder / "curves.png").exists() and done.stdout.decode().strip().endswith("best.safetensors")
-    used = dpc("segment", "predict", data, "--method", "ward", "--flow", folder, "-o", tmp_path / "p.h5", OMP_NUM_THREADS="1")
+    words = ("segment", "predict", data, "--method", "ward", "--flow", folder, "-o", tmp_path / "p.h5")
+    used = dpc(*words, OMP_NUM_THREADS="1")
     assert used.returncode == 0, used.stderr.decode()
+    again = dpc(*words, OMP_NUM_THREADS="1")
+    assert again.returncode == 0 and b"already complete" in again.stderr
+    learn = ("segment", "train", data, "-o", tmp_path / "run", *TRAIN[2:], "--flow", folder)
+    assert dpc(*learn, OMP_NUM_THREADS="1").returncode == 0
+    weights = folder / "best.safetensors"  # the estimator is trained on: the same path, another network
+    header, tensors = weights.read_bytes()[:-4], weights.read_bytes()[-4:]
+    weights.write_bytes(header + bytes(byte ^ 1 for byte in tensors))
+    other = dpc(*words, OMP_NUM_THREADS="1")
+    assert other.returncode == 2 and b"another model, data or choice" in other.stderr
+    other = dpc(*learn, OMP_NUM_THREADS="1")
+    assert other.returncode == 2 and b"another configuration (flow_weights" in other.stderr, other.stderr
 
 
 @pytest.mark.parametrize(
@@ -423,6 +486,19 @@ def test_a_wrong_choice_is_named_before_anything_is_made(words, dpc_here, data, 
     done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, *words)
     assert done.returncode == 2 and f"{words[0]} {words[1]}".encode() in done.stderr and b"expected" in done.stderr
     assert not (tmp_path / "model").exists()
+
+
+@pytest.mark.parametrize("words, said", [
+    (("train", "--validation", "drawer", *TRAIN), "--validation drawer: holds out all of the 4 training sequences"),
+    (("predict", "--method", "ward", "--model", "x"), "--model x: --method ward uses no network"),
+    (("predict", "--method", "ward", "--method-option", "max_points=1"), "expected int, 2 or more"),
+    (("predict", "--method", "ward", "--method-option", "threshold=inf"), "expected a positive float"),
+    (("predict", "--method", "ward", "--parts", "40000"), "--parts 40000: more than the 512 points"),
+])  # fmt: skip
+def test_what_cannot_be_meant_is_refused(words, said, dpc_here, data, tmp_path):
+    done = dpc_here("segment", words[0], data, "-o", tmp_path / "out.h5", *words[1:])
+    assert done.returncode == 2 and said.encode() in done.stderr, done.stderr
+    assert not (tmp_path / "out.h5").exists()
 
 
 def test_a_profile_names_the_groups_it_knows(dpc_here):

@@ -171,6 +171,15 @@ def test_the_check_rejects_broken_twins(cloud):
         assert_equivariant(PartNetwork(small(group="trivial")).eval(), cloud, [13], 1e-4)
 
 
+def test_a_cloud_s_masks_do_not_depend_on_what_it_is_computed_with(cloud):
+    torch.manual_seed(1)
+    network = PartNetwork(compact()).eval()
+    with torch.inference_mode():
+        alone = network(cloud).mask
+        together = network(torch.cat([cloud, 20 * cloud, cloud.flip(1)])).mask
+    np.testing.assert_allclose(together[:1], alone, atol=1e-5)
+
+
 def test_neighbourhoods_do_not_jump(cloud):
     """A point that leaves the ball, or the count, counts nothing there: weights move as little as the point does."""
     near = nearest_neighbourhood(cloud, cloud[:, :50], 0.3, 16)

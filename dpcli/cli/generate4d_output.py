@@ -107,7 +107,9 @@ def view(
     title: Annotated[str | None, typer.Option("--title", help="Heading. Default: what was fitted.")] = None,
     min_opacity: Annotated[float, typer.Option("--min-opacity", min=0, max=1, help="Leave fainter Gaussians out.")] = 1
     / 255,
-    fps: Annotated[float | None, typer.Option("--fps", min=1, max=120, help="Default: the clip's own speed.")] = None,
+    fps: Annotated[
+        float | None, typer.Option("--fps", min=1, max=120, help="Frames of the clip per second. Default: its own, within 1 to 60.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Write one HTML file that shows a scene in any browser, without server or network: turn, zoom, play, colour by part."""

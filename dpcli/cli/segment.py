@@ -152,6 +152,8 @@ def predict(
         raise UsageError(f"--pairs {pairs}: expected adjacent or all")
     if method is None and (parts is not None or method_option):
         raise UsageError("--parts and --method-option belong to --method; the network finds its own number of parts")
+    if method is not None and model is not None:
+        raise UsageError(f"--model {model}: --method {method} uses no network; give one of both")
     options = dict(word.split("=", 1) if "=" in word else (word, "") for word in method_option or [])
     divide = not no_split and method is None
     refinement = {"points": points, "pairs": pairs, "icp": icp, "vote": not no_vote, "split": divide, "smallest": smallest}

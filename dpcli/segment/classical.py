@@ -109,15 +109,20 @@ def classical_options(method: str, values: Mapping[str, Any] | None = None) -> C
 
 
 def _converted(where: str, value: Any, default: Any) -> Any:
-    """The value as the default's type; numbers must be positive (smallest, still and motion_weight: or zero)."""
+    """The value as the default's type; numbers must be finite and positive (smallest, still and motion_weight: or zero), and
+    points at least 2, so that there is something to cluster."""
     try:
         converted = type(default)(value)
     except (TypeError, ValueError):
         raise UsageError(f"{where} is {value!r}; expected {type(default).__name__}") from None
+    if isinstance(default, str):
+        return converted
     whole = not isinstance(default, int) or converted == float(value)
-    may_be_zero = where.split()[1] in ("smallest", "still", "motion_weight")
-    if not isinstance(default, str) and not (whole and (converted > 0 or may_be_zero and converted == 0)):
-        raise UsageError(f"{where} is {value!r}; expected a positive {type(default).__name__}")
+    name = where.split()[1]
+    least = {"max_points": 2, "smallest": 0, "still": 0, "motion_weight": 0}.get(name)
+    if not (whole and np.isfinite(converted) and (converted > 0 if least is None else converted >= least)):
+        expected = f"a positive {type(default).__name__}" if least is None else f"{type(default).__name__}, {least} or more"
+        raise UsageError(f"{where} is {value!r}; expected {expected}")
     return converted
 
 

@@ -55,6 +55,9 @@ def run_training(
         _check_supervision(reader, aims)
         record = {"network": json.loads(shape.to_json()), "schedule": asdict(plan), "objective": asdict(aims), "flow": flow,
                   "validation": validation, "start_from": start_from, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
+        used = {"flow_weights": None if aims.supervised else flow_weights(flow),
+                "start_weights": find_model(start_from, "--start-from") if start_from else None}  # fmt: skip
+        record |= {role: provenance.file_digest(file) for role, file in used.items() if file}  # what a path leads to may change
         mixed = wanted(amp, chosen)
         record |= {"amp": True} if mixed else {}
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
@@ -93,9 +96,9 @@ def _check_flows(
     except (OSError, ValueError):
         raise UsageError(f"--flows-of {folder}: no folder of a `dpc segment train` run") from None
     mine = json.loads(json.dumps(record))
-    for key in ("data", "seed", "validation", "flow"):
-        if other.get(key) != mine[key]:
-            raise UsageError(f"--flows-of {folder}: its {key} is {other.get(key)!r}, here {mine[key]!r}; flows don't fit")
+    for key in ("data", "seed", "validation", "flow", "flow_weights"):
+        if other.get(key) != mine.get(key):
+            raise UsageError(f"--flows-of {folder}: its {key} is {other.get(key)!r}, here {mine.get(key)!r}; flows don't fit")
     first_flows(folder, len(training.pairs), training.points)
 
 
@@ -141,12 +144,16 @@ def split_sequences(reader: CloudsReader, validation: str | None, seed: int) -> 
     try:
         share = float(validation)
     except ValueError:
-        return _hold_out_classes(reader, train, validation)
-    if not 0 < share < 1:
-        raise UsageError(f"--validation {validation}: expected none, a fraction below 1, or class names")
-    order = generator(seed, 7004).permutation(len(train))
-    count = max(1, round(share * len(train)))
-    return [train[i] for i in sorted(order[count:])], [train[i] for i in sorted(order[:count])]
+        left, held = _hold_out_classes(reader, train, validation)
+    else:
+        if not 0 < share < 1:
+            raise UsageError(f"--validation {validation}: expected none, a fraction below 1, or class names")
+        order = generator(seed, 7004).permutation(len(train))
+        count = max(1, round(share * len(train)))
+        left, held = [train[i] for i in sorted(order[count:])], [train[i] for i in sorted(order[:count])]
+    if not left:
+        raise UsageError(f"--validation {validation}: holds out all of the {len(train)} training sequences; none is left to train on")
+    return left, held
 
 
 def _hold_out_classes(reader: CloudsReader, train: list[int], names: str) -> tuple[list[int], list[int]]:
@@ -175,9 +182,13 @@ def run_prediction(
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         sequences = _select(reader, split)
-        segmenter, slots, said = _segmenter(method, method_options, num_parts, model, chosen, seed, wanted(amp, chosen))
+        segmenter, slots, said = _segmenter(
+            method, method_options, num_parts, model, chosen, seed, wanted(amp, chosen), options.points
+        )
         config = {"split": split, "flow": flow, "refinement": asdict(options), **said}
-        history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
+        estimator = flow_weights(flow)
+        inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
+        history = [*reader.provenance, provenance.record(config, seed, inputs)]
         fields = [name for name in reader.fields if name not in ("part", "pose")]
         if force or not _already_there(target, history[-1]):
             with PartsWriter(target, num_parts=slots, class_names=reader.class_names, length_unit=reader.length_unit, seed=seed,
@@ -191,7 +202,7 @@ def run_prediction(
 
 def _segmenter(
     method: str | None, method_options: dict[str, Any], num_parts: int | None, model_name: str, device: torch.device, seed: int,
-    mixed: bool = False,
+    mixed: bool = False, points: int = Refinement.points,
 ) -> tuple[Segmenter, int, dict[str, Any]]:  # fmt: skip
     if method is None:
         model, notes = load_model(model_name)
@@ -203,6 +214,8 @@ def _segmenter(
         raise UsageError(f"--method {method}: expected one of {', '.join(CLASSICAL)}; without it the network is used")
     chosen = classical_options(method, method_options)
     said = {"method": method, "options": asdict(chosen), "num_parts": num_parts}
+    if num_parts is not None and num_parts > points:
+        raise UsageError(f"--parts {num_parts}: more than the {points} points of a frame that are divided (--points)")
     slots = max(chosen.max_parts, num_parts or 0)
     return _classical_segmenter(method, method_options, num_parts, slots, seed), slots, said
 

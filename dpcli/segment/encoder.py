@@ -40,8 +40,9 @@ class InvariantPooling(nn.Module):
     def forward(self, features: Tensor, points: Tensor, near: Neighbourhood) -> Tensor:
         """features (B,P,G,C), points (B,P,3) -> (B,P,H*C)."""
         rotations = GROUPS[self.config.group]().rotations_like(points)
-        if self.config.canonical_heads:  # scaled by the radius: of order 1, like the features
-            centred = -near.offsets.mean(2) / near.offsets.square().sum(-1).mean().sqrt().clamp(min=1e-6)
+        if self.config.canonical_heads:  # scaled by the radius, each cloud's own: of order 1, like the features
+            radius = near.offsets.square().sum(-1).mean((1, 2)).sqrt().clamp(min=1e-6)
+            centred = -near.offsets.mean(2) / radius[:, None, None]
         else:
             centred = points - points.mean(1, keepdim=True)
         local = _turned_back(rotations, centred).to(features.dtype)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.runtime.progress import log
 from dpcli.runtime.seed import generator
 from dpcli.store import CloudSequence, CloudsReader
 
@@ -47,24 +48,27 @@ def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarr
 
 
 class PairSource:
-    """All pairs of adjacent frames of some sequences. A frame's points are drawn once: its flow belongs to them."""
+    """All pairs of adjacent frames with points of some sequences. A frame's points are drawn once: its flow belongs to them."""
 
     def __init__(self, reader: CloudsReader, sequences: list[int], points: int, seed: int) -> None:
         self.reader, self.points, self.seed = reader, points, seed
-        spots = [(s, f) for s in sequences for f in range(int(reader.frame_counts[s]) - 1)]
-        self.pairs = [Pair(n, s, f) for n, (s, f) in enumerate(spots)]
-        if not self.pairs:
-            raise DataError(f"{reader.path}: no sequence of two frames or more to train on")
+        sizes = np.split(reader.frame_sizes, np.cumsum(reader.frame_counts)[:-1])
+        spots = [(s, f) for s in sequences for f in range(len(sizes[s]) - 1)]
+        both = [(s, f) for s, f in spots if sizes[s][f : f + 2].all()]
+        if not both:
+            without = ", all with a frame without points" if spots else ""
+            raise DataError(f"{reader.path}: no two frames that follow each other in {len(sequences)} sequences to train on{without}")
+        if len(both) < len(spots):
+            log.warn(f"{reader.path}: {len(spots) - len(both)} of {len(spots)} pairs of frames left out: one has no points")
+        self.pairs = [Pair(n, s, f) for n, (s, f) in enumerate(both)]
         truth = next((name for name in MOTION_FIELDS if name in reader.fields), None)
         self.fields = [name for name in ("part", truth) if name in reader.fields]
 
     def load(self, pair: Pair) -> LoadedPair:
-        """One pair. DataError when a frame is empty."""
+        """One pair."""
         frames = [pair.first, pair.first + 1]
         sample = self.reader.read(pair.sequence, frames, self.fields)
         clouds = [sample.frame(t) for t in range(2)]
-        if min(map(len, clouds)) == 0:
-            raise DataError(f"{self.reader.path}: frame without points in {sample.name!r}; prepare without empty frames")
         picks = [
             choose_points(len(c), self.points, generator(self.seed, _FRAME_KEY, pair.sequence, f))
             for c, f in zip(clouds, frames)

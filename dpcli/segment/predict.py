@@ -80,14 +80,17 @@ def predict_parts(
     """Hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
 
     Frames are thinned to `points`, centred and scaled together to diameter 1 (so no unit or place matters); masks are
-    carried back to all points from the three nearest. One frame gives parts and no motion.
+    carried back to all points from the three nearest. One frame gives parts and no motion. Frames without points are
+    left out of everything: their neighbours are each other's, and what leads from or to them stands still.
     """
     clouds = [np.float32(sequence.frame(t)) for t in range(sequence.num_frames)]
+    seen = [t for t, cloud in enumerate(clouds) if len(cloud)] or [0]
     centre = np.float32(np.concatenate([c for c in clouds if len(c)] or [np.zeros((1, 3))]).mean(0))
     scale = np.float32(sequence_scale([c for c in clouds if len(c)])) if options.normalize else np.float32(1)
-    whole = [torch.from_numpy((cloud - centre) * scale) for cloud in clouds]
-    thin = [_thinned(cloud, options.points, generator(seed, index, t)) for t, cloud in enumerate(whole)]
-    pairs = needs_flows(len(thin), options.pairs)
+    whole = [torch.from_numpy((clouds[t] - centre) * scale) for t in seen]
+    thin = [_thinned(cloud, options.points, generator(seed, index, t)) for t, cloud in zip(seen, whole)]
+    wanted, place = needs_flows(len(clouds), options.pairs), {t: number for number, t in enumerate(seen)}
+    pairs = [(place[i], place[j]) for i, j in wanted if i in place and j in place]
     chain = [(t, t + 1) for t in range(len(thin) - 1)]
     flows, masks = _flows_and_masks(thin, [*pairs, *chain], estimate, segmenter)
     if options.split and len(thin) > 1:
@@ -102,7 +105,21 @@ def predict_parts(
     labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
     probability = torch.cat(full).numpy().astype(np.float32)
     motion, flow = _motions(thin, whole, masks, full, flows, pairs, options, float(scale), centre)
-    return labels, PartsSample(probability, np.array(pairs, np.int32).reshape(-1, 2), motion, flow)
+    if len(pairs) < len(wanted):
+        motion, flow = _with_empty_frames(wanted, [(seen[i], seen[j]) for i, j in pairs], clouds, motion, flow)
+    return labels, PartsSample(probability, np.array(wanted, np.int32).reshape(-1, 2), motion, flow)
+
+
+def _with_empty_frames(
+    wanted: list[tuple[int, int]], known: list[tuple[int, int]], clouds: list[np.ndarray], motion: np.ndarray, flow: list[np.ndarray]
+) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+    """Motions (Q,S,4,4) and flows of all wanted pairs: what is not known stands still."""
+    every = np.tile(np.eye(4, dtype=np.float32), (len(wanted), motion.shape[1], 1, 1))
+    flows = [np.zeros_like(clouds[i]) for i, _ in wanted]
+    for pair, one, own in zip(known, motion, flow):
+        number = wanted.index(pair)
+        every[number], flows[number] = one, own
+    return every, flows
 
 
 def _thinned(cloud: Tensor, wanted: int, rng: np.random.Generator) -> Tensor:
