@@ -226,12 +226,15 @@ def stopped_after(count: int, monkeypatch, *arguments, **options) -> None:
 
 
 def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
-    """Other inputs or a pipe: nothing is continued; a conversion of the same name is, or stays untouched."""
+    """Other inputs: it stays, unless --force; a pipe leaves nothing; a conversion of the same name goes on, or stays."""
     out, journal = tmp_path / "all.h5", tmp_path / ".all.h5.part"
     again = write(tmp_path / "c.h5", ["c0", "c1"], ["hand wave", "push", "bend"])
     stopped_after(2, monkeypatch, [two[0], again], out)
     assert journal.exists()
-    merge([again, two[0]], out)
+    with pytest.raises(UsageError, match='of other work .config.merge ."a.h5", "c.h5"., now'):
+        merge([again, two[0]], out)
+    assert journal.exists()
+    merge([again, two[0]], out, force=True)
     assert list(joined(out)) == ["c0", "c1", "a0", "a1", "a2"] and not journal.exists()
     stopped_after(2, monkeypatch, [two[0], again], tmp_path / "pipe.h5", resume=False)
     assert not (tmp_path / ".pipe.h5.part").exists()

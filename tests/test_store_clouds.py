@@ -102,12 +102,15 @@ def test_stopped_part_continues_to_identical_bytes(tmp_path, three):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["stopped.h5", "whole.h5"]
 
 
-def test_part_of_another_configuration_is_not_continued(tmp_path, three):
+def test_part_of_another_configuration_stays_and_force_starts_over(tmp_path, three):
     path = tmp_path / "a.h5"
     with pytest.raises(Stopped), CloudsWriter(path, provenance={"config": 1}, resume=True) as writer:
         writer.write(three[0])
         raise Stopped("now")
-    with CloudsWriter(path, provenance={"config": 2}, resume=True) as writer:
+    with pytest.raises(UsageError, match="of other work .config 1, now 2"):
+        CloudsWriter(path, provenance={"config": 2}, resume=True)
+    assert (tmp_path / ".a.h5.part").exists() and (tmp_path / ".a.h5.new").exists()
+    with CloudsWriter(path, provenance={"config": 2}, resume=True, force=True) as writer:
         assert writer.written_names == []
         writer.write(three[1])
     assert CloudsReader(path).names == ["s1"]

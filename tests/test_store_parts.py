@@ -140,12 +140,14 @@ def test_a_sample_cut_short_is_written_again(tmp_path, samples, monkeypatch, rea
     assert digest(path) == digest(whole)
 
 
-def test_a_part_with_another_number_of_parts_is_not_continued(tmp_path, samples):
+def test_a_part_with_another_number_of_parts_stays_and_force_starts_over(tmp_path, samples):
     with pytest.raises(Stopped), PartsWriter(tmp_path / "a.h5", num_parts=K, resume=True) as writer:
         writer.write(*samples[0])
         raise Stopped("now")
     more = perfect(truth_sequence("s0"), K + 1)
-    with PartsWriter(tmp_path / "a.h5", num_parts=K + 1, resume=True) as writer:
+    with pytest.raises(UsageError, match=f"of other work .num_parts {K}, now {K + 1}"):
+        PartsWriter(tmp_path / "a.h5", num_parts=K + 1, resume=True)
+    with PartsWriter(tmp_path / "a.h5", num_parts=K + 1, resume=True, force=True) as writer:
         assert writer.written_names == []
         writer.write(*more)
     assert PartsReader(tmp_path / "a.h5").num_parts == K + 1

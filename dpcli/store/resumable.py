@@ -6,6 +6,7 @@ early. What a sample is and where it goes is its subclass's.
 
 from __future__ import annotations
 
+import textwrap
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -85,7 +86,8 @@ class ResumableWriter(ABC):
     def _kept_of(self, other: dict[str, Any], mine: dict[str, Any]) -> UsageError:
         """What was kept is of other work; it stays."""
         old, new = ({**about, **(about.get("provenance") or [{}])[-1], "provenance": None} for about in (other, mine))
-        said = "; ".join(differences(old, new)[:3]) or "an earlier step of its files differs"
+        some = [textwrap.shorten(one, 100, placeholder=" ...") for one in differences(old, new)[:3]]
+        said = "; ".join(some) or "an earlier step of its files differs"
         return UsageError(
             f"{self.path}: what a stopped run kept for it is of other work ({said}); run that command again to go on with it,"
             " write to another file, or --force to start over"
