@@ -18,9 +18,9 @@ from dpcli.evaluate.image_metrics import ssim_reference
 from dpcli.evaluate.networks.clip import Clip, clip_across_views, clip_similarity, clip_spherical, clip_temporal
 from dpcli.evaluate.networks.lpips import Lpips
 from dpcli.evaluate.video import evaluate_video
-from dpcli.evaluate.video_features import FeatureNetwork, feature_variant
+from dpcli.evaluate.video_features import FeatureNetwork, feature_variant, prepare
 from dpcli.evaluate.video_protocol import PROTOCOLS, video_protocol
-from dpcli.evaluate.warping import Warping, warping_compute, warping_merge
+from dpcli.evaluate.warping import Warping, warping_compute
 from tests.test_evaluate_video import FRAMES, clip, header, white, write
 
 ROLES = ("reference", "test", "test")
@@ -100,16 +100,16 @@ def test_each_metric_is_that_of_its_own_function(files, fake_networks) -> None:
         warping = Warping()
         for pair in zip(video, truth):
             warping.add(*pair)
-        parts.append(warping.result())
-    assert value["warping"] == pytest.approx(warping_compute(warping_merge(parts)).squared, rel=1e-5)
+        parts.append(warping_compute(warping.result()))
+    assert value["warping"] == pytest.approx(np.mean([part.squared for part in parts]), rel=1e-5)
+    assert report.learned["warping"].truth == pytest.approx(np.mean([part.truth_squared for part in parts]), rel=1e-5)
+    assert report.learned["warping"].counts == {"views": 3, "pairs": 3 * (FRAMES - 1)}
 
 
 def test_frechet_distances_by_hand(files, fake_networks) -> None:
     """The closed form of one video against one, a view being a video: computed here from the network's own features."""
     report = evaluate_video(*files, metrics=("fvd", "fid_vid_inception", "fid_vid_r3d50"))
     network = FeatureNetwork.load("consistent4d", Path())
-    from dpcli.evaluate.video_features import prepare
-
     each = []
     for video, truth in zip(pictures(0), pictures(1)):
         f, g = (network.features([prepare(network.variant, frame) for frame in v]) for v in (video, truth))
@@ -117,6 +117,36 @@ def test_frechet_distances_by_hand(files, fake_networks) -> None:
     assert report.learned["fvd"].value == pytest.approx(np.mean(each), rel=1e-4)
     assert report.learned["fid_vid_inception"].counts == {"videos": 3, "clips": 3 * FRAMES, "frames": 3 * FRAMES}
     assert "needs at least 16" in report.missing["fid_vid_r3d50"]  # three frames: said, the others are there
+
+
+def test_warping_is_one_number_in_video_compare_and_runs(tmp_path: Path) -> None:
+    """Of views that show unlike shares of their pixels twice, a mean over pixels isn't the mean over views."""
+    rng = np.random.default_rng(0)
+    made = clip(views=2, frames=5)
+    made[..., 3] = 255
+    made[1, ..., :3] = rng.integers(0, 255, made[1, ..., :3].shape)  # nothing to follow: mostly occluded
+    head = header(("reference", "test"), frames=5)
+    truth = write(tmp_path / "truth.h5", made, head)
+    noisy = made.copy()
+    noisy[..., :3] = np.clip(made[..., :3] + rng.normal(0, 30, made[..., :3].shape), 0, 255)
+    said, other = write(tmp_path / "said.h5", noisy, head), write(tmp_path / "other.h5", noisy[:, ::-1].copy(), head)
+
+    def run(*arguments: object) -> dict:
+        given = [*map(str, arguments), "--truth", str(truth), "--metrics", "warping", "--json"]
+        return json.loads(CliRunner().invoke(evaluate.app, given, catch_exceptions=False).stdout)
+
+    alone = [run("video", path)["metrics"]["warping"] for path in (said, other)]
+    found = run("video", said)
+    each = list(found["metrics"]["per_view_learned"]["warping"].values())
+    assert alone[0] == pytest.approx(np.mean(each)) and max(each) > 1.5 * min(each)
+    interval = found["intervals"]["metrics"]["warping"]
+    assert min(each) <= interval[0] <= alone[0] <= interval[1] <= max(each)
+    compared = run("compare", said, other)["metrics"]["warping"]
+    assert [compared["a"], compared["b"]] == pytest.approx(alone)
+    assert run("runs", said, other)["metrics"]["warping"]["mean"] == pytest.approx(np.mean(alone))
+    (tmp_path / "video.json").write_text(json.dumps(found))
+    told = CliRunner().invoke(evaluate.app, ["runs", str(tmp_path / "video.json"), "--json"], catch_exceptions=False)
+    assert json.loads(told.stdout)["metrics"]["warping"]["mean"] == pytest.approx(alone[0])
 
 
 def test_equal_videos_score_perfectly(files, fake_networks) -> None:

@@ -263,7 +263,10 @@ class FrechetMetric(LearnedMetric):
 
 
 class WarpingMetric(LearnedMetric):
-    """Mean squared warping error along the truth's flow; the truth's own beside it."""
+    """Mean squared warping error along the truth's flow, then over views; the truth's own beside it.
+
+    A view counts the same whatever its share of occluded pixels, as it does in comparisons and intervals.
+    """
 
     def __init__(self) -> None:
         self._parts: dict[str, Any] = {}
@@ -282,11 +285,15 @@ class WarpingMetric(LearnedMetric):
     def score(self) -> LearnedScore:
         from dpcli.evaluate.warping import warping_compute, warping_merge
 
-        found = warping_compute(warping_merge(self._parts.values()))
-        each = {view: warping_compute(part).squared for view, part in self._parts.items()}
+        each = {view: warping_compute(part) for view, part in self._parts.items()}
+        value, own = (mean_defined(np.array([getattr(one, key) for one in each.values()]))
+                      for key in ("squared", "truth_squared"))  # fmt: skip
+        shown = [one for one in each.values() if not np.isnan(one.squared)]
+        counts = {"views": len(shown), "pairs": sum(one.pairs for one in shown)}
         choices = {"flow": "OpenCV DIS of the truth, forward-backward check", "error": "mean square, colours in 0..1",
-                   "occluded": round(found.occluded, 4)}  # fmt: skip
-        return LearnedScore("warping", found.squared, each, found.truth_squared, {"pairs": found.pairs}, choices)
+                   "mean": "over the pixels of each view, then over views",
+                   "occluded": round(warping_compute(warping_merge(self._parts.values())).occluded, 4)}  # fmt: skip
+        return LearnedScore("warping", value, {view: one.squared for view, one in each.items()}, own, counts, choices)
 
 
 def load_metrics(
