@@ -7,6 +7,7 @@ that the others are still computed.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,15 +53,15 @@ class Networks:
 
 
 class LearnedMetric(ABC):
-    """Fed view by view, frames in order: `start`, `add` for each frame, `end`; then `score`."""
+    """Fed view by view, frames in order, some of them perhaps left out: `start`, `add` for each, `end`; then `score`."""
 
     @abstractmethod
     def start(self, view: str) -> None:
         """A view begins."""
 
     @abstractmethod
-    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
-        """The view's next frame, both f32 (3,H,W), RGB in 0..1."""
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
+        """The view's next frame and its number, both f32 (3,H,W), RGB in 0..1."""
 
     @abstractmethod
     def end(self) -> None:
@@ -69,6 +70,18 @@ class LearnedMetric(ABC):
     @abstractmethod
     def score(self) -> LearnedScore:
         """Of all views seen. DataError when there were too few."""
+
+
+class _Gap:
+    """Tells whether frames of a view were left out before the one at hand: it then has no neighbour before it."""
+
+    def __init__(self) -> None:
+        self._next: int | None = None
+
+    def before(self, frame: int) -> bool:
+        """Of frames in rising order; never before the first one."""
+        expected, self._next = self._next, frame + 1
+        return expected not in (None, frame)
 
 
 class _PerFrame(LearnedMetric):
@@ -83,7 +96,7 @@ class _PerFrame(LearnedMetric):
         self._view = view
         self._found[view] = []
 
-    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
         self._found[self._view].append(self.measure(predicted, truth))
 
     def end(self) -> None:
@@ -97,7 +110,7 @@ class _PerFrame(LearnedMetric):
         return {}
 
     def score(self) -> LearnedScore:
-        means = {view: mean_defined(np.array(values)) for view, values in self._found.items()}
+        means = {view: mean_defined(np.array(values)) for view, values in self._found.items() if values}
         counts = {"views": len(means), "frames": sum(map(len, self._found.values()))}
         value = mean_defined(np.array(list(means.values())))
         return LearnedScore(self.name, value, means, counts=counts, choices=self.choices())
@@ -172,20 +185,20 @@ class ClipTemporal(LearnedMetric):
         self._found: dict[str, list[np.ndarray]] = {}
 
     def start(self, view: str) -> None:
-        self._before, self._view = None, view
+        self._before, self._gap, self._view = None, _Gap(), view
         self._found[view] = []
 
-    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
         from dpcli.evaluate.networks.clip import cosines
 
         now = np.stack(self._embedded.pair(predicted, truth))
-        if self._before is not None:
+        if not self._gap.before(frame) and self._before is not None:
             self._found[self._view].append(cosines(self._before, now))
         self._before = now
 
     def end(self) -> None:
         if not self._found[self._view]:
-            raise DataError(f"view {self._view!r}: one frame; clip_temporal compares consecutive ones")
+            raise DataError(f"view {self._view!r}: no two frames in a row; clip_temporal compares consecutive ones")
 
     def score(self) -> LearnedScore:
         means = {view: np.mean(rows, axis=0) for view, rows in self._found.items()}
@@ -198,36 +211,37 @@ class ClipTemporal(LearnedMetric):
 class ClipViews(LearnedMetric):
     """Mean cosine over all pairs of views at the same time (thesis C.1.4); the truth's own beside it.
 
-    Holds the sum of the views' embeddings for each frame: sum over pairs = (|sum|^2 - V) / 2 of unit vectors.
+    Holds the sum of the views' embeddings for each frame: sum over pairs = (|sum|^2 - V) / 2 of unit vectors. Of the
+    frames that all views have: the mean of fewer views would be another number.
     """
 
     def __init__(self, embedded: _Embedded) -> None:
         self._embedded, self._views = embedded, 0
-        self._sums: list[np.ndarray] = []  # of each frame, f64 (2,D)
+        self._sums: dict[int, np.ndarray] = {}  # by the number of the frame, f64 (2,D)
+        self._seen: Counter[int] = Counter()  # views by the number of the frame
 
     def start(self, view: str) -> None:
-        self._frame = 0
         self._views += 1
 
-    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
-        both = np.stack(self._embedded.pair(predicted, truth)).astype(np.float64)
-        if self._views == 1:
-            self._sums.append(both)
-        elif self._frame < len(self._sums):
-            self._sums[self._frame] = self._sums[self._frame] + both
-        self._frame += 1
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
+        self._sums[frame] = self._sums.get(frame, 0) + np.stack(self._embedded.pair(predicted, truth)).astype(np.float64)
+        self._seen[frame] += 1
 
     def end(self) -> None:
-        if self._frame != len(self._sums):
-            raise DataError("clip_views compares views of the same times, but theirs differ")
+        pass
 
     def score(self) -> LearnedScore:
         if self._views < 2:
             raise DataError("clip_views compares views, and there is one; leave it out of --metrics")
-        squares = np.square(np.stack(self._sums)).sum(-1).mean(0)
+        sums = [self._sums[frame] for frame, views in self._seen.items() if views == self._views]
+        if not sums:
+            raise DataError("clip_views compares views at the same time, and no frame is there in all of them")
+        squares = np.square(np.stack(sums)).sum(-1).mean(0)
         found = (squares - self._views) / (self._views * (self._views - 1))
-        counts = {"views": self._views, "frames": len(self._sums)}
-        return LearnedScore("clip_views", float(found[0]), {}, float(found[1]), counts, self._embedded.choices())
+        counts, choices = {"views": self._views, "frames": len(sums)}, self._embedded.choices()
+        if len(sums) < len(self._seen):
+            choices |= {"frames left out": f"{len(self._seen) - len(sums)}, which some views lack"}
+        return LearnedScore("clip_views", float(found[0]), {}, float(found[1]), counts, choices)
 
 
 class FrechetMetric(LearnedMetric):
@@ -243,10 +257,12 @@ class FrechetMetric(LearnedMetric):
     def start(self, view: str) -> None:
         from dpcli.evaluate.video_features import VideoFeatures
 
-        self._video = VideoFeatures(self._network, self._every)
+        self._video, self._gap = VideoFeatures(self._network, self._every), _Gap()
         self._views.append(view)
 
-    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
+        if self._gap.before(frame):
+            self._video.restart()
         self._video.add(predicted, truth)
 
     def end(self) -> None:
@@ -263,7 +279,10 @@ class FrechetMetric(LearnedMetric):
 
 
 class WarpingMetric(LearnedMetric):
-    """Mean squared warping error along the truth's flow; the truth's own beside it."""
+    """Mean squared warping error along the truth's flow, then over views; the truth's own beside it.
+
+    A view counts the same whatever its share of occluded pixels, as it does in comparisons and intervals.
+    """
 
     def __init__(self) -> None:
         self._parts: dict[str, Any] = {}
@@ -271,9 +290,11 @@ class WarpingMetric(LearnedMetric):
     def start(self, view: str) -> None:
         from dpcli.evaluate.warping import Warping
 
-        self._warping, self._view = Warping(), view
+        self._warping, self._gap, self._view = Warping(), _Gap(), view
 
-    def add(self, predicted: np.ndarray, truth: np.ndarray) -> None:
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
+        if self._gap.before(frame):
+            self._warping.restart()
         self._warping.add(predicted, truth)
 
     def end(self) -> None:
@@ -282,11 +303,15 @@ class WarpingMetric(LearnedMetric):
     def score(self) -> LearnedScore:
         from dpcli.evaluate.warping import warping_compute, warping_merge
 
-        found = warping_compute(warping_merge(self._parts.values()))
-        each = {view: warping_compute(part).squared for view, part in self._parts.items()}
+        each = {view: warping_compute(part) for view, part in self._parts.items()}
+        value, own = (mean_defined(np.array([getattr(one, key) for one in each.values()]))
+                      for key in ("squared", "truth_squared"))  # fmt: skip
+        shown = [one for one in each.values() if not np.isnan(one.squared)]
+        counts = {"views": len(shown), "pairs": sum(one.pairs for one in shown)}
         choices = {"flow": "OpenCV DIS of the truth, forward-backward check", "error": "mean square, colours in 0..1",
-                   "occluded": round(found.occluded, 4)}  # fmt: skip
-        return LearnedScore("warping", found.squared, each, found.truth_squared, {"pairs": found.pairs}, choices)
+                   "mean": "over the pixels of each view, then over views",
+                   "occluded": round(warping_compute(warping_merge(self._parts.values())).occluded, 4)}  # fmt: skip
+        return LearnedScore("warping", value, {view: one.squared for view, one in each.items()}, own, counts, choices)
 
 
 def load_metrics(

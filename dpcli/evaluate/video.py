@@ -218,14 +218,16 @@ class _Run:
         return scores
 
     def feed(self, pairs: list[tuple[int, int]], metrics: dict[str, LearnedMetric], missing: dict[str, str]) -> None:
-        """Show every frame of every pair of views to the metrics; one that can't go on leaves its reason in `missing`."""
+        """Show every usable frame of every pair of views to the metrics, with its number, since others may be missing
+        before it; a metric that can't go on leaves its reason in `missing`."""
         counts = [(ours, theirs, self._frames(ours, theirs)) for ours, theirs in pairs]
         damaged: list[str] = []
         with Progress("learned metrics", sum(count for *_, count in counts), "frame") as progress:
             for ours, theirs, count in counts:
                 self._each(metrics, missing, "start", self.real.views[theirs].title)
-                for _, predicted, truth in self._checked(ours, theirs, count, damaged):
-                    self._each(metrics, missing, "add", scaled(predicted, self.protocol), scaled(truth, self.protocol))
+                for frame, predicted, truth in self._checked(ours, theirs, count, damaged):
+                    pair = (scaled(picture, self.protocol) for picture in (predicted, truth))
+                    self._each(metrics, missing, "add", *pair, frame)
                     progress.advance()
                 self._each(metrics, missing, "end")
         self._say_damaged(damaged)

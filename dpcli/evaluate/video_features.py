@@ -219,13 +219,15 @@ class FeatureNetwork:
 class ClipFeatures:
     """Features of one video's clips while its frames stream in; holds one clip at most.
 
-    every: a window starts at each so many frames (1 in the published code).
+    every: a window starts at each so many frames (1 in the published code). frames: all that came; used: those that lie
+    in a clip.
     """
 
     def __init__(self, network: FeatureNetwork, every: int = 1) -> None:
         if every < 1:
             raise UsageError(f"a window every {every} frames: expected 1 or more")
-        self.network, self.every, self.frames = network, every, 0
+        self.network, self.every, self.frames, self.used = network, every, 0, 0
+        self._row = self._longest = self._new = 0  # frames without a gap, at present and at most; since the last clip
         self._waiting: deque[torch.Tensor] = deque(maxlen=network.variant.clip)
         self._found: FeatureStatistics | None = None
 
@@ -236,27 +238,40 @@ class ClipFeatures:
             raise DataError(f"fvd variant {self.network.variant.name} takes a whole video at once, {LONGEST} frames at "
                             "most: cut it, or take variant disco, whose windows have 16 frames")  # fmt: skip
         self._waiting.append(prepare(self.network.variant, picture))
-        self.frames += 1
-        if clip is not None and self.frames >= clip and (self.frames - clip) % self.every == 0:
+        self.frames, self._row, self._new = self.frames + 1, self._row + 1, self._new + 1
+        self._longest = max(self._longest, self._row)
+        if clip is not None and self._row >= clip and (self._row - clip) % self.every == 0:
             self._look()
+
+    def restart(self) -> None:
+        """Frames are missing here: no window reaches across. DataError for a variant whose clip is the whole video."""
+        variant = self.network.variant
+        if variant.clip is None:
+            raise DataError(f"frames are missing inside a view, and {variant.metric} variant {variant.name} takes a whole "
+                            "video at once: make them again, or take variant disco, whose windows have 16 frames")  # fmt: skip
+        if variant.clip > 1:  # single frames have no neighbours to lose
+            self._waiting.clear()
+            self._row = self._new = 0
 
     def result(self) -> FeatureStatistics:
         """Statistics of the clips; ends the video. DataError when it had too few frames."""
         variant = self.network.variant
-        if self.frames < variant.least:
-            raise DataError(f"{self.frames} frames: {variant.metric} ({variant.name}) needs at least {variant.least}")
+        if self._longest < variant.least:
+            had = f"{self._longest} frames{' in a row' if self._longest < self.frames else ''}"
+            raise DataError(f"{had}: {variant.metric} ({variant.name}) needs at least {variant.least}")
         if variant.clip is None and self._waiting:
             self._look()
             self._waiting.clear()
         return self._found
 
     def _look(self) -> None:
+        self.used, self._new = self.used + min(self._new, len(self._waiting)), 0  # windows overlap
         self._found = feature_update(self.network.features(self._waiting)[None], self._found)
 
 
 @dataclass(frozen=True)
 class VideoPair:
-    """Statistics of one predicted video's clips and of the true one's."""
+    """Statistics of one predicted video's clips and of the true one's, and how many frames lie in them."""
 
     predicted: FeatureStatistics
     truth: FeatureStatistics
@@ -274,10 +289,15 @@ class VideoFeatures:
         for side, picture in zip(self._sides, (predicted, truth), strict=True):
             side.add(picture)
 
+    def restart(self) -> None:
+        """Frames are missing here, on both sides. Raises as `ClipFeatures.restart`."""
+        for side in self._sides:
+            side.restart()
+
     def result(self) -> VideoPair:
         """DataError when there were too few frames."""
         predicted, truth = (side.result() for side in self._sides)
-        return VideoPair(predicted, truth, self._sides[0].frames)
+        return VideoPair(predicted, truth, self._sides[0].used)
 
 
 @dataclass(frozen=True)

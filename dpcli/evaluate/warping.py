@@ -81,10 +81,14 @@ class Warping:
             self._found += _pair(self._before, (predicted, truth, grey))
         self._before = (predicted, truth, grey)
 
+    def restart(self) -> None:
+        """Frames are missing here: the next one is no neighbour of the last one."""
+        self._before = None
+
     def result(self) -> WarpingStatistics:
-        """DataError when there were fewer than two frames."""
+        """DataError when no two frames followed each other."""
         if not self._found.pairs:
-            raise DataError("temporal consistency compares neighbouring frames: at least 2 are needed")
+            raise DataError("temporal consistency compares neighbouring frames: at least 2 in a row are needed")
         return self._found
 
 
