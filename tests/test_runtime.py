@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import signal
 import subprocess
@@ -12,12 +13,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.runtime import device, progress, provenance
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.seed import generator
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.weights import load_weights, save_weights
 
 
 def square(x: int) -> int:
@@ -78,6 +81,7 @@ def test_a_second_signal_exits_at_once():
     code = """
 import time
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.weights import load_weights, save_weights
 with stop_requested():
     print("ready", flush=True)
     time.sleep(60)
@@ -107,6 +111,19 @@ def test_a_batch_log_gets_plain_lines(monkeypatch):
 
 def test_durations():
     assert [progress.duration(s) for s in (5.9, 75, 3725)] == ["5s", "1m15s", "1h02m"]
+
+
+def test_equal_weights_are_equal_bytes(tmp_path):
+    """A file's digest tells whether a network is another one, however often it was written."""
+    tensors = {"b": torch.arange(6.0).view(2, 3), "a": torch.ones(3, dtype=torch.float16)}
+    header = {"format": "f", "notes": json.dumps({"of": "gl\u00e4\n"}), "maker": "m", "config": "{}", "more": "\u001b"}
+    found = set()
+    for _ in range(12):  # the library's own order is another one nearly each time
+        save_weights(tmp_path / "w.safetensors", tensors, header)
+        found.add((tmp_path / "w.safetensors").read_bytes())
+    assert len(found) == 1
+    loaded, told = load_weights(tmp_path / "w.safetensors", "f", "m")
+    assert header.items() <= told.items() and all(torch.equal(loaded[key], value) for key, value in tensors.items())
 
 
 def test_the_recorded_command_leaves_out_what_doesn_t_change_the_result():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -21,9 +22,23 @@ def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str,
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with whole_file(path) as part:
         save_file(whole, part, {"version": __version__, **header})
+        _sort_header(part)
         umask = os.umask(0)
         os.umask(umask)
         part.chmod(0o666 & ~umask)  # the library writes files that only their owner can read
+
+
+def _sort_header(path: Path) -> None:
+    """Equal weights and texts as equal bytes: the library writes the texts in another order each time. A file begins with
+    the length of its header, 8 bytes, and the header in JSON, perhaps with spaces behind it."""
+    with path.open("r+b") as file:
+        length = int.from_bytes(file.read(8), "little")
+        header = json.loads(file.read(length))
+        header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+        text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+        if len(text) <= length:
+            file.seek(8)
+            file.write(text.ljust(length))
 
 
 def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

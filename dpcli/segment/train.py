@@ -87,12 +87,13 @@ class Trainer:
         self.flows = FlowStore(self.folder.path, *shape, state is None, self.flows_of)
         if state is not None:
             self._restore(state)
+        over = self.epoch >= self.schedule.epochs  # run again: what is there has been finished
         total = self.schedule.epochs * self._steps() * self.schedule.batch
         with Progress("train parts", total, "pair") as bar:
             bar.skip((self.epoch * self._steps() + self.step) * self.schedule.batch)
             while self.epoch < self.schedule.epochs:
                 self._run_epoch(bar)
-        if self.validation is None:
+        if self.validation is None and not (over and self.folder.file("best.safetensors").exists()):
             save_model(self.folder.file("best.safetensors"), self.model, self.notes)
 
     def _steps(self) -> int:
