@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
+from dpcli.segment.flow_store import FlowStore
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.file import read_skipped, write_skipped
 from tests.prepare_helpers import ROOT, write_msr
@@ -42,17 +43,17 @@ def namespace(script: str, **env: str) -> subprocess.CompletedProcess:
     )  # fmt: skip
 
 
-def can_mount(folder: Path) -> bool:
-    if shutil.which("unshare") is None:
-        return False
-    return namespace('mount -t tmpfs -o size=1m none "$D" && touch "$D/x"', D=str(folder)).returncode == 0
+@pytest.fixture
+def mounting(tmp_path) -> None:
+    """For tests that mount a small file system of their own, as root of a namespace; not every machine lets people."""
+    script = 'mount -t tmpfs -o size=1m none "$D" && touch "$D/x"'
+    if shutil.which("unshare") is None or namespace(script, D=str(tmp_path)).returncode != 0:
+        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
-def test_a_full_disk_ends_with_a_sentence_and_leaves_nothing(raw, tmp_path, jobs):
+def test_a_full_disk_ends_with_a_sentence_and_leaves_nothing(raw, tmp_path, jobs, mounting):
     """A file system of 2 MiB for 11 MB of points."""
-    if not can_mount(tmp_path):
-        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
     script = (
         'mount -t tmpfs -o size=2m none "$D"; set +e\n'
         f'"{sys.executable}" -m dpcli prepare msraction3d "$RAW" -o "$D/out.h5" --jobs {jobs}\n'
@@ -65,10 +66,8 @@ def test_a_full_disk_ends_with_a_sentence_and_leaves_nothing(raw, tmp_path, jobs
     assert "Traceback" not in done.stderr
 
 
-def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc):
+def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc, mounting):
     """`-o -` spools beside nothing the user named: the message still says what was full."""
-    if not can_mount(tmp_path):
-        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
     script = (
         'mount -t tmpfs -o size=2m none "$TMPDIR"; set +e\n'
         f'"{sys.executable}" -m dpcli prepare msraction3d "$RAW" -o - --jobs 1 | wc -c; ls -A "$TMPDIR"'
@@ -78,10 +77,8 @@ def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc):
     assert "no space left on the device" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_flows_that_the_disk_has_no_room_for_are_told_before_a_training_begins(tmp_path):
+def test_flows_that_the_disk_has_no_room_for_are_told_before_a_training_begins(tmp_path, mounting):
     """Mapped files get their room when they are made: a page without room, later, would end the process by SIGBUS."""
-    if not can_mount(tmp_path):
-        pytest.skip("this machine lets nobody mount a file system of their own (unshare -rm)")
     code = (
         "import os; from pathlib import Path; from dpcli.errors import DpcError; from dpcli.segment.flow_store import FlowStore\n"
         "try: store = FlowStore(Path(os.environ['D']), 40, 2048, fresh=True)\n"
@@ -93,6 +90,13 @@ def test_flows_that_the_disk_has_no_room_for_are_told_before_a_training_begins(t
     for size, said in (("1m", "flows_first.npy: no space left"), ("3m", "flows.npy: no space left"), ("9m", "written")):
         done = namespace(script.format(size), **env)  # two files of 1.9 MiB
         assert said in done.stdout and done.stdout.endswith("code 0\n"), done.stdout + done.stderr
+
+
+def test_flows_have_their_room_on_the_disk_from_the_start(tmp_path):
+    """What keeps the process above from a bus error, on any machine: the files are not sparse."""
+    FlowStore(tmp_path, 40, 2048, fresh=True)
+    for path in tmp_path.glob("flows*.npy"):
+        assert path.stat().st_blocks * 512 >= path.stat().st_size > 0
 
 
 WRITES = """

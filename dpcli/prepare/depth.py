@@ -20,7 +20,6 @@ from dpcli.store import CloudSequence
 
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 DEFAULT_FPS = 30.0
-DEFAULT_DEPTH_SCALE = {"uint8": 100.0, "integers": 1000.0, "floats": 1.0}  # raw units per metre
 BACKGROUNDS = ("none", "median", "first")
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
 
@@ -125,8 +124,8 @@ class DepthVideos:
         kind = frames.dtype
         if kind.kind == "f" and not np.isfinite(frames).all():
             frames = np.nan_to_num(frames, nan=0, posinf=0, neginf=0)  # the usual marks for "no return"
-        usual = kind.name if kind.name in DEFAULT_DEPTH_SCALE else "floats" if kind.kind == "f" else "integers"
-        scale = self.depth_scale or DEFAULT_DEPTH_SCALE[usual]
+        usual = 1.0 if kind.kind == "f" else 100.0 if kind.itemsize == 1 else 1000.0  # raw units per metre
+        scale = self.depth_scale or usual
         if self.invert:
             if kind.kind != "u":
                 raise DataError(

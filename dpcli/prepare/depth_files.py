@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -102,16 +101,6 @@ def _coloured(frame: np.ndarray) -> bool:
     return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLOURED_SHARE)
 
 
-def _refuse_pages(path: Path, data: bytes) -> None:
-    """A TIFF of several pages: which of them is the frame?"""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data)) as image:
-        pages = getattr(image, "n_frames", 1)
-    if pages > 1:
-        raise DataError(f"{path}: holds {pages} pages; expected one depth image a file: save each page as its own, frame_0001.tiff ...")
-
-
 def read_image(path: Path) -> np.ndarray:
     """One gray depth image (H,W) u8, u16 or f32; DataError when unreadable or coloured."""
     data = path.read_bytes()
@@ -119,11 +108,12 @@ def read_image(path: Path) -> np.ndarray:
     if image is not None:
         return image
     cv2 = load_cv2()
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if image is None:
+    pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
+    if not pages:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
-    if path.suffix.lower() in (".tif", ".tiff"):
-        _refuse_pages(path, data)
+    if len(pages) > 1:  # which of them is the frame?
+        raise DataError(f"{path}: holds {len(pages)} pages; expected one depth image a file: save each page as its own file")
+    image = pages[0]
     if image.ndim == 3:
         if image.shape[2] != 3 or (image != image[..., :1]).any():
             raise DataError(f"{path}: a colour image of shape {image.shape}; expected one gray channel of depth")

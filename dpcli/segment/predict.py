@@ -116,9 +116,9 @@ def _with_empty_frames(
     """Motions (Q,S,4,4) and flows of all wanted pairs: what is not known stands still."""
     every = np.tile(np.eye(4, dtype=np.float32), (len(wanted), motion.shape[1], 1, 1))
     flows = [np.zeros_like(clouds[i]) for i, _ in wanted]
+    place = {pair: number for number, pair in enumerate(wanted)}
     for pair, one, own in zip(known, motion, flow):
-        number = wanted.index(pair)
-        every[number], flows[number] = one, own
+        every[place[pair]], flows[place[pair]] = one, own
     return every, flows
 
 

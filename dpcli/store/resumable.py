@@ -24,9 +24,9 @@ class ResumableWriter(ABC):
 
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
     written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
-    the next writer with the same provenance continues, and `written_names` lists what is already there; one with another
-    provenance is refused (UsageError) unless `force` is on. Until the file
-    is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists and `force` is off.
+    the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
+    is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists, or what another provenance kept for
+    it, and `force` is off.
 
     A subclass calls `_open` at the end of its constructor and `_record` for each sample that is written, and says in
     `_complete` what is left to write and in `_write_again` how a sample comes back from the journal.
