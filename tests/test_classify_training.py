@@ -28,7 +28,7 @@ from tests.test_classify_commands import gestures
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "none")
-SHORT = (*SMALL, "--epochs", "3", "--epochs-dynamic", "2", "--lr", "0.0001", "--label-smoothing", "0.05")
+SHORT = (*SMALL, "--epochs", "3", "--epochs-dynamic", "2", "--lr", "0.0001", "--label-smoothing", "0.05", "--draws", "1")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

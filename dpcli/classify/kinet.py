@@ -28,9 +28,9 @@ class Kinet(nn.Module):
     def static_logits(self, points: Tensor) -> Tensor:
         return self.static(self.group(points))
 
-    def dynamic_logits(self, points: Tensor) -> Tensor:
-        """Gradients reach the dynamic branch only; the static network must be in eval mode."""
-        return self.dynamic(self._stages(points)[0])
+    def dynamic_logits(self, points: Tensor, groups: list[Grouping] | None = None) -> Tensor:
+        """Gradients reach the dynamic branch only; the static network must be in eval mode. groups: where they are known."""
+        return self.dynamic(self._stages(points, groups)[0])
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
@@ -38,8 +38,8 @@ class Kinet(nn.Module):
         return static, self.dynamic(stages)
 
     @torch.no_grad()
-    def _stages(self, points: Tensor) -> tuple[list[Stage], Tensor]:
-        return self.static.taps(self.group(points))
+    def _stages(self, points: Tensor, groups: list[Grouping] | None = None) -> tuple[list[Stage], Tensor]:
+        return self.static.taps(self.group(points) if groups is None else groups)
 
     def freeze_static(self) -> None:
         """Stop the static stream's gradients and keep its batch norms at their running statistics."""

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from dpcli.classify.backbone import BACKBONES
+from dpcli.classify.backbone import BACKBONES, Grouping
 from dpcli.classify.kinet import Kinet
+from dpcli.classify.neighbor_cache import NeighborCache
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.sync_norm import synchronise_norms
 from dpcli.runtime.precision import reduced_products
@@ -29,8 +30,8 @@ class _Logits(nn.Module):
         self.branch = model.static if stage == 0 else model.dynamic
         self._logits = [model.static_logits if stage == 0 else model.dynamic_logits]  # in a list: not a submodule
 
-    def forward(self, points: Tensor) -> Tensor:
-        return self._logits[0](points)
+    def forward(self, points: Tensor, *groups: list[Grouping]) -> Tensor:
+        return self._logits[0](points, *groups)
 
 
 @dataclass
@@ -60,9 +61,11 @@ class StageStep:
     """Optimiser and forward pass of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
 
     def __init__(
-        self, model: Kinet, stage: int, schedule: Schedule, device: torch.device, processes: Processes
-    ) -> None:
+        self, model: Kinet, stage: int, schedule: Schedule, device: torch.device, processes: Processes,
+        neighbors: NeighborCache | None = None,
+    ) -> None:  # fmt: skip
         self.schedule, self.device, self.processes = schedule, device, processes
+        self.neighbors = neighbors
         module = _Logits(model, stage)
         if processes.count > 1:
             synchronise_norms(module)
@@ -72,17 +75,21 @@ class StageStep:
         if processes.count > 1:
             self.module = _shared(module, model, stage, device)
 
-    def __call__(self, points: Tensor, labels: Tensor, rate: float) -> tuple[float, int, bool]:
-        """points (b,T,P,3), labels (b), learning rate -> (sum of losses, rightly classified, whether weights were changed)."""
+    def __call__(self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None) -> tuple[float, int, bool]:
+        """points (b,T,P,3), labels (b), learning rate -> (sum of losses, rightly classified, whether weights were changed).
+
+        clips i64 (b): numbers by which `neighbors` knows them.
+        """
         for group in self.optimizer.param_groups:
             group["lr"] = rate * group["share"]
         self.optimizer.zero_grad(set_to_none=True)
         size = self.schedule.share(self.processes.count)
-        parts = list(zip(points.split(size), labels.split(size)))
+        batch = (points, labels) if self.neighbors is None or clips is None else (points, labels, clips)
+        parts = list(zip(*(values.split(size) for values in batch)))
         total, correct = 0.0, 0
-        for number, (some, known) in enumerate(parts):
+        for number, (some, known, *which) in enumerate(parts):
             with self._without_exchange(number + 1 < len(parts)):
-                loss, right = self._backward(some.to(self.device), known.to(self.device), len(labels))
+                loss, right = self._backward(some.to(self.device), known.to(self.device), which, len(labels))
             total, correct = total + loss, correct + right
         norm = nn.utils.clip_grad_norm_(self.parameters, 5.0)
         # a nearly singular fit can overflow: such a step is left out rather than poisoning the weights
@@ -91,9 +98,10 @@ class StageStep:
             self.optimizer.step()
         return total, correct, stepped
 
-    def _backward(self, points: Tensor, labels: Tensor, clips: int) -> tuple[float, int]:
+    def _backward(self, points: Tensor, labels: Tensor, which: list[Tensor], clips: int) -> tuple[float, int]:
+        groups = [self.neighbors(points, *which)] if self.neighbors is not None and which else []
         with reduced_products(self.device, self.schedule.amp):
-            logits = self.module(points).float()
+            logits = self.module(points, *groups).float()
         loss = nn.functional.cross_entropy(
             logits, labels, label_smoothing=self.schedule.label_smoothing, reduction="sum"
         )

@@ -17,6 +17,7 @@ import torch
 from dpcli.classify.clips import Clip, ClipSource
 from dpcli.classify.kinet import STREAMS, Kinet, fuse
 from dpcli.classify.model_file import ModelInfo, load_model, save_model
+from dpcli.classify.neighbor_cache import NeighborCache
 from dpcli.classify.predict import batches
 from dpcli.classify.schedule import Schedule
 from dpcli.classify.step import LossWatch, StageStep
@@ -24,22 +25,23 @@ from dpcli.errors import DpcError
 from dpcli.runtime.processes import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.seed import generator
 from dpcli.runtime.signals import StopRequest
 
 
 class _Loader(torch.utils.data.Dataset):
-    """One epoch's clips as arrays, for a DataLoader."""
+    """One draw's clips as arrays, for a DataLoader: points, label, and the clip's number among all draws."""
 
-    def __init__(self, source: ClipSource, clips: list[Clip], epoch: int) -> None:
-        self.source, self.clips, self.epoch = source, clips, epoch
+    def __init__(self, source: ClipSource, clips: list[Clip], draw: int, first: int) -> None:
+        self.source, self.clips, self.draw, self.first = source, clips, draw, first
 
     def __len__(self) -> int:
         return len(self.clips)
 
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, int, int]:
         clip = self.clips[index]
-        points = self.source.load(clip, self.epoch, index, 0)
-        return torch.from_numpy(np.ascontiguousarray(points, np.float32)), int(self.source.reader.labels[clip.sequence])
+        points = torch.from_numpy(np.ascontiguousarray(self.source.load(clip, self.draw, index, 0), np.float32))
+        return points, int(self.source.reader.labels[clip.sequence]), self.first + index
 
 
 class Trainer:
@@ -96,18 +98,30 @@ class Trainer:
                 self._run_epoch(epochs, bar)
 
     def _new_step(self) -> StageStep:
-        return StageStep(self.model, self.stage, self.schedule, self.device, self.processes)
+        neighbors = None
+        if self._draws():
+            clips = len(self.training.epoch(0, self.schedule.clips_per_video))
+            neighbors = NeighborCache(self.model.group, self.folder.path, clips * self._draws())
+        return StageStep(self.model, self.stage, self.schedule, self.device, self.processes, neighbors)
+
+    def _draws(self) -> int:
+        """How many draws of every clip this stage comes back to; 0: each epoch has its own."""
+        return min(self.schedule.draws, self.schedule.epochs[1]) if self.stage == 1 else 0
 
     def _run_epoch(self, epochs: int, bar: Progress) -> None:
         (self.model.static if self.stage == 0 else self.model.dynamic).train()
         started = time.monotonic()
-        clips = self.training.epoch(self.stage * 100_000 + self.epoch, self.schedule.clips_per_video)
+        turn = self.epoch % self._draws() if self._draws() else self.epoch
+        draw = self.stage * 100_000 + turn
+        clips = self.training.epoch(draw, self.schedule.clips_per_video)
         per_epoch = self._per_epoch(clips)
+        loader = _Loader(self.training, clips, draw, turn * len(clips))
+        order = self._order(len(clips))[: per_epoch * self.schedule.batch]
         # a run stopped after an epoch's last step has none left to do, and logs that one's rate
         rate = self.schedule.rate(self.stage, self.epoch * per_epoch + max(self.step - 1, 0), epochs * per_epoch)
-        for points, labels in self._batches(clips[: per_epoch * self.schedule.batch]):
+        for batch in self._batches(loader, order):
             rate = self.schedule.rate(self.stage, self.epoch * per_epoch + self.step, epochs * per_epoch)
-            stopping = self._take(points, labels, rate)
+            stopping = self._take(*batch, rate)
             bar.note(
                 epoch=f"{self.epoch + 1}/{epochs}",
                 loss=self.sums[0] / self.sums[2],
@@ -118,12 +132,18 @@ class Trainer:
                 self._stop_here(started)
         self._end_epoch(rate, started)
 
-    def _take(self, points: torch.Tensor, labels: torch.Tensor, rate: float) -> bool:
+    def _order(self, clips: int) -> list[int]:
+        """In which order an epoch takes its draw's clips: as drawn, or, of a draw that comes back, in another one each time."""
+        if not self._draws():
+            return list(range(clips))
+        return generator(self.training.seed, 5, self.epoch).permutation(clips).tolist()
+
+    def _take(self, points: torch.Tensor, labels: torch.Tensor, clips: torch.Tensor, rate: float) -> bool:
         """One step of all processes together; whether one of them was asked to stop."""
         assert self.optimize is not None
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
         torch.manual_seed(int(np.random.SeedSequence(where).generate_state(1)[0]))  # dropout, whenever the run was begun
-        loss, correct, stepped = self.optimize(points, labels, rate)
+        loss, correct, stepped = self.optimize(points, labels, rate, clips)
         shares = (loss, float(correct), float(len(labels)), float(self.stop.requested))
         loss, correct, count, stopping = self.processes.sums(shares, self.device)
         problem = self.watch.see(loss / count, stepped)
@@ -156,18 +176,15 @@ class Trainer:
         """Whole batches in an epoch; the few clips left over come in another epoch's order."""
         return max(len(clips) // self.schedule.batch, 1)
 
-    def _batches(self, clips: list[Clip]) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
-        """This process's part of the epoch's batches from `self.step` on.
+    def _batches(self, data: _Loader, order: list[int]) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        """This process's part of the epoch's batches from `self.step` on: points, labels, numbers of the clips.
 
-        Each clip's position in the epoch, not the process, seeds it.
+        Each clip's position in its draw, not the process, seeds it.
         """
-        data = _Loader(self.training, clips, self.stage * 100_000 + self.epoch)
         starts = range(
-            self.step * self.schedule.batch + self.processes.rank * self.share, len(clips), self.schedule.batch
+            self.step * self.schedule.batch + self.processes.rank * self.share, len(order), self.schedule.batch
         )
-        mine = torch.utils.data.Subset(
-            data, [i for start in starts for i in range(start, min(start + self.share, len(clips)))]
-        )
+        mine = torch.utils.data.Subset(data, [i for start in starts for i in order[start : start + self.share]])
         workers = (
             {"num_workers": self.schedule.workers, "multiprocessing_context": "forkserver"}
             if self.schedule.workers

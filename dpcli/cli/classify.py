@@ -135,6 +135,13 @@ def train(
         str | None, typer.Option(help="A trained or shipped model whose both streams to start from, e.g. of another --frames,"
                               " or of other classes (the last layers are fresh then).")
     ] = None,
+    draws: Annotated[
+        int,
+        typer.Option(
+            help="Dynamic stage: so many fixed draws of every clip (start, points, augmentation) in turn, their neighbours searched"
+            " once and kept in a nameless file of the folder (preset thesis: 0.22 MB a clip and draw). 0: a new draw every epoch."
+        ),
+    ] = 0,
     workers: Annotated[
         int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU; with a GPU 4, or as many as there are CPUs.")
     ] = None,
@@ -155,7 +162,7 @@ def train(
     schedule = {
         "batch": batch, "learning_rate": lr, "learning_rate_dynamic": lr_dynamic, "decay": decay, "workers": workers,
         "clips_per_video": clips_per_video, "epochs": (epochs, epochs_dynamic), "accumulate": accumulate, "amp": amp,
-        "label_smoothing": label_smoothing,
+        "label_smoothing": label_smoothing, "draws": draws,
     }  # fmt: skip
     from dpcli.classify.train_command import run_training
 

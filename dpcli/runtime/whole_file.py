@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 from collections.abc import Iterator
@@ -24,6 +25,17 @@ def disk_full(path: Path, error: BaseException | None) -> DiskFull | None:
             return DiskFull(f"{path}: {NO_ROOM[number]}; make room, then run the same command again")
         error = error.__context__  # torch.save hides it behind an error of its own
     return None
+
+
+def reserve(file: int, size: int) -> None:
+    """Take the room of an open file (descriptor, bytes) now: a mapped page that finds none later ends the process by SIGBUS, unheard."""
+    if not hasattr(os, "posix_fallocate"):  # macOS, Windows
+        return
+    try:
+        os.posix_fallocate(file, 0, size)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # a file system that can't reserve
+            raise
 
 
 @contextmanager

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import errno
-import os
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from dpcli.errors import UsageError
-from dpcli.runtime.whole_file import disk_full
+from dpcli.runtime.whole_file import disk_full, reserve
 
 _FIRST, _NOW, _KNOWN = "flows_first.npy", "flows.npy", "flows_known.npy"
 _THERE, _TELLING, _CORRECTED = 1, 2, 4  # bits of `flows_known.npy`
@@ -106,7 +104,8 @@ def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.n
 def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
     try:
         array = _mapped(path, shape, dtype, fresh)
-        _reserve(path)
+        with path.open("r+b") as file:
+            reserve(file.fileno(), path.stat().st_size)
     except OSError as error:
         raise disk_full(path, error) or error from None
     return array
@@ -118,15 +117,3 @@ def _mapped(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.
         if array.shape == shape:
             return array
     return np.lib.format.open_memmap(path, "w+", dtype, shape)
-
-
-def _reserve(path: Path) -> None:
-    """Take the file's room on the disk now: a mapped page that finds none later ends the process by SIGBUS, unheard."""
-    if not hasattr(os, "posix_fallocate"):  # macOS, Windows
-        return
-    with path.open("r+b") as file:
-        try:
-            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
-        except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP):  # a file system that can't reserve
-                raise
