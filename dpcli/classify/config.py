@@ -29,6 +29,7 @@ class KinetConfig:
     neighbors: int = 64
     radii: tuple[float, float] = (0.5, 1.0)  # at time distance 0
     temporal_radius: int = 1  # frames
+    static_temporal_radius: int | None = None  # of the static stream's own neighbourhoods; None: one set serves both streams
     grouping: str = (
         "balanced"  # which neighbours within the radius: first | nearest | balanced (equal shares of each frame)
     )
@@ -74,11 +75,16 @@ class KinetConfig:
                 f"--group-size {self.group_size}: one group holds the three coordinates (presets quick, tiny, release);"
                 " expected at least 3, or --preset thesis"
             )
-        reach = 2 * self.temporal_radius + 1
+        if self.own_static_groups and self.backbone in ("dgcnn", "spidercnn"):
+            raise UsageError(
+                f"--static-temporal-radius {self.static_temporal_radius}: {self.backbone}'s one graph serves both streams; leave it out"
+            )
+        reach = 2 * max(self.temporal_radius, self.static_temporal_radius or 0) + 1
         if self.grouping == "balanced" and self.neighbors < reach:
             raise UsageError(
                 f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
             )
+        reach = 2 * min(self.temporal_radius, self.static_radius) + 1
         near = min(reach, self.num_frames) * self.points_per_frame
         if self.neighbors > near:
             raise UsageError(
@@ -94,6 +100,16 @@ class KinetConfig:
             raise UsageError(
                 f"{self.num_frames} frames x {self.points_per_frame} points = {have} are fewer than {first} centroids"
             )
+
+    @property
+    def static_radius(self) -> int:
+        """Frames before and after that the static stream's neighbourhoods reach."""
+        return self.temporal_radius if self.static_temporal_radius is None else self.static_temporal_radius
+
+    @property
+    def own_static_groups(self) -> bool:
+        """Whether the static stream has neighbourhoods of its own."""
+        return self.static_radius != self.temporal_radius
 
     @property
     def dynamic_head(self) -> tuple[int, int]:
@@ -112,10 +128,10 @@ class KinetConfig:
     def changed(self, **changes: object) -> KinetConfig:
         return replace(self, **changes)
 
-    def radius_table(self, stage: int) -> tuple[float, ...]:
-        """Radius per |dt| = 0..temporal_radius: r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (as the release)."""
+    def radius_table(self, stage: int, reach: int | None = None) -> tuple[float, ...]:
+        """Radius per |dt| = 0..reach (None: temporal_radius): r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (as the release)."""
         growth = 0.2 * self.radii[stage] / max(self.num_frames - 1, 1)
-        return tuple(self.radii[stage] + growth * d for d in range(self.temporal_radius + 1))
+        return tuple(self.radii[stage] + growth * d for d in range((self.temporal_radius if reach is None else reach) + 1))
 
     def groups(self, width: int) -> int:
         """Number of feature groups fitted at a layer of this width, the xyz group included."""
@@ -149,6 +165,7 @@ _LEAST = {
     "neighbors": (1, "--neighbors"),
     "group_size": (1, "--group-size"),
     "temporal_radius": (0, "--temporal-radius"),
+    "static_radius": (0, "--static-temporal-radius"),
 }
 _LEGAL = {
     "variant": VARIANTS,

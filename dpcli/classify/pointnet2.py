@@ -13,27 +13,33 @@ from dpcli.ops.grouped_mlp import frozen_activations
 
 
 @torch.no_grad()
-def group_clip(points: Tensor, times: Tensor, config: KinetConfig) -> list[Grouping]:
-    """Both stages' centroids (farthest points of the union of frames) and space-time neighbours. points (B,N,3), times (B,N)."""
-    stages = []
+def group_clip(points: Tensor, times: Tensor, config: KinetConfig, *reaches: int) -> list[Grouping]:
+    """Both stages' centroids (farthest points of the union of frames) and space-time neighbours. points (B,N,3), times (B,N).
+
+    reaches: frames before and after that neighbours may come from (none given: the configuration's); for each of them both
+    stages, one after the other, about the same centroids.
+    """
+    reaches = reaches or (config.temporal_radius,)
+    found: list[list[Grouping]] = [[] for _ in reaches]
     for stage, count in enumerate(config.centroids):
         # centroids are in the order of farthest point sampling, so any first few of them are such a sample, too
         chosen = fps(points, count) if stage == 0 else torch.arange(count, device=points.device).expand(len(points), -1)
         centers = gather_points(points, chosen)
         center_times = gather_points(times[..., None], chosen)[..., 0]
-        idx = _neighbors(points, times, centers, center_times, config, stage)
-        stages.append(Grouping(points, times, centers, center_times, idx))
+        for stages, reach in zip(found, reaches):
+            idx = _neighbors(points, times, centers, center_times, config, stage, reach)
+            stages.append(Grouping(points, times, centers, center_times, idx))
         points, times = centers, center_times
-    return stages
+    return [group for stages in found for group in stages]
 
 
 def _neighbors(
-    points: Tensor, times: Tensor, centers: Tensor, center_times: Tensor, config: KinetConfig, stage: int
+    points: Tensor, times: Tensor, centers: Tensor, center_times: Tensor, config: KinetConfig, stage: int, reach: int
 ) -> Tensor:
     # `first` fills all slots from the earliest frame when frames are dense, and then no surface in time can be fitted:
     # so every frame gets an equal share. Points come in random order, hence the first hits of a frame are a random draw.
-    order = "first" if config.temporal_radius == 0 and config.grouping == "balanced" else config.grouping
-    radii = config.radius_table(stage)
+    order = "first" if reach == 0 and config.grouping == "balanced" else config.grouping
+    radii = config.radius_table(stage, reach)
     return space_time_ball_query(points, times, centers, center_times, radii, config.neighbors, order=order)[0]
 
 
@@ -51,7 +57,13 @@ class SetAbstraction(SharedLayers):
 
 
 class PointNet2(Backbone):
-    """Two set abstractions and a global head; of the config: centroids, neighbors, radii, grouping, widths."""
+    """Two set abstractions and a global head; of the config: centroids, neighbors, radii, grouping, widths.
+
+    With `static_temporal_radius` the static stream pools neighbourhoods of its own, such as those within a frame, and sees no
+    motion (the text's "identical to common static models"; the release pools what the dynamic stream fits). The dynamic
+    stream then reads the same layers at its neighbourhoods, over what the static stream pooled. `group` gives the static
+    stream's two stages first, then the dynamic stream's; while the static stream is in training, only its own.
+    """
 
     def __init__(self, config: KinetConfig) -> None:
         super().__init__()
@@ -62,7 +74,9 @@ class PointNet2(Backbone):
         he_init(self)
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        return group_clip(points, times, self.config)
+        config = self.config
+        shared = not config.own_static_groups or self.training
+        return group_clip(points, times, config, config.static_radius, *([] if shared else [config.temporal_radius]))
 
     def forward(self, groups: list[Grouping]) -> Tensor:
         """Class logits (B,C)."""
@@ -73,12 +87,15 @@ class PointNet2(Backbone):
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
         """Both stages with their two layers' activations, and the logits, in one pass of the frozen network."""
         first, features = self.stage1.taps(groups[0], None)
-        second, features = self.stage2.taps(groups[1], features)
-        stages = [Stage(group, taps) for group, taps in zip(groups, (first, second))]
-        return stages, self.head(groups[1].centers, features)
+        second, pooled = self.stage2.taps(groups[1], features)
+        logits = self.head(groups[1].centers, pooled)
+        shown = groups[2:] or groups
+        if shown is not groups:  # the same layers, at the dynamic stream's neighbours
+            first, second = self.stage1.taps(shown[0], None)[0], self.stage2.taps(shown[1], features)[0]
+        return [Stage(group, taps) for group, taps in zip(shown, (first, second))], logits
 
     def macs_as_written(self) -> int:
-        """Multiply-adds of one clip as papers count them: each layer on every gathered neighbour."""
+        """Multiply-adds of one clip as papers count them: each layer on every gathered neighbour, once."""
         last = (self.head.linear1, self.head.linear2)
         total = (
             self.config.centroids[1] * sum(layer.weight.numel() for layer in last) + self.head.classify.weight.numel()

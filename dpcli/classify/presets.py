@@ -78,4 +78,4 @@ BACKBONE_CHANGES: dict[str, dict[str, dict[str, Any]]] = {
 def with_backbone(config: KinetConfig, preset: str, backbone: str) -> KinetConfig:
     """A preset's configuration on another backbone, with `BACKBONE_CHANGES`; a user's own (`module:Class`) changes nothing
     else and reads from the configuration what it wants."""
-    return config.changed(backbone=backbone, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {}))
+    return config.changed(backbone=backbone, static_temporal_radius=None, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {}))

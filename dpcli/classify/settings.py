@@ -16,7 +16,8 @@ from dpcli.runtime.device import cpu_count
 from dpcli.runtime.precision import wanted
 
 _RELEASE = {key: getattr(KinetConfig.release(), key) for key in
-            ("variant", "group_size", "xyz_group", "time_input", "weighting", "merge", "guard", "fusion", "grouping")}  # fmt: skip
+            ("variant", "group_size", "xyz_group", "time_input", "weighting", "merge", "guard", "fusion", "grouping",
+             "static_temporal_radius")}  # fmt: skip
 
 
 def network_config(

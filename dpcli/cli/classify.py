@@ -108,6 +108,13 @@ def train(
     temporal_radius: Annotated[
         int | None, typer.Option(help="Frames before and after that count as neighbours.")
     ] = None,
+    static_temporal_radius: Annotated[
+        int | None,
+        typer.Option(
+            help="The same for the static stream alone (pointnet2): 0 keeps its neighbourhoods within a frame, so that it sees no"
+            " motion. Default: the preset's (as --temporal-radius: one set of neighbourhoods for both streams)."
+        ),
+    ] = None,
     radius: Annotated[
         float | None, typer.Option(help="Spatial radius of stage 1, in the input's unit; stage 2 doubles it.")
     ] = None,
@@ -155,7 +162,8 @@ def train(
     """
     network = {
         "num_frames": frames, "points_per_frame": points, "normalize": normalize, "grouping": grouping, "solver": solver,
-        "group_size": group_size, "reduction": reduction, "temporal_radius": temporal_radius, "dropout": dropout,
+        "group_size": group_size, "reduction": reduction, "temporal_radius": temporal_radius,
+        "static_temporal_radius": static_temporal_radius, "dropout": dropout,
         "radii": None if radius is None else (radius, 2 * radius), "centroids": centroids, "neighbors": neighbors,
         "normals": False if no_normals else None, "weighting": "none" if no_weights or no_normals else None,
     }  # fmt: skip
