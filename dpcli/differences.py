@@ -13,7 +13,10 @@ def differences(before: object, now: object) -> list[str]:
 
 
 def _settings(value: object, path: str = "") -> dict[str, str]:
-    """A nested record as one level, values as JSON: {"network.num_frames": "16"}."""
+    """A nested record as one level, values as JSON: {"network.num_frames": "16"}. None counts as not there: a run that was
+    begun before a setting existed goes on while nobody sets it."""
+    if value is None:
+        return {}
     if not isinstance(value, dict):
         return {path: json.dumps(value, sort_keys=True)}
     return {name: one for key, item in value.items() for name, one in _settings(item, f"{path}.{key}" if path else key).items()}

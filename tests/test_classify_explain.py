@@ -91,8 +91,14 @@ def weights(data, model) -> Path:
 # --- eq. A.2 and Grad-CAM on the network
 
 
-def test_equation_a2_in_loops(model):
-    """max over channels and neighbours of relu(bn2(W2 relu(bn1(W1 (x_j - x_i))))), centroid by centroid in float64."""
+@pytest.mark.parametrize("within_frames", [False, True])
+def test_equation_a2_in_loops(model, within_frames):
+    """max over channels and neighbours of relu(bn2(W2 relu(bn1(W1 (x_j - x_i))))), centroid by centroid in float64; also of a
+    static stream whose neighbourhoods are its own."""
+    if within_frames:
+        plain, model = model, Kinet(model.config.changed(static_temporal_radius=0)).eval()
+        model.load_state_dict(plain.state_dict())
+        assert not torch.equal(model.group(body_like_clip(4, 32))[0].idx, plain.group(body_like_clip(4, 32))[0].idx)
     points = body_like_clip(4, 32)
     layer = stage_layer(model, points, "static", 0, None)
     group, stage = model.group(points)[0], copy.deepcopy(model.static.stage1).double()

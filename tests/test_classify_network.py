@@ -63,11 +63,12 @@ CONFIGS = [
     KinetConfig(**TINY, weighting="none"),
     KinetConfig(**TINY, temporal_radius=0, grouping="balanced"),
     KinetConfig(**TINY, group_size=8, temporal_radius=2),
+    KinetConfig(**TINY, static_temporal_radius=0),
 ]
 
 
 @pytest.mark.parametrize(
-    "config", CONFIGS, ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}"
+    "config", CONFIGS, ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}-s{c.static_radius}"
 )
 def test_every_switch_trains_the_dynamic_branch_alone(config):
     torch.manual_seed(0)
@@ -196,6 +197,8 @@ def test_config_survives_json_and_refuses_nonsense():
         ({"num_frames": 0}, "--frames 0: expected at least 1"),
         ({"group_size": 0}, "--group-size 0: expected at least 1"),
         ({"temporal_radius": -1}, "--temporal-radius -1: expected at least 0"),
+        ({"static_temporal_radius": -1}, "--static-temporal-radius -1: expected at least 0"),
+        ({"static_temporal_radius": 0, "backbone": "dgcnn"}, "--static-temporal-radius 0: dgcnn's one graph serves both"),
         ({"temporal_radius": 32}, "--temporal-radius 32: balanced grouping shares 64 neighbours among 65 frames"),
         ({"dropout": 1.0}, "--dropout 1.0: expected a probability"),
         ({"dropout": float("nan")}, "--dropout nan: expected a probability"),
@@ -294,3 +297,50 @@ def test_profile_splits_steps_into_their_parts():
         assert total == pytest.approx(1000 * step["seconds_on_one_thread"] / step["batch"], rel=0.1, abs=0.05)
         assert f"\n{name.replace('_', ' ')}" in render(result)
     assert "in matrix products" in render(result)
+
+
+def test_a_static_stream_within_frames_knows_nothing_of_their_order():
+    """With every point a centroid, sampling has no say: any order of the frames gives the same logits. Neighbourhoods that
+    reach into the next frame don't, nor does the dynamic stream, which reads the same layers across frames."""
+    clip, order = body_like_clip(4, 32), torch.tensor([2, 0, 3, 1])
+    sizes = {**TINY, "centroids": (128, 128), "points_per_frame": 32, "grouping": "nearest", "solver": "ridge"}
+    moved = {}
+    for reach in (0, None):
+        torch.manual_seed(0)
+        model = Kinet(KinetConfig(**sizes, static_temporal_radius=reach)).eval()
+        with torch.no_grad():
+            (static, dynamic), (static2, dynamic2) = model(clip), model(clip[:, order])
+        moved[reach] = (static - static2).abs().max() / static.abs().max(), (dynamic - dynamic2).abs().max()
+    assert moved[0][0] < 1e-5 < 1e-3 < moved[None][0]
+    assert moved[0][1] > 1e-3
+
+
+def test_a_static_stream_of_its_own_is_that_of_a_network_of_its_reach_and_the_dynamic_one_reads_it_across_frames():
+    torch.manual_seed(0)
+    model = Kinet(KinetConfig(**TINY, static_temporal_radius=0)).eval()
+    alone, shared = (Kinet(KinetConfig(**TINY, temporal_radius=reach)).eval() for reach in (0, 1))
+    for other in (alone, shared):
+        other.load_state_dict(model.state_dict())
+    clip = body_like_clip(4, 64, 2)
+    with torch.no_grad():
+        assert torch.equal(model.static_logits(clip), alone.static_logits(clip))
+        assert torch.equal(model(clip)[0], alone(clip)[0]) and not torch.equal(model(clip)[0], shared(clip)[0])
+        groups = model.group(clip)
+        across = shared.group(clip)
+        assert all(torch.equal(mine.idx, theirs.idx) for mine, theirs in zip(groups[2:], across))
+        stages, _ = model.static.taps(groups)
+        pooled = alone.static.stage1(alone.group(clip)[0], None)
+        expected = model.static.stage2.taps(across[1], pooled)[0]
+        assert all(map(torch.equal, stages[1].activations, expected))
+        theirs = shared.static.taps(across)[0]
+        assert torch.equal(stages[0].activations[1], theirs[0].activations[1])  # the first stage reads coordinates alone
+        assert not torch.equal(stages[1].activations[1], theirs[1].activations[1])
+    assert len(model.train().group(clip)) == 2  # training asks for its own alone
+
+
+def test_models_made_before_the_static_stream_had_neighbourhoods_of_its_own_stay_as_they_are():
+    values = json.loads(KinetConfig(temporal_radius=2).to_json())
+    del values["static_temporal_radius"]
+    config = KinetConfig.from_json(json.dumps(values))
+    assert config.static_radius == 2 and not config.own_static_groups
+    assert KinetConfig.release().static_temporal_radius is None

@@ -142,8 +142,9 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
         pass
     with pytest.raises(UsageError, match="another configuration"):
         RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
-    with pytest.raises(UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*null, and 1 more\)"):
-        RunFolder(tmp_path / "scene.fit", {"config": {"a": 1, "b": {"c": None, "d": 2}}}, columns=COLUMNS)
+    with pytest.raises(UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*d absent, now 2, and 1 more\)"):
+        RunFolder(tmp_path / "scene.fit", {"config": {"a": 1, "b": {"c": None, "d": 2, "e": 3}}}, columns=COLUMNS)
+    RunFolder(tmp_path / "scene.fit", {"config": 1, "newer": None}, columns=COLUMNS)  # a setting that nobody sets
     done = dpc_here("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
     assert done.returncode == 2 and b"another configuration" in done.stderr
 
