@@ -101,7 +101,8 @@ def test_a_constant_left_on_the_cpu_is_found(card, monkeypatch):
 
 def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, tmp_path):
     data, model = gestures(tmp_path / "clouds.h5", videos=6), tmp_path / "model"
-    done = dpc_here("classify", "train", data, "-o", model, *TRAIN, "--epochs", 1, "--epochs-dynamic", 1, "--workers", 0)
+    done = dpc_here("classify", "train", data, "-o", model, *TRAIN, "--epochs", 1, "--epochs-dynamic", 2, "--workers", 0,
+                    "--draws", 1, "--static-temporal-radius", 0)  # fmt: skip
     assert done.returncode == 0 and b"training on pretend card" in done.stderr, done.stderr
     scores = []
     for device in ("cuda", "cpu"):

@@ -12,7 +12,8 @@ VARIANTS = ("thesis", "release")
 
 @dataclass(frozen=True)
 class KinetConfig:
-    """Network and input of a Kinet. Defaults are the thesis's text; `release()` is the published code's choices.
+    """Network and input of a Kinet. Defaults are the thesis's text, but for `static_temporal_radius` (0 there, which the preset
+    says; models made before it was a choice have None); `release()` is the published code's choices.
 
     Lengths are in the input's unit after normalisation, times in frames.
     """

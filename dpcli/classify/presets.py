@@ -27,7 +27,7 @@ _TINY = {**_SMALL, "centroids": (128, 64), "neighbors": 16, "points_per_frame": 
          "widths": ((32, 64), (64, 128), (128, 256))}  # fmt: skip
 
 PRESETS = {
-    "thesis": Preset(KinetConfig(), Schedule(), AUGMENTATIONS["peers"]),
+    "thesis": Preset(KinetConfig(static_temporal_radius=0), Schedule(), AUGMENTATIONS["peers"]),
     "release": Preset(
         KinetConfig.release(num_frames=32, points_per_frame=128, normalize="image"),
         Schedule((250, 250), batch=8, decay="staircase", validate_every=5), AUGMENTATIONS["release"],
