@@ -249,12 +249,16 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
         )
         == 0
     )
-    assert "tensors taken" in capfd.readouterr().err
+    told = capfd.readouterr().err
+    assert "tensors taken" in told and "--static-temporal-radius" not in told
     ours, theirs = load_model(str(tmp_path / "six")), load_model(str(alone))
     config = ours[1].config
     assert (config.num_frames, config.centroids, config.neighbors) == (6, (48, 24), 9)
     for key, value in theirs[0].state_dict().items():
         assert torch.equal(ours[0].state_dict()[key], value), key
+    within = (*SHORT, "--epochs", 0, "--epochs-dynamic", 0, "--static-temporal-radius", 0)
+    assert dpc("classify", "train", data, "-o", tmp_path / "within", *within, "--init", alone) == 0
+    assert "--static-temporal-radius 1 goes on as it was" in capfd.readouterr().err
     assert (
         dpc("classify", "train", data, "-o", tmp_path / "q", "--preset", "quick", "--frames", 4, "--init", alone) == 2
     )

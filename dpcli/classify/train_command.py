@@ -140,6 +140,11 @@ def _new_model(
         other, _ = load_model(name, backbone, option)
         theirs = other.static if option == "--static-from" else other
         _copy_fitting(mine, theirs, f"{option} {name}")
+        if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:
+            log.warn(
+                f"{option} {name}: its static stream learned from neighbours up to {other.config.static_radius} frames away, here"
+                f" {config.static_radius}; --static-temporal-radius {other.config.static_radius} goes on as it was"
+            )
     return model
 
 
