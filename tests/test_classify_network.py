@@ -198,6 +198,7 @@ def test_config_survives_json_and_refuses_nonsense():
         ({"group_size": 0}, "--group-size 0: expected at least 1"),
         ({"temporal_radius": -1}, "--temporal-radius -1: expected at least 0"),
         ({"static_temporal_radius": -1}, "--static-temporal-radius -1: expected at least 0"),
+        ({"static_temporal_radius": 0, "points_per_frame": 63, "num_frames": 32}, "--static-temporal-radius 0 hold 63 points"),
         ({"static_temporal_radius": 0, "backbone": "dgcnn"}, "--static-temporal-radius 0: dgcnn's one graph serves both"),
         ({"temporal_radius": 32}, "--temporal-radius 32: balanced grouping shares 64 neighbours among 65 frames"),
         ({"dropout": 1.0}, "--dropout 1.0: expected a probability"),

@@ -85,12 +85,11 @@ class KinetConfig:
             raise UsageError(
                 f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
             )
-        reach = 2 * min(self.temporal_radius, self.static_radius) + 1
-        near = min(reach, self.num_frames) * self.points_per_frame
+        least = min(self.temporal_radius, self.static_radius)
+        near = min(2 * least + 1, self.num_frames) * self.points_per_frame
         if self.neighbors > near:
-            raise UsageError(
-                f"--neighbors {self.neighbors}: the frames within --temporal-radius {self.temporal_radius} hold {near} points"
-            )
+            option = "--temporal-radius" if least == self.temporal_radius else "--static-temporal-radius"
+            raise UsageError(f"--neighbors {self.neighbors}: the frames within {option} {least} hold {near} points")
 
     def _check_centroids(self) -> None:
         first, second = self.centroids
