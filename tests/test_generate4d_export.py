@@ -14,6 +14,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.export import as_sequence, export_sequence, thinned
 from dpcli.generate4d.output import run_export
 from dpcli.generate4d.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
+from dpcli.prepare.open3d_import import load_open3d
 from dpcli.store import CloudsReader, PartsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
 
@@ -38,9 +39,7 @@ def _matrices(quaternions: np.ndarray) -> np.ndarray:
 
 
 def _open3d(path: Path) -> dict[str, np.ndarray]:
-    import open3d
-
-    cloud = open3d.t.io.read_point_cloud(str(path))
+    cloud = load_open3d().t.io.read_point_cloud(str(path))
     return {key: cloud.point[key].numpy() for key in cloud.point}
 
 
