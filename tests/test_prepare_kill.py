@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import itertools
-import os
 import shutil
-import signal
 import subprocess
 import time
 from pathlib import Path
