@@ -51,7 +51,7 @@ def test_kept_neighbourhoods_are_those_that_a_search_finds(backbone, tmp_path):
         found = cache(clips[numbers], torch.tensor(numbers))
         assert all(map(torch.equal, fields(found), fields(model.group(clips[numbers]))))
     assert searched == [2, 1, 2]  # each clip once
-    assert cache.bytes_per_clip > 0 and not list(tmp_path.iterdir())  # a file without a name
+    assert not list(tmp_path.iterdir())  # a file without a name
     other = cache(clips[[1, 0]], torch.tensor([0, 1]))  # numbers of other clips: what the comparison must see
     assert not all(map(torch.equal, fields(other), fields(model.group(clips[[1, 0]]))))
 
@@ -102,7 +102,7 @@ def test_a_training_with_kept_neighbours_is_the_one_that_searches_each_time(data
     assert dpc("classify", "train", data, "-o", tmp_path / "fresh", *SMALL, "--epochs-dynamic", 5, "--accumulate", 2) == 0
     fresh = last_weights(tmp_path / "fresh")
     assert not all(torch.equal(kept[key], fresh[key]) for key in kept)  # draws that come back are another training
-    assert "draws" not in json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]  # older runs go on
+    assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] is None  # older runs go on
 
 
 def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from dpcli.classify.kinematic import KinematicUnit
 from dpcli.classify.kinet import Kinet, fuse
 from dpcli.classify.layers import GlobalHead, he_init
 from dpcli.classify.profile import body_like_clip, count_parameters, macs, measure, paper_parameters, render
+from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
 from dpcli.ops import fps
 
@@ -146,7 +147,7 @@ def test_balanced_grouping_shares_the_slots_between_frames():
     inner = (group.center_times > 0) & (group.center_times < 3)
     counts = torch.stack([(offsets[inner] == d).sum(-1) for d in (-1, 0, 1)], -1)
     assert (counts == 3).all() and (offsets.abs() <= 1).all()
-    assert (group.relative().norm(dim=-1) < config.radius_table(0)[1]).all()
+    assert (group.relative().norm(dim=-1) < config.radius_table(0, 1)[1]).all()
     first = Kinet(config.changed(grouping="first")).group(body_like_clip(4, 256))[0]
     early = (first.neighbor_times() - first.center_times[..., None])[first.center_times > 0]
     assert (early == -1).float().mean() > 0.9  # why the release's rule can't fit a surface in time on dense frames
@@ -345,3 +346,11 @@ def test_models_made_before_the_static_stream_had_neighbourhoods_of_its_own_stay
     config = KinetConfig.from_json(json.dumps(values))
     assert config.static_radius == 2 and not config.own_static_groups
     assert KinetConfig.release().static_temporal_radius is None
+
+
+def test_the_preset_thesis_keeps_its_static_stream_within_a_frame_where_it_can():
+    """Also with the default backbone named; a graph that serves both streams, a user's own network and the release share."""
+    for backbone, variant, radius in ((None, None, 0), ("pointnet2", None, 0), ("dgcnn", None, 1), ("spidercnn", None, 1),
+                                      ("tests.tiny_backbone:TinyBackbone", None, 1), (None, "release", 1)):  # fmt: skip
+        assert network_config("thesis", variant, {}, 20, backbone).static_radius == radius
+    assert network_config("quick", None, {}, 20).static_radius == 1

@@ -76,20 +76,21 @@ class KinetConfig:
                 f"--group-size {self.group_size}: one group holds the three coordinates (presets quick, tiny, release);"
                 " expected at least 3, or --preset thesis"
             )
-        if self.own_static_groups and self.backbone in ("dgcnn", "spidercnn"):
+        if self.own_static_groups and self.backbone != "pointnet2":
             raise UsageError(
-                f"--static-temporal-radius {self.static_temporal_radius}: {self.backbone}'s one graph serves both streams; leave it out"
+                f"--static-temporal-radius {self.static_radius}: {self.backbone}'s one graph serves both streams; leave it out"
             )
-        reach = 2 * max(self.temporal_radius, self.static_temporal_radius or 0) + 1
+        self._check_reach("--temporal-radius", self.temporal_radius)
+        self._check_reach("--static-temporal-radius", self.static_radius)
+
+    def _check_reach(self, option: str, radius: int) -> None:
+        """Whether the frames of a neighbourhood have a slot each, and points for all slots."""
+        reach = 2 * radius + 1
         if self.grouping == "balanced" and self.neighbors < reach:
-            raise UsageError(
-                f"--temporal-radius {self.temporal_radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames"
-            )
-        least = min(self.temporal_radius, self.static_radius)
-        near = min(2 * least + 1, self.num_frames) * self.points_per_frame
+            raise UsageError(f"{option} {radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames")
+        near = min(reach, self.num_frames) * self.points_per_frame
         if self.neighbors > near:
-            option = "--temporal-radius" if least == self.temporal_radius else "--static-temporal-radius"
-            raise UsageError(f"--neighbors {self.neighbors}: the frames within {option} {least} hold {near} points")
+            raise UsageError(f"--neighbors {self.neighbors}: the frames within {option} {radius} hold {near} points")
 
     def _check_centroids(self) -> None:
         first, second = self.centroids
@@ -128,10 +129,10 @@ class KinetConfig:
     def changed(self, **changes: object) -> KinetConfig:
         return replace(self, **changes)
 
-    def radius_table(self, stage: int, reach: int | None = None) -> tuple[float, ...]:
-        """Radius per |dt| = 0..reach (None: temporal_radius): r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (as the release)."""
+    def radius_table(self, stage: int, reach: int) -> tuple[float, ...]:
+        """Radius per |dt| = 0..reach: r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (as the release)."""
         growth = 0.2 * self.radii[stage] / max(self.num_frames - 1, 1)
-        return tuple(self.radii[stage] + growth * d for d in range((self.temporal_radius if reach is None else reach) + 1))
+        return tuple(self.radii[stage] + growth * d for d in range(reach + 1))
 
     def groups(self, width: int) -> int:
         """Number of feature groups fitted at a layer of this width, the xyz group included."""

@@ -46,9 +46,8 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
     """
     with torch.no_grad():
         groups = model.group(points)
-        stages, _ = model.static.taps(groups)
-        if stream == "static":  # where it pools neighbourhoods of its own, those come first
-            stages, _ = model.static.taps(groups[: len(stages)])
+        own = stream == "static" and model.config.own_static_groups  # they come first, as many as the dynamic stream's
+        stages, _ = model.static.taps(groups[: len(groups) // 2] if own else groups)
     count = len(stages)
     chosen = count - 1 if stage is None else stage
     if not 0 <= chosen < count:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from dpcli.classify.backbone import Grouping, clip_points
 from dpcli.errors import UsageError
+from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import disk_full, reserve
 
 Search = Callable[[Tensor], list[Grouping]]
@@ -25,7 +27,7 @@ class NeighborCache:
     """What `search` finds for each of `clips` numbered clips of one shape: centroids and indices of neighbours, on disk.
 
     Memory: a byte a clip. The file has no name and goes with the process, killed or not; a run that is continued fills a new
-    one. DiskFull (with a sentence) when `folder` has no room for it, before anything is searched twice.
+    one. DiskFull (with a sentence) at the first batch when `folder` has no room for it.
     """
 
     def __init__(self, search: Search, folder: Path, clips: int) -> None:
@@ -43,11 +45,6 @@ class NeighborCache:
             self._keep(numbers[new], clip_points(some), self.search(some))
         return self._read(numbers, clip_points(points))
 
-    @property
-    def bytes_per_clip(self) -> int:
-        """Room of a clip in the file; 0 before the first search."""
-        return self._records.dtype.itemsize if len(self._sources) else 0
-
     def _keep(self, numbers: np.ndarray, cloud: tuple[Tensor, Tensor], groups: list[Grouping]) -> None:
         if not self._sources:
             self._sources = _sources(cloud, groups)
@@ -58,6 +55,7 @@ class NeighborCache:
 
     def _new_file(self, record: np.dtype) -> np.ndarray:
         size = len(self._known) * record.itemsize
+        log.info(f"keeping neighbours in {self.folder}: {size / 1e6:.0f} MB, {record.itemsize / 1e6:.2g} MB a clip and draw")
         try:
             with tempfile.TemporaryFile(dir=self.folder) as file:
                 file.truncate(size)
@@ -80,11 +78,12 @@ class NeighborCache:
         return groups
 
 
+@dataclass(frozen=True)
 class _Source:
     """Where a stage's points come from (the clip, else the stage before), and whether each of them is a centroid."""
 
-    def __init__(self, of_clip: bool, all_points: bool) -> None:
-        self.of_clip, self.all_points = of_clip, all_points
+    of_clip: bool
+    all_points: bool
 
 
 def _sources(cloud: tuple[Tensor, Tensor], groups: list[Grouping]) -> list[_Source]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -13,13 +15,12 @@ from dpcli.ops.grouped_mlp import frozen_activations
 
 
 @torch.no_grad()
-def group_clip(points: Tensor, times: Tensor, config: KinetConfig, *reaches: int) -> list[Grouping]:
+def group_clip(points: Tensor, times: Tensor, config: KinetConfig, reaches: Sequence[int]) -> list[Grouping]:
     """Both stages' centroids (farthest points of the union of frames) and space-time neighbours. points (B,N,3), times (B,N).
 
-    reaches: frames before and after that neighbours may come from (none given: the configuration's); for each of them both
-    stages, one after the other, about the same centroids.
+    reaches: frames before and after that neighbours may come from; for each of them both stages, one after the other, about
+    the same centroids.
     """
-    reaches = reaches or (config.temporal_radius,)
     found: list[list[Grouping]] = [[] for _ in reaches]
     for stage, count in enumerate(config.centroids):
         # centroids are in the order of farthest point sampling, so any first few of them are such a sample, too
@@ -75,8 +76,10 @@ class PointNet2(Backbone):
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
         config = self.config
-        shared = not config.own_static_groups or self.training
-        return group_clip(points, times, config, config.static_radius, *([] if shared else [config.temporal_radius]))
+        reaches = [config.static_radius]
+        if config.own_static_groups and not self.training:
+            reaches.append(config.temporal_radius)
+        return group_clip(points, times, config, reaches)
 
     def forward(self, groups: list[Grouping]) -> Tensor:
         """Class logits (B,C)."""

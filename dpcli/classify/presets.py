@@ -52,7 +52,8 @@ _GRAPH = {
     "neighbors": 20,
     "grouping": "balanced",
     "merge": "residual",
-}  # the release's merge pairs PointNet++'s two stages
+    "static_temporal_radius": None,
+}  # the release's merge pairs PointNet++'s two stages, as two sets of neighbourhoods do
 _FULL = {**_GRAPH, "head": (512, 1024), "points_per_frame": 128}
 _DGCNN = {**_FULL, "widths": ((64, 64, 64, 128), (1024,), (64, 128, 1024, 512, 256), (512, 256)), "dropout": 0.5}
 _SPIDER = {**_FULL, "widths": ((32, 64, 128, 256), (5,), (1024, 512)), "dropout": 0.7}
@@ -78,4 +79,4 @@ BACKBONE_CHANGES: dict[str, dict[str, dict[str, Any]]] = {
 def with_backbone(config: KinetConfig, preset: str, backbone: str) -> KinetConfig:
     """A preset's configuration on another backbone, with `BACKBONE_CHANGES`; a user's own (`module:Class`) changes nothing
     else and reads from the configuration what it wants."""
-    return config.changed(backbone=backbone, static_temporal_radius=None, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {}))
+    return config.changed(backbone=backbone, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {}))

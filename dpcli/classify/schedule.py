@@ -27,7 +27,7 @@ class Schedule:
     accumulate: int = 1  # parts a batch is computed in, one after the other: less memory; batch norm sees one part at a time
     amp: bool = False  # matrix products in bfloat16
     workers: int = 0  # processes that load clips; 0: this one
-    draws: int = 0  # dynamic stage: fixed draws of each clip, taken in turn, neighbours searched once; 0: a new one every epoch
+    draws: int | None = None  # dynamic stage: fixed draws of each clip in turn, neighbours searched once; None: one an epoch
 
     def __post_init__(self) -> None:
         dynamic = self.learning_rate_dynamic
@@ -41,7 +41,7 @@ class Schedule:
             f"--decay {self.decay}: expected cosine, staircase or constant": self.decay not in DECAYS,
             f"--accumulate {self.accumulate}: expected at least 1": self.accumulate < 1,
             f"--workers {self.workers}: expected 0 or more": self.workers < 0,
-            f"--draws {self.draws}: expected 0 (new every epoch) or more": self.draws < 0,
+            f"--draws {self.draws}: expected 0 (new every epoch) or more": self.draws is not None and self.draws < 1,
             f"--clips-per-video {self.clips_per_video}: expected 0 (every start) or more": (self.clips_per_video or 1)
             < 1,
         }

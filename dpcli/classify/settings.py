@@ -32,7 +32,7 @@ def network_config(
     if backbone in BACKBONES:
         config = with_backbone(config, preset, backbone)
     elif backbone is not None:
-        config = config.changed(backbone=backbone)
+        config = config.changed(backbone=backbone, static_temporal_radius=None)  # PointNet++'s alone
     return config.changed(num_classes=classes, **{key: value for key, value in changes.items() if value is not None})
 
 

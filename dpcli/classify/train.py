@@ -106,7 +106,7 @@ class Trainer:
 
     def _draws(self) -> int:
         """How many draws of every clip this stage comes back to; 0: each epoch has its own."""
-        return min(self.schedule.draws, self.schedule.epochs[1]) if self.stage == 1 else 0
+        return min(self.schedule.draws or 0, self.schedule.epochs[1]) if self.stage == 1 else 0
 
     def _run_epoch(self, epochs: int, bar: Progress) -> None:
         (self.model.static if self.stage == 0 else self.model.dynamic).train()

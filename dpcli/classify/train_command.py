@@ -123,9 +123,8 @@ def check_shares(clips: int, plan: Schedule, processes: int) -> None:
 
 
 def _content(plan: Schedule) -> dict:
-    """What of the schedule shapes the result: not how many processes load clips. Runs begun before `draws` was one go on."""
-    left = {"workers", *(["draws"] if not plan.draws else [])}
-    return {key: value for key, value in asdict(plan).items() if key not in left}
+    """What of the schedule shapes the result: not how many processes load clips."""
+    return {key: value for key, value in asdict(plan).items() if key != "workers"}
 
 
 def _new_model(
