@@ -94,7 +94,7 @@ NV_IS     := the folder of NvGesture's lists and Video_data
 EITHER     = $(if $(strip $(NVGESTURE)),nvgesture "$(NVGESTURE)",msraction3d "$(MSRACTION)")
 PLAN       = --preset $(PRESET) --seeds "$(SEEDS)" $(if $(CLIPS),--clips $(CLIPS)) $(if $(PREPARE),--prepare="$(PREPARE)")
 CHAIN      = --from "$(FROM)" $(if $(MORE),--more="$(MORE)")
-TABLES    := $(BIN)/python -m tests.tables
+TABLES    := $(BIN)/python -m dpcli.reproduce
 
 table-3.1: $(READY)
 	$(call needs_either)
@@ -167,16 +167,16 @@ table-4.1: $(READY)
 	mkdir -p $(T41)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
-	$(BIN)/python -m tests.tables.table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
+	$(BIN)/python -m dpcli.reproduce.table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
 
 # Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files. Stopped, it goes on where it was.
 MESHES ?=
 table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m tests.tables.table_5_2 "$(MESHES)" table/5.2
+	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2
 
 fuzz: $(READY)
-	$(BIN)/python -m tests.fuzz_options fuzz --only "$(ONLY)"
+	$(BIN)/python -m tests.fuzz.fuzz_options fuzz --only "$(ONLY)"
 
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from dpcli.classify.augment import PRESETS as AUGMENTATIONS
-from dpcli.classify.augment import Augmentation
-from dpcli.classify.config import KinetConfig
-from dpcli.classify.schedule import Schedule
+from dpcli.classify.data.augment import PRESETS as AUGMENTATIONS
+from dpcli.classify.data.augment import Augmentation
+from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
 
 

@@ -12,7 +12,7 @@ import typer
 
 from dpcli.cli.options import Json, Picture
 from dpcli.errors import UsageError
-from dpcli.streams import printable
+from dpcli.standard_streams import printable
 
 _PIPE_WIDTH = 120
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
@@ -35,9 +35,9 @@ def info(
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights_files import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights_lookup import SUFFIX, locate_weights, weights_summary
     from dpcli.store import input_file
-    from dpcli.store.info import summary
+    from dpcli.store.summary import summary
 
     model = locate_weights(file, sorted(Path(__file__).parents[1].glob("*/weights")))
     if model is not None and model.suffix == SUFFIX:
@@ -60,8 +60,8 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
-    from dpcli.evaluate.contact_sheet import contact_sheet
-    from dpcli.evaluate.pictures import check_picture
+    from dpcli.draw.contact_sheet import contact_sheet
+    from dpcli.evaluate.classification.confusion_picture import check_picture
     from dpcli.store import CloudsReader
 
     if kind not in ("clouds", "parts", "views"):
@@ -77,7 +77,7 @@ def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
 
 
 def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str | None) -> None:
-    from dpcli.evaluate.views_sheet import views_sheet
+    from dpcli.draw.views_sheet import views_sheet
     from dpcli.store.views import ViewsReader
 
     if view is not None:

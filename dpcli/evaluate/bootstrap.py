@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import UsageError
-from dpcli.runtime.seed import generator
+from dpcli.runtime.seeds import generator
 
 Weighted = Callable[[np.ndarray], dict[str, np.ndarray]]
 """Counts f64 (R,n), how often each of n samples counts in each of R resamples -> value f64 (R) by metric, NaN = 0/0."""

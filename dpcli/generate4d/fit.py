@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from dpcli.errors import DpcError
-from dpcli.generate4d.canonical import CanonicalGaussians
 from dpcli.generate4d.config import FitConfig
-from dpcli.generate4d.control_points import ControlPoints
-from dpcli.generate4d.identification import ball_neighbours, spatial_loss, temporal_loss
-from dpcli.generate4d.losses import arap_loss, picture_loss, roundness_loss, thickness_loss
-from dpcli.generate4d.model import Instant, Model4D
-from dpcli.generate4d.priors.sampling import novel_cameras
-from dpcli.generate4d.start import hull, in_sphere, inflated, spread_seeds
+from dpcli.generate4d.priors.camera_sampling import novel_cameras
+from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
+from dpcli.generate4d.scene.control_points import ControlPoints
+from dpcli.generate4d.scene.identification import ball_neighbours, spatial_loss, temporal_loss
+from dpcli.generate4d.scene.initialization import hull, in_sphere, inflated, spread_seeds
+from dpcli.generate4d.scene.losses import arap_loss, picture_loss, roundness_loss, thickness_loss
+from dpcli.generate4d.scene.model import Instant, Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.runtime.progress import Progress
 from dpcli.runtime.run_folder import RunFolder

@@ -126,7 +126,7 @@ def _query_numba(
     k: int,
     order: str,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    from dpcli.ops.kernels_neighbours import ball_query_kernel
+    from dpcli.ops.cpu.neighbor_search import ball_query_kernel
 
     batch, rows = centroid_times.shape
     index = torch.empty((batch, rows, k), dtype=torch.int64)
@@ -146,7 +146,7 @@ def _balanced_numba(
     limits: torch.Tensor,
     k: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    from dpcli.ops.kernels_neighbours import balanced_query_kernel
+    from dpcli.ops.cpu.neighbor_search import balanced_query_kernel
 
     batch, rows = centroid_times.shape
     index = torch.empty((batch, rows, k), dtype=torch.int64)

@@ -52,7 +52,7 @@ def _check(features: Tensor, idx: Tensor) -> None:
 class _GatherMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features: Tensor, idx: Tensor) -> Tensor:
-        from dpcli.ops.kernels_gather import mean_kernel
+        from dpcli.ops.cpu.gather import mean_kernel
 
         ctx.save_for_backward(idx)
         ctx.points = features.shape[1]
@@ -65,7 +65,7 @@ class _GatherMean(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        from dpcli.ops.kernels_gather import mean_back_kernel
+        from dpcli.ops.cpu.gather import mean_back_kernel
 
         (idx,) = ctx.saved_tensors
         out = torch.zeros(len(idx), ctx.points, grad.shape[2], dtype=grad.dtype)
@@ -86,7 +86,7 @@ class _GatherRows(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
-        from dpcli.ops.kernels_gather import scatter_add_kernel
+        from dpcli.ops.cpu.gather import scatter_add_kernel
 
         (rows,) = ctx.saved_tensors
         shape, batch = ctx.sizes

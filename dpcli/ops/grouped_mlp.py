@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from dpcli.ops.backend import chosen_backend
+from dpcli.ops.cpu.cache_blocks import TASKS, ranges, share_tasks, steps
+from dpcli.ops.cpu.parallel import parallel_kernels
 from dpcli.ops.gather import gather_points
-from dpcli.ops.parallel import parallel_kernels
-from dpcli.ops.pieces import TASKS, ranges, share_tasks, steps
 
 # Bytes of activations between two matrix products, which then stay in the cache.
 _PIECE = 1 << 21
@@ -100,7 +100,7 @@ def _frozen_pieces(
     points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor],
     linear2: tuple[Tensor, Tensor],
 ) -> tuple[list[Tensor], Tensor]:  # fmt: skip
-    kernels = parallel_kernels("kernels_grouped")
+    kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
     if features is None:  # cheaper from positions than gathered: the projected points are many
         make = kernels.hidden_xyz
         inputs = (points.numpy(), centers.numpy(), idx.numpy(), linear1[0].t().contiguous().numpy(), linear1[1].numpy())
@@ -206,7 +206,7 @@ class _FromPositions:
     """First layer on relative positions x alone: W x + b. Its statistics and gradients follow from moments of x."""
 
     def __init__(self, points: Tensor, centers: Tensor, idx: Tensor, weight: Tensor, bias: Tensor) -> None:
-        self.kernels = parallel_kernels("kernels_grouped")
+        self.kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
         self.idx, self.rows, self.channels = idx, idx.numel(), len(bias)
         self.arrays = (points.numpy(), centers.numpy(), idx.numpy())
         self.weight, self.bias = weight.detach(), bias.detach()
@@ -258,7 +258,7 @@ class _FromTable:
     """First layer as a difference of projected points and centres: table[j] - offset[i], offset = W_x centre."""
 
     def __init__(self, points, centers, idx, table: Tensor, offset: Tensor, weight: Tensor) -> None:
-        self.kernels = parallel_kernels("kernels_grouped")
+        self.kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
         self.idx, self.rows, self.channels = idx, idx.numel(), table.shape[2]
         self.centers, self.weight_x = centers, weight.detach()[:, :3].t().contiguous()  # (3,C)
         self.table, self.offset = table.contiguous(), offset.contiguous()

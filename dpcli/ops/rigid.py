@@ -31,7 +31,7 @@ def weighted_kabsch(
     _check(source, target, weights)
     if not _by_kernel(source, target, weights):
         return _kabsch_torch(source, target, weights)
-    from dpcli.ops.kernels_rigid import kabsch_kernel
+    from dpcli.ops.cpu.rigid import kabsch_kernel
 
     (batch, count), slots = source.shape[:2], weights.shape[2]
     rotation, translation = source.new_empty(batch, slots, 3, 3), source.new_empty(batch, slots, 3)
@@ -88,7 +88,7 @@ def rigid_flow(
         raise ValueError(f"points (B,N,3), mask (B,N,S), rotation (B,S,3,3), translation (B,S,3) do not fit: {given}")
     if not _by_kernel(points, mask, rotation, translation):
         return rigid_flow_reference(points, mask, rotation, translation)
-    from dpcli.ops.kernels_rigid import flow_kernel
+    from dpcli.ops.cpu.rigid import flow_kernel
 
     out = points.new_empty(points.shape)
     arrays = [_array(tensor) for tensor in (points, mask, rotation, translation, out)]

@@ -22,7 +22,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.prepare.one_item import convert_item
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.shards import WHOLE, Shard, describe_shard
-from dpcli.prepare.thin import Thinning
+from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
@@ -142,7 +142,7 @@ def convert(
 
 def _needed_by_workers(reader: Reader, thinning: Thinning) -> list[str]:
     """Modules that every worker imports and that take long: the reader's, the sampling's."""
-    video = ["dpcli.prepare.warm_video"] if "dpcli.prepare.depth_files" in sys.modules else []
+    video = ["dpcli.prepare.warm_video"] if "dpcli.prepare.decode.depth_files" in sys.modules else []
     sampling = ["dpcli.prepare.warm_fps"] if thinning.points and thinning.sampling == "fps" else []
     return [type(reader).__module__, convert_item.__module__, *video, *sampling]
 

@@ -11,9 +11,9 @@ from types import TracebackType
 
 import torch
 
-from dpcli.differences import differences
+from dpcli.config_diff import differences
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.lock import open_alone
+from dpcli.file_lock import open_alone
 from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import DiskFull, disk_full, whole_file
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.draw.palette import part_colours
+from dpcli.draw.shaded_points import draw_balls, view_matrix
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime.palette import part_colours
-from dpcli.segment.balls import draw_balls, view_matrix
 from dpcli.store import CloudSequence
 
 _WHITE, _DARK = (255, 255, 255), (17, 20, 26)

@@ -16,7 +16,7 @@ import numpy as np
 
 from dpcli import __version__
 from dpcli.errors import NO_ROOM, DataError, DpcError
-from dpcli.paths import as_utf8
+from dpcli.path_names import as_utf8
 from dpcli.store.pipes import check_regular, refuse_pipe
 
 SCHEMA = 1

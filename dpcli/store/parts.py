@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.reader import CloudsReader
+from dpcli.store.clouds_reader import CloudsReader
+from dpcli.store.clouds_writer import PACKED, CloudsWriter
 from dpcli.store.sequence import CloudSequence
-from dpcli.store.writer import PACKED, CloudsWriter
 
 _TOLERANCE = 1e-3  # of float32 probabilities and rotations
 

@@ -20,8 +20,8 @@ import torch
 
 from dpcli import ops
 from dpcli.errors import DpcError
-from dpcli.prepare.open3d_import import load_open3d
-from tests.ops_helpers import backend
+from dpcli.prepare.decode.open3d_import import load_open3d
+from tests.support.ops_helpers import backend
 
 
 def median_ms(function: Callable[[], object], repeat: int) -> float:

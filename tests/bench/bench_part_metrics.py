@@ -19,8 +19,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dpcli.evaluate.bootstrap import replicates
-from dpcli.evaluate.resampled import segmentation_weighted
-from dpcli.evaluate.segmentation import (
+from dpcli.evaluate.compare.resampled import segmentation_weighted
+from dpcli.evaluate.segmentation.metrics import (
     Frame,
     SegmentationMetrics,
     SegmentationStatistics,

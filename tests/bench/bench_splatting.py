@@ -17,8 +17,8 @@ from collections.abc import Callable
 
 import torch
 
-from dpcli.ops.splatting import rasterization, rasterization_reference
-from tests.splatting_helpers import cameras, scene
+from dpcli.ops.splatting.rasterization import rasterization, rasterization_reference
+from tests.support.splatting_helpers import cameras, scene
 
 ROWS = ((1_250, 256), (2_500, 256), (5_000, 256), (10_000, 256), (20_000, 256), (40_000, 256), (10_000, 64),
         (10_000, 128), (10_000, 512))  # fmt: skip

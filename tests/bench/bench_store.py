@@ -44,7 +44,7 @@ def write_sources(folder: Path, videos: int) -> dict[str, Path]:
     """`png`: a folder of folders of 16-bit PNG; `avi`: a folder of FFV1 videos of the same frames, 16 bits."""
     import cv2
 
-    from tests.prepare_helpers import write_video
+    from tests.support.prepare_helpers import write_video
 
     for number in range(videos):
         depth = make_depth(number)
@@ -58,7 +58,7 @@ def write_sources(folder: Path, videos: int) -> dict[str, Path]:
 
 def decode(path: Path) -> int:
     """Frames of one video, decoded as the reader decodes them and dropped."""
-    from dpcli.prepare.depth_files import image_paths, read_image, video_frames
+    from dpcli.prepare.decode.depth_files import image_paths, read_image, video_frames
 
     if path.is_dir():
         return sum(read_image(image) is not None for image in image_paths(path))
@@ -144,7 +144,7 @@ def bench_clips(folder: Path, processes: int = 2) -> None:
 def depth_sequences(raw: Path | None, count: int) -> list[CloudSequence]:
     """Clouds of depth videos in raster order."""
     if raw is None:
-        from dpcli.prepare.camera import Intrinsics
+        from dpcli.prepare.decode.pinhole_camera import Intrinsics
 
         camera, found = Intrinsics(280, 280, WIDTH / 2, HEIGHT / 2), []
         for seed in range(count):
@@ -155,7 +155,7 @@ def depth_sequences(raw: Path | None, count: int) -> list[CloudSequence]:
             frames = np.split(points.astype(np.float32), np.cumsum(np.bincount(t))[:-1])
             found.append(CloudSequence.from_frames(f"v{seed}", frames))
         return found
-    from dpcli.prepare.msraction3d import MSRAction3D
+    from dpcli.prepare.actions.msraction3d import MSRAction3D
 
     reader = MSRAction3D(raw)
     items = reader.items()

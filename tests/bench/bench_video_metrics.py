@@ -21,10 +21,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from dpcli.evaluate.image_metrics import picture_compute, picture_merge, ssim_reference
-from dpcli.evaluate.video import _in_threads
-from dpcli.evaluate.video_protocol import VideoProtocol, score_frame
-from dpcli.evaluate.video_sources import Picture
+from dpcli.evaluate.video.comparison import _in_threads
+from dpcli.evaluate.video.image_metrics import picture_compute, picture_merge, ssim_reference
+from dpcli.evaluate.video.protocol import VideoProtocol, score_frame
+from dpcli.evaluate.video.sources import Picture
 from dpcli.runtime.progress import Progress, log
 
 _BLOCK = 25  # frames timed at once

@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.networks import full_precision
-from dpcli.evaluate.weights import check, fill, find, load_state, named
+from dpcli.evaluate.networks.weights import check, fill, find, load_state, named
 
 VARIANTS = {"openai": "clip-openai", "laion": "clip-laion"}
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)

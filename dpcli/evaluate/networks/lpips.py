@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks import full_precision
 from dpcli.evaluate.networks.trunks import alexnet, squeezenet, vgg16
-from dpcli.evaluate.weights import fill, find, load_state, state_of
+from dpcli.evaluate.networks.weights import fill, find, load_state, state_of
 
 HEADS = Path(__file__).parent / "heads"  # the linear weights, BSD-2, see LPIPS.md there
 NETS = {"alex": (alexnet, "alexnet"), "vgg": (vgg16, "vgg16"), "squeeze": (squeezenet, "squeezenet")}

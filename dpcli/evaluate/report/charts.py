@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from dpcli.evaluate.ratio import divide
+from dpcli.evaluate.proportions import divide
 from dpcli.evaluate.report.blocks import text_of
 
 _WIDTH, _HEIGHT, _LEFT, _BOTTOM, _TOP = 560, 170, 44, 34, 8

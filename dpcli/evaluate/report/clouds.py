@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from dpcli.evaluate.motion import true_flow, true_motion
-from dpcli.evaluate.pairing import Compared, Comparison
-from dpcli.evaluate.part_matching import mean_iou, overlap
-from dpcli.evaluate.ratio import divide, mean_defined
+from dpcli.draw.palette import PALETTE, UNKNOWN
+from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.report.blocks import Figure, Table, cell, table, text_of
 from dpcli.evaluate.report.charts import histogram
-from dpcli.runtime.palette import PALETTE, UNKNOWN
+from dpcli.evaluate.segmentation.motion_metrics import true_flow, true_motion
+from dpcli.evaluate.segmentation.part_matching import mean_iou, overlap
+from dpcli.evaluate.segmentation.truth_pairing import Compared, Comparison
 
 _WORST, _MEDIAN = 3, 2
 _MOST_POINTS = 1500  # of a cloud on the page

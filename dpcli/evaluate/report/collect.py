@@ -167,7 +167,7 @@ def _checked(found: Any, where: str) -> dict[str, Any]:
 
 def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.protocol import as_json, evaluate_classification
+    from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
     return Result(_plain(as_json(report, str(path), ScoresReader(path).provenance)), str(path))
@@ -176,8 +176,8 @@ def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
 def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[Result]:
     """Segmentation, and motion where the truth has poses and the prediction frame pairs."""
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.motion_protocol import evaluate_motion, motion_json
-    from dpcli.evaluate.segmentation_protocol import evaluate_segmentation, segmentation_json
+    from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion, motion_json
+    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation, segmentation_json
 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
@@ -199,8 +199,8 @@ def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) ->
 
 
 def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
-    from dpcli.evaluate.video import evaluate_video
-    from dpcli.evaluate.video_tables import video_json
+    from dpcli.evaluate.video.comparison import evaluate_video
+    from dpcli.evaluate.video.tables import video_json
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from dpcli import __version__
+from dpcli.draw.palette import part_colours
 from dpcli.errors import DataError
-from dpcli.generate4d.colours import WEIGHTS
-from dpcli.generate4d.paths import clip_rate, own_rate
+from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
+from dpcli.generate4d.out.picture_colors import WEIGHTS
 from dpcli.ops.cameras import orbit_of
-from dpcli.runtime.palette import part_colours
 from dpcli.store.gaussians import GaussianScene
 
 SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")

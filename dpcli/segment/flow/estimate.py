@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dpcli.errors import UsageError
 from dpcli.ops import fps_numpy, gather_points, knn
-from dpcli.segment.flow.bodies import Bodies, BodySearch, find_bodies
+from dpcli.segment.flow.rigid_bodies import Bodies, BodySearch, find_bodies
 
 METHODS = ("icp", "nearest")
 _FEWEST, _MOST = 16, 1024  # points of a frame that ICP works with

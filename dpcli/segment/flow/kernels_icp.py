@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dpcli.ops.jit import kernel
+from dpcli.ops.cpu.jit import kernel
 
 _BLOCK = 128  # distances whose least is found at once; the compiler vectorises that for 128, not for 64
 _WORST = np.int32(0x7FFFFFFF)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.flow.config import FlowConfig
-from dpcli.segment.flow.network import FlowNetwork
+from dpcli.segment.flow.flow_network import FlowNetwork
 
 _FORMAT, _MAKER = "dpc-flow-1", "dpc segment flow"
 _MOST, _FEWEST = 2048, 16  # points the network sees at once; fewer than the latter move as one
