@@ -13,7 +13,7 @@ PACKAGE = ROOT / "dpcli"
 COMMON = {"config_diff", "errors", "file_lock", "path_names", "standard_streams"}  # files that every room may import
 GROUND = {"store", "ops", "runtime", "draw"}
 ALLOWED = {
-    "store": set(),
+    "store": {"runtime"},
     "ops": set(),
     "runtime": set(),
     "draw": {"ops", "runtime"},

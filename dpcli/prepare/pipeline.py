@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -127,29 +126,24 @@ def convert(
         report.was_complete = True
         return count_samples(report, output)
     work = partial(convert_item, reader, thinning, seed)
-    try:
-        with (
-            stop_requested() as stop,
-            CloudsWriter(
-                output,
-                class_names=reader.class_names,
-                length_unit=reader.length_unit,
-                source=type(reader).__name__,
-                seed=seed,
-                fields=reader.fields,
-                compression=compression,
-                provenance=provenance,
-                force=force,
-                resume=resume,
-            ) as writer,
-        ):
-            run = _Run(writer, report, stop, on_error, items, shard)
-            run.stream(work, jobs, executor, task)
-            writer.skipped = report.skipped
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        raise DpcError(f"{output}: no space left on the device; nothing was left under this name") from None
+    with (
+        stop_requested() as stop,
+        CloudsWriter(
+            output,
+            class_names=reader.class_names,
+            length_unit=reader.length_unit,
+            source=type(reader).__name__,
+            seed=seed,
+            fields=reader.fields,
+            compression=compression,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        ) as writer,
+    ):
+        run = _Run(writer, report, stop, on_error, items, shard)
+        run.stream(work, jobs, executor, task)
+        writer.skipped = report.skipped
     return count_samples(report, output)
 
 

@@ -40,9 +40,7 @@ def write_embedding(
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
     _check(str(path), names, labels, splits, streams)
-    atomic = AtomicFile(path)
-    try:
-        file = atomic.file
+    with AtomicFile(path) as file:
         write_root(
             file, "embedding", length_unit="", source=source, seed=seed, class_names=class_names, provenance=provenance
         )
@@ -52,10 +50,6 @@ def write_embedding(
         for stream, said in streams.items():
             file.create_dataset(f"features/{stream}", data=said.features)
             file.create_dataset(f"coordinates/{stream}", data=said.coordinates).attrs.update(said.values)
-    except BaseException as error:
-        atomic.failed(type(error), error, None)
-        raise
-    atomic.commit()
 
 
 def _check(

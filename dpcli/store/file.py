@@ -15,9 +15,9 @@ import h5py
 import numpy as np
 
 from dpcli import __version__
-from dpcli.errors import NO_ROOM, DataError, DpcError
+from dpcli.errors import DataError, DpcError
 from dpcli.path_names import as_utf8
-from dpcli.store.pipes import check_regular, refuse_pipe
+from dpcli.runtime.whole_file import check_regular, disk_full, put_in_place, refuse_pipe
 
 SCHEMA = 1
 KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
@@ -245,7 +245,8 @@ class AtomicFile:
     """An HDF5 file written beside its target (`.NAME.part`, or another suffix) and renamed when whole.
 
     A file under the final name is therefore always complete. `commit` closes, syncs and renames; `discard` removes.
-    Write errors become DpcError with the reason in words.
+    Write errors become DpcError with the reason in words. As a context manager it gives the open HDF5 file, and commits
+    it at the end of the block, or discards it when the block fails.
     """
 
     def __init__(self, target: str | Path, mode: str = "w", suffix: str = ".part") -> None:
@@ -267,13 +268,20 @@ class AtomicFile:
             why = "another dpc is writing it" if busy else str(error).splitlines()[0]
             raise DpcError(f"{self.target}: cannot write ({why})") from None
 
+    def __enter__(self) -> h5py.File:
+        return self.file
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.commit()
+        else:
+            self.failed(kind, error, trace)
+
     def problem(self, error: BaseException) -> DpcError | None:
-        """A DpcError for a failed write, or None when `error` is something else."""
-        text = str(error).lower()
-        for number, words in NO_ROOM.items():
-            if getattr(error, "errno", None) == number or f"errno = {number}," in text:
-                return DpcError(f"{self.target}: {words}; nothing was left under that name. Free space, then run again")
-        return None
+        """Returns a DpcError for a write that found no room, None when `error` is something else."""
+        return disk_full(self.target, error, "nothing was left under that name. Free space, then run again")
 
     def flush(self) -> None:
         """Hand everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
@@ -290,9 +298,7 @@ class AtomicFile:
         try:
             self.file.flush()
             self.file.close()
-            with open(self.part, "rb") as whole:
-                os.fsync(whole.fileno())
-            os.replace(self.part, self.target)
+            put_in_place(self.part, self.target)
         except (OSError, RuntimeError) as error:
             worded = self.problem(error)
             if worded is not None:

@@ -235,22 +235,11 @@ def write_scene(
         raise UsageError(f"{path}: exists already; --force replaces it")
     scene.validate(f"{path}")
     history = [provenance] if isinstance(provenance, dict) else list(provenance or [])
-    atomic = AtomicFile(path)
-    try:
+    with AtomicFile(path) as file:
         write_root(
-            atomic.file,
-            "gaussians",
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            class_names=[],
-            provenance=history,
+            file, "gaussians", length_unit=length_unit, source=source, seed=seed, class_names=[], provenance=history
         )
-        _write_arrays(atomic.file, scene)
-    except BaseException as error:
-        atomic.failed(type(error), error, None)
-        raise
-    atomic.commit()
+        _write_arrays(file, scene)
 
 
 def _write_arrays(file: h5py.File, scene: GaussianScene) -> None:

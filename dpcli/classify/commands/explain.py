@@ -31,9 +31,9 @@ from dpcli.runtime.device import choose_device
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.whole_file import FIGURES, PICTURES, check_target
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.embedding import StreamEmbedding, write_embedding
-from dpcli.store.pipes import FIGURES, PICTURES, check_target
 
 
 def run_pac(

@@ -25,9 +25,9 @@ from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import read_scene, scene_origin, write_scene
-from dpcli.store.pipes import PICTURES, check_target
 
 
 def run_fit(

@@ -20,6 +20,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.baselines.classical import classical_labels, classical_options
 from dpcli.segment.commands.estimate_flow import flow_weights
 from dpcli.segment.flow.pair_flow import pair_flow
@@ -34,7 +35,6 @@ from dpcli.segment.training.objective import Objective
 from dpcli.segment.training.trainer import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
-from dpcli.store.pipes import PICTURES, check_target
 
 _SHOWN = 8  # sequences in a picture
 CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
