@@ -14,7 +14,7 @@ COMMON = {"config_diff", "errors", "file_lock", "path_names", "standard_streams"
 GROUND = {"store", "ops", "runtime", "draw"}
 ALLOWED = {
     "store": {"runtime"},
-    "ops": set(),
+    "ops": {"runtime"},
     "runtime": set(),
     "draw": {"ops", "runtime"},
     "prepare": GROUND,

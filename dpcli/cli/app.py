@@ -17,11 +17,9 @@ import typer
 
 from dpcli import __version__
 from dpcli.errors import DpcError, UsageError
+from dpcli.runtime.tuning import tune_environment
 
-# Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores, and a large
-# tensor in pages of 4 kB takes longer to get from the system than to fill.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+tune_environment()  # before torch and numba load
 
 # Options are many and take long to set up: only the room that is asked for is loaded, and of it only the command that is
 # asked for is set up; `dpc --help` loads none.

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.writing.atomic_file import AtomicFile
 
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
