@@ -166,6 +166,10 @@ def test_help_all_lists_every_setting(capsys, monkeypatch):
         assert "network:" in text.splitlines() and "schedule:" in text.splitlines()
 
 
+def test_help_all_comes_before_any_refusal(capsys):
+    assert "schedule:" in said(capsys, "train", "--frames", "0", "--help-all")
+
+
 def test_help_all_without_presets(capsys):
     assert "[default: 1024,512]" in " ".join(said(capsys, "plain", "--help-all").split())
 

@@ -259,6 +259,12 @@ def test_toml_is_told_apart_and_explained():
     assert not re.search("^# [WF]", CATALOG.to_toml(BASE, "classify train", helps=False), re.M)
 
 
+def test_any_letter_reads_back(config):
+    schedule = Schedule(note='"\\\x7f\x00\r\n\t\u2028 \U0001f642', initial="'")
+    text = CATALOG.to_toml({"schedule": schedule}, "classify train")
+    assert CATALOG.resolve(BASE, Given(config=CATALOG.read_config(config(text))))["schedule"] == schedule
+
+
 def legal(hint: Any, low: float, high: float) -> st.SearchStrategy:
     """All values of a type, numbers between the bounds."""
     if kinds.may_be_none(hint):
