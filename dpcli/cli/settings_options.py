@@ -17,9 +17,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from dpcli.runtime.setting_types import metavar, without_none, words_of, write_text
-from dpcli.runtime.settings import Setting, settings_of
-from dpcli.runtime.settings_catalog import Catalog, Given
+from dpcli.runtime.settings.catalog import Catalog, Given
+from dpcli.runtime.settings.fields import Setting, settings_of
+from dpcli.runtime.settings.value_types import metavar, without_none, words_of, write_text
 
 _SAID_NONE = object()  # the word none after a flag; None itself is a flag that was not given
 Presets = Mapping[str, Mapping[str, Any]]  # preset -> group -> instance

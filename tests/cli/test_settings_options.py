@@ -13,8 +13,8 @@ import typer
 
 from dpcli.cli.settings_options import options_of
 from dpcli.errors import UsageError
-from dpcli.runtime.settings import check, setting
-from dpcli.runtime.settings_catalog import Catalog, Given
+from dpcli.runtime.settings.catalog import Catalog, Given
+from dpcli.runtime.settings.fields import check, setting
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from dpcli import __version__
 from dpcli.errors import UsageError
-from dpcli.runtime import setting_types as kinds
-from dpcli.runtime.settings import check, setting, settings_of
-from dpcli.runtime.settings_catalog import Catalog, Given
+from dpcli.runtime.settings import value_types as kinds
+from dpcli.runtime.settings.catalog import Catalog, Given
+from dpcli.runtime.settings.fields import check, setting, settings_of
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@
         def __post_init__(self) -> None:
             check(self)
 
-`runtime/settings_catalog.py` joins the dataclasses of one command and reads what a user changes.
+`runtime/settings/catalog.py` joins the dataclasses of one command and reads what a user changes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from functools import cache
 from typing import Any, get_type_hints
 
 from dpcli.errors import UsageError
-from dpcli.runtime import setting_types as kinds
+from dpcli.runtime.settings import value_types as kinds
 
 LARGEST = 1e30  # of any number: float32 ends soon after
 _LARGEST_INT = 2**63 - 1  # what torch and HDF5 hold

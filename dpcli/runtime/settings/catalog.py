@@ -13,8 +13,8 @@ from typing import Any
 
 from dpcli import __version__
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime import setting_types as kinds
-from dpcli.runtime.settings import Setting, nearest, settings_of, shown
+from dpcli.runtime.settings import value_types as kinds
+from dpcli.runtime.settings.fields import Setting, nearest, settings_of, shown
 from dpcli.runtime.toml_file import read_toml
 
 
