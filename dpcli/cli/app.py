@@ -54,7 +54,6 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
     dpc = typer.Typer(
         name="dpc",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
@@ -73,6 +72,14 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
             room = import_module(f"dpcli.cli.{name}.app").app
             dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about)
     return dpc
+
+
+def _words_to_complete() -> list[str] | None:
+    """Returns the words after `dpc` that a shell wants completed, or None where this is an ordinary run."""
+    if "_DPC_COMPLETE" not in os.environ:
+        return None
+    words = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")  # bash; zsh and fish
+    return words.split()[1:]
 
 
 def _narrowed(group: typer.Typer, path: Sequence[str]) -> typer.Typer:
@@ -230,7 +237,7 @@ def _keeping_inputs(command: Any) -> Any:
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(arguments))))
+    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(_words_to_complete() or arguments))))
     from dpcli.runtime.progress import log
 
     try:
