@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, knn, three_nn_interpolate, weighted_kabsch
-from dpcli.ops.rigid import rigid_flow, to_matrix
+from dpcli.ops.rigid import rigid_flow
+from dpcli.ops.rotations import motion_matrix
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.flow.object_icp import object_icp
@@ -212,7 +213,7 @@ def _motions(
         flow.append((rigid_flow(whole[i][None], full[i][None], rotation[None], shift[None])[0] / scale).numpy())
         used = one_hot(masks[i]).sum(0) > 0
         own = shift / scale + middle - (rotation @ middle)
-        motion[q] = torch.where(used[:, None, None], to_matrix(rotation, own), torch.eye(4)).numpy()
+        motion[q] = torch.where(used[:, None, None], motion_matrix(rotation, own), torch.eye(4)).numpy()
     return motion, flow
 
 

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.model import Model4D
-from dpcli.generate4d.scene.quaternion import normalize
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
+from dpcli.ops.rotations import normalize_quaternion
 from dpcli.store.gaussians import GaussianScene
 
 
@@ -41,12 +41,12 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     return GaussianScene(
         mean=_array(own.mean),
         log_scale=_array(own.log_scale),
-        quaternion=_array(normalize(own.quaternion)),
+        quaternion=_array(normalize_quaternion(own.quaternion)),
         opacity_logit=_array(own.opacity_logit),
         sh=_array((own.color[:, None] - 0.5) / SH0),
         time=targets.seconds,
         frame_mean=_array(frame_mean),
-        frame_quaternion=_array(normalize(torch.stack(quaternions))),
+        frame_quaternion=_array(normalize_quaternion(torch.stack(quaternions))),
         part=probability.argmax(1).numpy().astype(np.int16),
         part_probability=_array(probability),
         part_motion=_part_motion(own.mean, frame_mean, probability, own.opacity_logit.sigmoid()),
@@ -54,7 +54,7 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
         control_point=_array(points),
         control_radius=_array(torch.zeros(0) if model.control is None else model.control.log_radius.exp()),
         control_position=_array(torch.stack(control) if control else empty),
-        control_quaternion=_array(normalize(torch.stack(turns)) if turns else torch.zeros(len(times), 0, 4)),
+        control_quaternion=_array(normalize_quaternion(torch.stack(turns)) if turns else torch.zeros(len(times), 0, 4)),
         camera_intrinsics=targets.intrinsics,
         camera_world_to_camera=targets.world_to_camera,
         size=targets.size,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dpcli.generate4d.scene.quaternion import multiply, normalize, rotate, to_matrix
+from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix, rotate_by_quaternion
 
 _POINT_FREQUENCIES, _TIME_FREQUENCIES = 10, 6  # thesis 5.5.1
 
@@ -30,7 +30,7 @@ class Motion:
     def part_matrix(self) -> Tensor:  # [B, S, 4, 4]
         """T_s^tau, canonical to the time's position."""
         matrix = torch.eye(4).to(self.part_translation).expand(*self.part_translation.shape[:2], 4, 4).clone()
-        matrix[..., :3, :3], matrix[..., :3, 3] = to_matrix(self.part_quaternion), self.part_translation
+        matrix[..., :3, :3], matrix[..., :3, 3] = quaternion_to_matrix(self.part_quaternion), self.part_translation
         return matrix
 
 
@@ -131,7 +131,7 @@ class MotionField(nn.Module):
         hidden = self.movement(encode(times[:, None], _TIME_FREQUENCIES))
         turn = _quaternion(self.movement_turn(hidden).reshape(len(times), self.parts, 3))
         shift = self.movement_shift(hidden).reshape(len(times), self.parts, 3)
-        return turn, self.center - rotate(turn, self.center) + shift
+        return turn, self.center - rotate_by_quaternion(turn, self.center) + shift
 
     def forward(self, points: Tensor, times: Tensor) -> Motion:
         """Motion of canonical points (N,3) at times (B,) in 0..1."""
@@ -143,15 +143,15 @@ class MotionField(nn.Module):
         if not self.rigid:
             none = torch.zeros(*rest.shape[:2], 1).to(rest)
             return Motion(rest, turn, part, none, part_turn, part_shift)
-        moved = torch.einsum("bns,bsij,nj->bni", part, to_matrix(part_turn), points) + part @ part_shift
-        rigid, rigid_turn = moved - points, normalize(part @ part_turn)
+        moved = torch.einsum("bns,bsij,nj->bni", part, quaternion_to_matrix(part_turn), points) + part @ part_shift
+        rigid, rigid_turn = moved - points, normalize_quaternion(part @ part_turn)
         if not self.fusion:
             whole = torch.ones(*rest.shape[:2], 1).to(rest)
-            both = multiply(turn, rigid_turn)
+            both = multiply_quaternions(turn, rigid_turn)
             both = torch.where(both[..., :1] < 0, -both, both)
             return Motion(rigid + rest, both, part, whole, part_turn, part_shift)
         weight = self.weighing_head(self.weighing(code)).sigmoid()
-        blended = normalize(weight * rigid_turn + (1 - weight) * turn)
+        blended = normalize_quaternion(weight * rigid_turn + (1 - weight) * turn)
         return Motion(weight * rigid + (1 - weight) * rest, blended, part, weight, part_turn, part_shift)
 
 
@@ -162,4 +162,4 @@ def _join(space: Tensor, time: Tensor) -> Tensor:  # [N, D], [B, E] -> [B, N, D 
 
 def _quaternion(vector: Tensor) -> Tensor:  # [..., 3] -> [..., 4]
     """Unit quaternion (1, v) / norm: the identity at zero, never ambiguous in sign, turns below 180 degrees."""
-    return normalize(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))
+    return normalize_quaternion(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))

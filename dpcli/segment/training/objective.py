@@ -9,9 +9,10 @@ from torch import Tensor
 
 from dpcli.errors import UsageError
 from dpcli.ops import apply_motions, weighted_kabsch
+from dpcli.ops.rotations import normalize_quaternion, quaternion_to_matrix
 from dpcli.segment.flow.object_icp import object_icp
 from dpcli.segment.flow.rigid_groups import rigid_groups
-from dpcli.segment.network.motion_head import quaternion_to_matrix, rotation_loss
+from dpcli.segment.network.motion_head import rotation_loss
 from dpcli.segment.network.part_network import FrameParts, PartNetwork
 from dpcli.segment.network.slot_matching import match_slots, permute_slots
 from dpcli.segment.training.losses import (
@@ -224,6 +225,6 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
 def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
-    rotation = quaternion_to_matrix(torch.randn(half, 4, generator=rng)).to(points)
+    rotation = quaternion_to_matrix(normalize_quaternion(torch.randn(half, 4, generator=rng))).to(points)
     rotation = torch.cat([rotation, rotation])
     return points @ rotation.mT, rotation
