@@ -85,7 +85,7 @@ def test_a_browser_draws_what_our_rasteriser_draws(scene, page, tmp_path):
     pictures = []
     for state, look in (
         ("time=0.4&azimuth=25&elevation=20", {}),
-        ("time=1&azimuth=25&elevation=20&colour=part&background=black", {"colour": "part", "background": (12, 14, 18)}),
+        ("time=1&azimuth=25&elevation=20&color=part&background=black", {"colour": "part", "background": (12, 14, 18)}),
     ):
         shown = show(page, f"{state}&controls=0", tmp_path)
         assert (shown.state, shown.error) == ("ready", "")
@@ -101,7 +101,7 @@ def test_a_browser_draws_what_our_rasteriser_draws(scene, page, tmp_path):
 
 @needs_browser
 def test_without_webgl_a_canvas_shows_the_same(scene, page, tmp_path):
-    shown = show(page, "time=0.5&azimuth=-20&elevation=10&colour=rigid&controls=0&renderer=2d", tmp_path)
+    shown = show(page, "time=0.5&azimuth=-20&elevation=10&color=rigid&controls=0&renderer=2d", tmp_path)
     assert shown.state == "ready" and 'data-renderer="2d"' in shown.page
     difference = np.abs(_ours(scene, 0.5, -20, 10, colour="rigid") - shown.pixels)
     assert difference.mean() < 2 and np.quantile(difference, 0.99) < 24  # colours of 5 bits, blobs of 32 pixels

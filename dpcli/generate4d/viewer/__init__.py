@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import json
-import os
-import zlib
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli import __version__
-from dpcli.errors import DataError
+from dpcli.draw.page import assemble
+from dpcli.draw.page.assemble import SHARED, STYLE, as_base64, as_json, filled, script_text, source_text
 from dpcli.generate4d.colours import WEIGHTS
 from dpcli.generate4d.paths import clip_rate, own_rate
 from dpcli.ops.cameras import orbit_of
@@ -38,26 +34,14 @@ def write_page(
     arrays = packed(scene)
     blob = b"".join(values.tobytes() for values in arrays.values())
     header = describe(scene, arrays, title=title, history=history, fps=fps or clip_rate(scene))
-    page = _filled(title, header, base64.b64encode(zlib.compress(blob, 9)).decode("ascii")).encode("utf-8")
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_bytes(page)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
-    return len(page)
-
-
-def _filled(title: str, header: dict[str, Any], data: str) -> str:
-    source = files(__package__)
-    script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
-    inside = json.dumps(header, allow_nan=False, sort_keys=True).replace("<", "\\u003c")  # nothing may end the script
-    page = source.joinpath("page.html").read_text(encoding="utf-8")
-    for mark, content in (("TITLE", html.escape(title)), ("HEADER", inside), ("SCRIPT", script), ("DATA", data)):
-        before, after = page.split(f"<!--{mark}-->", 1)
-        page = before + content + after
-    return page
+    page = filled(
+        source_text("page.html", __package__),
+        {
+            "TITLE": html.escape(title), "STYLE": source_text(STYLE), "HEADER": as_json(header), "DATA": as_base64(blob),
+            "SCRIPT": f"{script_text(SHARED)}\n{script_text(SCRIPTS, __package__)}",
+        },
+    )  # fmt: skip
+    return assemble.write_page(page, path)
 
 
 def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
@@ -78,7 +62,7 @@ def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     rgba = np.concatenate([scene.color.T, np.rint(scene.opacity * _BYTE).astype(np.uint8)[None]])
     return {
         "position": np.stack([(change & 255).astype(np.uint8), (change >> 8).astype(np.uint8)]),
-        "turn": _differences(turns), "weight": _differences(weight), "scale": scene.scale.T.astype("<f4"), "colour": rgba,
+        "turn": _differences(turns), "weight": _differences(weight), "scale": scene.scale.T.astype("<f4"), "color": rgba,
         "part": np.clip(scene.part + 1, 0, 255).astype(np.uint8),
     }  # fmt: skip
 
@@ -109,7 +93,7 @@ def describe(
         "low": low.tolist(), "extent": extent.tolist(), "starts": dict(zip(arrays, starts)), "bytes": starts[-1],
         "camera": {"azimuth": azimuth, "elevation": elevation, "radius": radius,
                    "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1]))},
-        "parts": [{"id": int(i), "count": int(c), "colour": part_colours(np.array([i]))[0].tolist()}
+        "parts": [{"id": int(i), "count": int(c), "color": part_colours(np.array([i]))[0].tolist()}
                   for i, c in zip(ids, counts)],
         "weights": WEIGHTS.tolist(), "metrics": scene.metrics, "sh_degree": scene.sh_degree,
         "control_points": len(scene.control_point),

@@ -1,0 +1,77 @@
+"""Put a page together from its template, styles, scripts and data, and write it whole."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from dpcli.errors import DataError
+from dpcli.runtime.whole_file import whole_file
+
+_MARK = re.compile(r"<!--([A-Z]+)-->")
+# The data pages share one template; only what stands in <main> and the scripts differ.
+TEMPLATE, STYLE, SHARED = "page.html", "theme.css", ("base.js", "player.js", "stage.js", "gl.js")
+
+
+def source_text(name: str, package: str = __package__) -> str:
+    """Return a template, style sheet or script that lies beside the code of `package`."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def script_text(names: Sequence[str], package: str = __package__) -> str:
+    """Return several scripts of `package` as one text, in the order of their names."""
+    return "\n".join(source_text(name, package) for name in names)
+
+
+def filled(template: str, marks: Mapping[str, str]) -> str:
+    """Replace every `<!--MARK-->` of the template. Contents are not searched again, so no content can bring a mark in."""
+    return _MARK.sub(lambda found: marks[found[1]], template)
+
+
+def as_json(header: Any) -> str:
+    """Spell a value as JSON that may stand within a `<script>`: it holds no `<`, so nothing in it can end the script."""
+    return json.dumps(header, allow_nan=False, sort_keys=True).replace("<", "\\u003c")
+
+
+def as_base64(data: bytes) -> str:
+    """Compress (deflate) and spell bytes as base64; `unpacked` of base.js reverses it. Equal bytes give equal text."""
+    return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
+
+
+def data_page(
+    header: Mapping[str, Any], *, main: str, script: Sequence[str], body: str, blocks: Sequence[bytes] = ()
+) -> str:
+    """Return a page about one file.
+
+    header: values for the script, among them `title`. main: HTML of the page's middle (ours, not the file's). script: names of
+    the page's own scripts. body: a class of <body> that the style sheet knows. blocks: binary data, one element each, which the
+    script unpacks when it needs them.
+    """
+    data = "\n".join(
+        f'<script type="text/plain" id="data{at}">{as_base64(block)}</script>' for at, block in enumerate(blocks)
+    )
+    return filled(
+        source_text(TEMPLATE),
+        {
+            "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE), "MAIN": main, "BODY": body,
+            "HEADER": as_json(header), "DATA": data, "SCRIPT": script_text([*SHARED, *script]),
+        },
+    )  # fmt: skip
+
+
+def write_page(page: str, path: Path) -> int:
+    """Write a page whole or not at all; return its size in bytes. DataError when it can't be written."""
+    content = page.encode("utf-8", "replace")
+    try:
+        with whole_file(path) as part:
+            part.write_bytes(content)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+    return len(content)
