@@ -35,7 +35,7 @@ ROOMS = {
     "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.",
 }
 
-_WRITTEN = ("output", "picture", "animation", "ply", "turntable")  # options that name what a command writes
+_WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 _FULL = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "disk quota exceeded", errno.EFBIG: "file too large"}

@@ -17,7 +17,8 @@ from dpcli.runtime.whole_file import whole_file
 
 _MARK = re.compile(r"<!--([A-Z]+)-->")
 # The data pages share one template; only what stands in <main> and the scripts differ.
-TEMPLATE, STYLE, SHARED = "page.html", "theme.css", ("base.js", "player.js", "stage.js", "gl.js")
+TEMPLATE, STYLE, DATA_STYLE = "page.html", "theme.css", "data.css"
+SHARED = ("base.js", "player.js", "stage.js", "gl.js")
 
 
 def source_text(name: str, package: str = __package__) -> str:
@@ -60,7 +61,7 @@ def data_page(
     return filled(
         source_text(TEMPLATE),
         {
-            "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE), "MAIN": main, "BODY": body,
+            "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE) + source_text(DATA_STYLE), "MAIN": main, "BODY": body,
             "HEADER": as_json(header), "DATA": data, "SCRIPT": script_text([*SHARED, *script]),
         },
     )  # fmt: skip
