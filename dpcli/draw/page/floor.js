@@ -1,39 +1,24 @@
 // Below the points: the ground as a grid whose squares have a round size, and the file's axes.
 
-// The largest of 1, 2, 5, 10, ... that is not above `most`.
-function roundBelow(most) {
-  const power = 10 ** Math.floor(Math.log10(most)), digit = [5, 2, 1].find((one) => one * power <= most * (1 + 1e-9));
-  return (digit || 1) * power;
-}
-
 class Floor {
-  constructor(canvas, axes) {
+  constructor(canvas) {
     this.canvas = canvas;
     this.pen = canvas.getContext("2d");
-    this.axes = axes;
   }
 
-  // Squares of the grid in the file's unit, for a clip about 10 squares wide.
-  static square(about) {
-    const wide = Math.max(about.high[0] - about.center[0], about.high[2] - about.center[2], 1e-9);
-    return roundBelow(Math.max(wide, 0.35 * about.size) / 4);
-  }
-
-  draw(clip, camera, dark) {
-    const { canvas, pen } = this, { about } = clip, ratio = camera.width / Math.max(canvas.clientWidth, 1);
+  // axes: where the file's x, y and z point.
+  draw(clip, axes, camera, dark) {
+    const { canvas, pen } = this, { square, side } = clip.ground, ratio = camera.width / Math.max(canvas.clientWidth, 1), y = clip.floor;
     canvas.width = camera.width;
     canvas.height = camera.height;
     pen.strokeStyle = dark ? "#dfe6f2" : "#26324a";
-    const square = Floor.square(about) / about.size, y = clip.floor;
-    const reach = [0, 2].map((k) => square * (1 + Math.ceil((about.high[k] - about.center[k]) / about.size / square)));
-    const side = Math.max(...reach);
+    pen.lineWidth = ratio;
     for (let n = Math.round(-side / square); n <= Math.round(side / square); n++) {
-      const at = n * square, faint = n % 5 === 0 ? 0.26 : 0.13;
-      pen.lineWidth = ratio;
-      this.line(camera, [at, y, -side], [at, y, side], faint);
-      this.line(camera, [-side, y, at], [side, y, at], faint);
+      const at = n * square, alpha = n % 5 === 0 ? 0.28 : 0.14;
+      this.line(camera, [at, y, -side], [at, y, side], alpha);
+      this.line(camera, [-side, y, at], [side, y, at], alpha);
     }
-    this.drawAxes(camera, ratio, dark);
+    this.drawAxes(axes, camera, ratio, dark);
   }
 
   // A line of the world, cut where it comes too near to the camera.
@@ -50,9 +35,9 @@ class Floor {
     pen.globalAlpha = 1;
   }
 
-  drawAxes(camera, ratio, dark) {
+  drawAxes(axes, camera, ratio, dark) {
     const { pen } = this, R = camera.rotation, length = 26 * ratio, x = 46 * ratio, y = camera.height - 46 * ratio;
-    const arms = this.axes.map((axis, k) => ({ name: "xyz"[k], way: [0, 3, 6].map((row) => R[row] * axis[0] + R[row + 1] * axis[1] + R[row + 2] * axis[2]) }));
+    const rows = [R.slice(0, 3), R.slice(3, 6), R.slice(6)], arms = axes.map((axis, k) => ({ name: "xyz"[k], way: times(rows, axis) }));
     arms.sort((a, b) => b.way[2] - a.way[2]);
     pen.lineWidth = 2 * ratio;
     pen.lineCap = "round";

@@ -2,15 +2,16 @@
 // #sequence=2&frame=3&color=part&azimuth=40&elevation=10&radius=2&play=0&theme=dark&controls=0&renderer=2d (degrees).
 
 const LOOKS = { part: "part", color: "stored color", label: "label", height: "height", time: "time" };
+const UPS = ["−y", "+y", "+z", "−z", "+x", "−x"];
 const FOVY = 32 * DEGREE, GROUND = { light: [252, 252, 253], dark: [22, 26, 34] };
 
 class PointsPage extends Stage {
   constructor(header) {
     super($("canvas"), FOVY, PointsPage.timelineOf(header.sequences[0]));
-    Object.assign(this, { header, hidden: new Set(), clips: [], at: 0 });
+    Object.assign(this, { header, hidden: new Set(), data: [], at: 0 });
     Object.assign(this.state, { color: header.looks[0], dots: 1, azimuth: 0, elevation: 0, radius: 3, target: [0, 0, 0] });
     this.painter = this.painterOf();
-    this.floor = new Floor($("floor"), header.axes);
+    this.floor = new Floor($("floor"));
   }
 
   // The time of a page is the frame's place; `rate` frames pass per second.
@@ -29,7 +30,7 @@ class PointsPage extends Stage {
   async start() {
     const { header } = this;
     fillHead(header);
-    fillAbout(header, "space plays · ← → step · [ ] or page keys other sequence · 1 to 5 color · , . size of points · + − zoom · r resets the view · b light or dark · ? this panel. Drag turns, wheel or pinch zooms, shift-drag or two fingers move.");
+    fillAbout(header, "space plays · ← → step · [ ] or page keys other sequence · 1 to 5 color · , . size of points · + − zoom · r resets the view · u which axis is up · b light or dark · ? this panel. Drag turns, wheel or pinch zooms, shift-drag or two fingers move.");
     for (const look of header.looks) {
       const button = made("button", LOOKS[look], { "data-color": look, title: header.looks.indexOf(look) + 1 });
       button.onclick = () => this.change({ color: look });
@@ -37,6 +38,9 @@ class PointsPage extends Stage {
     }
     for (const [at, { title }] of header.sequences.entries()) $("sequence").append(made("option", title, { value: at }));
     $("sequence").onchange = () => this.choose(Number($("sequence").value));
+    for (const axis of UPS) $("up").append(made("option", `${axis} is up`, { value: axis }));
+    $("up").value = UPS.find((axis) => this.direction(axis)[1] === 1);
+    $("up").onchange = () => this.choose(this.at);
     $("dots").oninput = () => this.change({ dots: 2 ** Number($("dots").value) });
     this.listenToBar();
     await this.choose(Number(addressed().get("sequence")) || 0);
@@ -55,7 +59,7 @@ class PointsPage extends Stage {
     return {
       ...Object.fromEntries(looks), " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1),
       "]": next, "[": before, PageDown: next, PageUp: before, ArrowDown: next, ArrowUp: before, ",": smaller, ".": larger,
-      r: () => this.goHome(), b: () => this.toggleTheme(), "?": () => $("open-about").click(), Escape: () => { $("about").hidden = true; },
+      r: () => this.goHome(), u: () => this.nextUp(), b: () => this.toggleTheme(), "?": () => $("open-about").click(), Escape: () => { $("about").hidden = true; },
       "+": () => this.zoom(0.9), "=": () => this.zoom(0.9), "-": () => this.zoom(1 / 0.9),
     };
   }
@@ -72,18 +76,28 @@ class PointsPage extends Stage {
     this.change(values);
   }
 
+  // Where a signed axis of the file, such as −y, points on the page as given.
+  direction(axis) { return this.header.axes["xyz".indexOf(axis[1])].map((value) => (axis[0] === "−" ? -value : value) + 0); }
+
+  nextUp() {
+    $("up").selectedIndex = ($("up").selectedIndex + 1) % UPS.length;
+    $("up").onchange();
+  }
+
   // Shows another sequence; it is unpacked when it is first wanted.
   async choose(at) {
     const { sequences } = this.header, count = sequences.length, place = (at + count) % count, data = $(`data${place}`);
     this.at = place;
-    this.clips[place] ??= unpacked(data.textContent, sequences[place].bytes).then((bytes) => { data.remove(); return new Clip(sequences[place], bytes); });
-    const clip = await this.clips[place];
+    this.data[place] ??= unpacked(data.textContent, sequences[place].bytes);
+    data?.remove();
+    const bytes = await this.data[place], turn = uprightTurn(this.direction($("up").value));
     if (this.at !== place) return;
-    this.clip = clip;
+    const clip = this.clip = new Clip(sequences[place], bytes, turn);
+    this.axes = this.header.axes.map((axis) => times(turn, axis));
     this.timeline = PointsPage.timelineOf(clip.about);
     this.fitBar();
     $("sequence").value = place;
-    $("scale").textContent = `${Floor.square(clip.about)}${this.header.unit ? ` ${this.header.unit}` : ""} a square`;
+    $("scale").textContent = `one square is ${(clip.ground.square * clip.size).toPrecision(1) * 1} ${this.header.unit}`;
     this.painted = null;
     this.hidden.clear();
     this.legendOf = null;
@@ -92,9 +106,9 @@ class PointsPage extends Stage {
   }
 
   home() {
-    const view = { azimuth: 28 * DEGREE, elevation: 14 * DEGREE, target: [0, 0, 0], radius: 1 };
+    const view = { azimuth: 28 * DEGREE, elevation: 14 * DEGREE, target: [0, -0.09, 0], radius: 1 };
     this.turned = false;
-    return { ...view, radius: this.clip.distance({ ...cameraOf(view, this.fovy, this.canvas) }) };
+    return { ...view, radius: this.clip.distance(cameraOf(view, this.fovy, this.canvas), view.target) };
   }
 
   // A picture of another size shows all again, unless the reader chose what to see.
@@ -115,7 +129,7 @@ class PointsPage extends Stage {
 
   clock() {
     const { about } = this.clip, frame = this.frameNumber, seconds = about.time ? ` · ${(about.time[frame] - about.time[0]).toFixed(2)} s` : "";
-    return `frame ${about.frames[frame]} of ${about.frame_count}${seconds}`;
+    return `frame ${about.frames[frame]} / ${about.frame_count - 1}${seconds}`;
   }
 
   fillLegend(color) {
@@ -126,7 +140,7 @@ class PointsPage extends Stage {
     $("legend-title").textContent = { part: "Parts", label: "Class", height: `Height${header.unit ? ` (${header.unit})` : ""}`, time: "Frame", color: "" }[color];
     if (color === "part") for (const part of about.parts) legend.append(this.entry(part.id < 0 ? "none" : `part ${part.id}`, part.color, part.share, part.id));
     if (color === "label") legend.append(this.entry(about.class || "unknown", about.label_color, ""));
-    if (color === "height") legend.append(...this.ramp(...about.heights.map((value) => (value - about.heights[0]).toPrecision(3) * 1)));
+    if (color === "height") legend.append(...this.ramp(0, (2 * this.clip.half[1] * this.clip.size).toPrecision(3) * 1));
     if (color === "time") legend.append(...this.ramp(about.frames[0], about.frames[about.frames.length - 1]));
   }
 
@@ -158,11 +172,10 @@ class PointsPage extends Stage {
     const { state, clip, camera, header } = this, dark = root.hasAttribute("data-dark"), distance = camera.shift[2];
     if (!clip) return;
     this.painted ??= clip.colors(state.color, header, this.hidden);
-    this.floor.draw(clip, camera, dark);
-    const above = state.elevation > 0, usual = clip.count / clip.about.counts.length;
+    this.floor.draw(clip, this.axes, camera, dark);
     this.painter.draw(clip, clip.spans(this.frameNumber, state.color), this.painted, camera, {
       reach: clip.reach * state.dots, ground: dark ? GROUND.dark : GROUND.light, depths: [distance - 1, distance + 1],
-      shadow: above ? Math.min(0.05, (dark ? 60 : 25) / Math.max(usual, 1)) : 0,
+      shadow: state.elevation > 0 ? (dark ? 0.5 : 0.16) : 0,
     });
   }
 }

@@ -16,7 +16,7 @@ MOST_POINTS = 1_000_000  # of all frames on a page: about 8 MB of positions in b
 MOST_FRAMES = 2400  # of all sequences on a page
 _FEWEST_POINTS, _MOST_IN_FRAME = 256, 65_536
 _FEWEST_FRAMES, _MOST_IN_SEQUENCE = 24, 240
-_STEPS, _MOST_PARTS, _STRAY = 65_535, 254, 0.1  # steps of a coordinate; ids of a sequence; percent of points beyond each side
+_STEPS, _MOST_PARTS = 65_535, 254  # steps of a coordinate; ids of a sequence
 _STOPS, _USUAL_RATE, _RATES = 12, 10.0, (1.0, 60.0)  # colors of the ramp; frames per second
 
 
@@ -108,16 +108,11 @@ def _ramp() -> list[list[int]]:
 def _described(sequence: PageSequence) -> dict[str, Any]:
     points = np.concatenate(sequence.points).astype(np.float64) if sequence.points else np.zeros((0, 3))
     low, step = _steps(points)
-    inner = np.percentile(points, [_STRAY, 100 - _STRAY], axis=0) if len(points) else np.zeros((2, 3))
-    center = inner.mean(0)
-    size = max(float(np.linalg.norm(inner[1] - inner[0]) / 2), 1e-9)
     time = sequence.time
     return {
-        "title": sequence.title, "frames": sequence.frames, "frame_count": sequence.frame_count - 1,
-        "counts": [len(frame) for frame in sequence.points], "time": None if time is None else time.tolist(), "rate": _rate(time),
-        "low": low.tolist(), "step": step.tolist(), "center": center.tolist(), "size": size, "high": inner[1].tolist(),
-        "floor": float(inner[0, 1]), "heights": inner[:, 1].tolist() if inner[1, 1] > inner[0, 1] else [center[1], center[1] + size],
-        "parts": _part_list(sequence), "colored": sequence.color is not None,
+        "title": sequence.title, "frames": sequence.frames, "frame_count": sequence.frame_count,
+        "counts": [len(frame) for frame in sequence.points], "time": None if time is None else time.tolist(), "rate": frame_rate(time),
+        "low": low.tolist(), "step": step.tolist(), "parts": _part_list(sequence), "colored": sequence.color is not None,
         "class": sequence.class_name or (f"label {sequence.label}" if sequence.label >= 0 else ""),
         "label_color": part_colours(np.array([sequence.label]))[0].tolist(),
     }  # fmt: skip
@@ -131,7 +126,7 @@ def _steps(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return low, np.maximum((points.max(0) - low) / _STEPS, 1e-12)
 
 
-def _rate(time: np.ndarray | None) -> float:
+def frame_rate(time: np.ndarray | None) -> float:
     """Return frames per second: as the times say, within what a screen shows and a person waits for."""
     if time is None or len(time) < 2 or not np.isfinite(time).all():
         return _USUAL_RATE

@@ -8,12 +8,12 @@ class CanvasPoints {
 
   draw(clip, spans, colors, camera, look) {
     const { pen } = this, { rotation: R, shift, focal, width, height } = camera, { places } = clip, seen = [];
-    for (const [first, count] of spans) for (let i = first; i < first + count; i++) {
+    for (const [k, [first, count]] of spans.entries()) for (let i = first; i < first + count; i++) {
       if (!colors[4 * i + 3]) continue;
-      const [x, y, z] = [0, 1, 2].map((k) => R[3 * k] * places[3 * i] + R[3 * k + 1] * places[3 * i + 1] + R[3 * k + 2] * places[3 * i + 2] + shift[k]);
-      if (z > 0.02) seen.push([width / 2 + focal * x / z, height / 2 + focal * y / z, z, i]);
+      const [x, y, z] = [0, 1, 2].map((row) => R[3 * row] * places[3 * i] + R[3 * row + 1] * places[3 * i + 1] + R[3 * row + 2] * places[3 * i + 2] + shift[row]);
+      if (z > 0.02) seen.push([width / 2 + focal * x / z, height / 2 + focal * y / z, z, i, z - 2 * look.reach * k]);
     }
-    seen.sort((a, b) => b[2] - a[2]);
+    seen.sort((a, b) => b[4] - a[4]);
     pen.clearRect(0, 0, width, height);
     const [near, far] = look.depths;
     for (const [x, y, z, i] of seen) {

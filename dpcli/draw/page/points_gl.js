@@ -4,14 +4,15 @@
 const BALL_VERTEX = `#version 300 es
 precision highp float;
 in vec3 place; in vec4 tint;
-uniform mat3 rotation; uniform vec3 shift; uniform vec2 lens; uniform vec2 range; uniform float reach; uniform float focal; uniform float ground; uniform bool shadow;
+uniform mat3 rotation; uniform vec3 shift; uniform vec2 lens; uniform vec2 range; uniform float reach; uniform float focal; uniform float ground; uniform float ahead; uniform bool shadow;
 out vec3 color; out float away;
 void main() {
   vec3 world = shadow ? vec3(place.x, ground, place.z) : place, p = rotation * world + shift;
   color = tint.rgb;
   away = p.z;
   if (p.z < range.x || tint.a == 0.0) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); gl_PointSize = 1.0; return; }
-  gl_Position = vec4(lens.x * p.x, -lens.y * p.y, ((range.y + range.x) * p.z - 2.0 * range.x * range.y) / (range.y - range.x), p.z);
+  float depth = (range.y + range.x) / (range.y - range.x) - 2.0 * range.x * range.y / (range.y - range.x) / max(p.z - ahead, range.x);
+  gl_Position = vec4(lens.x * p.x, -lens.y * p.y, depth * p.z, p.z);
   gl_PointSize = clamp(2.0 * reach * focal / p.z, 1.5, 96.0);
 }`;
 
@@ -105,7 +106,7 @@ class GlPoints {
     gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
   }
 
-  setter(program, finer) {
+  setter(program) {
     const { gl } = this;
     gl.useProgram(program);
     return (kind, name, ...values) => gl[`uniform${kind}`](gl.getUniformLocation(program, name), ...values);
@@ -136,16 +137,19 @@ class GlPoints {
     this.show(target, range);
   }
 
-  // Balls, or for `darkness` > 0 their soft shadow on the ground.
+  // Balls, or for `darkness` > 0 their soft shadow on the ground. A later span hides an earlier one that is hardly nearer.
   pass(set, spans, reach, darkness) {
     const { gl } = this, shadow = darkness > 0;
     gl[shadow ? "disable" : "enable"](gl.DEPTH_TEST);
     gl[shadow ? "enable" : "disable"](gl.BLEND);
-    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.blendEquation(gl.MAX);  // many shadows on one place are as dark as one
     set("1i", "shadow", shadow);
     set("1f", "darkness", darkness);
     set("1f", "reach", reach);
-    for (const [first, count] of spans) gl.drawArrays(gl.POINTS, first, count);
+    for (const [k, [first, count]] of spans.entries()) {
+      set("1f", "ahead", 2 * reach * k);
+      gl.drawArrays(gl.POINTS, first, count);
+    }
   }
 
   show(target, range) {

@@ -1,0 +1,77 @@
+// The page of views: a screen and a strip of frames for each camera. #frame=3&play=0&theme=dark sets its state.
+
+class FilmPage extends Player {
+  constructor(header) {
+    super(new Timeline(header.frames.map((_, frame) => frame), header.rate, 1));
+    this.header = header;
+  }
+
+  async start() {
+    const { header } = this;
+    fillHead(header);
+    fillAbout(header, "space plays · ← → step · + − size of the pictures · b light or dark · ? this panel. A click on a picture goes to its frame.");
+    this.rows = header.views.map((view) => this.row(view));
+    await Promise.all(this.rows.flatMap((row) => row.pictures.map((picture) => picture.decode())));
+    this.listenToBar();
+    const toggleTheme = followTheme(() => {});
+    $("theme").onclick = toggleTheme;
+    let size = 1;
+    const sized = (factor) => { size = Math.min(Math.max(size * factor, 0.4), 3); root.style.setProperty("--size", size); };
+    listenToKeys(() => ({
+      " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1), b: toggleTheme,
+      "+": () => sized(1.25), "=": () => sized(1.25), "-": () => sized(0.8),
+      "?": () => $("open-about").click(), Escape: () => { $("about").hidden = true; },
+    }));
+    window.addEventListener("hashchange", () => this.readAddress());
+    this.readAddress();
+  }
+
+  readAddress() {
+    const given = addressed();
+    if (given.has("frame")) this.state.time = Number(given.get("frame"));
+    this.change(given.has("frame") || given.has("play") ? { play: given.get("play") === "1" } : {});
+  }
+
+  row({ title, pictures }) {
+    const row = made("section", "", { class: "camera", "aria-label": title }), strip = made("div", "", { class: "strip" });
+    const screen = made("canvas", "", { class: "screen", role: "img", "aria-label": `${title}: the frame that is shown` }), [name, ...rest] = title.split(" · ");
+    const images = pictures.map((source, frame) => {
+      const button = made("button", "", { title: `frame ${this.header.frames[frame]}` }), image = made("img", "", { alt: "" });
+      image.src = source;
+      button.append(image, made("span", this.header.frames[frame]));
+      button.onclick = () => this.change({ time: frame, play: false });
+      strip.append(button);
+      return image;
+    });
+    const head = made("h2", `camera ${name}`);
+    head.append(made("span", rest.join(" · ")));
+    row.append(head, screen, strip);
+    $("strips").append(row);
+    return { screen, strip, pictures: images };
+  }
+
+  get frameNumber() { return Math.min(Math.floor(this.state.time + 1e-6), this.timeline.end); }
+
+  clock() {
+    const { frames, frame_count: count, time } = this.header, frame = this.frameNumber;
+    return `frame ${frames[frame]} / ${count - 1} · ${(time[frame] - time[0]).toFixed(2)} s`;
+  }
+
+  draw() {
+    const frame = this.frameNumber;
+    if (this.drawn === frame) return;
+    this.drawn = frame;
+    for (const { screen, strip, pictures } of this.rows) {
+      const picture = pictures[frame], pen = screen.getContext("2d");
+      screen.width = picture.naturalWidth;
+      screen.height = picture.naturalHeight;
+      pen.drawImage(picture, 0, 0);
+      for (const [at, button] of [...strip.children].entries()) button.toggleAttribute("data-now", at === frame);
+      const now = strip.children[frame];  // in sight, without moving the page
+      strip.scrollLeft = now.offsetLeft - strip.offsetLeft - (strip.clientWidth - now.clientWidth) / 2;
+    }
+  }
+}
+
+window.page = new FilmPage(JSON.parse($("header").textContent));
+window.page.start();
