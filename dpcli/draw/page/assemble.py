@@ -16,9 +16,9 @@ from dpcli.errors import DataError
 from dpcli.runtime.whole_file import whole_file
 
 _MARK = re.compile(r"<!--([A-Z]+)-->")
-# The data pages share one template; only what stands in <main> and the scripts differ.
-TEMPLATE, STYLE, DATA_STYLE = "page.html", "theme.css", "data.css"
-SHARED = ("base.js", "player.js", "stage.js", "gl.js")
+# shared/ is in every page, the scene viewer's too; web/ is of the pages about a file, which have one template and one style sheet.
+STYLE, SHARED = "shared/theme.css", ("shared/base.js", "shared/player.js", "shared/stage.js", "shared/gl.js")
+_TEMPLATE, _DATA_STYLE = "web/page.html", "web/data.css"
 
 
 def source_text(name: str, package: str = __package__) -> str:
@@ -47,22 +47,23 @@ def as_base64(data: bytes) -> str:
 
 
 def data_page(
-    header: Mapping[str, Any], *, main: str, script: Sequence[str], body: str, blocks: Sequence[bytes] = ()
+    header: Mapping[str, Any], name: str, *, script: Sequence[str], blocks: Sequence[bytes] = ()
 ) -> str:
     """Return a page about one file.
 
-    header: values for the script, among them `title`. main: HTML of the page's middle (ours, not the file's). script: names of
-    the page's own scripts. body: a class of <body> that the style sheet knows. blocks: binary data, one element each, which the
-    script unpacks when it needs them.
+    header: values for the script, among them `title`. name: of the page: NAME.html is its middle, and the style sheet knows it.
+    script: names of the page's own scripts, in their order. blocks: binary data, one element each, which the script unpacks when
+    it needs them.
     """
     data = "\n".join(
         f'<script type="text/plain" id="data{at}">{as_base64(block)}</script>' for at, block in enumerate(blocks)
     )
     return filled(
-        source_text(TEMPLATE),
+        source_text(_TEMPLATE),
         {
-            "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE) + source_text(DATA_STYLE), "MAIN": main, "BODY": body,
-            "HEADER": as_json(header), "DATA": data, "SCRIPT": script_text([*SHARED, *script]),
+            "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE) + source_text(_DATA_STYLE), "BODY": name,
+            "MAIN": source_text(f"web/{name}.html"),
+            "HEADER": as_json(header), "DATA": data, "SCRIPT": script_text([*SHARED, *(f"web/{one}.js" for one in script)]),
         },
     )  # fmt: skip
 

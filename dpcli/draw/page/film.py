@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.draw.page.assemble import data_page, source_text
+from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts, frame_rate
 
 _QUALITY = 82  # of WebP; its transparency loses nothing
@@ -34,7 +34,7 @@ def film_page(
     header = facts.header() | {
         "views": shown, "frames": list(frames), "frame_count": frame_count, "time": time.tolist(), "rate": frame_rate(time),
     }  # fmt: skip
-    return data_page(header, main=source_text("film.html"), script=("film.js",), body="film")
+    return data_page(header, "film", script=("film",))
 
 
 def _webp(rgba: np.ndarray, side: int) -> str:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.draw.page.assemble import data_page, source_text
+from dpcli.draw.page.assemble import data_page
 from dpcli.runtime.palette import UNKNOWN, part_colours
 
-SCRIPTS = ("clip.js", "points_gl.js", "points_canvas.js", "floor.js", "points.js")
+SCRIPTS = ("clip", "points_gl", "points_canvas", "floor", "points")
 MOST_POINTS = 1_000_000  # of all frames on a page: about 8 MB of positions in base64
 MOST_FRAMES = 2400  # of all sequences on a page
 _FEWEST_POINTS, _MOST_IN_FRAME = 256, 65_536
@@ -85,7 +85,7 @@ def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np
     blocks = [_packed(sequence) for sequence in sequences]
     for about, block in zip(header["sequences"], blocks):
         about["bytes"] = len(block)
-    return data_page(header, main=source_text("points.html"), script=SCRIPTS, body="points", blocks=blocks)
+    return data_page(header, "points", script=SCRIPTS, blocks=blocks)
 
 
 def _looks(sequences: Sequence[PageSequence]) -> list[str]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dpcli.draw.page.assemble import data_page, source_text
+from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts, spread
 from dpcli.runtime.palette import part_colours
 
@@ -32,4 +32,4 @@ def scatter_page(
         "planes": [{"title": title, "places": np.round(places[kept].astype(np.float64), 4).tolist(), "figures": dict(figures)}
                    for title, (places, figures) in planes.items()],
     }  # fmt: skip
-    return data_page(header, main=source_text("scatter.html"), script=("scatter.js",), body="scatter")
+    return data_page(header, "scatter", script=("scatter",))

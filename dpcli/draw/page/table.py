@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.draw.page.assemble import data_page, source_text
+from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts
 
 MOST_ROWS = 5000
@@ -31,7 +31,7 @@ def scores_page(
         "streams": list(streams), "tally": {name: _tally(own, labels) for name, own in {"": scores, **streams}.items()},
         "rows": [_row(at, names, labels, scores, splits, streams) for at in range(shown)],
     }  # fmt: skip
-    return data_page(header, main=source_text("table.html"), script=("table.js",), body="table")
+    return data_page(header, "table", script=("table",))
 
 
 def _are_probabilities(scores: np.ndarray) -> bool:

@@ -41,6 +41,7 @@ class PointsPage extends Stage {
     for (const axis of UPS) $("up").append(made("option", `${axis} is up`, { value: axis }));
     $("up").value = UPS.find((axis) => this.direction(axis)[1] === 1);
     $("up").onchange = () => this.choose(this.at);
+    $("home").onclick = () => this.goHome();
     $("dots").oninput = () => this.change({ dots: 2 ** Number($("dots").value) });
     this.listenToBar();
     await this.choose(Number(addressed().get("sequence")) || 0);
@@ -86,7 +87,8 @@ class PointsPage extends Stage {
 
   // Shows another sequence; it is unpacked when it is first wanted.
   async choose(at) {
-    const { sequences } = this.header, count = sequences.length, place = (at + count) % count, data = $(`data${place}`);
+    const { sequences } = this.header, count = sequences.length, place = ((Math.round(at) % count) + count) % count, data = $(`data${place}`);
+    const time = place === this.at && this.clip ? this.state.time : 0;
     this.at = place;
     this.data[place] ??= unpacked(data.textContent, sequences[place].bytes);
     data?.remove();
@@ -101,7 +103,7 @@ class PointsPage extends Stage {
     this.painted = null;
     this.hidden.clear();
     this.legendOf = null;
-    this.change({ time: 0, play: this.moves && this.state.play, ...this.home() });
+    this.change({ time, play: this.moves && this.state.play, ...this.home() });
     this.turned = false;
   }
 

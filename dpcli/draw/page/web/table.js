@@ -19,7 +19,7 @@ class ScoresPage {
     const verdict = (right) => made("td", right === null ? "–" : right ? "right" : "wrong", { class: right === null ? "" : right ? "right" : "wrong" });
     const streams = header.streams.map((stream, k) => ({
       title: stream, key: (row) => named(row.streams[k][0]),
-      cell: (row) => { const cell = this.scored(named(row.streams[k][0]), row.streams[k][1]); cell.classList.toggle("other", row.streams[k][0] !== row.predicted); return cell; },
+      cell: (row) => this.scored(named(row.streams[k][0]), row.streams[k][1], row.label >= 0 && row.streams[k][0] !== row.label),
     }));
     return [
       { title: "name", key: (row) => row.name, cell: (row) => text(row.name) },
@@ -41,8 +41,8 @@ class ScoresPage {
     return cell;
   }
 
-  scored(name, score) {
-    const cell = made("td", name);
+  scored(name, score, wrong) {
+    const cell = made("td", name, wrong ? { class: "wrong" } : {});
     cell.append(made("small", this.shown(score)));
     return cell;
   }

@@ -11,7 +11,8 @@ class FilmPage extends Player {
     fillHead(header);
     fillAbout(header, "space plays · ← → step · + − size of the pictures · b light or dark · ? this panel. A click on a picture goes to its frame.");
     this.rows = header.views.map((view) => this.row(view));
-    await Promise.all(this.rows.flatMap((row) => row.pictures.map((picture) => picture.decode())));
+    const loaded = (picture) => picture.complete || new Promise((done) => { picture.onload = picture.onerror = done; });
+    await Promise.all(this.rows.flatMap((row) => row.pictures.map(loaded)));
     this.listenToBar();
     const toggleTheme = followTheme(() => {});
     $("theme").onclick = toggleTheme;
