@@ -8,7 +8,7 @@ def main() -> None:
     import sys
 
     try:
-        from dpcli.streams import ready_streams
+        from dpcli.standard_streams import ready_streams
 
         ready_streams()
         from dpcli.prepare.head_start import head_start

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dpcli.store import CloudSequence
-from tests.commands import exit_code
+from tests.support.commands import exit_code
 
 ROOT = Path(__file__).resolve().parents[1]
 

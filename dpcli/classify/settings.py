@@ -7,17 +7,29 @@ from typing import Any
 
 import torch
 
-from dpcli.classify.backbone import BACKBONES
-from dpcli.classify.config import KinetConfig
+from dpcli.classify.network.backbones.interface import BACKBONES
+from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.presets import find_preset, with_backbone
-from dpcli.classify.schedule import Schedule
+from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
 from dpcli.runtime.device import cpu_count
-from dpcli.runtime.precision import wanted
+from dpcli.runtime.mixed_precision import wanted
 
-_RELEASE = {key: getattr(KinetConfig.release(), key) for key in
-            ("variant", "group_size", "xyz_group", "time_input", "weighting", "merge", "guard", "fusion", "grouping",
-             "static_temporal_radius")}  # fmt: skip
+_RELEASE = {
+    key: getattr(KinetConfig.release(), key)
+    for key in (
+        "variant",
+        "group_size",
+        "xyz_group",
+        "time_input",
+        "weighting",
+        "merge",
+        "guard",
+        "fusion",
+        "grouping",
+        "static_temporal_radius",
+    )
+}
 
 
 def network_config(

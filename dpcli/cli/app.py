@@ -28,17 +28,21 @@ os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 # asked for is set up; `dpc --help` loads none.
 ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
-    "classify": "Recognise actions and gestures (Kinet).",
+    "classify": "Recognize actions and gestures (Kinet).",
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
     "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.",
+    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.",
 }
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
-_FULL = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "disk quota exceeded", errno.EFBIG: "file too large"}
+_FULL = {
+    errno.ENOSPC: "no space left on the device",
+    errno.EDQUOT: "disk quota exceeded",
+    errno.EFBIG: "file too large",
+}
 
 
 def _version(wanted: bool) -> None:
@@ -58,11 +62,10 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
     dpc = typer.Typer(
         name="dpc",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-        help="Dynamic point clouds: recognise actions, find rigid parts and their motions, rebuild a scene in 4D.",
+        help="Dynamic point clouds: recognize actions, find rigid parts and their motions, rebuild a scene in 4D.",
         epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
     )
     dpc.callback()(_root)
@@ -74,9 +77,17 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
         elif name == "info":
             dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
         else:
-            room = import_module(f"dpcli.cli.{name}").app
+            room = import_module(f"dpcli.cli.{name}.app").app
             dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about)
     return dpc
+
+
+def _words_to_complete() -> list[str] | None:
+    """Returns the words after `dpc` that a shell wants completed, or None where this is an ordinary run."""
+    if "_DPC_COMPLETE" not in os.environ:
+        return None
+    words = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")  # bash; zsh and fish
+    return words.split()[1:]
 
 
 def _narrowed(group: typer.Typer, path: Sequence[str]) -> typer.Typer:
@@ -213,7 +224,13 @@ def _keeping_inputs(command: Any) -> Any:
         for name, value in values.items():
             if name not in written:
                 for one in value if isinstance(value, (list, tuple)) else [value]:
-                    inputs += [str(one), *one.split(",")] if isinstance(one, str) else [str(one)] if isinstance(one, Path) else []
+                    inputs += (
+                        [str(one), *one.split(",")]
+                        if isinstance(one, str)
+                        else [str(one)]
+                        if isinstance(one, Path)
+                        else []
+                    )
         for name, option in written.items():
             if values.get(name) and str(values[name]) != "-":
                 check_output(Path(values[name]), option, inputs)
@@ -226,7 +243,7 @@ def _keeping_inputs(command: Any) -> Any:
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(arguments))))
+    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(_words_to_complete() or arguments))))
     from dpcli.runtime.progress import log
 
     try:

@@ -12,7 +12,7 @@ import typer
 
 from dpcli.cli.options import Json, Picture
 from dpcli.errors import UsageError
-from dpcli.streams import printable
+from dpcli.standard_streams import printable
 
 _PIPE_WIDTH = 120
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
@@ -20,35 +20,48 @@ _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
 
 def info(
     file: Annotated[
-        str, typer.Argument(help="File of any kind, or - for a pipe; or a model: .safetensors, a training folder, a shipped name.")
+        str,
+        typer.Argument(
+            help="File of any kind, or - for a pipe; or a model: .safetensors, a training folder, a shipped name."
+        ),
     ],
     as_object: Json = False,
     picture: Picture = None,
-    samples: Annotated[int, typer.Option("--samples", min=1, max=100, help="Rows of the picture; sequences on the page.")] = 8,
+    samples: Annotated[
+        int, typer.Option("--samples", min=1, max=100, help="Rows of the picture; sequences on the page.")
+    ] = 8,
     frames: Annotated[int, typer.Option("--frames", min=1, max=60, help="Columns of the picture: moments.")] = 8,
     view: Annotated[
         str | None,
         typer.Option("--view", help="Axes that point right, down and away in the picture, such as xyz or x-zy (z up)."),
     ] = None,
     page: Annotated[
-        Path | None, typer.Option("--page", help="Write one HTML page (.html) that shows the file in any browser, without a network.")
+        Path | None,
+        typer.Option(
+            "--page", help="Write one HTML page (.html) that shows the file in any browser, without a network."
+        ),
     ] = None,
     sequence: Annotated[
-        list[str] | None, typer.Option("--sequence", help="Only this sequence on the page: its name, or its number from 0; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            "--sequence", help="On the page only this sequence: its name or its number from 0; may be repeated."
+        ),
     ] = None,
 ) -> None:
     """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights_files import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights_lookup import SUFFIX, locate_weights, weights_summary
     from dpcli.store import input_file
-    from dpcli.store.info import summary
+    from dpcli.store.summary import summary
 
     model = locate_weights(file, sorted(Path(__file__).parents[1].glob("*/weights")))
     if model is not None and model.suffix == SUFFIX:
         if picture is not None:
-            raise UsageError(f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png")
+            raise UsageError(
+                f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png"
+            )
         if page is not None:
             raise UsageError(f"--page shows data files, {model} holds weights; without --page you see what is in it")
         _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
@@ -81,8 +94,8 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
-    from dpcli.evaluate.contact_sheet import contact_sheet
-    from dpcli.evaluate.pictures import check_picture
+    from dpcli.draw.contact_sheet import contact_sheet
+    from dpcli.evaluate.classification.confusion_picture import check_picture
     from dpcli.store import CloudsReader
 
     if kind not in ("clouds", "parts", "views"):
@@ -98,7 +111,7 @@ def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
 
 
 def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str | None) -> None:
-    from dpcli.evaluate.views_sheet import views_sheet
+    from dpcli.draw.views_sheet import views_sheet
     from dpcli.store.views import ViewsReader
 
     if view is not None:
@@ -125,10 +138,15 @@ def _show(found: dict[str, Any]) -> None:
 def _show_model(told: dict[str, Any]) -> None:
     from rich.console import Console
 
-    console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+    console = Console(
+        file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH
+    )
     made = f"dpc {told['version']}, " if told["version"] else ""
-    lines = [("file", told["file"]), ("kind", f"model, {told['format'] or 'of another program'}, {made}{told['bytes'] / 1e6:.3g} MB"),
-             ("weights", f"{told['weights']:,} numbers in {told['tensors']} tensors, {', '.join(told['types'])}")]  # fmt: skip
+    lines = [
+        ("file", told["file"]),
+        ("kind", f"model, {told['format'] or 'of another program'}, {made}{told['bytes'] / 1e6:.3g} MB"),
+        ("weights", f"{told['weights']:,} numbers in {told['tensors']} tensors, {', '.join(told['types'])}"),
+    ]
     if told["card"]:
         lines.append(("card", told["card"]))
     for key, value in told["header"].items():
@@ -155,8 +173,13 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     if "counts" in found:
         counts = (f"{count:,} {name.replace('_', ' ')}" for name, count in found["counts"].items())
         lines.append(("counts", ", ".join(counts)))
-    for key, unit in (("frames_per_sequence", ""), ("points_per_frame", ""), ("parts_per_sequence", ""),
-                      ("pairs_per_sequence", ""), ("frame_interval", " s")):  # fmt: skip
+    for key, unit in (
+        ("frames_per_sequence", ""),
+        ("points_per_frame", ""),
+        ("parts_per_sequence", ""),
+        ("pairs_per_sequence", ""),
+        ("frame_interval", " s"),
+    ):
         if found.get(key):
             spread = " / ".join(f"{found[key][name]:.6g}" for name in ("min", "median", "max"))
             lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
@@ -203,9 +226,14 @@ def _view_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _scene_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     parts = ", ".join(f"{part}: {count:,}" for part, count in found["gaussians_per_part"].items())
-    lines = [("size", f"{found['size'][0]}x{found['size'][1]} pixels"), ("duration", f"{found['duration']:.4g} s"),
-             ("Gaussians by part", parts)]  # fmt: skip
-    return lines + [(name, str(value)) for name, value in found["metrics"].items() if isinstance(value, (int, float, str))]
+    lines = [
+        ("size", f"{found['size'][0]}x{found['size'][1]} pixels"),
+        ("duration", f"{found['duration']:.4g} s"),
+        ("Gaussians by part", parts),
+    ]
+    return lines + [
+        (name, str(value)) for name, value in found["metrics"].items() if isinstance(value, (int, float, str))
+    ]
 
 
 def _class_table(found: dict[str, Any]) -> Any:

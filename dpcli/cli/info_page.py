@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dpcli.errors import UsageError
-from dpcli.streams import printable
+from dpcli.standard_streams import printable
 
 if TYPE_CHECKING:
     from dpcli.draw.page.points import PageFacts, PageSequence
@@ -60,14 +60,14 @@ def _facts(path: Path, title: str, rows: Sequence[tuple[str, str]]) -> PageFacts
 def _write_scene(path: Path, page: Path, title: str) -> None:
     from dpcli.generate4d.viewer import write_page
     from dpcli.store.gaussians import read_scene
-    from dpcli.store.info import summary
+    from dpcli.store.summary import summary
 
     write_page(read_scene(path), page, title=title, history=summary(path)["provenance"])
 
 
 def _clouds(path: Path, facts: PageFacts, *, samples: int, chosen: Sequence[str], view: str | None) -> str:
+    from dpcli.draw.contact_sheet import default_view, parse_view
     from dpcli.draw.page.points import frame_budget, point_budget, points_page, spread
-    from dpcli.evaluate.contact_sheet import default_view, parse_view
     from dpcli.store import CloudsReader
 
     with CloudsReader(path) as reader:
@@ -88,8 +88,8 @@ def _short_unit(unit: str) -> str:
 
 def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[int]:
     """The sequences to show: those named (by name, else by number), else some of each class."""
+    from dpcli.draw.contact_sheet import spread_samples
     from dpcli.errors import DataError
-    from dpcli.evaluate.contact_sheet import spread_samples
 
     if not len(reader):
         raise DataError(f"{reader.path}: no sequences to show")
@@ -133,8 +133,14 @@ def _sequence(reader: CloudsReader, row: int, frames: list[int], most: int, axes
 
 def _cloud_words(reader: CloudsReader, kind: str) -> str:
     sizes = reader.frame_sizes
-    usual = f"{int(sizes.min()):,}" if len(sizes) and sizes.min() == sizes.max() else f"about {int(np.median(sizes)) if len(sizes) else 0:,}"
-    words = [kind, _many(len(reader), "sequence"), _many(int(reader.frame_counts.sum()), "frame"), f"{usual} points a frame"]
+    about = "" if len(set(sizes.tolist())) < 2 else "about "
+    usual = f"{about}{int(np.median(sizes)) if len(sizes) else 0:,}"
+    words = [
+        kind,
+        _many(len(reader), "sequence"),
+        _many(int(reader.frame_counts.sum()), "frame"),
+        f"{usual} points a frame",
+    ]
     return " · ".join([*words, *([_many(len(reader.class_names), "class")] if reader.class_names else [])])
 
 
@@ -164,7 +170,7 @@ def _left_out(reader: CloudsReader, frames: dict[int, list[int]], most: int, cho
 def _views(path: Path, facts: PageFacts) -> str:
     from dpcli.draw.page.film import PageView, film_page
     from dpcli.draw.page.points import spread
-    from dpcli.evaluate.views_sheet import view_title
+    from dpcli.draw.views_sheet import view_title
     from dpcli.store.views import ViewsReader
 
     with ViewsReader(path) as reader:
@@ -184,7 +190,9 @@ def _views(path: Path, facts: PageFacts) -> str:
         if max(header.size) > _SIDE:
             facts.notes.append(f"Pictures are reduced to {_SIDE} pixels.")
         made = (PageView(view_title(reader, view), (reader.rgba(view, frame) for frame in frames)) for view in views)
-        return film_page(facts, made, frames=frames, frame_count=header.num_frames, time=header.time[frames], side=_SIDE)
+        return film_page(
+            facts, made, frames=frames, frame_count=header.num_frames, time=header.time[frames], side=_SIDE
+        )
 
 
 def _scores(path: Path, facts: PageFacts) -> str:
@@ -195,7 +203,13 @@ def _scores(path: Path, facts: PageFacts) -> str:
     facts.subtitle = f"scores · {_many(len(reader.names), 'sample')} · {_many(len(reader.class_names), 'class')}"
     names = [printable(name) for name in reader.class_names]
     return scores_page(
-        facts, [printable(name) for name in reader.names], names, reader.labels, reader.scores, splits=reader.splits, streams=reader.streams
+        facts,
+        [printable(name) for name in reader.names],
+        names,
+        reader.labels,
+        reader.scores,
+        splits=reader.splits,
+        streams=reader.streams,
     )
 
 

@@ -1,1 +1,4 @@
-"""Pictures of point clouds, views and scores: this room takes arrays and writes pictures or pages; it never reads a file of ours."""
+"""This room holds everything that draws: points, contact sheets, palettes, curves, animations, pages and colored PLY files.
+
+It may import `ops` and `runtime` only, never a level or a file format.
+"""

@@ -1,4 +1,4 @@
-"""Geometry with more than one backend: sampling, neighbours, interpolation, small inverses.
+"""Geometry with more than one backend: sampling, neighbors, interpolation, small inverses.
 
 Every operation is one public function with a torch reference and a fast CPU kernel behind it (see `backend`).
 Names resolve on first use, so that `from dpcli.ops import fps_numpy` needs neither torch nor numba at import.
@@ -10,25 +10,25 @@ from importlib import import_module
 from typing import Any
 
 _HOME = {
-    "fps": "sampling",
-    "fps_reference": "sampling",
-    "fps_numpy": "sampling_numpy",
+    "fps": "farthest_point_sampling",
+    "fps_reference": "farthest_point_sampling",
+    "fps_numpy": "cpu.sampling_without_torch",
     "space_time_ball_query": "ball_query",
     "space_time_ball_query_reference": "ball_query",
-    "knn": "nearest",
-    "knn_reference": "nearest",
+    "knn": "knn",
+    "knn_reference": "knn",
     "three_nn_interpolate": "interpolate",
     "gather_mean": "gather",
     "gather_points": "gather",
-    "small_inverse": "linalg",
-    "small_inverse_reference": "linalg",
-    "small_solve": "linalg",
+    "small_inverse": "small_inverses",
+    "small_inverse_reference": "small_inverses",
+    "small_solve": "small_inverses",
     "weighted_kabsch": "rigid",
     "apply_motions": "rigid",
     "rigid_flow": "rigid",
     "to_matrix": "rigid",
-    "rasterization": "splatting",
-    "rasterization_reference": "splatting",
+    "rasterization": "splatting.rasterization",
+    "rasterization_reference": "splatting.rasterization",
     "orbit_pose": "cameras",
     "orbit_of": "cameras",
     "pinhole": "cameras",

@@ -15,7 +15,7 @@ def gather_points(features: Tensor, idx: Tensor) -> Tensor:
 
     Backward adds each row's gradient to its source: by a kernel per cloud on CPU (threads never share a cloud, so sums
     repeat exactly), by index_add_ elsewhere. Raises ValueError on wrong shapes and, on CPU, on indices out of range (on
-    a GPU that look would stall the stream, and an index past a cloud's end reads its neighbour in the batch).
+    a GPU that look would stall the stream, and an index past a cloud's end reads its neighbor in the batch).
     """
     _check(features, idx)
     batch, count, channels = features.shape
@@ -30,7 +30,7 @@ def gather_points(features: Tensor, idx: Tensor) -> Tensor:
 
 
 def gather_mean(features: Tensor, idx: Tensor) -> Tensor:
-    """Mean of each row's neighbours, features (B,N,C), idx (B,M,K) i64 -> (B,M,C): `gather_points(features, idx).mean(2)`.
+    """Mean of each row's neighbors, features (B,N,C), idx (B,M,K) i64 -> (B,M,C): `gather_points(features, idx).mean(2)`.
 
     On a CPU the (B,M,K,C) in between are never made. Differentiable in features; errors as `gather_points`.
     """
@@ -52,7 +52,7 @@ def _check(features: Tensor, idx: Tensor) -> None:
 class _GatherMean(torch.autograd.Function):
     @staticmethod
     def forward(ctx, features: Tensor, idx: Tensor) -> Tensor:
-        from dpcli.ops.kernels_gather import mean_kernel
+        from dpcli.ops.cpu.gather import mean_kernel
 
         ctx.save_for_backward(idx)
         ctx.points = features.shape[1]
@@ -65,7 +65,7 @@ class _GatherMean(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
-        from dpcli.ops.kernels_gather import mean_back_kernel
+        from dpcli.ops.cpu.gather import mean_back_kernel
 
         (idx,) = ctx.saved_tensors
         out = torch.zeros(len(idx), ctx.points, grad.shape[2], dtype=grad.dtype)
@@ -86,7 +86,7 @@ class _GatherRows(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
-        from dpcli.ops.kernels_gather import scatter_add_kernel
+        from dpcli.ops.cpu.gather import scatter_add_kernel
 
         (rows,) = ctx.saved_tensors
         shape, batch = ctx.sizes

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 
 _VIDEO = "dpcli.prepare.warm_video"
 NEEDED = {
-    "msraction3d": ("dpcli.prepare.msraction3d",),
-    "nvgesture": ("dpcli.prepare.nvgesture", _VIDEO),
-    "depth": ("dpcli.prepare.depth", _VIDEO),
-    "clouds": ("dpcli.prepare.clouds",),
-    "shrec17": ("dpcli.prepare.shrec17", _VIDEO),
-    "ntu60": ("dpcli.prepare.ntu60", _VIDEO),
-    "kitti-sf": ("dpcli.prepare.kitti_sf",),
-    "kitti-det": ("dpcli.prepare.kitti_det",),
-    "semantickitti": ("dpcli.prepare.semantickitti",),
+    "msraction3d": ("dpcli.prepare.actions.msraction3d",),
+    "nvgesture": ("dpcli.prepare.actions.nvgesture", _VIDEO),
+    "depth": ("dpcli.prepare.actions.depth", _VIDEO),
+    "clouds": ("dpcli.prepare.scans.clouds",),
+    "shrec17": ("dpcli.prepare.actions.shrec17", _VIDEO),
+    "ntu60": ("dpcli.prepare.actions.ntu60", _VIDEO),
+    "kitti-sf": ("dpcli.prepare.scans.kitti_sf",),
+    "kitti-det": ("dpcli.prepare.scans.kitti_det",),
+    "semantickitti": ("dpcli.prepare.scans.semantickitti",),
 }  # command -> modules that its workers import
 
 

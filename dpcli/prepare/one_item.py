@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dpcli.errors import DataError
 from dpcli.prepare.reader import Item, Reader, Sample
-from dpcli.prepare.thin import Thinning
-from dpcli.runtime.seed import generator
+from dpcli.prepare.thinning import Thinning
+from dpcli.runtime.seeds import generator
 
 
 def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 try:
-    from dpcli.prepare.depth_files import load_cv2
+    from dpcli.prepare.decode.depth_files import load_cv2
 
     load_cv2()
 except Exception:  # a worker that needs it will say what is wrong

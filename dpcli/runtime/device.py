@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from dpcli.errors import UsageError
-from dpcli.runtime.products import choose_products
+from dpcli.runtime.matrix_products import choose_products
 
 
 def cpu_count() -> int:

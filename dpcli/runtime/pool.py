@@ -15,7 +15,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DpcError
-from dpcli.runtime import handover
+from dpcli.runtime import shared_memory as handover
 from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 

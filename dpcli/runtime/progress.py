@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TextIO
 
-from dpcli.streams import printable
+from dpcli.standard_streams import printable
 
 _PLAIN_INTERVAL = 5.0  # seconds between lines in a log that is not a terminal
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import rigid_flow, weighted_kabsch
-from dpcli.segment.matching import one_hot
-from dpcli.segment.rigid_groups import rigid_groups
+from dpcli.segment.flow.rigid_groups import rigid_groups
+from dpcli.segment.network.slot_matching import one_hot
 
 _RIGID = 3e-4  # mean residual of one motion, diameters, up to which `rigid_groups` can find no second body worth taking
 

@@ -13,8 +13,8 @@ from typing import Any
 
 _HOME = {
     "CloudSequence": "sequence",
-    "CloudsReader": "reader",
-    "CloudsWriter": "writer",
+    "CloudsReader": "clouds_reader",
+    "CloudsWriter": "clouds_writer",
     "PartsReader": "parts",
     "PartsSample": "parts",
     "PartsWriter": "parts",

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DpcError
-from dpcli.lock import open_alone
+from dpcli.file_lock import open_alone
 from dpcli.store.sequence import CloudSequence
 
 Placed = tuple[np.ndarray, list[tuple[int, int]]]  # an array, (offset in the HDF5 file, bytes) of its first bytes

@@ -103,7 +103,7 @@ def plain_nvgesture(items: list, points: int, output: Path) -> int:
 
 def sampled(cloud: np.ndarray, points: int) -> np.ndarray:
     """Open3D's farthest point sampling of one frame."""
-    from dpcli.prepare.open3d_import import load_open3d
+    from dpcli.prepare.decode.open3d_import import load_open3d
 
     open3d = load_open3d()
     if len(cloud) <= points:
@@ -114,8 +114,8 @@ def sampled(cloud: np.ndarray, points: int) -> np.ndarray:
 
 def compare(name: str, raw: Path, folder: Path, subset: int, jobs: int) -> None:
     """One data set: our pipeline over all of it, the plain one over a subset, their ratio; then memory."""
-    from dpcli.prepare.msraction3d import MSRAction3D
-    from dpcli.prepare.nvgesture import NvGesture
+    from dpcli.prepare.actions.msraction3d import MSRAction3D
+    from dpcli.prepare.actions.nvgesture import NvGesture
 
     points = POINTS[name]
     items = (MSRAction3D if name == "msraction3d" else NvGesture)(raw).items()

@@ -21,15 +21,15 @@ import numpy as np
 import torch
 
 from dpcli.ops import weighted_kabsch
-from dpcli.prepare.synthetic_articulated import SyntheticArticulated
-from dpcli.runtime.seed import generator
-from dpcli.segment.commands import default_model
-from dpcli.segment.model_file import load_model
-from dpcli.segment.object_icp import object_icp
-from dpcli.segment.pair_flow import pair_flow
-from dpcli.segment.predict import Refinement, network_segmenter, predict_parts
+from dpcli.prepare.articulated.synthetic_articulated import SyntheticArticulated
+from dpcli.runtime.seeds import generator
+from dpcli.segment.commands.predict import default_model
+from dpcli.segment.flow.object_icp import object_icp
+from dpcli.segment.flow.pair_flow import pair_flow
+from dpcli.segment.network.model_file import load_model
+from dpcli.segment.prediction import Refinement, network_segmenter, predict_parts
 from dpcli.store import CloudSequence
-from tests.ops_helpers import backend
+from tests.support.ops_helpers import backend
 
 LIMIT_S = 0.5
 Stage = Callable[[CloudSequence], object]

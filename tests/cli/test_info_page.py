@@ -19,8 +19,8 @@ from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter,
 from dpcli.store.embedding import StreamEmbedding, write_embedding
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader
-from tests.browser import needs_browser, open_page
-from tests.scenes import toy_scene
+from tests.support.browser import needs_browser, open_page
+from tests.support.scenes import toy_scene
 
 WIDTH, HEIGHT = 900, 640
 FLAGS = (
@@ -48,7 +48,9 @@ def show(page: Path, tmp_path: Path, state: str = "", script: str = "", flags: t
 
     opened, picture = tmp_path / "opened.html", tmp_path / "opened.png"
     text = page.read_text(encoding="utf-8")
-    opened.write_text(text.replace("</body>", f"<script>{script}</script></body>") if script else text, encoding="utf-8")
+    opened.write_text(
+        text.replace("</body>", f"<script>{script}</script></body>") if script else text, encoding="utf-8"
+    )
     size = f"--window-size={WIDTH},{HEIGHT}"
     for _ in range(3):
         html, said = open_page(f"{opened.as_uri()}#{state}", tmp_path, *FLAGS, size, f"--screenshot={picture}", *flags)
@@ -79,11 +81,12 @@ def write_balls(path: Path, name: str = "balls") -> Path:
     """Part 0 left and part 1 right, part 2 above them (camera axes: y down); in frame 1 left and right are exchanged."""
     left, right, top = ball((-1, 0, 0)), ball((1, 0, 0)), ball((0, -1, 0))
     frames = [np.concatenate([left, right, top]), np.concatenate([right, left, top])]
-    part = np.repeat(np.arange(3, dtype=np.int16), 400)
-    color = np.tile(np.array([[200, 30, 30]], np.uint8), (1200, 1))
-    with CloudsWriter(path, class_names=[name, "wave"], fields=("part", "color", "time"), length_unit="m") as writer:
-        writer.write(CloudSequence.from_frames(name, frames, label=0, part=[part, part], color=[color, color], time=np.array([0.0, 0.5])))
-        writer.write(CloudSequence.from_frames("second", frames[::-1], label=1, part=[part, part], color=[color, color], time=np.array([0.0, 0.5])))  # fmt: skip
+    part = [np.repeat(np.arange(3, dtype=np.int16), 400)] * 2
+    color = [np.tile(np.array([[200, 30, 30]], np.uint8), (1200, 1))] * 2
+    fields = {"part": part, "color": color, "time": np.array([0.0, 0.5])}
+    with CloudsWriter(path, class_names=[name, "wave"], fields=tuple(fields), length_unit="m") as writer:
+        writer.write(CloudSequence.from_frames(name, frames, label=0, **fields))
+        writer.write(CloudSequence.from_frames("second", frames[::-1], label=1, **fields))
     return path
 
 
@@ -149,7 +152,12 @@ def test_only_the_shown_frames_are_read_one_at_a_time(tmp_path, dpc_here, monkey
     monkeypatch.setattr(points_module, "MOST_POINTS", 200)
     monkeypatch.setattr(points_module, "_FEWEST_POINTS", 8)
     asked, read = [], CloudsReader.read
-    monkeypatch.setattr(CloudsReader, "read", lambda self, row, frames, *more: asked.append((row, frames)) or read(self, row, frames, *more))
+
+    def noted(self: CloudsReader, row: int, frames: list[int], *more: object) -> CloudSequence:
+        asked.append((row, frames))
+        return read(self, row, frames, *more)
+
+    monkeypatch.setattr(CloudsReader, "read", noted)
     result = dpc_here("info", tmp_path / "long.h5", "--page", tmp_path / "long.html", "--samples", 2)
     assert result.returncode == 0, result.stderr
     assert len(asked) == 20 and all(len(frames) == 1 for _, frames in asked)
@@ -157,7 +165,11 @@ def test_only_the_shown_frames_are_read_one_at_a_time(tmp_path, dpc_here, monkey
     assert header["sequences"][0]["frames"] == [0, 4, 9, 13, 17, 22, 26, 30, 35, 39]
     assert set(header["sequences"][0]["counts"]) == {10}  # 200 points on 20 frames
     said = result.stderr.decode()
-    for sentence in ("Showing 2 of 4 sequences", "Showing 10 of up to 40 frames", "Showing 10 of up to 89 points a frame."):
+    for sentence in (
+        "Showing 2 of 4 sequences",
+        "Showing 10 of up to 40 frames",
+        "Showing 10 of up to 89 points a frame.",
+    ):
         assert sentence in said and any(sentence in note for note in header["notes"])
 
 
@@ -186,7 +198,9 @@ def test_where_a_page_may_be_written(tmp_path, dpc_here, monkeypatch):
         refused = dpc_here("info", source, "--page", page)
         assert refused.returncode == code and sentence in refused.stderr
     assert source.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["balls.html"]
-    monkeypatch.setattr(Path, "write_bytes", lambda self, data: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(
+        Path, "write_bytes", lambda self, data: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
     full = dpc_here("info", source, "--page", tmp_path / "page.html")
     assert full.returncode == 1 and b"no space left" in full.stderr
     assert [one.name for one in tmp_path.iterdir()] == ["balls.html"]
@@ -224,7 +238,7 @@ def test_the_browser_shows_parts_where_they_are(balls, tmp_path, renderer):
     blue, orange, green = places(show(balls, tmp_path, f"{state}&frame=1"))
     assert orange[1] < green[1] < blue[1]
     red = show(balls, tmp_path, f"{state}&color=color")
-    assert near(red.pixels, np.array([200, 30, 30])).sum() > 2000 and not near(red.pixels, GREEN).any()
+    assert near(red.pixels, np.array([200, 30, 30])).sum() > 2000 and near(red.pixels, GREEN).sum() < 50
 
 
 @needs_browser
@@ -234,7 +248,7 @@ def test_a_lost_context_is_built_again(balls, tmp_path):
     blue, orange, _ = places(show(balls, tmp_path, state, lose % "setTimeout(() => lost.restoreContext(), 300);"))
     assert blue[1] < orange[1]
     gone = show(balls, tmp_path, state, lose % "")
-    assert not near(gone.pixels, BLUE).any()  # the loss is real: without the restoring nothing is left
+    assert near(gone.pixels, BLUE).sum() < 50  # the loss is real: without the restoring nothing is left
 
 
 @needs_browser
@@ -242,7 +256,10 @@ def test_keys(balls, tmp_path):
     """Space plays and stops, arrows step, digits color, brackets choose, ? explains, b changes the theme."""
     script = """
     const press = (key) => document.body.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
-    const told = [], tell = () => told.push([page.frameNumber, page.state.play, page.state.color, page.at, !$("about").hidden, root.hasAttribute("data-dark")].join());
+    const told = [], tell = () => {
+      const { frameNumber, state, at } = page;
+      told.push([frameNumber, state.play, state.color, at, !$("about").hidden, root.hasAttribute("data-dark")].join());
+    };
     setTimeout(async () => {
       press("ArrowRight"); tell(); press("ArrowLeft"); tell(); press(" "); tell(); press(" "); tell(); press("3"); tell();
       press("]"); await new Promise((done) => setTimeout(done, 300)); tell(); press("?"); tell(); press("Escape"); press("b"); tell();
@@ -259,7 +276,8 @@ def test_keys(balls, tmp_path):
 @needs_browser
 def test_dragging_turns_and_a_part_can_be_hidden(balls, tmp_path):
     script = """
-    const point = (kind, x) => $("canvas").dispatchEvent(new PointerEvent(kind, { pointerId: 1, clientX: x, clientY: 300, bubbles: true }));
+    const at = (x) => ({ pointerId: 1, clientX: x, clientY: 300, bubbles: true });
+    const point = (kind, x) => $("canvas").dispatchEvent(new PointerEvent(kind, at(x)));
     $("canvas").setPointerCapture = () => {};
     setTimeout(() => {
       const before = page.state.azimuth; point("pointerdown", 300); point("pointermove", 400); point("pointerup", 400);
@@ -268,9 +286,8 @@ def test_dragging_turns_and_a_part_can_be_hidden(balls, tmp_path):
     }, 800);"""
     shown = show(balls, tmp_path, "play=0&frame=0&theme=light&controls=0&azimuth=0&elevation=0", script)
     assert float(shown.attribute("turned")) == pytest.approx(-0.8)
-    from PIL import Image
-    Image.fromarray(shown.pixels).save("/tmp/page/dbg.png")
-    assert near(shown.pixels, BLUE).any() and not near(shown.pixels, ORANGE).any(), near(shown.pixels, ORANGE).sum()
+    blue, orange = (near(shown.pixels, color).sum() for color in (BLUE, ORANGE))
+    assert blue > 500 and orange < 50  # a few pixels of the axis x are reddish, too
 
 
 @needs_browser
@@ -284,7 +301,9 @@ def test_what_a_file_says_is_never_run(kind, tmp_path, dpc_here):
             writer.write(HOSTILE, np.array([0.1, 0.9]), label=1, split=HOSTILE)
     assert dpc_here("info", source, "--page", tmp_path / "h.html").returncode == 0
     shown = show(tmp_path / "h.html", tmp_path)
-    assert shown.attribute("ran") is None and "<img" not in re.sub(r"<(script|style|title)\b.*?</\1>", "", shown.html, flags=re.S)
+    assert shown.attribute("ran") is None and "<img" not in re.sub(
+        r"<(script|style|title)\b.*?</\1>", "", shown.html, flags=re.S
+    )
     assert source.name in unescape(re.search(r'<h1 id="title">(.*?)</h1>', shown.html)[1])
     assert HOSTILE in unescape(re.search(r"<(select id=\"sequence\"|tbody).*?</(select|tbody)>", shown.html, re.S)[0])
 
@@ -316,7 +335,9 @@ def test_on_a_phone_nothing_lies_over_the_points(balls, tmp_path):
 
 @needs_browser
 def test_light_and_dark_follow_the_system(balls, tmp_path):
-    light, dark = (show(balls, tmp_path, "play=0", flags=(f"--blink-settings=preferredColorScheme={k}",)) for k in (1, 0))
+    light, dark = (
+        show(balls, tmp_path, "play=0", flags=(f"--blink-settings=preferredColorScheme={k}",)) for k in (1, 0)
+    )
     assert light.pixels[5, 5].min() > 200 and dark.pixels[5, 5].max() < 60
 
 
@@ -357,8 +378,12 @@ def test_a_page_of_views_holds_the_pictures(tmp_path, dpc_here):
 def test_the_film_shows_one_frame_of_all_cameras(tmp_path, dpc_here):
     colors = write_views(tmp_path / "v.h5")
     assert dpc_here("info", tmp_path / "v.h5", "--page", tmp_path / "v.html").returncode == 0
-    script = """setTimeout(() => { document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight" , bubbles: true }));
-      setTimeout(() => { root.dataset.seen = [...document.querySelectorAll("canvas")].map((own) => [...own.getContext("2d").getImageData(9, 9, 1, 1).data].join()).join(";"); }, 300); }, 1500);"""
+    script = """
+    const middle = (canvas) => [...canvas.getContext("2d").getImageData(9, 9, 1, 1).data].join();
+    setTimeout(() => {
+      document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
+      setTimeout(() => { root.dataset.seen = [...document.querySelectorAll("canvas")].map(middle).join(";"); }, 300);
+    }, 1500);"""
     shown = show(tmp_path / "v.html", tmp_path, "frame=1", script)
     seen = [[int(value) for value in own.split(",")] for own in shown.attribute("seen").split(";")]
     assert np.abs(np.array(seen) - colors[:, 2]).max() < 12
@@ -376,7 +401,9 @@ def test_the_table_of_scores_sorts_and_shows_mistakes(tmp_path, dpc_here):
     shown = show(tmp_path / "s.html", tmp_path, "sort=probability&down=1&which=wrong")
     body = re.search(r"<tbody.*?</tbody>", shown.html, re.S)[0]
     names = re.findall(r"<td>video (\d+)</td>", body)
-    wrong = [at for at in np.argsort(-scores.max(1), kind="stable") if labels[at] >= 0 and scores[at].argmax() != labels[at]]
+    wrong = [
+        at for at in np.argsort(-scores.max(1), kind="stable") if labels[at] >= 0 and scores[at].argmax() != labels[at]
+    ]
     assert [int(name) for name in names] == wrong
     right, known = int((scores.argmax(1) == labels).sum()), int((labels >= 0).sum())
     assert f"{right} of {known} right" in shown.html and f"{100 * right / known:.1f} %" in shown.html
@@ -410,4 +437,7 @@ def test_an_embedding_is_a_scatter(tmp_path, dpc_here):
 def test_a_scene_gets_the_viewer(tmp_path, dpc_here):
     write_scene(tmp_path / "scene.h5", toy_scene(per_part=20, frames=2), source="toy")
     assert dpc_here("info", tmp_path / "scene.h5", "--page", tmp_path / "scene.html").returncode == 0
-    assert "<title>scene.h5</title>" in (tmp_path / "scene.html").read_text() and header_of(tmp_path / "scene.html")["count"] == 40
+    assert (
+        "<title>scene.h5</title>" in (tmp_path / "scene.html").read_text()
+        and header_of(tmp_path / "scene.html")["count"] == 40
+    )

@@ -46,9 +46,7 @@ def as_base64(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
 
 
-def data_page(
-    header: Mapping[str, Any], name: str, *, script: Sequence[str], blocks: Sequence[bytes] = ()
-) -> str:
+def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], blocks: Sequence[bytes] = ()) -> str:
     """Return a page about one file.
 
     header: values for the script, among them `title`. name: of the page: NAME.html is its middle, and the style sheet knows it.

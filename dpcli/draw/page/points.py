@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.draw.page.assemble import data_page
-from dpcli.runtime.palette import UNKNOWN, part_colours
+from dpcli.draw.palette import UNKNOWN, part_colors
 
 SCRIPTS = ("clip", "points_gl", "points_canvas", "floor", "points")
 MOST_POINTS = 1_000_000  # of all frames on a page: about 8 MB of positions in base64
@@ -53,7 +53,13 @@ class PageFacts:
     def header(self) -> dict[str, Any]:
         """Return the values that the script of every page reads."""
         history = [{"command": str(entry.get("command", ""))} for entry in self.history]
-        return {"title": self.title, "subtitle": self.subtitle, "notes": self.notes, "facts": self.rows, "history": history}
+        return {
+            "title": self.title,
+            "subtitle": self.subtitle,
+            "notes": self.notes,
+            "facts": self.rows,
+            "history": history,
+        }
 
 
 def spread(count: int, most: int) -> np.ndarray:
@@ -114,7 +120,7 @@ def _described(sequence: PageSequence) -> dict[str, Any]:
         "counts": [len(frame) for frame in sequence.points], "time": None if time is None else time.tolist(), "rate": frame_rate(time),
         "low": low.tolist(), "step": step.tolist(), "parts": _part_list(sequence), "colored": sequence.color is not None,
         "class": sequence.class_name or (f"label {sequence.label}" if sequence.label >= 0 else ""),
-        "label_color": part_colours(np.array([sequence.label]))[0].tolist(),
+        "label_color": part_colors(np.array([sequence.label]))[0].tolist(),
     }  # fmt: skip
 
 
@@ -148,7 +154,7 @@ def _part_list(sequence: PageSequence) -> list[dict[str, Any]]:
         return []
     ids, counts = _ids(sequence)
     total = max(sum(len(frame) for frame in sequence.part), 1)
-    told = [{"id": int(one), "share": _percent(count / total), "color": part_colours(np.array([one]))[0].tolist()}
+    told = [{"id": int(one), "share": _percent(count / total), "color": part_colors(np.array([one]))[0].tolist()}
             for one, count in zip(ids, counts)]  # fmt: skip
     if counts.sum() < total and -1 not in ids:  # some ids were cut: their points count as none
         told.append({"id": -1, "share": _percent(1 - counts.sum() / total), "color": list(UNKNOWN)})
@@ -181,4 +187,3 @@ def _places(sequence: PageSequence) -> np.ndarray:
     places = order[ranks]
     none = listed.index(-1) if -1 in listed else 0
     return np.where(np.array(listed)[places] == given, places, none).astype(np.uint8)
-

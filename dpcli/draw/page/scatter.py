@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts, spread
-from dpcli.runtime.palette import part_colours
+from dpcli.draw.palette import part_colors
 
 MOST_DOTS = 20_000
 
@@ -23,7 +23,7 @@ def scatter_page(
         facts.notes.append(f"Showing {len(kept):,} of {len(names):,} samples, evenly spread.")
     used = sorted(set(labels[kept].tolist()))
     classes = [
-        {"label": label, "color": part_colours(np.array([label]))[0].tolist(),
+        {"label": label, "color": part_colors(np.array([label]))[0].tolist(),
          "name": "unknown" if label < 0 else class_names[label] if label < len(class_names) and class_names[label] else f"label {label}"}
         for label in used
     ]  # fmt: skip

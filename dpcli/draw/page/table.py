@@ -11,7 +11,11 @@ from dpcli.draw.page.assemble import data_page
 from dpcli.draw.page.points import PageFacts
 
 MOST_ROWS = 5000
-_BEST, _DIGITS, _ONE = 5, 4, 1e-3  # classes told of a sample; digits of a score; how far a sum of probabilities may be from 1
+_BEST, _DIGITS, _ONE = (
+    5,
+    4,
+    1e-3,
+)  # classes told of a sample; digits of a score; how far a sum of probabilities may be from 1
 
 
 def scores_page(
@@ -45,7 +49,12 @@ def _tally(scores: np.ndarray, labels: np.ndarray) -> list[int]:
 
 
 def _row(
-    at: int, names: Sequence[str], labels: np.ndarray, scores: np.ndarray, splits: Sequence[str], streams: Mapping[str, np.ndarray]
+    at: int,
+    names: Sequence[str],
+    labels: np.ndarray,
+    scores: np.ndarray,
+    splits: Sequence[str],
+    streams: Mapping[str, np.ndarray],
 ) -> dict[str, Any]:
     best = np.argsort(-scores[at], kind="stable")[:_BEST]
     return {

@@ -16,8 +16,10 @@ from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.pipes import standard_input
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_EXPECTED = ("expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
-             "or a video as PRED=TRUTH")  # fmt: skip
+_EXPECTED = (
+    "expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
+    "or a video as PRED=TRUTH"
+)
 _MAPPINGS, _LISTS = ("metrics", "protocol", "units", "denominators", "intervals"), ("left_out", "provenance")
 _VIDEO = ("views", "gaussians")
 
@@ -41,9 +43,13 @@ class Collected:
 
 
 def collect(
-    arguments: Sequence[str], truth: Path | None = None, *, split: str | None = None, pictures: bool = True,
+    arguments: Sequence[str],
+    truth: Path | None = None,
+    *,
+    split: str | None = None,
+    pictures: bool = True,
     stdin: BinaryIO | None = None,
-) -> Collected:  # fmt: skip
+) -> Collected:
     """The results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
 
     truth: of the parts files, and of scores files if given with them only. pictures: also what needs the files behind a
@@ -60,7 +66,7 @@ def collect(
 
 def _results(
     argument: str, truth: Path | None, split: str | None, pictures: bool, stdin: BinaryIO | None
-) -> list[Result]:  # fmt: skip
+) -> list[Result]:
     if argument == "-":
         return _objects((stdin or standard_input()).read(), "stdin", pictures)
     path, own = _named(argument)
@@ -167,7 +173,7 @@ def _checked(found: Any, where: str) -> dict[str, Any]:
 
 def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.protocol import as_json, evaluate_classification
+    from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
     return Result(_plain(as_json(report, str(path), ScoresReader(path).provenance)), str(path))
@@ -176,8 +182,8 @@ def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
 def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[Result]:
     """Segmentation, and motion where the truth has poses and the prediction frame pairs."""
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.motion_protocol import evaluate_motion, motion_json
-    from dpcli.evaluate.segmentation_protocol import evaluate_segmentation, segmentation_json
+    from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion, motion_json
+    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation, segmentation_json
 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
@@ -199,8 +205,8 @@ def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) ->
 
 
 def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
-    from dpcli.evaluate.video import evaluate_video
-    from dpcli.evaluate.video_tables import video_json
+    from dpcli.evaluate.video.comparison import evaluate_video
+    from dpcli.evaluate.video.tables import video_json
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")

@@ -18,10 +18,10 @@ _INSTANTS, _MOST_VIEWS, _QUALITY = 6, 4, 82
 
 def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", background: str | None = None) -> Figure:
     """Pictures of up to four views; reads, or renders, only the frames it shows. DataError as `evaluate_video`."""
-    from dpcli.evaluate.video_pairing import match_views
-    from dpcli.evaluate.video_protocol import BACKGROUNDS, video_protocol
-    from dpcli.evaluate.video_sources import open_source
-    from dpcli.evaluate.video_strip import Strip
+    from dpcli.evaluate.video.difference_strip import Strip
+    from dpcli.evaluate.video.protocol import BACKGROUNDS, video_protocol
+    from dpcli.evaluate.video.sources import open_source
+    from dpcli.evaluate.video.view_pairing import match_views
 
     chosen = video_protocol(protocol, background)
     strip = Strip(BACKGROUNDS[chosen.background])
@@ -47,5 +47,7 @@ def _markup(title: str, cells: Sequence[tuple[int, np.ndarray]]) -> str:
     frames = ", ".join(str(frame) for frame, _ in cells)
     words = escape(f"{title}; frames {frames}")
     height, width = sheet.shape[:2]
-    return (f'<figure class="strip"><figcaption>{words}</figcaption><div class="wide" tabindex="0" role="region" aria-label="{words}">'
-            f'<img alt="{words}" width="{width}" height="{height}" src="data:image/jpeg;base64,{data}"></div></figure>')  # fmt: skip
+    return (
+        f'<figure class="strip"><figcaption>{words}</figcaption><div class="wide" tabindex="0" role="region" aria-label="{words}">'
+        f'<img alt="{words}" width="{width}" height="{height}" src="data:image/jpeg;base64,{data}"></div></figure>'
+    )

@@ -12,10 +12,10 @@ import numpy as np
 from dpcli import __version__
 from dpcli.draw.page import assemble
 from dpcli.draw.page.assemble import SHARED, STYLE, as_base64, as_json, filled, script_text, source_text
-from dpcli.generate4d.colours import WEIGHTS
-from dpcli.generate4d.paths import clip_rate, own_rate
+from dpcli.draw.palette import part_colors
+from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
+from dpcli.generate4d.out.picture_colors import WEIGHTS
 from dpcli.ops.cameras import orbit_of
-from dpcli.runtime.palette import part_colours
 from dpcli.store.gaussians import GaussianScene
 
 SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")
@@ -28,8 +28,8 @@ def write_page(
     """Write the page; returns its size in bytes. DataError when it can't be written. fps: frames of the clip per second,
     None = as videos play it (`clip_rate`).
 
-    Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colours, opacities and weights
-    to 1/255; colour terms that depend on the direction are left out. Equal scenes give equal bytes.
+    Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colors, opacities and weights
+    to 1/255; color terms that depend on the direction are left out. Equal scenes give equal bytes.
     """
     arrays = packed(scene)
     blob = b"".join(values.tobytes() for values in arrays.values())
@@ -53,7 +53,7 @@ def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
 def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     """What the page reads, in its order. Moving things are differences to the frame before, which compress better;
     bytes of 16-bit numbers lie apart, low bytes first: position u8 (2,T,3,N), turn u8 (T,4,N), weight u8 (T,N), scale
-    f32 (3,N), colour u8 (4,N) with opacity, part u8 (N) = id + 1."""
+    f32 (3,N), color u8 (4,N) with opacity, part u8 (N) = id + 1."""
     low, extent = _box(scene)
     steps = np.rint((scene.frame_mean - low) / extent * _POSITIONS).astype(np.uint16).transpose(0, 2, 1)
     change = _differences(steps)
@@ -62,9 +62,12 @@ def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     rgba = np.concatenate([scene.color.T, np.rint(scene.opacity * _BYTE).astype(np.uint8)[None]])
     return {
         "position": np.stack([(change & 255).astype(np.uint8), (change >> 8).astype(np.uint8)]),
-        "turn": _differences(turns), "weight": _differences(weight), "scale": scene.scale.T.astype("<f4"), "color": rgba,
+        "turn": _differences(turns),
+        "weight": _differences(weight),
+        "scale": scene.scale.T.astype("<f4"),
+        "color": rgba,
         "part": np.clip(scene.part + 1, 0, 255).astype(np.uint8),
-    }  # fmt: skip
+    }
 
 
 def _differences(values: np.ndarray) -> np.ndarray:
@@ -88,14 +91,30 @@ def describe(
     starts = np.cumsum([0, *(values.nbytes for values in arrays.values())]).tolist()
     ids, counts = np.unique(scene.part, return_counts=True)
     return {
-        "title": title, "version": __version__, "count": scene.num_gaussians, "frames": scene.num_frames,
-        "time": scene.time.tolist(), "rate": fps / own_rate(scene), "tail": 1 / own_rate(scene),
-        "low": low.tolist(), "extent": extent.tolist(), "starts": dict(zip(arrays, starts)), "bytes": starts[-1],
-        "camera": {"azimuth": azimuth, "elevation": elevation, "radius": radius,
-                   "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1]))},
-        "parts": [{"id": int(i), "count": int(c), "color": part_colours(np.array([i]))[0].tolist()}
-                  for i, c in zip(ids, counts)],
-        "weights": WEIGHTS.tolist(), "metrics": scene.metrics, "sh_degree": scene.sh_degree,
+        "title": title,
+        "version": __version__,
+        "count": scene.num_gaussians,
+        "frames": scene.num_frames,
+        "time": scene.time.tolist(),
+        "rate": fps / own_rate(scene),
+        "tail": 1 / own_rate(scene),
+        "low": low.tolist(),
+        "extent": extent.tolist(),
+        "starts": dict(zip(arrays, starts)),
+        "bytes": starts[-1],
+        "camera": {
+            "azimuth": azimuth,
+            "elevation": elevation,
+            "radius": radius,
+            "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1])),
+        },
+        "parts": [
+            {"id": int(i), "count": int(c), "color": part_colors(np.array([i]))[0].tolist()}
+            for i, c in zip(ids, counts)
+        ],
+        "weights": WEIGHTS.tolist(),
+        "metrics": scene.metrics,
+        "sh_degree": scene.sh_degree,
         "control_points": len(scene.control_point),
         "history": [{key: entry.get(key) for key in ("command", "version", "seed")} for entry in history],
-    }  # fmt: skip
+    }

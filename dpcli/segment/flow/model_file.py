@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.flow.config import FlowConfig
-from dpcli.segment.flow.network import FlowNetwork
+from dpcli.segment.flow.flow_network import FlowNetwork
 
 _FORMAT, _MAKER = "dpc-flow-1", "dpc segment flow"
 _MOST, _FEWEST = 2048, 16  # points the network sees at once; fewer than the latter move as one
@@ -51,12 +51,12 @@ def trained_flow(points1: Tensor, points2: Tensor, name: str, device: str = "cpu
 
 
 def _one(model: FlowNetwork, points1: Tensor, points2: Tensor) -> Tensor:
-    centre = points1.mean(1, keepdim=True)
-    size = 2 * (points1 - centre).square().sum(-1).max().sqrt()
-    shift = points2.mean(1, keepdim=True) - centre
+    center = points1.mean(1, keepdim=True)
+    size = 2 * (points1 - center).square().sum(-1).max().sqrt()
+    shift = points2.mean(1, keepdim=True) - center
     if min(points1.shape[1], points2.shape[1]) < _FEWEST or not size > 0:
         return shift.expand_as(points1).clone()
-    first, second = ((p - centre) / size for p in (points1, points2))
+    first, second = ((p - center) / size for p in (points1, points2))
     thin1, thin2 = _thinned(first), _thinned(second)
     flow = model(thin1, thin2)[-1]
     if thin1.shape[1] < first.shape[1]:

@@ -1,0 +1,157 @@
+"""From a `clouds` file to clips: which frames, which points of them, in which coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.classify.data.augment import NONE, Augmentation
+from dpcli.classify.network.config import KinetConfig
+from dpcli.errors import DataError
+from dpcli.runtime.seeds import generator
+from dpcli.store import CloudsReader
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames of one sequence, by number; a number repeats where a short video is padded."""
+
+    sequence: int
+    frames: tuple[int, ...]
+
+
+def clip_starts(length: int, frames: int, count: int | None) -> list[int]:
+    """First frames of the clips of a video: every one (stride 1), or `count` of them spread evenly."""
+    last = max(length - frames, 0)
+    if count is None or count > last:
+        return list(range(last + 1))
+    if count == 1:
+        return [last // 2]
+    return sorted({round(i * last / (count - 1)) for i in range(count)})
+
+
+def clip_frames(length: int, frames: int, start: int) -> tuple[int, ...]:
+    """`frames` consecutive frames from `start`; the last frame is held where the video is too short."""
+    return tuple(min(start + t, length - 1) for t in range(frames))
+
+
+def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, ...]:
+    """`frames` frames over the whole video: int((j + phase) * length / frames), phase in [0, 1).
+
+    Phase 0 is what the gesture benchmarks take. Training draws one phase a clip: one for each j would shake the
+    time between frames, and with it every speed.
+    """
+    return tuple(int(t) for t in np.minimum((np.arange(frames) + phase) * length // frames, length - 1))
+
+
+class ClipSource:
+    """Clips of some sequences of a `clouds` file as arrays a network takes. Picklable, for DataLoader workers.
+
+    `timing` is `clips` (consecutive frames, as MSR-Action3D's peers) or `uniform` (frames spread over the whole video).
+    `dropped` lists the videos left out because they are shorter than a clip (only with `drop_short`).
+    """
+
+    def __init__(
+        self,
+        reader: CloudsReader,
+        sequences: Sequence[int],
+        config: KinetConfig,
+        *,
+        timing: str = "clips",
+        augmentation: Augmentation = NONE,
+        drop_short: bool = False,
+        seed: int = 0,
+    ) -> None:
+        self.reader, self.config, self.timing = reader, config, timing
+        self.augmentation, self.seed = augmentation, seed
+        lengths = reader.frame_counts
+        short = [s for s in sequences if lengths[s] < config.num_frames]
+        self.dropped = [reader.names[s] for s in short] if drop_short else []
+        self.padded = [] if drop_short else [reader.names[s] for s in short]
+        self.sequences = [s for s in sequences if not drop_short or lengths[s] >= config.num_frames]
+        if not self.sequences:
+            raise DataError(
+                f"{reader.path}: no video has {config.num_frames} frames; use fewer --frames or pad short videos"
+            )
+
+    def clips(self, count: int | None) -> list[Clip]:
+        """The clips of every video, for prediction: every start, or `count` a video."""
+        return [clip for s in self.sequences for clip in self._video_clips(s, count)]
+
+    def _video_clips(self, sequence: int, count: int | None) -> list[Clip]:
+        length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
+        if self.timing == "uniform":
+            return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]
+        return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
+
+    def epoch(self, number: int, per_video: int | None) -> list[Clip]:
+        """The clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
+        rng = generator(self.seed, 1, number)
+        if per_video is None and self.timing == "clips":
+            clips = self.clips(None)
+        else:
+            clips = [self._random_clip(s, rng) for s in self.sequences for _ in range(per_video or 1)]
+        return [clips[i] for i in rng.permutation(len(clips))]
+
+    def _random_clip(self, sequence: int, rng: np.random.Generator) -> Clip:
+        length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
+        if self.timing == "uniform":
+            lost = int(rng.uniform(0, self.augmentation.crop) * length)
+            start = int(rng.integers(lost + 1))
+            return Clip(sequence, tuple(start + t for t in uniform_frames(length - lost, frames, rng.random())))
+        steps = self.augmentation.frame_steps(frames, rng)
+        span = int(steps[-1]) + 1
+        shown = clip_frames(length, span, int(rng.integers(max(length - span, 0) + 1)))
+        return Clip(sequence, tuple(shown[step] for step in steps))
+
+    def load(self, clip: Clip, *key: int) -> np.ndarray:
+        """The clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
+        rng = generator(self.seed, 2, *key)
+        sequence = self.reader.read(clip.sequence, clip.frames, fields=())
+        points = np.stack(
+            [sample_points(sequence.frame(t), self.config.points_per_frame, rng) for t in range(len(clip.frames))]
+        )
+        points = normalize(points, self.config.normalize)
+        return points if self.augmentation == NONE else self.augmentation(points, rng)
+
+
+def sample_points(frame: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
+    """`count` points of a frame in random order: without replacement, or whole copies and a random remainder if it has fewer.
+
+    An empty frame gives `count` points at the origin.
+    """
+    if len(frame) == 0:
+        return np.zeros((count, 3), np.float32)
+    copies, rest = divmod(count, len(frame))
+    picks = [rng.permutation(len(frame)) for _ in range(copies)]
+    if rest:
+        picks.append(rng.choice(len(frame), rest, replace=False))
+    return frame[np.concatenate(picks)]
+
+
+DEVIATION = 0.27  # length units, of y, under `height`: as of a body 1.1 tall, which the presets' radii are meant for
+
+
+def normalize(points: np.ndarray, rule: str) -> np.ndarray:
+    """A clip's coordinates (T,P,3) as the configuration's `normalize` says.
+
+    `height` makes bodies equally tall, whatever the unit: y, the vertical, deviates by `DEVIATION` in the median frame. One
+    factor a clip, so that who crouches or rises within it still does. `image` is the gesture benchmarks' rule for (row,
+    column, depth) in pixels and depth units: rows / 120, columns / 160, depth / its deviation, each about its mean over the
+    clip.
+    """
+    if rule == "none":
+        return points
+    centered = points - points.mean((0, 1))
+    if rule == "center":
+        return centered
+    if rule == "height":
+        deviations = centered[..., 1].std(1, dtype=np.float64)
+        seen = deviations[deviations > 1e-6]  # an empty frame says nothing about the body
+        return (centered * np.float32(DEVIATION / np.median(seen) if len(seen) else 1)).astype(np.float32)
+    if rule == "unit":
+        return centered / max(float(np.linalg.norm(centered, axis=-1).max()), 1e-9)
+    deviation = float(centered[..., 2].std())
+    return (centered / np.array([120, 160, deviation if deviation > 1e-6 else 1], np.float32)).astype(np.float32)

@@ -1,0 +1,131 @@
+"""Which videos train and which choose: validation is what the file says it is, or carved from the training videos; never
+the test ones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime.seeds import generator
+from dpcli.store import CloudsReader
+
+
+def labeled(reader: CloudsReader, split: str) -> list[int]:
+    """Sequences of this split that have a label. DataError when there are none."""
+    chosen = [i for i, name in enumerate(reader.splits) if name == split and reader.labels[i] >= 0]
+    if not chosen:
+        raise DataError(f"{reader.path}: no labeled sample of split {split!r}; {_instead(reader)}")
+    return chosen
+
+
+def _instead(reader: CloudsReader) -> str:
+    """What a file without training samples has, and how it comes by some."""
+    if reader.labels.max(initial=-1) < 0:
+        return "none has a label: prepare them with --labels TABLE or, where a folder is a class, --label-from-folder"
+    if not any(reader.splits):
+        name = f"{reader.path.stem}-split.h5"
+        return f"none has a split: `dpc prepare split {reader.path} -o {name} --fractions 0.8,0,0.2` divides them"
+    return f"the file has {', '.join(sorted({repr(name) for name in reader.splits}))}"
+
+
+def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[int], list[int]]:
+    """(training, validation) sequences, from the split `train` but for the rule `split`.
+
+    `rule`: `none`; `split` (the file's own split `validation`); `subject` (the training subject with the highest number);
+    `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
+    """
+    chosen = labeled(reader, "train")
+    if rule == "none":
+        return chosen, []
+    if rule == "split":
+        return chosen, labeled(reader, "validation")
+    if rule.startswith("fold"):
+        return _one_fold(reader, chosen, rule, seed)
+    if rule.startswith("subject"):
+        held = _held_out(reader, chosen, rule)
+        rest = [i for i in chosen if reader.subjects[i] not in held]
+        return rest, [i for i in chosen if reader.subjects[i] in held]
+    try:
+        share = float(rule)
+    except ValueError:
+        share = -1
+    if not 0 < share < 1:
+        raise UsageError(
+            f"--validation {rule}: expected none, split, subject, subjects:3,5, fold:3/10 or a fraction such as 0.15"
+        )
+    return _stratified(reader, chosen, share, seed)
+
+
+def _held_out(reader: CloudsReader, chosen: list[int], rule: str) -> set[int]:
+    subjects = {int(reader.subjects[i]) for i in chosen}
+    if rule == "subject":
+        held = {max(subjects)}
+    else:
+        try:
+            held = {int(word) for word in rule.split(":", 1)[1].split(",")}
+        except (IndexError, ValueError):
+            raise UsageError(f"--validation {rule}: expected subjects:3,5") from None
+    if not held < subjects:
+        raise UsageError(
+            f"--validation {rule}: training subjects are {sorted(subjects)}; hold out some of them, not all"
+        )
+    return held
+
+
+def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int) -> tuple[list[int], list[int]]:
+    held: set[int] = set()
+    for label in sorted({int(reader.labels[i]) for i in chosen}):
+        members = [i for i in chosen if reader.labels[i] == label]
+        count = min(round(share * len(members)), len(members) - 1)
+        held.update(int(members[k]) for k in generator(seed, 3, label).permutation(len(members))[:count])
+    return [i for i in chosen if i not in held], sorted(held)
+
+
+def folds(labels: np.ndarray, subjects: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """Which of `count` folds each video is in, i64 (N), for cross-validation (figure 3.5 of the thesis).
+
+    labels, subjects: i32 (N). Whole subjects share a fold where all are known and there are at least `count` of them,
+    as FlickerNet leaves subjects out; else each class is spread over the folds, whose sizes differ by at most one.
+    The same seed gives the same folds whichever of them is asked for.
+    """
+    people = np.unique(subjects)
+    fold = np.empty(len(labels), np.int64)
+    if len(people) >= count and people[0] >= 0:
+        for place, k in enumerate(generator(seed, 4).permutation(len(people))):
+            fold[subjects == people[k]] = place % count
+        return fold
+    members = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+    shuffled = [own[generator(seed, 4, k).permutation(len(own))] for k, own in enumerate(members)]
+    fold[np.concatenate(shuffled)] = np.arange(len(labels)) % count
+    return fold
+
+
+def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> tuple[list[int], list[int]]:
+    try:
+        which, count = (int(word) for word in rule.removeprefix("fold:").split("/"))
+    except ValueError:
+        which, count = -1, 0
+    if not 0 <= which < count or count < 2:
+        raise UsageError(
+            f"--validation {rule}: expected fold:I/N with I = 0 ... N-1 and N at least 2, such as fold:3/10"
+        )
+    if count > len(chosen):
+        raise UsageError(f"--validation {rule}: {count} folds of {len(chosen)} training videos; ask for fewer folds")
+    of = folds(reader.labels[chosen], reader.subjects[chosen], count, seed)
+    return [i for i, k in zip(chosen, of) if k != which], [i for i, k in zip(chosen, of) if k == which]
+
+
+def default_rule(reader: CloudsReader) -> str:
+    """`split` when the file has labeled validation videos, `subject` when the training videos have several known subjects,
+    else 15 % of each class."""
+    if any(name == "validation" and label >= 0 for name, label in zip(reader.splits, reader.labels)):
+        return "split"
+    subjects = {int(reader.subjects[i]) for i in labeled(reader, "train")}
+    return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
+
+
+def class_table(reader: CloudsReader) -> list[str]:
+    """Class names; numbers where the file has labels but no names."""
+    if reader.class_names:
+        return reader.class_names
+    return [str(i) for i in range(int(np.max(reader.labels)) + 1)]

@@ -1,0 +1,64 @@
+"""Which videos of a file a command works on, and what it says of them."""
+
+from __future__ import annotations
+
+from dpcli.classify.data.clips import ClipSource
+from dpcli.classify.data.validation_split import carve_validation
+from dpcli.classify.network.model_file import ModelInfo
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime import provenance
+from dpcli.runtime.progress import log
+from dpcli.store import CloudsReader
+
+
+def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name: str) -> list[int]:
+    """Sequences of a split, of all for `all`; `auto` is the test split where there is one, `validation` is `held_out` where
+    no sample bears that name. DataError when there are none."""
+    wanted = split
+    if split == "validation" and split not in reader.splits:
+        return held_out(reader, info, model_name)
+    if split == "auto":
+        wanted = "test" if "test" in reader.splits else "all"
+    chosen = [i for i, name in enumerate(reader.splits) if wanted == "all" or name == wanted]
+    if not chosen:
+        raise DataError(f"{reader.path}: no sample of split {wanted!r}; it has {sorted(set(reader.splits))}")
+    if split == "auto":
+        log.info(f"scoring split {wanted!r}: {len(chosen)} of {len(reader)} videos (--split chooses)")
+    return chosen
+
+
+def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int]:
+    """The training videos that the model's training held out for validation, by the rule and seed in its notes.
+
+    UsageError when it held none out; DataError when the rule needs the file it was trained on and this is another.
+    """
+    rule = str(info.notes.get("validation", "none"))
+    if rule == "none":
+        raise UsageError(
+            f"--split validation: {model_name} held no video out (--validation none); ask for another split"
+        )
+    if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
+        raise DataError(
+            f"{reader.path}: not the file that {model_name} was trained on, and its validation videos were drawn "
+            f"from that (--validation {rule}); predict on that file"
+        )
+    return carve_validation(reader, rule, int(info.notes.get("seed", 0)))[1]
+
+
+def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> None:
+    """DataError that names the first class in which the file and the model differ."""
+    if reader.class_names and reader.class_names != info.class_names:
+        pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
+        index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
+        raise DataError(
+            f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; the model was trained for other classes"
+        )
+
+
+def report_short(source: ClipSource, frames: int) -> None:
+    """Name the videos that are dropped or padded, with a message each."""
+    for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
+        if names:
+            log.info(
+                f"{len(names)} videos shorter than {frames} frames are {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
+            )

@@ -1,0 +1,112 @@
+"""What Kinet asks of a static network, and where the networks are found: three methods make any of them a backbone.
+
+A backbone turns a clip into class logits on its own (the static stream) and shows the activations of its neighborhoods
+before they are pooled; the dynamic stream fits its surfaces to those. docs/backbones.md writes one from scratch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.network.config import KinetConfig
+from dpcli.errors import UsageError
+from dpcli.ops import gather_points
+
+BACKBONES = {
+    "pointnet2": "dpcli.classify.network.backbones.pointnet2:PointNet2",
+    "dgcnn": "dpcli.classify.network.backbones.dgcnn:DGCNN",
+    "spidercnn": "dpcli.classify.network.backbones.spidercnn:SpiderCNN",
+}
+
+
+@dataclass
+class Grouping:
+    """Centroids of one stage and their neighbors among its points. Frame numbers are float."""
+
+    points: Tensor  # (B,N,3) what is grouped
+    times: Tensor  # (B,N)
+    centers: Tensor  # (B,M,3)
+    center_times: Tensor  # (B,M)
+    idx: Tensor  # (B,M,K) i64 into the N points
+
+    def neighbor_times(self) -> Tensor:
+        """Frame number of each neighbor, (B,M,K)."""
+        return gather_points(self.times[..., None], self.idx)[..., 0]
+
+    def relative(self) -> Tensor:
+        """Neighbor minus centroid, (B,M,K,3)."""
+        return gather_points(self.points, self.idx) - self.centers[:, :, None]
+
+
+@dataclass
+class Stage:
+    """One set of neighborhoods and the layers that act on it: activations (B,M,K,C) before pooling, non-negative or not."""
+
+    grouping: Grouping
+    activations: list[Tensor]
+
+
+class Backbone(nn.Module, ABC):
+    """A static network of point clouds. Built as `Class(config)`; `config.num_classes` is the width of its logits.
+
+    `tap_widths` are the channels of the activations that `taps` shows, a tuple a stage. The points that a stage groups are
+    the centroids of the stage before (in DGCNN: all points, every time).
+    """
+
+    tap_widths: tuple[tuple[int, ...], ...]
+
+    @abstractmethod
+    def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
+        """Neighborhoods that follow from positions alone. points (B,N,3) of all frames, times (B,N) their frame numbers."""
+
+    @abstractmethod
+    def forward(self, groups: list[Grouping]) -> Tensor:
+        """Class logits (B,C): what the static stream is trained with."""
+
+    @abstractmethod
+    def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
+        """What the dynamic stream reads, in eval mode: each stage with its activations; and the logits."""
+
+
+def resolve_backbone(name: str) -> type[nn.Module]:
+    """The class of a built-in name or of `module:Class`. UsageError when there is none or it isn't a backbone.
+
+    A module of the user's is imported, and so executed: only a name that the user typed may come here.
+    """
+    place = BACKBONES.get(name, name)
+    module, _, attribute = place.partition(":")
+    if not attribute:
+        raise UsageError(f"--backbone {name}: expected {', '.join(BACKBONES)} or your own as module:Class")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UsageError(f"--backbone {name}: {error}; is its folder on PYTHONPATH?") from None
+    left = getattr(found, "__abstractmethods__", ())  # named by Backbone and not written
+    missing = [
+        name for name in ("group", "taps", "forward") if name in left or not callable(getattr(found, name, None))
+    ]
+    if missing or not (isinstance(found, type) and issubclass(found, nn.Module)):
+        lacks = f"lacks {', '.join(missing)}" if missing else "is no torch.nn.Module"
+        raise UsageError(f"--backbone {name}: {lacks}; docs/backbones.md shows the three methods")
+    return found
+
+
+def build_backbone(config: KinetConfig) -> nn.Module:
+    """The static network that `config.backbone` names."""
+    network = resolve_backbone(config.backbone)(config)
+    widths = getattr(network, "tap_widths", None)
+    if not widths or not all(isinstance(width, int) for stage in widths for width in stage):
+        raise UsageError(f"--backbone {config.backbone}: tap_widths = {widths!r}, expected integers, a tuple a stage")
+    return network
+
+
+def clip_points(points: Tensor) -> tuple[Tensor, Tensor]:
+    """A batch of clips (B,T,P,3) as one cloud a clip: points (B,T*P,3) frame after frame, times (B,T*P)."""
+    batch, frames, count = points.shape[:3]
+    times = torch.arange(frames, device=points.device, dtype=points.dtype).repeat_interleave(count)
+    return points.reshape(batch, frames * count, 3), times.expand(batch, -1).contiguous()

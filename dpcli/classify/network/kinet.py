@@ -1,0 +1,53 @@
+"""Kinet: a static stream, a dynamic stream on its frozen activations, and their fusion."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.network.backbones.interface import Grouping, Stage, build_backbone, clip_points
+from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.kinematic import Kinematics
+
+STREAMS = ("static", "dynamic")
+
+
+class Kinet(nn.Module):
+    """Both streams. `static_logits` trains the first, `dynamic_logits` the second, `forward` gives both in one pass."""
+
+    def __init__(self, config: KinetConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.static = build_backbone(config)
+        self.dynamic = Kinematics(config, self.static.tap_widths)
+
+    def group(self, points: Tensor) -> list[Grouping]:
+        """Neighborhoods of a batch of clips: points (B,T,P,3), frame after frame."""
+        return self.static.group(*clip_points(points))
+
+    def static_logits(self, points: Tensor) -> Tensor:
+        return self.static(self.group(points))
+
+    def dynamic_logits(self, points: Tensor, groups: list[Grouping] | None = None) -> Tensor:
+        """Gradients reach the dynamic branch only; the static network must be in eval mode. groups: where they are known."""
+        return self.dynamic(self._stages(points, groups)[0])
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """(static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
+        stages, static = self._stages(points)
+        return static, self.dynamic(stages)
+
+    @torch.no_grad()
+    def _stages(self, points: Tensor, groups: list[Grouping] | None = None) -> tuple[list[Stage], Tensor]:
+        return self.static.taps(self.group(points) if groups is None else groups)
+
+    def freeze_static(self) -> None:
+        """Stop the static stream's gradients and keep its batch norms at their running statistics."""
+        self.static.requires_grad_(False).eval()
+
+
+def fuse(static: Tensor, dynamic: Tensor, rule: str) -> Tensor:
+    """Class probabilities of both streams together: mean of softmax scores (thesis), or softmax of mean logits (release)."""
+    if rule == "logits":
+        return torch.softmax((static + dynamic) / 2, -1)
+    return (torch.softmax(static, -1) + torch.softmax(dynamic, -1)) / 2

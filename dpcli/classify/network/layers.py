@@ -1,0 +1,86 @@
+"""Layers that the networks of this room share: linear layers over neighborhoods, the head of a clip, the initialization."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.network.sync_norm import SyncNorm
+from dpcli.ops import gather_points
+from dpcli.ops.grouped_mlp import Norm, grouped_mlp
+
+
+class SharedLayers(nn.Module):
+    """Two linear layers shared by all neighbors, each with batch norm and ReLU, over [relative xyz, feature]."""
+
+    def __init__(self, inputs: int, widths: tuple[int, int]) -> None:
+        super().__init__()
+        self.linear1, self.norm1 = nn.Linear(3 + inputs, widths[0]), nn.BatchNorm1d(widths[0], eps=1e-3)
+        self.linear2, self.norm2 = nn.Linear(widths[0], widths[1]), nn.BatchNorm1d(widths[1], eps=1e-3)
+
+    def _arguments(self) -> tuple:
+        return tuple(
+            (layer.weight, layer.bias) if isinstance(layer, nn.Linear) else self._norm(layer)
+            for layer in (self.linear1, self.norm1, self.linear2, self.norm2)
+        )
+
+    def _norm(self, norm: nn.BatchNorm1d) -> Norm:
+        mean, var = (None, None) if self.training else (norm.running_mean, norm.running_var)
+        return Norm(norm.weight, norm.bias, mean, var, norm.eps)
+
+    def pool(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
+        """Maximum over the neighbors, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
+        if self.training and isinstance(self.norm1, SyncNorm):
+            return self._pool_together(points, centers, idx, features)
+        pooled, statistics = grouped_mlp(points, centers, idx, features, *self._arguments())
+        if self.training:
+            self._update(statistics, idx.numel())
+        return pooled
+
+    def _pool_together(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
+        """`pool` layer by layer: between layers the processes of a shared run exchange their statistics."""
+        values = gather_points(points, idx) - centers[:, :, None]
+        if features is not None:
+            values = torch.cat([values, gather_points(features, idx)], -1)
+        hidden = torch.relu(self.norm1(self.linear1(values.flatten(0, 2))))
+        return torch.relu(self.norm2(self.linear2(hidden))).view(*idx.shape, -1).amax(2)
+
+    def _update(self, statistics: list[Tensor], rows: int) -> None:
+        with torch.no_grad():
+            for norm, mean, var in zip((self.norm1, self.norm2), statistics[::2], statistics[1::2]):
+                norm.num_batches_tracked += 1
+                norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
+                norm.running_var.lerp_(var.to(norm.running_var) * (rows / max(rows - 1, 1)), norm.momentum)
+
+
+class GlobalHead(SharedLayers):
+    """[xyz, feature] of every centroid -> two shared layers -> max over the clip -> class logits."""
+
+    def __init__(self, inputs: int, widths: tuple[int, int], classes: int, dropout: float) -> None:
+        super().__init__(inputs, widths)
+        self.dropout = nn.Dropout(dropout)
+        self.classify = nn.Linear(widths[1], classes)
+
+    def embed(self, centers: Tensor, features: Tensor) -> Tensor:
+        """The clip's feature vector, (B, widths[1])."""
+        batch, count = centers.shape[:2]
+        if self.training:  # as one group: its center is the origin, its neighbors are all centroids
+            everyone = torch.arange(count, device=centers.device).expand(batch, 1, count)
+            return self.pool(centers, centers.new_zeros(batch, 1, 3), everyone, features)[:, 0]
+        values = torch.cat([centers, features], -1)
+        hidden = torch.relu_(self.norm1(self.linear1(values.view(batch * count, -1))))
+        return torch.relu_(self.norm2(self.linear2(hidden))).view(batch, count, -1).amax(1)
+
+    def forward(self, centers: Tensor, features: Tensor) -> Tensor:
+        return self.classify(self.dropout(self.embed(centers, features)))
+
+
+def he_init(module: nn.Module) -> None:
+    """Variance-scaling initialization of every linear layer (fan-in, factor 2, truncated normal), zero biases."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear):
+            nn.init.trunc_normal_(layer.weight, std=(2 / layer.in_features) ** 0.5)
+            nn.init.zeros_(layer.bias)
+    for layer in module.modules():
+        if isinstance(layer, GlobalHead):  # logits near zero, so that the first steps don't unlearn large random ones
+            nn.init.trunc_normal_(layer.classify.weight, std=0.01)

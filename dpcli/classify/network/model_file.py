@@ -1,0 +1,64 @@
+"""A Kinet on disk, with its configuration and class names."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from torch import nn
+
+from dpcli.classify.network.backbones.interface import BACKBONES
+from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.kinet import Kinet
+from dpcli.errors import UsageError
+from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
+
+
+@dataclass
+class ModelInfo:
+    """What a model file says of itself beside the weights."""
+
+    config: KinetConfig
+    class_names: list[str]
+    timing: str = "clips"
+    notes: dict = field(default_factory=dict)
+
+
+_FORMAT, _MAKER = "dpc-kinet-1", "dpc classify train"
+SHIPPED = Path(__file__).parents[1] / "weights"
+
+
+def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
+    """Weights as float32; configuration, class names and notes in the header."""
+    header = {
+        "format": _FORMAT,
+        "config": info.config.to_json(),
+        "timing": info.timing,
+        "class_names": json.dumps(info.class_names),
+        "notes": json.dumps(info.notes, sort_keys=True),
+    }
+    save_weights(path, model.state_dict(), header)
+
+
+def find_model(name: str, option: str = "--model") -> Path:
+    """A model's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
+    return find_weights(name, SHIPPED, _MAKER, option)
+
+
+def load_model(name: str, backbone: str | None = None, option: str = "--model") -> tuple[Kinet, ModelInfo]:
+    """A Kinet in eval mode. DataError when the file is not one of ours or its weights don't fit its configuration.
+
+    A model on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
+    """
+    path = find_model(name, option)
+    tensors, header = load_weights(path, _FORMAT, _MAKER)
+    config = KinetConfig.from_json(header["config"])
+    if config.backbone not in BACKBONES and config.backbone != backbone:
+        raise UsageError(
+            f"{path}: made on the backbone {config.backbone}, which is code of yours; if you trust it, add --backbone {config.backbone}"
+        )
+    model = Kinet(config)
+    load_state(model, tensors, path)
+    names, notes = json.loads(header["class_names"]), json.loads(header["notes"])
+    return model.eval(), ModelInfo(model.config, names, header["timing"], notes)

@@ -1,0 +1,144 @@
+"""Predictions while the frames still come: a window of the last frames, a prediction per hop, equal to the batch ones."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dpcli.classify.data.clips import Clip, ClipSource, clip_frames, uniform_frames
+from dpcli.classify.network.kinet import STREAMS, Kinet
+from dpcli.classify.network.model_file import ModelInfo
+from dpcli.classify.video_scores import clip_scores
+from dpcli.errors import UsageError
+from dpcli.runtime.seeds import generator
+from dpcli.store import CloudSequence
+
+
+class Window:
+    """The last `size` frames of one video without end, read by number as from a `clouds` file: what ClipSource asks for."""
+
+    names, path = ("stream",), Path("stream")
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._frames: deque[np.ndarray] = deque(maxlen=size)
+        self.count = 0  # frames so far
+
+    def append(self, points: np.ndarray) -> None:
+        """The next frame, f32 (P,3); the oldest one leaves."""
+        self._frames.append(points)
+        self.count += 1
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    @property
+    def frame_counts(self) -> list[int]:
+        return [self.count]
+
+    def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
+        """Frames by their number in the stream; they must still be in the window."""
+        first = self.count - len(self._frames)
+        return CloudSequence.from_frames(self.names[sequence], [self._frames[t - first] for t in frames])
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """After frame number `frame` (from 0): probabilities f32 (1+S,C) of the window and their mean over all clips so far.
+
+    Rows: fused, then each of the S streams that were trained.
+    """
+
+    frame: int
+    clips: int
+    scores: np.ndarray
+    mean: np.ndarray
+
+
+def window_size(info: ModelInfo, window: int | None) -> int:
+    """Frames looked back at: a clip for a model of consecutive frames, else `window`, over which its frames are spread."""
+    needed = info.config.num_frames
+    if info.timing != "uniform":
+        if window not in (None, needed):
+            raise UsageError(f"--window {window}: this model takes {needed} consecutive frames; leave the option out")
+        return needed
+    if window is None:
+        raise UsageError(
+            f"this model takes {needed} frames spread over a whole video, and a stream has no whole: name the frames to look back at,"
+            " about as many as an action lasts (--window 40, say)"
+        )
+    if window < needed:
+        raise UsageError(f"--window {window}: the model takes {needed} frames; expected at least as many")
+    return window
+
+
+class StreamPredictor:
+    """Frames in, a Prediction every `hop` frames out, the first when the window is full. Memory does not grow.
+
+    The points drawn depend on the seed and the frames' numbers, as in `ClipSource.load` for a file's first video: with hop 1
+    these are the clips that batch prediction takes, and the last `mean` is the video's score.
+    """
+
+    def __init__(
+        self,
+        model: Kinet,
+        info: ModelInfo,
+        *,
+        window: int | None = None,
+        hop: int = 1,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if hop < 1:
+            raise UsageError(f"--hop {hop}: expected at least 1 frame")
+        self.model, self.info, self.hop, self.device = model.to(device), info, hop, device
+        self.window = Window(window_size(info, window))
+        self._source = ClipSource(self.window, [0], info.config, timing=info.timing, seed=seed)
+        self.streams = tuple(info.notes.get("streams", STREAMS))
+        self.clips = 0
+        self._sum = np.zeros((1 + len(self.streams), info.config.num_classes))
+
+    def warm_up(self) -> None:
+        """One made-up clip: loading kernels takes a second that the first prediction need not wait for."""
+        shape = (1, self.info.config.num_frames, self.info.config.points_per_frame, 3)
+        self._scores(torch.from_numpy(generator(0).random(shape, np.float32)))
+
+    def add(self, points: np.ndarray) -> Prediction | None:
+        """Take a frame f32 (P,3); the prediction when one is due."""
+        self.window.append(points)
+        since_full = self.window.count - self.window.size
+        return self._predict() if since_full >= 0 and since_full % self.hop == 0 else None
+
+    def finish(self) -> Prediction | None:
+        """At the end: the prediction of a stream too short for one window, its last frame held as batch prediction does."""
+        return self._predict() if self.window.count and not self.clips else None
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Probabilities f32 (1+S,C) averaged over all clips so far."""
+        return (self._sum / max(self.clips, 1)).astype(np.float32)
+
+    def clip(self) -> Clip:
+        """The clip that ends at the newest frame, by frame numbers."""
+        count, frames = self.window.count, self.info.config.num_frames
+        first = count - len(self.window)
+        if self.info.timing == "uniform":
+            return Clip(0, tuple(first + t for t in uniform_frames(count - first, frames)))
+        return Clip(0, clip_frames(count, frames, first))
+
+    def _predict(self) -> Prediction:
+        clip = self.clip()
+        points = self._source.load(clip, clip.sequence, *clip.frames)
+        scores = self._scores(torch.from_numpy(points)[None])
+        self.clips += 1
+        self._sum += scores
+        return Prediction(self.window.count - 1, self.clips, scores, self.mean)
+
+    @torch.inference_mode()
+    def _scores(self, points: torch.Tensor) -> np.ndarray:
+        return clip_scores(self.model, points.to(self.device), self.streams)[:, 0].cpu().numpy()

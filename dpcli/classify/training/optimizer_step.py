@@ -1,0 +1,147 @@
+"""One optimizer step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import warnings
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.network.backbones.interface import BACKBONES, Grouping
+from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.sync_norm import synchronize_norms
+from dpcli.classify.training.neighbor_cache import NeighborCache
+from dpcli.classify.training.schedule import Schedule
+from dpcli.runtime.distributed import Processes
+from dpcli.runtime.mixed_precision import reduced_products
+
+_PATIENCE = 5  # steps without a finite loss or gradient before a run counts as lost
+_RUNAWAY = 10  # times the loss of guessing
+
+
+class _Logits(nn.Module):
+    """The branch that a stage trains, as one module whose parameters are that branch's alone."""
+
+    def __init__(self, model: Kinet, stage: int) -> None:
+        super().__init__()
+        self.branch = model.static if stage == 0 else model.dynamic
+        self._logits = [model.static_logits if stage == 0 else model.dynamic_logits]  # in a list: not a submodule
+
+    def forward(self, points: Tensor, *groups: list[Grouping]) -> Tensor:
+        return self._logits[0](points, *groups)
+
+
+@dataclass
+class LossWatch:
+    """Says when a loss has run away: not finite for five steps on end, or on average far above the loss of guessing."""
+
+    classes: int
+    lost: int = 0
+    mean: float = field(default=math.nan)
+
+    def see(self, loss: float, stepped: bool) -> str | None:
+        """After each step; a sentence once it is time to stop. stepped: the gradient was finite."""
+        self.lost = 0 if stepped and math.isfinite(loss) else self.lost + 1
+        if self.lost >= _PATIENCE:
+            return f"no finite loss or gradient in {_PATIENCE} steps on end"
+        if math.isfinite(loss):
+            self.mean = loss if math.isnan(self.mean) else 0.95 * self.mean + 0.05 * loss
+        limit = _RUNAWAY * max(math.log(self.classes), 1)
+        return (
+            f"the loss grew to {self.mean:.3g}; guessing has {math.log(self.classes):.3g}"
+            if self.mean > limit
+            else None
+        )
+
+
+class StageStep:
+    """Optimizer and forward pass of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
+
+    def __init__(
+        self,
+        model: Kinet,
+        stage: int,
+        schedule: Schedule,
+        device: torch.device,
+        processes: Processes,
+        neighbors: NeighborCache | None = None,
+    ) -> None:
+        self.schedule, self.device, self.processes = schedule, device, processes
+        self.neighbors = neighbors
+        module = _Logits(model, stage)
+        if processes.count > 1:
+            synchronize_norms(module)
+        self.optimizer = _new_optimizer(module.branch, schedule)
+        self.parameters = list(module.branch.parameters())
+        self.module: nn.Module = module
+        if processes.count > 1:
+            self.module = _shared(module, model, stage, device)
+
+    def __call__(
+        self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None
+    ) -> tuple[float, int, bool]:
+        """points (b,T,P,3), labels (b), learning rate -> (sum of losses, rightly classified, whether weights were changed).
+
+        clips i64 (b): numbers by which `neighbors` knows them.
+        """
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate * group["share"]
+        self.optimizer.zero_grad(set_to_none=True)
+        size = self.schedule.share(self.processes.count)
+        batch = (points, labels) if self.neighbors is None or clips is None else (points, labels, clips)
+        parts = list(zip(*(values.split(size) for values in batch)))
+        total, correct = 0.0, 0
+        for number, (some, known, *which) in enumerate(parts):
+            with self._without_exchange(number + 1 < len(parts)):
+                loss, right = self._backward(some.to(self.device), known.to(self.device), which, len(labels))
+            total, correct = total + loss, correct + right
+        norm = nn.utils.clip_grad_norm_(self.parameters, 5.0)
+        # a nearly singular fit can overflow: such a step is left out rather than poisoning the weights
+        stepped = bool(torch.isfinite(norm))
+        if stepped:
+            self.optimizer.step()
+        return total, correct, stepped
+
+    def _backward(self, points: Tensor, labels: Tensor, which: list[Tensor], clips: int) -> tuple[float, int]:
+        groups = [self.neighbors(points, *which)] if self.neighbors is not None and which else []
+        with reduced_products(self.device, self.schedule.amp):
+            logits = self.module(points, *groups).float()
+        loss = nn.functional.cross_entropy(
+            logits, labels, label_smoothing=self.schedule.label_smoothing, reduction="sum"
+        )
+        (loss / clips).backward()
+        return float(loss.detach()), int((logits.argmax(-1) == labels).sum())
+
+    def _without_exchange(self, on: bool) -> contextlib.AbstractContextManager:
+        """Gradients are exchanged once a step: not after its earlier parts."""
+        return self.module.no_sync() if on and self.processes.count > 1 else contextlib.nullcontext()
+
+
+def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -> nn.Module:
+    """The module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
+    config = model.config  # some switches leave parameters without a gradient
+    unused = (stage == 1 and (config.merge == "cross" or not config.normals)) or config.backbone not in BACKBONES
+    where = [device.index] if device.type == "cuda" else None
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", FutureWarning
+        )  # torch 2.13 renames broadcast_buffers, earlier ones know no other
+        return nn.parallel.DistributedDataParallel(
+            module, device_ids=where, broadcast_buffers=False, find_unused_parameters=unused
+        )
+
+
+def _new_optimizer(branch: nn.Module, schedule: Schedule) -> torch.optim.Optimizer:
+    # The last layer sums a thousand pooled maxima, all positive: at the others' rate its first steps overshoot.
+    named = dict(branch.named_parameters())
+    last = [p for name, p in named.items() if name.startswith("head.classify")]
+    rest = [p for name, p in named.items() if not name.startswith("head.classify")]
+    groups = [
+        {"params": last, "weight_decay": schedule.weight_decay, "share": 0.1},
+        {"params": [p for p in rest if p.dim() > 1], "weight_decay": schedule.weight_decay, "share": 1.0},
+        {"params": [p for p in rest if p.dim() <= 1], "weight_decay": 0.0, "share": 1.0},
+    ]
+    return torch.optim.AdamW([group for group in groups if group["params"]], lr=schedule.learning_rate)

@@ -1,0 +1,4 @@
+"""This folder holds the options and printed output of `dpc evaluate`, one module per command.
+
+What a command computes lives in the room `evaluate`.
+"""

@@ -1,0 +1,252 @@
+"""Several runs of one experiment (seeds): each run's metrics, their mean, standard deviation and t interval."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.bootstrap import Interval
+from dpcli.evaluate.classification.protocol import samples_json
+from dpcli.evaluate.compare.sample_metrics import Measured, Question, history_seed, is_pictures, measure
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change
+
+
+@dataclass(frozen=True)
+class Run:
+    """Metrics of one run, None = undefined; `identity`: what must be equal in all runs, most telling first."""
+
+    title: str
+    source: str
+    task: str
+    metrics: dict[str, float | None]
+    units: dict[str, str]
+    identity: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Over runs: mean, standard deviation (n - 1 in the denominator) and t interval of the mean; NaN = undefined."""
+
+    mean: float
+    sd: float
+    interval: Interval
+
+
+@dataclass(frozen=True)
+class RunsReport:
+    """Runs of one task on the same samples: `number` of `kind` ("" where the files don't say)."""
+
+    task: str
+    runs: list[Run]
+    units: dict[str, str]
+    confidence: float
+    kind: str
+    number: int
+
+    @property
+    def spreads(self) -> dict[str, Spread]:
+        """By metric; undefined where a run has no number."""
+        columns = {key: [run.metrics[key] for run in self.runs] for key in self.units}
+        return {
+            key: spread([math.nan if v is None else v for v in column], self.confidence, self.units[key] == "fraction")
+            for key, column in columns.items()
+        }
+
+
+def spread(values: Sequence[float], confidence: float = 0.95, share: bool = False) -> Spread:
+    """Mean, sd (ddof 1) and Student's t interval of the mean of independent runs; one run has no sd and no interval.
+
+    share: the interval of values from 0 to 1 ends there, as their mean does.
+    """
+    column = np.asarray(values, np.float64)
+    mean = float(column.mean())
+    if len(column) < 2:
+        return Spread(mean, math.nan, Interval(math.nan, math.nan))
+    from scipy.special import stdtrit
+
+    sd = float(column.std(ddof=1))
+    half = float(stdtrit(len(column) - 1, (1 + confidence) / 2)) * sd / math.sqrt(len(column))
+    ends = np.array([mean - half, mean + half])
+    if share and 0 <= column.min() and column.max() <= 1:
+        ends = ends.clip(0, 1)
+    return Spread(mean, sd, Interval(*map(float, ends)))
+
+
+def evaluate_runs(
+    paths: Sequence[Path], question: Question, confidence: float = 0.95, sources: Sequence[str] | None = None
+) -> RunsReport:
+    """The same question on each file: scores files, parts files, or files of JSON objects, one a line, that
+    `dpc evaluate ... --json` printed.
+
+    DataError when they are of different kinds, tasks, protocols, units or samples.
+    """
+    runs = [
+        run
+        for path, source in zip(paths, sources or map(str, paths), strict=True)
+        for run in (_file_runs if is_pictures(path) or _is_hdf5(path) else _json_runs)(path, source, question)
+    ]
+    for run in runs[1:]:
+        _same_experiment(runs[0], run)
+    runs = _distinct_titles(runs)
+    samples = runs[0].identity.get("samples") or {}
+    return RunsReport(
+        runs[0].task, runs, runs[0].units, confidence, str(samples.get("kind", "")), int(samples.get("number", 0))
+    )
+
+
+def _is_hdf5(path: Path) -> bool:
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(_HDF5)) == _HDF5
+    except OSError as error:
+        raise DataError(f"{path}: {error.strerror or error}") from None
+
+
+def _file_runs(path: Path, source: str, question: Question) -> list[Run]:
+    found = measure(path, source, question)
+    values = {key: value for one in found for key, value in one.values().items()}
+    units = {key: unit for one in found for key, unit in one.units.items()}
+    identity = {"kind": "file", "samples": samples_json(found[0].kind, found[0].names), **_facts(found)}
+    title = f"seed {found[0].seed}" if found[0].seed is not None else Path(source).stem
+    metrics = {key: None if math.isnan(value) else value for key, value in values.items()}
+    return [Run(title, source, " and ".join(one.task for one in found), metrics, units, identity)]
+
+
+def _facts(found: Sequence[Measured]) -> dict[str, Any]:
+    facts = {key: value for one in found for key, value in one.same.items()}
+    return facts | {
+        what: dict(zip(one.names, own, strict=True)) for one in found for what, own in one.of_sample.items()
+    }
+
+
+def _json_runs(path: Path, source: str, question: Question) -> list[Run]:
+    try:
+        lines = [line for line in path.read_text().splitlines() if line.strip()]
+        objects = [json.loads(line) for line in lines]
+    except (UnicodeDecodeError, json.JSONDecodeError):
+        raise DataError(
+            f"{source}: neither a file of this program nor JSON objects, one a line; expected what "
+            "`dpc evaluate ... --json` prints"
+        ) from None
+    if not objects:
+        raise DataError(f"{source}: empty; the command that should have filled it failed")
+    return [
+        _json_run(own, source if len(objects) == 1 else f"{source}:{row}", question.metrics)
+        for row, own in enumerate(objects, 1)
+    ]
+
+
+def _json_run(own: Any, source: str, wanted: Sequence[str] | None) -> Run:
+    if not isinstance(own, dict) or not all(isinstance(own.get(key), dict) for key in ("metrics", "units", "protocol")):
+        raise DataError(f"{source}: not an object of `dpc evaluate ... --json` (no metrics, units and protocol)")
+    metrics = {key: own["metrics"][key] for key in own["units"] if _is_number(own["metrics"].get(key, ""))}
+    missing = [key for key in wanted or () if key not in metrics]
+    if missing:
+        raise UsageError(f"--metrics {missing[0]}: {source} has {', '.join(metrics) or 'none'}")
+    metrics = {key: metrics[key] for key in wanted or metrics}
+    if not metrics:
+        raise DataError(f"{source}: no metric in it is a number")
+    bad = [key for key, value in metrics.items() if value is not None and not math.isfinite(value)]
+    if bad:
+        raise DataError(f"{source}: {', '.join(bad)} of {len(metrics)} metrics not finite; evaluate again")
+    counts = own.get("denominators") or {}
+    identity = {
+        "kind": "JSON",
+        "protocol": own["protocol"],
+        "samples": own.get("samples"),
+        "denominators": {key: counts[key] for key in _COUNTS if key in counts},
+    }
+    return Run(
+        _title(own, source),
+        source,
+        str(own.get("task", "")),
+        metrics,
+        {key: str(own["units"][key]) for key in metrics},
+        identity,
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, (int, float)) and not isinstance(value, bool))
+
+
+def _title(own: dict[str, Any], source: str) -> str:
+    history = own.get("provenance")
+    seed = history_seed([entry for entry in history if isinstance(entry, dict)]) if isinstance(history, list) else None
+    return f"seed {seed}" if seed is not None else Path(str(own.get("input", source))).stem
+
+
+def _same_experiment(first: Run, other: Run) -> None:
+    for what, one, two in (
+        ("task", first.task, other.task),
+        ("metrics", list(first.units), list(other.units)),
+        *((f"unit of {key}", first.units[key], other.units.get(key)) for key in first.units),
+        *((key, own, other.identity.get(key)) for key, own in first.identity.items()),
+    ):
+        if one != two:
+            raise DataError(
+                f"{other.source}: another {what} than {first.source}: {_differing(one, two)}; "
+                "runs are the same experiment on the same samples"
+            )
+
+
+def _differing(one: Any, two: Any) -> str:
+    """The first entry in which two values differ."""
+    if isinstance(one, dict) and isinstance(two, dict):
+        key = next(key for key in [*one, *two] if one.get(key) != two.get(key))
+        return f"{key} {_short(two.get(key))}, not {_short(one.get(key))}"
+    return f"{_short(two)}, not {_short(one)}"
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _distinct_titles(runs: Sequence[Run]) -> list[Run]:
+    """Runs of equal titles are told apart by their place."""
+    titles = [run.title for run in runs]
+    return [
+        run
+        if titles.count(run.title) == 1
+        else Run(f"{run.title} #{place}", run.source, run.task, run.metrics, run.units, run.identity)
+        for place, run in enumerate(runs, 1)
+    ]
+
+
+def runs_json(report: RunsReport) -> dict[str, Any]:
+    """One object for `--json`; under `metrics`, for each metric its mean, sd, interval and the values of the runs."""
+    first = report.runs[0]
+    metrics = {}
+    for key, own in report.spreads.items():
+        shown = {name: None if math.isnan(value) else value for name, value in (("mean", own.mean), ("sd", own.sd))}
+        ends = [own.interval.low, own.interval.high] if own.interval.defined else None
+        metrics[key] = shown | {
+            "n": len(report.runs),
+            "interval": ends,
+            "values": [run.metrics[key] for run in report.runs],
+        }
+    return {
+        "task": "runs",
+        "input": [run.source for run in report.runs],
+        "runs": [run.title for run in report.runs],
+        "protocol": {
+            "of": report.task,
+            "sd": "over runs, n - 1 in the denominator",
+            "interval": f"of the mean, Student's t, {100 * report.confidence:.4g} %",
+        }
+        | ({"each": first.identity["protocol"]} if "protocol" in first.identity else {}),
+        "metrics": metrics,
+        "samples": first.identity.get("samples"),
+        "units": report.units,
+        "denominators": {"runs": len(report.runs), **({report.kind: report.number} if report.number else {})},
+    }

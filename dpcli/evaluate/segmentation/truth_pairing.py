@@ -1,0 +1,148 @@
+"""A parts file beside its truth: the same sequences, frames and points on both sides, or an error that says where not."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.evaluate.classification.protocol import LeftOut, listing
+from dpcli.runtime.progress import Progress
+from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One sequence: truth and prediction with the same points, and what is said of its parts."""
+
+    truth: CloudSequence
+    predicted: CloudSequence
+    said: PartsSample
+
+
+class Comparison:
+    """Sequences of a parts file that count, each beside its truth, in the order of the parts file.
+
+    `split`: only sequences of this split of the truth; "all" every one; None = "test" if there are any. Sequences on
+    one side only are an error, with `intersect` they are left out and listed. `fields` names what the truth needs,
+    `instead` what serves as well where it lacks some of them; the attribute `fields` tells which of the two it is.
+    DataError when the truth lacks a field or nothing is left to compare.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        truth: str | Path,
+        *,
+        split: str | None = None,
+        intersect: bool = False,
+        fields: Sequence[str] = ("part",),
+        instead: Sequence[str] = (),
+    ) -> None:
+        self.predicted, self.truth = PartsReader(path), CloudsReader(truth)
+        missing = [field for field in fields if field not in self.truth.fields]
+        serves = bool(instead) and all(field in self.truth.fields for field in instead)
+        if missing and not serves:
+            other = f", nor {' and '.join(instead)}" if instead else ""
+            raise DataError(
+                f"{truth}: no {' and no '.join(missing)} in it{other}, so it can't be the truth; "
+                "`dpc prepare` writes them for data sets that have them"
+            )
+        self.fields = tuple(instead if missing else fields)
+        self._same_unit()
+        self.split = split or ("test" if "test" in self.truth.splits else "all")
+        self.left_out: list[LeftOut] = []
+        self.rows = self._match(intersect)
+
+    def _same_unit(self) -> None:
+        """A unit that a file doesn't name may be any."""
+        unit, other = self.predicted.length_unit, self.truth.length_unit
+        if unit and other and unit != other:
+            raise DataError(
+                f"{self.predicted.path}: length_unit {unit!r}, but {other!r} in {self.truth.path}; "
+                "predict again from that file"
+            )
+
+    def _match(self, intersect: bool) -> list[tuple[int, int]]:
+        """(index in the parts file, index in the truth) of what counts."""
+        where = {name: index for index, name in enumerate(self.truth.names)}
+        names = self.predicted.names
+        unknown = [name for name in names if name not in where]
+        said = set(names)
+        wanted = [
+            name for name, own in zip(self.truth.names, self.truth.splits, strict=True) if self.split in ("all", own)
+        ]
+        unsaid = [name for name in wanted if name not in said]
+        if not intersect:
+            self._same_names(unknown, unsaid)
+        counted = set(wanted)
+        self._leave_out("the truth doesn't have", unknown)
+        self._leave_out("not predicted", unsaid)
+        self._leave_out(f"not of split {self.split!r}", [n for n in names if n in where and n not in counted])
+        rows = [(index, where[name]) for index, name in enumerate(names) if name in counted]
+        if not rows:
+            raise DataError(
+                f"{self.predicted.path}: no sequence of split {self.split!r} of {self.truth.path}; "
+                "--split all takes every one"
+            )
+        return rows
+
+    def _same_names(self, unknown: list[str], unsaid: list[str]) -> None:
+        if unknown:
+            raise DataError(
+                f"{self.truth.path}: has no {listing(unknown)}, which {self.predicted.path} has; "
+                "was it predicted from another? --intersect compares what both have"
+            )
+        if unsaid:
+            raise DataError(
+                f"{self.predicted.path}: has no {listing(unsaid)} of split {self.split!r} of "
+                f"{self.truth.path}; predict them too, or --intersect compares what both have"
+            )
+
+    def _leave_out(self, reason: str, names: list[str]) -> None:
+        if names:
+            self.left_out.append(LeftOut(reason, names))
+
+    def __iter__(self) -> Iterator[Compared]:
+        """One sequence in memory at a time. DataError at the first point in which the two files differ."""
+        with Progress("evaluate", len(self.rows), "sequence") as progress:
+            for own, other in self.rows:
+                truth = self.truth.read(other, fields=self.fields)
+                predicted = self.predicted.read(own, fields=("part",))
+                self._same_points(truth, predicted)
+                yield Compared(truth, predicted, self.predicted.read_parts(own))
+                progress.advance()
+
+    def _same_points(self, truth: CloudSequence, predicted: CloudSequence) -> None:
+        where = f"{self.predicted.path}: {truth.name!r} has"
+        again = f"in {self.truth.path}; predict again from that file"
+        if truth.num_frames != predicted.num_frames:
+            raise DataError(f"{where} {predicted.num_frames} frames, {truth.num_frames} {again}")
+        sizes, others = np.diff(predicted.frame_offsets), np.diff(truth.frame_offsets)
+        if (sizes != others).any():
+            frame = int((sizes != others).argmax())
+            raise DataError(f"{where} {sizes[frame]} points in frame {frame}, {others[frame]} {again}")
+        differ = (truth.points != predicted.points).any(axis=1)
+        if differ.any():
+            row = int(differ.argmax())
+            frame = int(np.searchsorted(truth.frame_offsets, row, side="right")) - 1
+            ours, theirs = (_point(sequence.points[row]) for sequence in (predicted, truth))
+            point = row - int(truth.frame_offsets[frame])
+            raise DataError(f"{where} point {point} of frame {frame} at {ours}, but {theirs} {again}")
+
+    def close(self) -> None:
+        self.predicted.close()
+        self.truth.close()
+
+    def __enter__(self) -> Comparison:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+def _point(xyz: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:.7g}" for value in xyz.tolist()) + ")"

@@ -1,0 +1,147 @@
+"""A scene in the formats of others: 3DGS .ply and .splat (one, or one a frame), our `clouds`, cameras and metrics."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply, write_whole
+from dpcli.store import CloudSequence, CloudsWriter
+from dpcli.store.gaussians import GaussianScene, opacity_of
+from dpcli.store.pipes import check_replaced
+
+FORMATS = ("ply", "ply-sequence", "splat", "splat-sequence", "clouds", "cameras", "metrics")
+AXES = ("player", "keep")
+_SINGLE = {"ply": write_splat_ply, "splat": write_splat}
+
+
+def visible(scene: GaussianScene, least: float) -> np.ndarray:
+    """Which Gaussians are at least `least` opaque (0..1), indices i64 (M). DataError when none is."""
+    kept = np.flatnonzero(opacity_of(scene.opacity_logit) >= least)
+    if not len(kept):
+        raise DataError(f"no Gaussian is {least:g} opaque or more; the most opaque has {scene.opacity.max():.3g}")
+    return kept
+
+
+def thinned(scene: GaussianScene, least: float) -> GaussianScene:
+    """The scene without Gaussians less than `least` opaque; frames, parts, control points and cameras stay."""
+    kept = visible(scene, least)
+    if len(kept) == scene.num_gaussians:
+        return scene
+    own = {key: getattr(scene, key) for key in scene.__dataclass_fields__}
+    own |= {
+        key: own[key][kept]
+        for key in ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part", "part_probability")
+    }
+    own |= {key: own[key][:, kept] for key in ("frame_mean", "frame_quaternion", "rigid_weight")}
+    return GaussianScene(**own)
+
+
+def export_file(
+    scene: GaussianScene, path: Path, form: str, *, time: float | None = None, axes: str = "player"
+) -> None:
+    """One .ply or .splat: the canonical Gaussians, or those at `time` seconds."""
+    _SINGLE[form](path, Splats.of(scene, time, axes))
+
+
+def export_sequence(
+    scene: GaussianScene,
+    folder: Path,
+    form: str,
+    *,
+    axes: str = "player",
+    times: Sequence[float] | None = None,
+    force: bool = False,
+) -> list[Path]:
+    """frame0001.ply (or .splat), ... in `folder`, with cameras.json and metrics.json; the names players line up as a clip.
+
+    The folder appears whole. UsageError when it exists and `force` is off; then it is replaced.
+    """
+    if folder.exists() and not force:
+        raise UsageError(f"{folder}: exists already; --force replaces it")
+    if folder.is_file():
+        raise UsageError(f"{folder}: is a file, expected a folder for the frames")
+    check_replaced(folder, ("frame*.ply", "frame*.splat", "cameras.json", "metrics.json"))
+    times = scene.time.tolist() if times is None else list(times)
+    width = max(4, len(str(len(times))))
+    names = [f"frame{number:0{width}d}.{form}" for number in range(1, len(times) + 1)]
+    try:
+        part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made ({error.strerror}); create {folder.parent} first") from None
+    try:
+        for name, time in zip(names, times, strict=True):
+            export_file(scene, part / name, form, time=time, axes=axes)
+        write_json(part / "cameras.json", camera_list(scene, axes))
+        write_json(part / "metrics.json", scene.metrics)
+        part.chmod(0o755)
+        if folder.exists():
+            shutil.rmtree(folder)
+        part.rename(folder)
+    except OSError as error:
+        raise DpcError(f"{folder}: cannot be written ({error.strerror})") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return [folder / name for name in names]
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
+    write_whole(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"))
+
+
+def as_sequence(
+    scene: GaussianScene,
+    name: str,
+    *,
+    least: float = 0.3,
+    points: int | None = None,
+    rng: np.random.Generator | None = None,
+    axes: str = "player",
+) -> CloudSequence:
+    """The Gaussians' means as a point cloud video: T frames of the same M points.
+
+    Kept: those at least `least` opaque; of them `points` drawn without replacement by `rng`, if there are more. `track`
+    is the index of the Gaussian, `part` its rigid part, `pose` the parts' motions, canonical to frame. axes player:
+    x right, y down, z away from the reference camera at azimuth 0, as `clouds` have them.
+    """
+    kept = visible(scene, least)
+    if points is not None and points < len(kept):
+        if rng is None:
+            raise UsageError(f"{points} of {len(kept)} points: a generator must draw them")
+        kept = np.sort(rng.choice(kept, points, replace=False))
+    turn = np.eye(4)
+    if axes == "player":
+        turn[:3, :3] = TO_PLAYER
+    frames = scene.frame_mean[:, kept] * np.float32(turn.diagonal()[:3])
+    count = scene.num_frames
+    per_point = {"color": scene.color[kept], "part": scene.part[kept], "track": kept.astype(np.int64)}
+    pose = turn @ scene.part_motion.astype(np.float64) @ turn if scene.num_parts else None  # turn is its own inverse
+    return CloudSequence.from_frames(
+        name, list(frames), time=scene.time, pose=pose, **{key: [value] * count for key, value in per_point.items()}
+    )
+
+
+def write_clouds(
+    path: Path,
+    sequence: CloudSequence,
+    *,
+    provenance: Sequence[dict],
+    source: str,
+    seed: int,
+    length_unit: str = "",
+    force: bool = False,
+) -> None:
+    """A `clouds` file of one sequence."""
+    fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(sequence, key) is not None]
+    with CloudsWriter(
+        path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance, force=force
+    ) as writer:
+        writer.write(sequence)

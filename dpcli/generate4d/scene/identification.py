@@ -1,0 +1,43 @@
+"""Finding quasi-rigid parts without labels: temporal-change and spatial-coherence preservation (eq. 5.3, 5.4)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.ops.knn import knn
+from dpcli.ops.rigid import rigid_flow, weighted_kabsch
+
+
+def temporal_loss(
+    points: Tensor,  # [N, 3] canonical
+    displacement: Tensor,  # [B, N, 3] taken as given
+    part: Tensor,  # [B, N, S]
+) -> Tensor:
+    """How badly one rigid motion per part (weighted Kabsch) explains where points went: eq. 5.3, mean over times.
+
+    The displacement is a target ("from the previous iteration"), so gradients reach the partition alone.
+    """
+    target = displacement.detach()
+    start = points.detach().expand(len(target), -1, -1)
+    rotation, translation = weighted_kabsch(start, start + target, part)
+    return (rigid_flow(start, part, rotation, translation) - target).square().sum(-1).mean()
+
+
+def spatial_loss(
+    part: Tensor,  # [B, N, S]
+    neighbors: Tensor,  # [N, H] indices of points nearby; a row's own index fills what is missing
+) -> Tensor:
+    """Mean L2 distance between the part probabilities of a point and its neighbors: eq. 5.4."""
+    difference = part[:, :, None] - part[:, neighbors]
+    return (difference.square().sum(-1) + 1e-12).sqrt().mean()
+
+
+def ball_neighbors(points: Tensor, radius: float, count: int) -> Tensor:  # [N, 3] -> [N, count]
+    """Indices of up to `count` points within `radius`, nearest first, without the point; its own index fills the rest."""
+    own = torch.arange(len(points), device=points.device)[:, None]
+    if len(points) < 2:
+        return own
+    squared, index = knn(points.detach()[None], points.detach()[None], min(count, len(points) - 1) + 1)
+    near = (squared[0] <= radius**2) & (index[0] != own)
+    return torch.where(near, index[0], own)[:, 1:]

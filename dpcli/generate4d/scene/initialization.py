@@ -1,0 +1,140 @@
+"""Where the first Gaussians are put: in a sphere, in the inflated silhouette of one view, or in the hull of several.
+
+A single view says nothing about depth: a fit that starts from a sphere settles on any shape with that picture, most of
+them flat. Inflation gives every silhouette point a thickness by its distance from the outline, as a drawing is read.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.errors import DataError
+
+
+def in_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """Positions f32 (count,3), uniform in the volume of a sphere about the origin."""
+    direction = rng.standard_normal((count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return (direction * radius * np.cbrt(rng.random((count, 1)))).astype(np.float32)
+
+
+def inflated(
+    rgba: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and colors (count,3) f32 that fill one picture (H,W,4, 0..1) with round thickness about the origin's depth.
+
+    The thickness is that of `ball_thickness`. Colors are the pixel's, on the far side as well.
+    """
+    mask = rgba[..., 3] > 0.5
+    if not mask.any():
+        raise DataError(
+            "the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again"
+        )
+    half = ball_thickness(mask)
+    rows, columns = np.nonzero(mask)
+    share = half[rows, columns] / half[rows, columns].sum()
+    picked = rng.choice(len(rows), count, p=share)
+    pixel = np.stack([columns[picked] + rng.random(count), rows[picked] + rng.random(count)], 1)
+    middle = float(world_to_camera[2, 3])  # depth of the world's origin
+    depth = middle + half[rows[picked], columns[picked]] * rng.uniform(-1, 1, count) * middle / intrinsics[0, 0]
+    camera = np.stack(
+        [
+            (pixel[:, 0] - intrinsics[0, 2]) / intrinsics[0, 0] * depth,
+            (pixel[:, 1] - intrinsics[1, 2]) / intrinsics[1, 1] * depth,
+            depth,
+        ],
+        1,
+    )
+    world = (camera - world_to_camera[:3, 3]) @ world_to_camera[:3, :3]
+    return world.astype(np.float32), rgba[rows[picked], columns[picked], :3].astype(np.float32)
+
+
+def ball_thickness(mask: np.ndarray) -> np.ndarray:
+    """Half the thickness (H,W) in pixels of a silhouette blown up into the union of the balls of its medial axis: a disc
+    becomes a ball, a limb a rod. At least half a pixel inside the mask, 0 outside."""
+    from scipy import ndimage
+
+    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    ridge = (distance > 0) & (distance >= ndimage.maximum_filter(distance, size=3) - 0.5)
+    squared = np.zeros(mask.shape)
+    for row, column in zip(*np.nonzero(ridge)):
+        radius = distance[row, column]
+        reach = int(radius)
+        top, left = max(row - reach, 0), max(column - reach, 0)
+        window = squared[top : row + reach + 1, left : column + reach + 1]
+        dy = np.arange(top, top + window.shape[0])[:, None] - row
+        dx = np.arange(left, left + window.shape[1]) - column
+        np.maximum(window, radius**2 - dy**2 - dx**2, out=window)
+    return np.where(mask, ndimage.gaussian_filter(np.sqrt(squared.clip(0.25)), 1.0), 0.0)
+
+
+def hull(
+    pictures: list[np.ndarray], intrinsics: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and colors (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
+
+    The common hull of few silhouettes has corners that no view contradicts: two views at a right angle make a box of every
+    body. With u the distance from a silhouette's middle line as a share of its half width, points are kept whose
+    u_i^2 + u_j^2 is at most 1 for every two views that look across each other, which makes that box an ellipse.
+    A color is the mean over views, weighted toward the view whose camera is nearest to the point.
+    """
+    offsets = [np.dstack([picture, _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
+    across = np.abs(poses[:, 2, :3] @ poses[:, 2, :3].T) < 0.7  # viewing directions at more than 45 degrees
+    kept: list[np.ndarray] = []
+    total = 0
+    for _ in range(200):
+        points = in_sphere(20_000, 0.85, rng)
+        seen = np.stack([_sample(o, points, k, p)[0][:, 3:] for o, k, p in zip(offsets, intrinsics, poses)])
+        inside = (seen[..., 0] > 0.5).all(0)
+        squared = seen[..., 1] ** 2
+        for i, j in zip(*np.nonzero(np.triu(across))):
+            inside &= squared[i] + squared[j] <= 1
+        kept.append(points[inside])
+        total += int(inside.sum())
+        if total >= count:
+            break
+    if not total:
+        raise DataError("the silhouettes of the views have no point in common; are the cameras right?")
+    points = np.concatenate(kept)[:count]
+    colors = np.zeros_like(points)
+    weights = np.zeros((len(points), 1), np.float32)
+    for picture, matrix, pose in zip(pictures, intrinsics, poses):
+        values, depth = _sample(picture, points, matrix, pose)
+        weight = (np.exp(-8 * (depth - depth.min())) * values[:, 3])[:, None]
+        colors, weights = colors + weight * values[:, :3], weights + weight
+    return points, (colors / np.maximum(weights, 1e-8)).astype(np.float32)
+
+
+def _share_of_width(mask: np.ndarray) -> np.ndarray:
+    """u (H,W): 0 on the middle line of a silhouette, 1 on its outline, from its distance d and ball thickness h:
+    h^2 = 2 R d - d^2 gives the half width R, and u = 1 - d / R."""
+    from scipy import ndimage
+
+    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    width = (ball_thickness(mask) ** 2 + distance**2) / np.maximum(2 * distance, 1e-6)
+    return np.where(mask, (1 - distance / np.maximum(width, 1e-6)).clip(0, 1), 1.0).astype(np.float32)
+
+
+def _sample(
+    picture: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel values (N,channels) under the points, zero outside the picture, and their depths (N,)."""
+    camera = points @ pose[:3, :3].T + pose[:3, 3]
+    depth = np.maximum(camera[:, 2], 1e-6)
+    column = np.floor(camera[:, 0] / depth * intrinsics[0, 0] + intrinsics[0, 2]).astype(int)
+    row = np.floor(camera[:, 1] / depth * intrinsics[1, 1] + intrinsics[1, 2]).astype(int)
+    height, width = picture.shape[:2]
+    good = (row >= 0) & (row < height) & (column >= 0) & (column < width) & (camera[:, 2] > 0)
+    values = np.zeros((len(points), picture.shape[2]), np.float32)
+    values[good] = picture[row[good], column[good]]
+    return values, depth
+
+
+def spread_seeds(points: Tensor, count: int) -> Tensor:
+    """`count` places spread over the points (N,3) by farthest point sampling, repeated when there are fewer points."""
+    from dpcli.ops.farthest_point_sampling import fps
+
+    chosen = fps(points.detach()[None], min(count, len(points)))[0]
+    return points.detach()[chosen[torch.arange(count) % len(chosen)]]

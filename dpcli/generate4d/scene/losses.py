@@ -1,0 +1,57 @@
+"""Losses of the fit that are not about finding parts: pictures, silhouettes, shape."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
+
+
+def picture_loss(
+    rendered: Tensor,  # [C, H, W, 3] on the background
+    alpha: Tensor,  # [C, H, W, 1]
+    target: Tensor,  # [C, H, W, 4] color times alpha, alpha
+    background: Tensor,  # [C, 3]
+    foreground: float,
+) -> Tensor:
+    """Mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
+    wanted = target[..., :3] + (1 - target[..., 3:]) * background[:, None, None]
+    return (rendered - wanted).square().mean() + foreground * (alpha - target[..., 3:]).square().mean()
+
+
+def arap_loss(
+    rest: Tensor,  # [N, 3]
+    moved: Tensor,  # [B, N, 3]
+    neighbors: Tensor,  # [N, H]
+) -> Tensor:
+    """As-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbors are from one rotation of them.
+
+    The best rotation of each point is found without gradient. A row's own index, where neighbors lack, adds nothing.
+    """
+
+    before = (rest[neighbors] - rest[:, None]).detach()  # [N, H, 3]
+    after = moved[:, neighbors] - moved[:, :, None]  # [B, N, H, 3]
+    with torch.no_grad():
+        covariance = torch.einsum("bnhi,nhj->bnij", after, before)
+        rotation = _nearest_rotation(covariance)
+    return (after - torch.einsum("bnij,nhj->bnhi", rotation, before)).square().sum(-1).mean()
+
+
+def _nearest_rotation(matrix: Tensor) -> Tensor:  # [..., 3, 3]
+    """U diag(1, 1, det) V^T."""
+    u, _, vh = torch.linalg.svd(matrix)
+    u = torch.cat([u[..., :2], u[..., 2:] * torch.det(u @ vh)[..., None, None]], -1)
+    return u @ vh
+
+
+def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:
+    """Needles and discs along the line of sight look right in the one picture and wrong in all others: the longest axis
+    beyond `aspect` times the geometric mean is penalized (log ratio)."""
+    log_scale = gaussians.log_scale
+    return (log_scale.max(1).values - log_scale.mean(1) - torch.tensor(aspect).log()).relu().mean()
+
+
+def thickness_loss(gaussians: CanonicalGaussians, view_axis: Tensor) -> Tensor:
+    """Mean squared drift along the line of sight (unit vector (3,)) from where the start put each Gaussian."""
+    return ((gaussians.mean - gaussians.anchor) @ view_axis).square().mean()

@@ -1,0 +1,71 @@
+"""The decorators of the CPU kernels: numba, cached on disk."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+
+import numba
+
+
+def _skip_blas() -> None:
+    """Import numba's array functions, as its first kernel will, without their look for scipy's BLAS: 0.3 s of a process.
+
+    What needs it looks again (np.dot), but for numba's np.cov and np.corrcoef, which no kernel here uses.
+    """
+    name = "scipy.linalg.cython_blas"
+    if name not in sys.modules and "numba.np.arraymath" not in sys.modules:
+        sys.modules[name] = None  # type: ignore[assignment]  # an import of it fails at once
+        try:
+            importlib.import_module("numba.np.arraymath")
+        finally:
+            del sys.modules[name]
+
+
+_skip_blas()
+
+# No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorize. Nothing that changes
+# a value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
+_FLAGS = {"nnan", "nsz"}
+_ARITHMETIC = {"contract", "nsz", "arcp", "reassoc"}
+
+
+def kernel(function: Callable) -> Callable:
+    """For searches, whose indices and distances must equal the reference's; compiled on first call.
+
+    Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
+    mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process. Helpers belong
+    in the file of the kernel that calls them: numba's cache looks for changes in that file only.
+    """
+    return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
+
+
+def inlined(function: Callable) -> Callable:
+    """A helper of a `kernel` whose text goes into the caller: for what is called once a microsecond."""
+    return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy", inline="always")
+
+
+def arithmetic_kernel(function: Callable) -> Callable:
+    """As `kernel`, but infinities and NaN pass through as IEEE 754 has them: for work on values nobody has checked."""
+    return _compiled(function, nogil=True, error_model="numpy")
+
+
+def _compiled(function: Callable, **options: object) -> Callable:
+    try:
+        return numba.njit(cache=True, **options)(function)
+    except RuntimeError:
+        return numba.njit(**options)(function)
+
+
+def parallel_kernel(function: Callable) -> Callable:
+    """For floating-point work on numba's own threads: contraction and reordering allowed, results to rounding only.
+
+    Must not run in a process that forks afterwards; `parallel.parallel_kernels` loads modules that use it.
+    """
+    return _compiled(function, parallel=True, fastmath=_ARITHMETIC, error_model="numpy")
+
+
+def piece_kernel(function: Callable) -> Callable:
+    """As `parallel_kernel`, but serial and without the GIL: for work that plain threads share among them."""
+    return _compiled(function, nogil=True, fastmath=_ARITHMETIC, error_model="numpy")

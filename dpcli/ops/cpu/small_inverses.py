@@ -1,0 +1,544 @@
+"""Batched small inverses in numba: `TILE` matrices side by side, entry by entry, so that the arithmetic vectorizes.
+
+Mirrors `linalg._inverse` for n <= 8: one block partition at most, whose blocks have the closed form.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.ops.cpu.jit import arithmetic_kernel
+
+TILE = 64  # matrices per tile: an 8x8 tile of float32 is 16 kB
+SCRATCH = 25  # of 4x4 that `guarded_gradient` works in
+_SIGNED, _NONE = 0, 2  # positions in linalg.GUARDS
+
+
+@arithmetic_kernel
+def _guard_row(det, moved, min_det, guard):
+    """Move small determinants (W,) away from zero and note which; then invert them in place."""
+    for w in range(det.size):
+        if guard != _NONE and abs(det[w]) < min_det:
+            moved[w] = True
+            det[w] = -min_det if guard == _SIGNED and det[w] < 0 else min_det
+        det[w] = 1 / det[w]
+
+
+@arithmetic_kernel
+def _closed1(m, out, at, det):
+    for w in range(TILE):
+        det[w] = m[at, at, w]
+        out[at, at, w] = 1
+
+
+@arithmetic_kernel
+def _closed2(m, out, at, det):
+    for w in range(TILE):
+        a, b, c, d = m[at, at, w], m[at, at + 1, w], m[at + 1, at, w], m[at + 1, at + 1, w]
+        det[w] = a * d - b * c
+        out[at, at, w], out[at, at + 1, w], out[at + 1, at, w], out[at + 1, at + 1, w] = d, -b, -c, a
+
+
+@arithmetic_kernel
+def _closed3(m, out, at, det):
+    for w in range(TILE):
+        a, b, c = m[at, at, w], m[at, at + 1, w], m[at, at + 2, w]
+        d, e, f = m[at + 1, at, w], m[at + 1, at + 1, w], m[at + 1, at + 2, w]
+        g, h, i = m[at + 2, at, w], m[at + 2, at + 1, w], m[at + 2, at + 2, w]
+        x, y, z = e * i - f * h, f * g - d * i, d * h - e * g
+        det[w] = a * x + b * y + c * z
+        out[at, at, w], out[at, at + 1, w], out[at, at + 2, w] = x, c * h - b * i, b * f - c * e
+        out[at + 1, at, w], out[at + 1, at + 1, w], out[at + 1, at + 2, w] = y, a * i - c * g, c * d - a * f
+        out[at + 2, at, w], out[at + 2, at + 1, w], out[at + 2, at + 2, w] = z, b * g - a * h, a * e - b * d
+
+
+@arithmetic_kernel
+def _closed4(m, out, at, det):
+    for w in range(TILE):
+        a, b, c, d = m[at, at, w], m[at, at + 1, w], m[at, at + 2, w], m[at, at + 3, w]
+        e, f, g, h = m[at + 1, at, w], m[at + 1, at + 1, w], m[at + 1, at + 2, w], m[at + 1, at + 3, w]
+        i, j, k, l = m[at + 2, at, w], m[at + 2, at + 1, w], m[at + 2, at + 2, w], m[at + 2, at + 3, w]  # noqa: E741 - the sixteen entries, a to p
+        n, o, p, q = m[at + 3, at, w], m[at + 3, at + 1, w], m[at + 3, at + 2, w], m[at + 3, at + 3, w]
+        u01, u02, u03 = a * f - b * e, a * g - c * e, a * h - d * e
+        u12, u13, u23 = b * g - c * f, b * h - d * f, c * h - d * g
+        v01, v02, v03 = i * o - j * n, i * p - k * n, i * q - l * n
+        v12, v13, v23 = j * p - k * o, j * q - l * o, k * q - l * p
+        det[w] = u01 * v23 - u02 * v13 + u03 * v12 + u12 * v03 - u13 * v02 + u23 * v01
+        out[at, at, w] = f * v23 - g * v13 + h * v12
+        out[at, at + 1, w] = -(b * v23 - c * v13 + d * v12)
+        out[at, at + 2, w] = o * u23 - p * u13 + q * u12
+        out[at, at + 3, w] = -(j * u23 - k * u13 + l * u12)
+        out[at + 1, at, w] = -(e * v23 - g * v03 + h * v02)
+        out[at + 1, at + 1, w] = a * v23 - c * v03 + d * v02
+        out[at + 1, at + 2, w] = -(n * u23 - p * u03 + q * u02)
+        out[at + 1, at + 3, w] = i * u23 - k * u03 + l * u02
+        out[at + 2, at, w] = e * v13 - f * v03 + h * v01
+        out[at + 2, at + 1, w] = -(a * v13 - b * v03 + d * v01)
+        out[at + 2, at + 2, w] = n * u13 - o * u03 + q * u01
+        out[at + 2, at + 3, w] = -(i * u13 - j * u03 + l * u01)
+        out[at + 3, at, w] = -(e * v12 - f * v02 + g * v01)
+        out[at + 3, at + 1, w] = a * v12 - b * v02 + c * v01
+        out[at + 3, at + 2, w] = -(n * u12 - o * u02 + p * u01)
+        out[at + 3, at + 3, w] = i * u12 - j * u02 + k * u01
+
+
+@arithmetic_kernel
+def _closed(m, out, at, n, det, moved, min_det, guard):
+    """Closed-form inverses of the diagonal n x n blocks, n <= 4, that start at row and column `at`."""
+    if n == 1:
+        _closed1(m, out, at, det)
+    elif n == 2:
+        _closed2(m, out, at, det)
+    elif n == 3:
+        _closed3(m, out, at, det)
+    else:
+        _closed4(m, out, at, det)
+    _guard_row(det, moved, min_det, guard)
+    for i in range(at, at + n):
+        for j in range(at, at + n):
+            for w in range(TILE):
+                out[i, j, w] *= det[w]
+
+
+@arithmetic_kernel
+def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
+    """Add sign * a b to `out`, for blocks that start at the entries given: shape (p,r,q) for p x r times r x q.
+
+    Offsets, not slices: a sliced tile has an unknown stride, and its loops no longer vectorize.
+    """
+    for i in range(shape[0]):
+        for j in range(shape[2]):
+            for k in range(shape[1]):
+                ai, ak, bk, bj = a_at[0] + i, a_at[1] + k, b_at[0] + k, b_at[1] + j
+                oi, oj = out_at[0] + i, out_at[1] + j
+                for w in range(TILE):
+                    out[oi, oj, w] += sign * a[ai, ak, w] * b[bk, bj, w]
+
+
+@arithmetic_kernel
+def _invert(m, out, left, right, det, moved, min_det, guard):
+    """Inverses of a tile (n,n,W), n <= 8, which is overwritten; left (q,p,W) and right (p,q,W) are scratch.
+
+    The leading p x p block A in closed form; where q = n - p rows are left, the others by its Schur complement. det (2,W):
+    one over the two blocks' guarded determinants.
+    """
+    p, q = right.shape[0], left.shape[0]
+    plus, minus = m.dtype.type(1), m.dtype.type(-1)
+    zero = p - p  # a literal 0 would compile every callee once more
+    a, b, c, d = (zero, zero), (zero, p), (p, zero), (p, p)
+    out[:] = 0
+    for at, size in ((zero, p), (p, q)):
+        if size == 0:
+            break
+        _closed(m, out, at, size, det[0 if at == 0 else 1], moved, min_det, guard)
+        if at == 0 and q > 0:
+            left[:] = 0
+            right[:] = 0
+            _add_product(m, c, out, a, plus, left, a, (q, p, p))
+            _add_product(out, a, m, b, plus, right, a, (p, p, q))
+            _add_product(left, a, m, b, minus, m, d, (q, p, q))
+    if q > 0:
+        _add_product(right, a, out, d, minus, out, b, (p, q, q))
+        _add_product(out, d, left, a, minus, out, c, (q, q, p))
+        _add_product(out, b, left, a, minus, out, a, (p, q, p))
+
+
+@arithmetic_kernel
+def _load(matrices, first, size, tile, transposed):
+    """Matrices first..first+size-1, or their transposes, as a tile (n,n,W); the identity behind them."""
+    n = tile.shape[0]
+    low = np.uintp(first)
+    for i in range(np.uintp(n)):
+        for j in range(np.uintp(n)):
+            if transposed:
+                for w in range(np.uintp(size)):
+                    tile[i, j, w] = matrices[low + w, j, i]
+            else:
+                for w in range(np.uintp(size)):
+                    tile[i, j, w] = matrices[low + w, i, j]
+            if size < TILE:
+                tile[i, j, size:] = 1 if i == j else 0
+
+
+@arithmetic_kernel
+def _store(tile, matrices, first, size):
+    low = np.uintp(first)
+    for w in range(np.uintp(size)):
+        for i in range(np.uintp(tile.shape[0])):
+            for j in range(np.uintp(tile.shape[0])):
+                matrices[low + w, i, j] = tile[i, j, w]
+
+
+@arithmetic_kernel
+def inverse_kernel(matrices, inverse, moved, min_det, guard, first, last):
+    """Invert matrices first..last-1 of (R,n,n), n <= 8, into `inverse`; moved (R,) bool: where the guard acted."""
+    n = matrices.shape[1]
+    half = n if n <= 4 else (n + 1) // 2
+    tile = np.empty((n, n, TILE), matrices.dtype)
+    out = np.empty((n, n, TILE), matrices.dtype)
+    left = np.empty((n - half, half, TILE), matrices.dtype)
+    right = np.empty((half, n - half, TILE), matrices.dtype)
+    det = np.empty((2, TILE), matrices.dtype)
+    floor = matrices.dtype.type(min_det)
+    acted = np.empty(TILE, np.bool_)
+    for low in range(first, last, TILE):
+        size = min(TILE, last - low)
+        _load(matrices, low, size, tile, False)
+        acted[:] = False
+        _invert(tile, out, left, right, det, acted, floor, guard)
+        _store(out, inverse, low, size)
+        for w in range(size):  # a slice assignment would compile an error message for 2 s
+            moved[low + w] = acted[w]
+
+
+@arithmetic_kernel
+def inverse_gradient_kernel(inverse, grad, out, first, last):
+    """out = -X' G X' for rows first..last-1 of X = inverse (R,n,n) and G = grad: the gradient of an exact inverse."""
+    n = inverse.shape[1]
+    x = np.empty((n, n, TILE), inverse.dtype)  # X'
+    g, inner, outer = np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype), np.empty(x.shape, x.dtype)
+    plus, minus = inverse.dtype.type(1), inverse.dtype.type(-1)
+    origin = (n - n, n - n)
+    for low in range(first, last, TILE):
+        size = min(TILE, last - low)
+        _load(inverse, low, size, x, True)
+        _load(grad, low, size, g, False)
+        inner[:] = 0
+        outer[:] = 0
+        _add_product(g, origin, x, origin, plus, inner, origin, (n, n, n))
+        _add_product(x, origin, inner, origin, minus, outer, origin, (n, n, n))
+        _store(outer, out, low, size)
+
+
+@arithmetic_kernel
+def _product(a, b, out, shape, turned_a, turned_b):
+    """out = a b, or with a or b transposed, for shape (p,r,q): p x r times r x q. Leading parts of larger arrays."""
+    for i in range(shape[0]):
+        for j in range(shape[2]):
+            total = 0.0
+            for k in range(shape[1]):
+                left = a[k, i] if turned_a else a[i, k]
+                right = b[j, k] if turned_b else b[k, j]
+                total += left * right
+            out[i, j] = total
+
+
+@arithmetic_kernel
+def _guarded_inverse(a, n, reciprocal, most, out, scratch):
+    """Adjugate (by Cayley and Hamilton) over guarded determinant of the leading n x n, n <= 4; whether the guard acted, and
+    the determinant. reciprocal: one over what the tile divided by, `most` where the guard acted: rounding may have made its sign."""
+    square, cube = scratch[0], scratch[1]
+    _product(a, a, square, (n, n, n), False, False)
+    _product(a, square, cube, (n, n, n), False, False)
+    t1 = t2 = t3 = 0.0
+    for i in range(n):
+        t1, t2, t3 = t1 + a[i, i], t2 + square[i, i], t3 + cube[i, i]
+    c2, c3 = (t1 * t1 - t2) / 2, (t1 * t1 * t1 - 3 * t1 * t2 + 2 * t3) / 6
+    for i in range(n):
+        for j in range(n):
+            one = 1.0 if i == j else 0.0
+            if n == 1:
+                out[i, j] = one
+            elif n == 2:
+                out[i, j] = t1 * one - a[i, j]
+            elif n == 3:
+                out[i, j] = square[i, j] - t1 * a[i, j] + c2 * one
+            else:
+                out[i, j] = -cube[i, j] + t1 * square[i, j] - c2 * a[i, j] + c3 * one
+    acted, det = abs(reciprocal) >= most, 0.0
+    if acted:
+        det = 1 / reciprocal
+    else:
+        for j in range(n):
+            det += a[0, j] * out[j, 0]
+    for i in range(n):
+        for j in range(n):
+            out[i, j] /= det
+    return acted, det
+
+
+@arithmetic_kernel
+def _guarded_gradient(a, inverse, grad, n, acted, det, out, scratch):
+    """The gradient at `a` from that at `_guarded_inverse`: -X' G X', or of the adjugate alone where the guard acted."""
+    part = scratch[0]
+    if not acted:
+        _product(inverse, grad, part, (n, n, n), True, False)
+        _product(part, inverse, out, (n, n, n), False, True)
+        for i in range(n):
+            for j in range(n):
+                out[i, j] = -out[i, j]
+        return
+    square, left, right, middle = scratch[1], scratch[2], scratch[3], scratch[4]
+    _product(a, a, square, (n, n, n), False, False)
+    t1 = t2 = trace = along = along2 = 0.0
+    for i in range(n):
+        t1, t2, trace = t1 + a[i, i], t2 + square[i, i], trace + grad[i, i]
+        for j in range(n):
+            along, along2 = along + grad[i, j] * a[i, j], along2 + grad[i, j] * square[i, j]
+    c2 = (t1 * t1 - t2) / 2
+    _product(grad, a, part, (n, n, n), False, True)
+    _product(a, grad, middle, (n, n, n), True, False)
+    for i in range(n):
+        for j in range(n):
+            part[i, j] += middle[i, j]  # G A' + A' G
+    if n == 4:
+        _product(grad, square, left, (n, n, n), False, True)
+        _product(square, grad, right, (n, n, n), True, False)
+        turned = scratch[5]
+        _product(middle, a, turned, (n, n, n), False, True)
+        for i in range(n):
+            for j in range(n):
+                left[i, j] += right[i, j] + turned[i, j]  # G A2' + A' G A' + A2' G
+    for i in range(n):
+        for j in range(n):
+            one, value = (1.0 if i == j else 0.0), 0.0
+            if n == 2:
+                value = trace * one - grad[i, j]
+            elif n == 3:
+                value = part[i, j] - along * one - t1 * grad[i, j] + trace * (t1 * one - a[j, i])
+            elif n == 4:
+                value = t1 * part[i, j] - left[i, j] + along2 * one - c2 * grad[i, j] - along * (t1 * one - a[j, i])
+                value += trace * (c2 * one - t1 * a[j, i] + square[j, i])
+            out[i, j] = value / det
+
+
+@arithmetic_kernel
+def _block(m, row, column, rows, columns, out):
+    for i in range(rows):
+        for j in range(columns):
+            out[i, j] = m[row + i, column + j]
+
+
+@arithmetic_kernel
+def guarded_gradient(m, grad, n, reciprocals, min_det, out, scratch):
+    """The gradient at m (n,n), n <= 8, from that at its guarded inverse, all float64: where a tile's guard acted.
+
+    reciprocals (2): one over both blocks' determinants, as the tile has them. scratch (SCRATCH,4,4).
+
+    Follows the partition of `_invert`: X11 = A^ + R S^ L, X12 = -R S^, X21 = -S^ L, X22 = S^ with R = A^ B, L = C A^ and
+    S = D - L B.
+    """
+    p = n if n <= 4 else (n + 1) // 2
+    q, most = n - p, (1 - 1e-6) / min_det
+    a, a_inverse, grad_a, g11 = scratch[6], scratch[7], scratch[8], scratch[9]
+    _block(m, 0, 0, p, p, a)
+    a_acted, a_det = _guarded_inverse(a, p, reciprocals[0], most, a_inverse, scratch)
+    _block(grad, 0, 0, p, p, g11)
+    if q == 0:
+        _guarded_gradient(a, a_inverse, g11, p, a_acted, a_det, out, scratch)
+        return
+    b, c, s, s_inverse, grad_s = scratch[10], scratch[11], scratch[12], scratch[13], scratch[14]
+    g12, g21, g22, to_s, to_left, to_right = (
+        scratch[15],
+        scratch[16],
+        scratch[17],
+        scratch[18],
+        scratch[19],
+        scratch[20],
+    )
+    left, right, x, y = scratch[21], scratch[22], scratch[23], scratch[24]
+    _block(m, 0, p, p, q, b)
+    _block(m, p, 0, q, p, c)
+    _block(m, p, p, q, q, s)
+    _block(grad, 0, p, p, q, g12)
+    _block(grad, p, 0, q, p, g21)
+    _block(grad, p, p, q, q, g22)
+    _product(c, a_inverse, left, (q, p, p), False, False)
+    _product(a_inverse, b, right, (p, p, q), False, False)
+    _product(left, b, x, (q, p, q), False, False)
+    for i in range(q):
+        for j in range(q):
+            s[i, j] -= x[i, j]
+    s_acted, s_det = _guarded_inverse(s, q, reciprocals[1], most, s_inverse, scratch)
+    _product(g11, left, x, (p, p, q), False, True)  # (G11 L' - G12) S^'
+    for i in range(p):
+        for j in range(q):
+            x[i, j] -= g12[i, j]
+    _product(x, s_inverse, to_right, (p, q, q), False, True)
+    _product(right, x, to_s, (q, p, q), True, False)  # R' (G11 L' - G12) - G21 L' + G22
+    _product(g21, left, y, (q, p, q), False, True)
+    for i in range(q):
+        for j in range(q):
+            to_s[i, j] += g22[i, j] - y[i, j]
+    _guarded_gradient(s, s_inverse, to_s, q, s_acted, s_det, grad_s, scratch)
+    _product(right, g11, y, (q, p, p), True, False)  # S^' (R' G11 - G21) - dS B'
+    for i in range(q):
+        for j in range(p):
+            y[i, j] -= g21[i, j]
+    _product(s_inverse, y, to_left, (q, q, p), True, False)
+    _product(grad_s, b, y, (q, q, p), False, True)
+    for i in range(q):
+        for j in range(p):
+            to_left[i, j] -= y[i, j]
+    _product(to_right, b, x, (p, q, p), False, True)
+    _product(c, to_left, y, (p, q, p), True, False)
+    for i in range(p):
+        for j in range(p):
+            g11[i, j] += x[i, j] + y[i, j]
+    _guarded_gradient(a, a_inverse, g11, p, a_acted, a_det, grad_a, scratch)
+    for i in range(p):
+        for j in range(p):
+            out[i, j] = grad_a[i, j]
+    for i in range(q):
+        for j in range(q):
+            out[p + i, p + j] = grad_s[i, j]
+    _product(a_inverse, to_right, x, (p, p, q), True, False)
+    _product(left, grad_s, y, (p, q, q), True, False)
+    for i in range(p):
+        for j in range(q):
+            out[i, p + j] = x[i, j] - y[i, j]
+    _product(to_left, a_inverse, x, (q, p, p), False, True)
+    for i in range(q):
+        for j in range(p):
+            out[p + i, j] = x[i, j]
+
+
+@arithmetic_kernel
+def _load_planes(moments, places, first, size, groups, tile, right, ridge):
+    """A tile (n,n,W) of normal matrices and one (n,W) of right sides of fits first..first+size-1, centroid after centroid;
+    the identity behind them. places (n,n+1): which of a fit's entries; ridge: the share of the mean diagonal added to it."""
+    n = tile.shape[0]
+    entries = places[n - 1, n] + 1
+    for w in range(size):
+        base = (first + w) // groups * entries * groups + (first + w) % groups
+        mean = tile.dtype.type(0)
+        for i in range(n):
+            for j in range(n):
+                tile[i, j, w] = moments[base + places[i, j] * groups]
+            right[i, w] = moments[base + places[i, n] * groups]
+            mean += tile[i, i, w]
+        if ridge > 0:
+            for i in range(n):
+                tile[i, i, w] += ridge * (mean / n) + tile.dtype.type(1e-9)
+    for w in range(size, TILE):
+        for i in range(n):
+            right[i, w] = 0
+            for j in range(n):
+                tile[i, j, w] = 1 if i == j else 0
+
+
+@arithmetic_kernel
+def _eliminate(m, sides):
+    """Solve m x = y for a tile (n,n,W) of symmetric positive definite matrices and sides (s,n,W), both overwritten: x where y was.
+
+    Without pivoting, which such matrices don't need. What a ridge makes of a rank-deficient matrix has a determinant far
+    below float32's rounding of its terms, so no adjugate of it is right; each pivot of this is at least the ridge.
+    """
+    n = m.shape[0]
+    for k in range(n):
+        for w in range(TILE):
+            m[k, k, w] = 1 / m[k, k, w]
+        for i in range(k + 1, n):
+            for w in range(TILE):
+                m[i, k, w] = m[k, i, w] * m[k, k, w]
+            for j in range(i, n):
+                for w in range(TILE):
+                    m[i, j, w] -= m[i, k, w] * m[k, j, w]
+            for s in range(sides.shape[0]):
+                for w in range(TILE):
+                    sides[s, i, w] -= m[i, k, w] * sides[s, k, w]
+    for s in range(sides.shape[0]):
+        for back in range(n):
+            k = n - 1 - back
+            for j in range(k + 1, n):
+                for w in range(TILE):
+                    sides[s, k, w] -= m[k, j, w] * sides[s, j, w]
+            for w in range(TILE):
+                sides[s, k, w] *= m[k, k, w]
+
+
+@arithmetic_kernel
+def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
+    """Coefficients of fits from their moments (centroids*entries*groups), flat, in `kernels_surface`'s order: planes
+    (centroids*n*groups) solve the normal equations, n <= 8; with a ridge by elimination, else by the guarded inverse."""
+    n = places.shape[0]
+    half = n if n <= 4 else (n + 1) // 2
+    tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
+    left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
+    det, acted, sides = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((1, n, TILE), np.float32)
+    side, solved, count = sides[0], np.empty((n, TILE), np.float32), planes.size // n
+    for low in range(0, count, TILE):
+        size = min(TILE, count - low)
+        _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
+        if ridge > 0:
+            _eliminate(tile, sides)
+            solved = side
+        else:
+            acted[:] = False
+            _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
+            solved[:] = 0
+            for i in range(n):
+                for j in range(n):
+                    for w in range(TILE):
+                        solved[i, w] += out[i, j, w] * side[j, w]
+        for i in range(n):
+            for w in range(size):
+                planes[((low + w) // groups * n + i) * groups + (low + w) % groups] = solved[i, w]
+
+
+@arithmetic_kernel
+def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad_matrix, grad_right):
+    """The gradient of `solve_planes`: grad (centroids*n*groups) at the planes -> grad_matrix (centroids*n*n*groups), G + G',
+    and grad_right (centroids*n*groups)."""
+    n = places.shape[0]
+    half = n if n <= 4 else (n + 1) // 2
+    tile, kept, out = (
+        np.empty((n, n, TILE), np.float32),
+        np.empty((n, n, TILE), np.float32),
+        np.empty((n, n, TILE), np.float32),
+    )
+    left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
+    det, acted, side = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((n, TILE), np.float32)
+    given, both_sides = np.empty((n, TILE), np.float32), np.empty((2, n, TILE), np.float32)
+    x, u = both_sides[0], both_sides[1]
+    one, one_grad, one_out, both = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(2)
+    scratch, count = np.empty((SCRATCH, 4, 4)), grad.size // n
+    for low in range(0, count, TILE):
+        size = min(TILE, count - low)
+        _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
+        for i in range(n):
+            given[i] = 0
+            for w in range(size):
+                given[i, w] = grad[((low + w) // groups * n + i) * groups + (low + w) % groups]
+        acted[:] = False
+        if ridge > 0:
+            for i in range(n):
+                for w in range(TILE):
+                    x[i, w], u[i, w] = side[i, w], given[i, w]
+            _eliminate(tile, both_sides)
+        else:
+            for i in range(n):
+                for j in range(n):
+                    for w in range(TILE):  # a slice assignment would compile an error message for 4 s
+                        kept[i, j, w] = tile[i, j, w]
+            _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
+            x[:] = 0
+            u[:] = 0
+            for i in range(n):
+                for j in range(n):
+                    for w in range(TILE):
+                        x[i, w] += out[i, j, w] * side[j, w]
+                        u[i, w] += out[j, i, w] * given[j, w]
+        for w in range(size):
+            p, k = (low + w) // groups, (low + w) % groups
+            trace, asked = np.float32(0), False
+            for i in range(n):
+                grad_right[(p * n + i) * groups + k] = u[i, w]
+                trace -= u[i, w] * x[i, w]
+                asked |= given[i, w] != 0
+            if acted[w] and asked:  # of a plane that nothing depends on, often a dead feature's, all gradients are 0
+                for i in range(n):
+                    for j in range(n):
+                        one[i, j], one_grad[i, j] = kept[i, j, w], np.float64(given[i, w]) * side[j, w]
+                both[0], both[1] = det[0, w], det[1, w]
+                guarded_gradient(one, one_grad, n, both, min_det, one_out, scratch)
+                for i in range(n):
+                    for j in range(n):
+                        grad_matrix[((p * n + i) * n + j) * groups + k] = one_out[i, j] + one_out[j, i]
+                continue
+            for i in range(n):
+                for j in range(n):
+                    value = -(u[i, w] * x[j, w] + u[j, w] * x[i, w])
+                    if i == j:
+                        value += np.float32(2 * ridge / n) * trace
+                    grad_matrix[((p * n + i) * n + j) * groups + k] = value

@@ -1,0 +1,185 @@
+"""Inverses of many small matrices at once (thesis A.1.1): closed form to 4x4, by blocks to 16x16, Cholesky beyond; and solutions
+without an inverse."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dpcli.ops.backend import chosen_backend, run_in_threads
+
+GUARDS = ("signed", "release", "none")
+MIN_DET = 1e-6
+KERNEL_SIZE = 8  # largest n of the CPU kernels
+_CLOSED, _BLOCKS = 4, 16  # of the closed form, and of the block partition
+_ENTRY_NS = 2.5  # measured, per matrix entry
+
+
+def small_inverse(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
+    """Inverses of matrices (...,n,n), differentiable; float32 or float64.
+
+    n <= 4: adjugate over determinant, element by element. n <= 16: 2x2 block partition with the Schur complement,
+    recursively down to the closed form; without pivoting, so it expects symmetric positive definite matrices, as normal
+    equations are. n > 16: Cholesky; reads the lower triangle only.
+    guard: what happens to a determinant (in a block partition: of a block) with |det| < min_det. "signed" moves it to
+    min_det with its own sign (0 counts as positive), "release" to +min_det, whatever its sign, as the released Kinet
+    does, "none" leaves it: a singular matrix then gives inf or nan. A moved determinant carries no gradient.
+    Cholesky has no determinant to move: with a guard, a matrix with a pivot below min_det of its trace has that much added
+    to its diagonal (a matrix of zeros min_det itself), and that carries no gradient either.
+    Backends: to n = 8 a numba kernel on CPU, else torch; equal up to rounding. Raises ValueError on a wrong shape, dtype
+    or guard; torch.linalg.LinAlgError where Cholesky meets a finite matrix that is not even then positive definite.
+    """
+    _check(matrices, guard)
+    n = matrices.shape[-1]
+    if n > _BLOCKS:
+        return _cholesky_inverse(matrices, min_det, guard)
+    if n <= KERNEL_SIZE and matrices.numel() and chosen_backend(matrices.device) == "numba":
+        return _KernelInverse.apply(matrices, min_det, guard)
+    return _inverse(matrices, min_det, guard)
+
+
+def small_inverse_reference(matrices: Tensor, *, min_det: float = MIN_DET, guard: str = "signed") -> Tensor:
+    """The torch twin of `small_inverse`: same arguments, same guard."""
+    _check(matrices, guard)
+    if matrices.shape[-1] > _BLOCKS:
+        return _cholesky_inverse(matrices, min_det, guard)
+    return _inverse(matrices, min_det, guard)
+
+
+def small_solve(matrices: Tensor, right: Tensor) -> Tensor:
+    """x of M x = r for symmetric positive definite matrices (...,n,n) and r (...,n) -> (...,n), differentiable.
+
+    By elimination: right up to a condition of about 1e6 in float32, where a closed-form inverse has long lost the
+    determinant to rounding. One form for all devices; where a matrix isn't finite or has no positive pivots, neither is x.
+    """
+    rows, sides, pivots = [], [], []
+    for _ in range(matrices.shape[-1]):
+        pivot, row, side = matrices[..., :1, 0], matrices[..., 0, 1:], right[..., :1]
+        factor = row / pivot  # by symmetry the column's
+        rows.append(row)
+        sides.append(side)
+        pivots.append(pivot)
+        matrices = matrices[..., 1:, 1:] - factor[..., None] * row[..., None, :]
+        right = right[..., 1:] - factor * side
+    found = right  # (...,0)
+    for pivot, row, side in zip(reversed(pivots), reversed(rows), reversed(sides)):
+        found = torch.cat([(side - (row * found).sum(-1, keepdim=True)) / pivot, found], -1)
+    return found
+
+
+def _check(matrices: Tensor, guard: str) -> None:
+    if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or matrices.shape[-1] == 0:
+        raise ValueError(f"matrices must have shape (...,n,n) with n >= 1, but have {tuple(matrices.shape)}")
+    if matrices.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"matrices must be float32 or float64, but are {matrices.dtype}")
+    if guard not in GUARDS:
+        raise ValueError(f"guard must be one of {', '.join(GUARDS)}, but is {guard!r}")
+
+
+def _guarded(det: Tensor, min_det: float, guard: str) -> Tensor:
+    if guard == "none":
+        return det
+    floor = torch.full_like(det, min_det)
+    if guard == "signed":
+        floor = torch.where(det < 0, -floor, floor)
+    return torch.where(det.abs() < min_det, floor, det)
+
+
+def _inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
+    n = m.shape[-1]
+    if n <= _CLOSED:
+        rows = m.reshape(-1, n * n).t().contiguous().unbind(0)  # contiguous: strided entries cost twice the time
+        adjugate, det = (_adjugate1, _adjugate2, _adjugate3, _adjugate4)[n - 1](*rows)
+        return (torch.stack(adjugate) / _guarded(det, min_det, guard)).t().reshape(m.shape)
+    return _block_inverse(m, min_det, guard)
+
+
+def _block_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
+    """[[A,B],[C,D]]^-1 from A^-1 and the inverse of the Schur complement D - C A^-1 B."""
+    half = (m.shape[-1] + 1) // 2
+    b, c, d = m[..., :half, half:], m[..., half:, :half], m[..., half:, half:]
+    a_inverse = _inverse(m[..., :half, :half], min_det, guard)
+    left, right = c @ a_inverse, a_inverse @ b
+    corner = _inverse(d - left @ b, min_det, guard)
+    upper = -right @ corner
+    top = torch.cat([a_inverse - upper @ left, upper], -1)
+    return torch.cat([top, torch.cat([-corner @ left, corner], -1)], -2)
+
+
+def _cholesky_inverse(m: Tensor, min_det: float, guard: str) -> Tensor:
+    """By Cholesky's factor; where it is (nearly) singular and a guard is on, of the matrix with a lifted diagonal."""
+    if guard != "none":
+        with torch.no_grad():
+            factor, failed = torch.linalg.cholesky_ex(m)
+            trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)
+            lift = min_det * torch.where(trace == 0, torch.ones_like(trace), trace)
+            small = (failed > 0) | (factor.diagonal(dim1=-2, dim2=-1).square().amin(-1) < lift)
+            lift = torch.where(small, lift, torch.zeros_like(lift))
+        m = m + torch.diag_embed(lift[..., None].expand(m.shape[:-1]))
+    finite = m.isfinite().all(-1).all(-1)[..., None, None]
+    known = torch.where(finite, m, torch.eye(m.shape[-1], dtype=m.dtype, device=m.device))
+    # what isn't finite stays so, as in the closed form: whoever trains notices a loss, not an error from here
+    return torch.where(finite, torch.cholesky_inverse(torch.linalg.cholesky(known)), torch.nan)
+
+
+def _adjugate1(a: Tensor) -> tuple[list[Tensor], Tensor]:
+    return [torch.ones_like(a)], a
+
+
+def _adjugate2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[list[Tensor], Tensor]:
+    return [d, -b, -c, a], a * d - b * c
+
+
+def _adjugate3(a, b, c, d, e, f, g, h, i) -> tuple[list[Tensor], Tensor]:  # nine tensors, row by row
+    first = [e * i - f * h, c * h - b * i, b * f - c * e]
+    second = [f * g - d * i, a * i - c * g, c * d - a * f]
+    third = [d * h - e * g, b * g - a * h, a * e - b * d]
+    return first + second + third, a * first[0] + b * second[0] + c * third[0]
+
+
+def _adjugate4(*m: Tensor) -> tuple[list[Tensor], Tensor]:
+    """By the 2x2 minors of the upper two rows (u) and the lower two (v): column pairs 01 02 03 12 13 23."""
+    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+    u = [m[i] * m[4 + j] - m[j] * m[4 + i] for i, j in pairs]
+    v = [m[8 + i] * m[12 + j] - m[j + 8] * m[12 + i] for i, j in pairs]
+    det = u[0] * v[5] - u[1] * v[4] + u[2] * v[3] + u[3] * v[2] - u[4] * v[1] + u[5] * v[0]
+    adjugate: list[Tensor] = [det] * 16
+    # Row r of the adjugate leaves out column r: its minors pair the three columns that are left.
+    for r, (p, q, s) in enumerate(((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))):
+        qs, ps, pq = pairs.index((q, s)), pairs.index((p, s)), pairs.index((p, q))
+        for col, (row, w) in enumerate(((1, v), (0, v), (3, u), (2, u))):
+            minor = m[4 * row + p] * w[qs] - m[4 * row + q] * w[ps] + m[4 * row + s] * w[pq]
+            adjugate[4 * r + col] = minor if (r + col) % 2 == 0 else -minor
+    return adjugate, det
+
+
+class _KernelInverse(torch.autograd.Function):
+    """Forward and the gradient -X' G X' by the CPU kernel; autograd's own where the guard moved a determinant."""
+
+    @staticmethod
+    def forward(ctx, matrices: Tensor, min_det: float, guard: str) -> Tensor:
+        from dpcli.ops.cpu.small_inverses import inverse_kernel
+
+        flat = matrices.detach().reshape(-1, *matrices.shape[-2:]).contiguous()
+        inverse, moved = torch.empty_like(flat), torch.empty(len(flat), dtype=torch.bool)
+        arrays = (flat.numpy(), inverse.numpy(), moved.numpy())
+        run_in_threads(inverse_kernel, (*arrays, min_det, GUARDS.index(guard)), len(flat), flat[0].numel() * _ENTRY_NS)
+        ctx.save_for_backward(flat, inverse, moved)
+        ctx.settings = (min_det, guard)
+        return inverse.view(matrices.shape)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad: Tensor) -> tuple[Tensor, None, None]:
+        from dpcli.ops.cpu.small_inverses import inverse_gradient_kernel
+
+        flat, inverse, moved = ctx.saved_tensors
+        flat_grad, out = grad.reshape(flat.shape).contiguous(), torch.empty_like(flat)
+        arrays = (inverse.numpy(), flat_grad.numpy(), out.numpy())
+        run_in_threads(inverse_gradient_kernel, arrays, len(flat), flat[0].numel() * _ENTRY_NS)
+        rows = moved.nonzero()[:, 0]
+        if len(rows):
+            with torch.enable_grad():
+                part = flat[rows].requires_grad_()
+                out[rows] = torch.autograd.grad(_inverse(part, *ctx.settings), part, flat_grad[rows])[0]
+        return out.view(grad.shape), None, None

@@ -1,0 +1,205 @@
+"""MSR-Action3D (Li et al. 2010): Kinect depth of 20 actions, the official ``.bin`` or the MATLAB ``.mat`` form."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.store import CloudSequence
+
+CLASS_NAMES = (
+    "high arm wave",
+    "horizontal arm wave",
+    "hammer",
+    "hand catch",
+    "forward punch",
+    "high throw",
+    "draw x",
+    "draw tick",
+    "draw circle",
+    "hand clap",
+    "two hand wave",
+    "side boxing",
+    "bend",
+    "forward kick",
+    "side kick",
+    "jogging",
+    "tennis swing",
+    "tennis serve",
+    "golf swing",
+    "pick up and throw",
+)
+NAME = re.compile(r"a(\d{2})_s(\d{2})_e(\d{2})_sdepth\.(bin|mat)", re.IGNORECASE)
+# (action, subject, trial) absent from the 567 published videos; trial 0 stands for all three
+ABSENT = (
+    [(a, 4, 0) for a in range(1, 7)]
+    + [(4, 3, 3), (5, 6, 3), (6, 6, 3), (7, 4, 3), (7, 7, 3), (15, 2, 3)]
+    + [(15, s, 0) for s in (3, 4, 5)]
+)
+
+
+def published() -> list[str]:
+    """Names ``aAA_sSS_eEE`` of the 567 videos that the authors published (of 20 x 10 x 3 recorded)."""
+    every = [(a, s, e) for a in range(1, 21) for s in range(1, 11) for e in range(1, 4)]
+    return [f"a{a:02}_s{s:02}_e{e:02}" for a, s, e in every if not {(a, s, e), (a, s, 0)} & set(ABSENT)]
+
+
+def read_bin(path: Path) -> tuple[np.ndarray, dict[str, int]]:
+    """Official binary -> depth uint32 (T,H,W) in raw units, 0 = background.
+
+    Little-endian uint32: number of frames, width, height, then frames x height x width depths, row by row.
+    """
+    with path.open("rb") as file:
+        header = np.fromfile(file, "<u4", 3).astype(int)
+        if len(header) < 3:
+            raise DataError(f"{path}: {path.stat().st_size} bytes; the header alone takes 12")
+        frames, width, height = (int(v) for v in header)
+        check_shape(path, frames, height, width)
+        expected, found = 12 + 4 * frames * height * width, path.stat().st_size
+        if found < expected:
+            raise DataError(
+                f"{path}: truncated: {frames} frames of {width}x{height} take {expected} bytes, found {found}"
+            )
+        depth = np.fromfile(file, "<u4", frames * height * width).reshape(frames, height, width)
+    return depth, {"files with bytes after the last frame": 1} if found > expected else {}
+
+
+def read_mat(path: Path) -> np.ndarray:
+    """MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3 -> depth (T,H,W), C order."""
+    with path.open("rb") as file:
+        is_hdf5 = b"MATLAB 7.3" in file.read(20)
+    depth = _read_mat73(path) if is_hdf5 else _read_mat5(path)
+    if depth.dtype.kind not in "uif":
+        raise DataError(f"{path}: 'depth' has type {depth.dtype}; expected numbers")
+    if depth.ndim == 2:  # MATLAB drops a trailing axis of length one
+        depth = depth[..., None]
+    if depth.ndim != 3:
+        raise DataError(f"{path}: 'depth' has shape {depth.shape}; expected (height, width, frames)")
+    check_shape(path, depth.shape[2], depth.shape[0], depth.shape[1])
+    if depth.dtype.kind == "f" and not np.isfinite(depth).all():
+        raise DataError(f"{path}: 'depth' holds NaN or infinity; expected finite numbers")
+    return np.ascontiguousarray(depth.transpose(2, 0, 1))
+
+
+def _read_mat5(path: Path) -> np.ndarray:
+    from scipy.io import loadmat, whosmat
+
+    try:
+        content = loadmat(path, variable_names=["depth"])
+    except Exception as error:  # scipy raises many kinds on damaged files: zlib.error, TypeError, IndexError...
+        raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
+    if "depth" not in content:
+        raise DataError(f"{path}: no variable 'depth'; found {[v[0] for v in whosmat(path)] or 'none'}")
+    return content["depth"]
+
+
+def _read_mat73(path: Path) -> np.ndarray:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if not isinstance(file.get("depth"), h5py.Dataset):
+                raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
+            return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
+    except OSError as error:
+        raise DataError(f"{path}: not a readable MATLAB 7.3 file, perhaps truncated ({error})") from None
+
+
+def check_shape(path: Path, frames: int, height: int, width: int) -> None:
+    """DataError unless there is at least one frame of a believable size (a wrong header shows itself here)."""
+    if frames == 0:
+        raise DataError(f"{path}: an empty video: 0 frames; expected at least 1")
+    if not (0 < height <= 8192 and 0 < width <= 8192):
+        raise DataError(f"{path}: frames of {width}x{height} pixels; expected 320x240")
+
+
+@dataclass(frozen=True)
+class MSRAction3D:
+    """Options of the reader; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
+
+    raw: Path
+    focal: float = 280.0  # pixels; a guess of the MeteorNet authors, no calibration was published
+    scale: float = 300.0  # raw depth units per unit of length in the output
+    train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
+    chooses: ClassVar[bool] = True
+    fields: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        if not (self.focal > 0 and self.scale > 0):
+            raise UsageError(f"--focal and --scale must be positive, found {self.focal:g} and {self.scale:g}")
+
+    @property
+    def class_names(self) -> list[str]:
+        return list(CLASS_NAMES)
+
+    @property
+    def length_unit(self) -> str:
+        return f"{self.scale:g} raw depth units" if self.scale != 1 else "raw depth unit"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {k: v for k, v in asdict(self).items() if k != "raw"}
+
+    def items(self) -> list[Item]:
+        expected = "MSR-Action3D files named aAA_sSS_eEE_sdepth.bin or .mat"
+        folder = require_folder(self.raw, expected)
+        found: dict[str, Item] = {}
+        for path in sorted(folder.rglob("*"), key=lambda p: (p.name.lower(), str(p))):
+            match = NAME.fullmatch(path.name)
+            # .bin sorts before .mat: where both are present the official form wins
+            if match and path.name[:11].lower() not in found:
+                found[path.name[:11].lower()] = self._item(path, *(int(v) for v in match.groups()[:3]))
+        if not found:
+            raise DataError(f"{folder}: no {expected} in it or below")
+        return [found[name] for name in sorted(found)]
+
+    def _item(self, path: Path, action: int, subject: int, trial: int) -> Item:
+        problem = ""
+        if not 1 <= action <= len(CLASS_NAMES):
+            problem = f"{path}: action {action} in the file name is out of range; expected 1 to {len(CLASS_NAMES)}"
+        return Item(
+            name=path.name[:11].lower(),
+            path=path,
+            label=action - 1,
+            subject=subject,
+            problem=problem,
+            split="train" if subject in self.train_subjects else "test",
+        )
+
+    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
+        notes: dict[str, int] = {}
+        if item.path.suffix.lower() == ".bin":
+            depth, notes = read_bin(item.path)
+        else:
+            depth = read_mat(item.path)
+        height, width = depth.shape[1:]
+        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2), choose=choose)
+        kept, dropped = drop_empty_frames(str(item.path), counts)
+        points *= np.float32(1 / self.scale)
+        sequence = CloudSequence(item.name, points, offsets(counts[kept]), **describe(item))
+        return Sample(sequence, {**notes, **dropped})
+
+    def summary(self, items: list[Item]) -> list[str]:
+        expected, names = published(), {item.name for item in items}
+        lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
+        train = {name for name in expected if int(name[5:7]) in self.train_subjects}
+        for split, wanted in (("train", train), ("test", set(expected) - train)):
+            missing = sorted(wanted - names)
+            subjects = Counter(name[4:7] for name in missing)
+            where = ", ".join(f"{s}: {n}" for s, n in sorted(subjects.items()))
+            lines.append(
+                f"{split}: {len(wanted) - len(missing)}/{len(wanted)}"
+                + (f"; missing by subject {where}" if missing else "")
+            )
+        extra = sorted(names - set(expected))
+        return lines + (
+            [f"not among the published: {', '.join(extra[:8])}{' ...' if len(extra) > 8 else ''}"] if extra else []
+        )

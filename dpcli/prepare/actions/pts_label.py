@@ -1,0 +1,158 @@
+"""`pts_label.npy`, the processed gestures of PointLSTM and Kinet: one integer array of clouds per gesture."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.actions.shrec17_lists import FINGERS, GESTURES, Entry, entries, find_lists, gesture_names
+from dpcli.prepare.decode.depth_png import leads_out
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
+from dpcli.store import CloudSequence
+
+FILE = "pts_label.npy"
+_SHREC = re.compile(r"(?:.*/)?(gesture_(\d+)/finger_(\d+)/subject_(\d+)/essai_\d+)")
+_NVGESTURE = re.compile(r"(?:.*/)?(class_(\d+)/subject(\d+)_r\d+)")
+
+
+def read_array(path: Path) -> np.ndarray:
+    """The array of a pts_label.npy (T,N,C), C >= 3: row, column, depth, then what isn't used; DataError otherwise."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise DataError(f"{path}: not a readable .npy array, perhaps truncated ({error})") from None
+    if array.ndim != 3 or array.shape[2] < 3 or 0 in array.shape or array.dtype.kind not in "iuf":
+        raise DataError(
+            f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, points, 8): "
+            "row, column, depth, ..."
+        )
+    array = array[..., :3]
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise DataError(f"{path}: holds NaN or infinity; expected finite coordinates")
+    return array
+
+
+@dataclass(frozen=True)
+class PtsLabel:
+    """Reader of pts_label.npy files in folders gesture_G/finger_F/subject_S/essai_E, or class_C/subjectS_rR.
+
+    ``lists``: the folder of SHREC'17's train_gestures.txt and test_gestures.txt; by default they are looked for in
+    ``raw``. Without lists there is no split, and the 28 labels are those of (gesture, finger) in their order.
+    """
+
+    raw: Path
+    labels: int = 28
+    lists: Path | None = None
+    fields: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        if self.labels not in (14, 28):
+            raise UsageError(f"--labels {self.labels}: expected 14 or 28")
+
+    @property
+    def class_names(self) -> list[str]:
+        if self._is_nvgesture():
+            return [f"gesture {number:02}" for number in range(1, 26)]
+        found = self._list_files()
+        if found:
+            return gesture_names(found, self.labels)
+        return list(GESTURES) if self.labels == 14 else [f"{g}, {f}" for g in GESTURES for f in FINGERS]
+
+    @property
+    def length_unit(self) -> str:
+        if self._is_nvgesture():
+            return "pixel (row, column), gray level (depth; nearer = larger)"
+        return "pixel (row, column), mm (depth)"
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {"labels": self.labels}
+
+    def _list_files(self) -> list:
+        if self.lists is not None:
+            return find_lists(self.lists)
+        try:
+            return find_lists(self.raw)
+        except DataError:
+            return []
+
+    def _is_nvgesture(self) -> bool:
+        return any(True for _ in self.raw.rglob("class_*")) and not any(True for _ in self.raw.rglob("gesture_*"))
+
+    def items(self) -> list[Item]:
+        root = require_folder(self.raw, f"{FILE} files in folders such as gesture_1/finger_1/subject_1/essai_1")
+        lists = self._list_files()
+        listed = {e.folder: (s, e) for s, _, e in entries(lists) if isinstance(e, Entry)}
+        items: dict[str, Item] = {}
+        for path in sorted(root.rglob(FILE)):
+            item = self._item(path, root, listed)
+            if item.name in items:
+                problem = f"{path}: {item.name} is there twice; {items[item.name].path} is read"
+                item = Item(f"{item.name} ({path})", path, problem=problem)
+            items[item.name] = item
+        if not items:
+            raise DataError(f"{root}: no {FILE} in it or below")
+        for item in self._absent(lists, items):
+            items[item.name] = item
+        return sorted(items.values(), key=lambda item: natural_key(item.name))
+
+    def _absent(self, lists: list, items: dict[str, Item]) -> Iterator[Item]:
+        """What the lists name and the folder lacks, and lines that can't be understood."""
+        for split, where, entry in entries(lists):
+            if isinstance(entry, str):
+                yield Item(where, self.raw, split, problem=entry)
+            elif entry.folder not in items:
+                problem = f"{self.raw}: {where} names {entry.folder}, which has no {FILE}"
+                yield Item(entry.folder, self.raw, split, problem=problem)
+
+    def _item(self, path: Path, root: Path, listed: dict[str, tuple[str, Entry]]) -> Item:
+        relative = path.parent.relative_to(root).as_posix()
+        if target := leads_out(path, root):
+            return Item(relative, path, problem=f"{path}: a link that leads out of the data, to {target}")
+        if match := _NVGESTURE.fullmatch(relative):
+            label, subject = int(match[2]) - 1, int(match[3])
+            problem = "" if 0 <= label < 25 else f"{path}: class {label + 1} is out of range; expected 1 to 25"
+            return Item(match[1], path, label=label, subject=subject, problem=problem)
+        if match := _SHREC.fullmatch(relative):
+            return self._gesture(match, path, listed)
+        reason = "not in a folder gesture_G/finger_F/subject_S/essai_E or class_C/subjectS_rR, so its label is unknown"
+        return Item(relative, path, problem=f"{path}: {reason}")
+
+    def _gesture(self, match: re.Match, path: Path, listed: dict[str, tuple[str, Entry]]) -> Item:
+        gesture, finger, subject = (int(match[k]) for k in (2, 3, 4))
+        if listed:
+            if match[1] not in listed:
+                return Item(match[1], path, problem=f"{path}: in neither list file, so its split is unknown")
+            split, entry = listed[match[1]]
+            return Item(match[1], path, split, label=entry.label(self.labels), subject=subject)
+        if not (1 <= gesture <= len(GESTURES) and 1 <= finger <= len(FINGERS)):
+            problem = f"{path}: gesture {gesture}, finger {finger} are out of range; expected 1 to 14 and 1 to 2"
+            return Item(match[1], path, problem=problem)
+        label = gesture - 1 if self.labels == 14 else (gesture - 1) * len(FINGERS) + finger - 1
+        return Item(match[1], path, label=label, subject=subject)
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        array = read_array(item.path)
+        # a frame in which nothing was found was filled with points of depth 0
+        seen = array[..., 2] > 0
+        counts = seen.sum(1).astype(np.int64)
+        kept, notes = drop_empty_frames(str(item.path), counts)
+        partly = int((~seen)[kept].sum())
+        if partly:
+            notes["points of depth 0 dropped"] = partly
+        sequence = CloudSequence(item.name, array[seen].astype(np.float32), offsets(counts[kept]), **describe(item))
+        return Sample(sequence, notes)
+
+    def summary(self, items: list[Item]) -> list[str]:
+        found = Counter(item.split for item in items if not item.problem)
+        lines = [f"{sum(found.values())} gestures found (train {found['train']}, test {found['test']})"]
+        if found[""]:
+            lines.append(f"{found['']} without a split: no train_gestures.txt and test_gestures.txt found (--lists)")
+        return lines

@@ -1,0 +1,149 @@
+"""PartNet-Mobility (SAPIEN) folders, or any URDF files: articulated objects into short sequences with exact parts."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
+from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
+from dpcli.prepare.reader import Item, Sample, describe, natural_key
+
+_EXPECTED = "a .urdf file, or a folder of objects, each a folder with a mobility.urdf or another .urdf"
+
+
+@dataclass(frozen=True)
+class FoundObject:
+    """One URDF of the raw data; ``category`` is "" when nothing tells it."""
+
+    path: Path
+    category: str
+    name: str
+
+
+@lru_cache(maxsize=4)
+def find_objects(raw: Path) -> tuple[FoundObject, ...]:
+    """Every object below ``raw``, in natural order. A folder's mobility.urdf hides other URDF files beside it.
+
+    The category is the folder that holds the object's folder (Category/ID/mobility.urdf); without such a folder,
+    ``model_cat`` of the object's meta.json, as the original distribution has it.
+    """
+    if not raw.exists():
+        raise DataError(f"{raw}: does not exist; expected {_EXPECTED}")
+    files = [raw] if raw.is_file() else _urdf_files(raw)
+    if not files or files[0].suffix.lower() != ".urdf":
+        raise DataError(f"{raw}: no URDF found; expected {_EXPECTED}")
+    found = [_describe(raw, path) for path in files]
+    twice = [name for name, count in Counter(f.name for f in found).items() if count > 1]
+    if twice:
+        raise DataError(f"{raw}: {len(twice)} objects have the same category and name, such as {twice[0]}; rename one")
+    return tuple(sorted(found, key=lambda f: (f.category, natural_key(f.name))))
+
+
+def _urdf_files(raw: Path) -> list[Path]:
+    files = []
+    for folder, below, names in os.walk(raw):
+        urdf = sorted(name for name in names if name.lower().endswith(".urdf"))
+        files += [Path(folder, name) for name in (["mobility.urdf"] if "mobility.urdf" in urdf else urdf)]
+        below[:] = sorted(below) if not urdf else []  # meshes lie below an object, other objects don't
+    return files
+
+
+def _describe(raw: Path, path: Path) -> FoundObject:
+    name = path.resolve().parent.name if path.name == "mobility.urdf" else path.stem
+    above = () if raw.is_file() else path.relative_to(raw).parts[:-1]
+    category = above[-2] if len(above) >= 2 else _model_category(path.parent / "meta.json")
+    return FoundObject(path, category, f"{category}_{name}" if category else name)
+
+
+def _model_category(meta: Path) -> str:
+    try:
+        return str(json.loads(meta.read_text())["model_cat"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ""
+
+
+@lru_cache(maxsize=3)
+def _studied(path: Path, options: Articulation) -> Study:
+    """Meshes are read once for all sequences of an object; a process keeps the last few objects."""
+    return study(load_object(read_skeleton(path)), options)
+
+
+@dataclass(frozen=True)
+class Sapien:
+    """Options of the reader. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how."""
+
+    raw: Path
+    pairs_per_object: int = 8
+    articulation: Articulation = Articulation()
+    split: SplitRule = SplitRule()
+    seed: int = 0
+    length_unit: ClassVar[str] = "object diameter"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
+
+    def __post_init__(self) -> None:
+        if self.pairs_per_object < 1:
+            raise UsageError(f"--pairs-per-object {self.pairs_per_object}: expected 1 or more")
+
+    @property
+    def class_names(self) -> list[str]:
+        return sorted({found.category for found in find_objects(self.raw)} - {""})
+
+    @property
+    def config(self) -> dict[str, Any]:
+        own = {"pairs_per_object": self.pairs_per_object, "seed": self.seed, "split": asdict(self.split)}
+        return {**own, **self.articulation.config}
+
+    def items(self) -> list[Item]:
+        found = find_objects(self.raw)
+        splits = self.split.assign([f.category for f in found], self.seed)
+        problems, joints = zip(*(_inspect(f.path) for f in found))
+        pad = min(self.articulation.max_parts, 1 + max(joints))
+        names = self.class_names
+        return [
+            Item(
+                f"{f.name}_{number:03}" if not problem else f.name,
+                f.path,
+                split=split,
+                label=names.index(f.category) if f.category else -1,
+                extra={"parts": pad},
+                problem=problem,
+            )
+            for f, split, problem in zip(found, splits, problems)
+            for number in range(1 if problem else self.pairs_per_object)
+        ]
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        studied = _studied(item.path, self.articulation)
+        return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
+
+    def summary(self, items: list[Item]) -> list[str]:
+        good = {item.path: item.split for item in items if not item.problem}
+        counts = Counter(good.values())
+        shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
+        names = f" of {len(self.class_names)} categories" if self.class_names else ""
+        return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"]
+
+
+def _inspect(path: Path) -> tuple[str, int]:
+    """(problem that shows without the meshes' content, number of joints)."""
+    try:
+        skeleton = read_skeleton(path)
+    except DataError as error:
+        return str(error), 0
+    missing = missing_meshes(skeleton)
+    if missing:
+        more = f" and {len(missing) - 1} others" if len(missing) > 1 else ""
+        return f"{path}: its mesh {missing[0]}{more} is missing", 0
+    if not skeleton.joints:
+        return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0
+    return "", len(skeleton.joints)

@@ -1,0 +1,94 @@
+"""Procedural articulated objects: as many shapes as one likes from a seed, with the exact parts and poses."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dpcli.errors import UsageError
+from dpcli.prepare.articulated.articulated_object import ArticulatedObject
+from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
+from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.procedural_kinds import KINDS
+from dpcli.prepare.articulated.solids import Builder
+from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.runtime.seeds import generator
+
+_OBJECT_KEY = 1 << 30  # keeps the generators of objects apart from those of items
+
+
+def build_object(seed: int, number: int, kinds: tuple[str, ...]) -> ArticulatedObject:
+    """Object ``number`` of a seed; its kind is the next in the circle of ``kinds``, its shape is drawn."""
+    kind = kinds[number % len(kinds)]
+    builder = Builder()
+    KINDS[kind](builder, generator(seed, _OBJECT_KEY, number))
+    return builder.build(f"{kind} {number}")
+
+
+@lru_cache(maxsize=8)
+def _studied(seed: int, number: int, kinds: tuple[str, ...], options: Articulation) -> Study:
+    return study(build_object(seed, number, kinds), options)
+
+
+@dataclass(frozen=True)
+class SyntheticArticulated:
+    """Options of the generator. ``kinds``: those to make; empty for all."""
+
+    objects: int = 220
+    sequences_per_object: int = 4
+    kinds: tuple[str, ...] = ()
+    articulation: Articulation = Articulation()
+    split: SplitRule = SplitRule()
+    seed: int = 0
+    length_unit: ClassVar[str] = "object diameter"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
+
+    def __post_init__(self) -> None:
+        for option in ("objects", "sequences_per_object"):
+            if getattr(self, option) < 1:
+                raise UsageError(f"--{option.replace('_', '-')} {getattr(self, option)}: expected 1 or more")
+        unknown = sorted(set(self.kinds) - set(KINDS))
+        if unknown:
+            raise UsageError(f"--kinds {', '.join(unknown)}: not known; expected some of {', '.join(KINDS)}")
+
+    @property
+    def class_names(self) -> list[str]:
+        return sorted(self.kinds or KINDS)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        own = asdict(self)
+        own.pop("articulation")
+        return {**own, **self.articulation.config}
+
+    def items(self) -> list[Item]:
+        names = tuple(self.class_names)
+        kinds = [names[number % len(names)] for number in range(self.objects)]
+        splits = self.split.assign(kinds, self.seed)
+        joints = max(len(build_object(self.seed, number, names).joints) for number in range(self.objects))
+        extra = {"parts": min(self.articulation.max_parts, 1 + joints)}
+        return [
+            Item(
+                f"{kind}_{number:05}_{k:03}",
+                Path(kind),
+                split=split,
+                label=names.index(kind),
+                extra={**extra, "object": number},
+            )
+            for number, (kind, split) in enumerate(zip(kinds, splits))
+            for k in range(self.sequences_per_object)
+        ]
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        studied = _studied(self.seed, item.extra["object"], tuple(self.class_names), self.articulation)
+        return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
+
+    def summary(self, items: list[Item]) -> list[str]:
+        counts = Counter({item.extra["object"]: item.split for item in items}.values())
+        shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
+        return [f"{self.objects} objects of {len(self.class_names)} kinds ({shares}), {len(items)} sequences"]

@@ -1,0 +1,222 @@
+"""URDF files (with yourdfpy) into articulated objects: links joined by fixed joints are one body."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.path_names import utf8_path
+from dpcli.prepare.articulated.articulated_object import ArticulatedObject, Joint, drop_degenerate, joint_motion
+from dpcli.prepare.articulated.urdf_meshes import geometry_triangles, resolve
+
+MOVABLE = ("revolute", "continuous", "prismatic")
+_UNSUPPORTED = ("floating", "planar")
+
+
+@dataclass
+class Skeleton:
+    """A URDF without its meshes. shapes: (body, 4x4 shape-to-body, geometry of yourdfpy) of every visual."""
+
+    path: Path
+    joints: list[Joint]
+    shapes: list[tuple[int, np.ndarray, Any]]
+    notes: Counter
+
+
+def read_skeleton(path: Path) -> Skeleton:
+    """Parse a URDF and merge links joined by fixed joints. DataError when it isn't a tree of links.
+
+    Limits: a continuous joint gets +-180 degrees, so does a revolute joint without limits; inverted ones are swapped;
+    a slide without limits has infinite ones here. Floating and planar joints are taken as fixed. All are noted.
+    """
+    robot = _parse(path)
+    notes: Counter = Counter()
+    order, place = _walk_tree(path, robot)
+    joints, sources = _movable(path, order, place, notes)
+    return Skeleton(path, _followers(path, robot, joints, sources), _shapes(robot, place, notes), notes)
+
+
+def load_object(skeleton: Skeleton) -> ArticulatedObject:
+    """The skeleton with the triangles of its visual geometry. DataError names a mesh that is missing or unreadable."""
+    notes = Counter(skeleton.notes)
+    triangles, bodies = [np.zeros((0, 3, 3))], [np.zeros(0, np.int64)]
+    for body, placement, geometry in skeleton.shapes:
+        corners = geometry_triangles(skeleton.path, geometry)
+        if not len(corners):
+            notes["mesh files without faces"] += 1
+        triangles.append(corners @ placement[:3, :3].T + placement[:3, 3])
+        bodies.append(np.full(len(corners), body, np.int64))
+    kept = drop_degenerate(np.concatenate(triangles), np.concatenate(bodies), notes)
+    return ArticulatedObject(str(skeleton.path), list(skeleton.joints), *kept, notes)
+
+
+def missing_meshes(skeleton: Skeleton) -> list[str]:
+    """File names of visual meshes that don't exist, as the URDF spells them."""
+    names = [geometry.mesh.filename for _, _, geometry in skeleton.shapes if geometry.mesh is not None]
+    return [name for name in dict.fromkeys(names) if not resolve(skeleton.path, name).is_file()]
+
+
+def _parse(path: Path) -> Any:
+    from lxml import etree
+    from yourdfpy import URDF
+
+    logging.getLogger("yourdfpy.urdf").setLevel(logging.CRITICAL)
+    name = utf8_path(path, "yourdfpy")
+    try:
+        root = etree.parse(name).getroot()
+        if root.tag != "robot":
+            raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
+        return URDF.load(name, build_scene_graph=False, load_meshes=False).robot
+    except etree.XMLSyntaxError as error:
+        raise DataError(f"{path}: not well-formed XML ({error.msg}); expected a URDF") from None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:  # an element or attribute that is absent or odd
+        raise DataError(f"{path}: not a valid URDF: {type(error).__name__} {error}") from None
+
+
+def _walk_tree(path: Path, robot: Any) -> tuple[list[Any], dict[str, tuple[int, np.ndarray]]]:
+    """Joints from the root outwards, and of every link its body and its 4x4 placement in that body."""
+    links = {link.name for link in robot.links}
+    children: dict[str, list[Any]] = {}
+    parent_of: dict[str, Any] = {}
+    for joint in robot.joints:
+        for role, name in (("parent", joint.parent), ("child", joint.child)):
+            if name not in links:
+                raise DataError(f"{path}: joint {joint.name!r} has the {role} {name!r}; there is no link of that name")
+        _check_numbers(path, joint)
+        if joint.child in parent_of:
+            first = parent_of[joint.child].name
+            raise DataError(
+                f"{path}: link {joint.child!r} is the child of two joints, {first!r} and {joint.name!r}; "
+                "a URDF is a tree"
+            )
+        parent_of[joint.child] = joint
+        children.setdefault(joint.parent, []).append(joint)
+    shaped = {link.name for link in robot.links if link.visuals or link.name in children}
+    roots = [link.name for link in robot.links if link.name not in parent_of and link.name in shaped]
+    if len(roots) > 1:
+        raise DataError(f"{path}: {len(roots)} links have no parent ({', '.join(roots[:4])}); expected one root")
+    place: dict[str, tuple[int, np.ndarray]] = {root: (0, np.eye(4)) for root in roots}
+    order, queue, bodies = [], deque(roots), 1
+    while queue:
+        for joint in children.get(queue.popleft(), []):
+            order.append(joint)
+            queue.append(joint.child)
+            body, placement = place[joint.parent]
+            if _moves(joint):
+                place[joint.child], bodies = (bodies, np.eye(4)), bodies + 1
+            else:
+                place[joint.child] = (body, placement @ _fixed_motion(joint))
+    left = [joint.child for joint in robot.joints if joint.child not in place]
+    if left:
+        raise DataError(f"{path}: links {', '.join(left[:4])} hang on each other in a cycle; a URDF is a tree")
+    return order, place
+
+
+def _check_numbers(path: Path, joint: Any) -> None:
+    if joint.type in MOVABLE and (joint.axis.shape != (3,) or not 1e-9 < np.linalg.norm(joint.axis) < np.inf):
+        raise DataError(f"{path}: joint {joint.name!r} has the axis {joint.axis}; expected three numbers, not all zero")
+    if joint.origin is not None and not np.isfinite(joint.origin).all():
+        raise DataError(f"{path}: joint {joint.name!r} has an origin that is not finite")
+
+
+def _limits(joint: Any) -> tuple[float, float, str]:
+    """(lower, upper, what was odd)."""
+    low, high = (joint.limit.lower, joint.limit.upper) if joint.limit is not None else (None, None)
+    given = low is not None and high is not None and np.isfinite(low + high)
+    if joint.type == "continuous":
+        return -np.pi, np.pi, ""
+    if not given and joint.type == "prismatic":
+        return -np.inf, np.inf, ""
+    if not given:
+        return -np.pi, np.pi, "hinges without limits (+-180 degrees taken)"
+    odd = "joints with inverted limits (swapped)" if low > high else ""
+    low, high = min(low, high), max(low, high)
+    return low, (min(high, low + 2 * np.pi) if joint.type == "revolute" else high), odd
+
+
+def _moves(joint: Any) -> bool:
+    return joint.type in MOVABLE and (joint.mimic is not None or np.ptp(_limits(joint)[:2]) > 0)
+
+
+def _fixed_motion(joint: Any) -> np.ndarray:
+    """What a joint that doesn't move does: its origin, and its one value when its limits are equal."""
+    origin = np.eye(4) if joint.origin is None else joint.origin
+    if joint.type not in MOVABLE:
+        return origin
+    low, high, _ = _limits(joint)
+    kind = "prismatic" if joint.type == "prismatic" else "revolute"
+    return origin @ joint_motion(Joint(0, 1, kind, origin, _axis(joint), low, high), np.array([low]))[0]
+
+
+def _axis(joint: Any) -> np.ndarray:
+    return joint.axis / np.linalg.norm(joint.axis)
+
+
+def _movable(
+    path: Path, order: list[Any], place: dict[str, tuple[int, np.ndarray]], notes: Counter
+) -> tuple[list[Joint], list[Any]]:
+    joints, sources = [], []
+    for joint in order:
+        if joint.type in _UNSUPPORTED:
+            notes[f"{joint.type} joints taken as fixed"] += 1
+        elif joint.type not in (*MOVABLE, "fixed"):
+            raise DataError(f"{path}: joint {joint.name!r} has the type {joint.type!r}; expected {', '.join(MOVABLE)}")
+        if not _moves(joint):
+            continue
+        low, high, odd = _limits(joint)
+        if odd:
+            notes[odd] += 1
+        body, placement = place[joint.parent]
+        origin = placement if joint.origin is None else placement @ joint.origin
+        kind = "prismatic" if joint.type == "prismatic" else "revolute"
+        joints.append(Joint(body, place[joint.child][0], kind, origin, _axis(joint), low, high))
+        sources.append(joint)
+    return joints, sources
+
+
+def _followers(path: Path, robot: Any, joints: list[Joint], sources: list[Any]) -> list[Joint]:
+    """Mimic joints follow the joint of their own that their chain of leaders ends at."""
+    index = {source.name: i for i, source in enumerate(sources)}
+    mimics = {joint.name: joint.mimic for joint in robot.joints if joint.mimic is not None}
+    values = {joint.name: _limits(joint)[0] for joint in robot.joints if joint.type in MOVABLE and not _moves(joint)}
+    result = list(joints)
+    for i, source in enumerate(sources):
+        name, multiplier, offset, seen = source.name, 1.0, 0.0, set()
+        while (mimic := mimics.get(name)) is not None:
+            if name in seen:
+                raise DataError(f"{path}: joint {source.name!r} mimics itself, through {', '.join(sorted(seen))}")
+            seen.add(name)
+            offset += multiplier * (mimic.offset or 0.0)
+            multiplier *= 1.0 if mimic.multiplier is None else mimic.multiplier
+            name = mimic.joint
+        if seen and name in index:
+            result[i] = replace(joints[i], follows=index[name], multiplier=multiplier, offset=offset)
+        elif seen:  # its leader never moves: it has the one value of its limits
+            value = multiplier * values.get(name, 0.0) + offset
+            result[i] = replace(joints[i], lower=value, upper=value)
+    return result
+
+
+def _shapes(robot: Any, place: dict[str, tuple[int, np.ndarray]], notes: Counter) -> list[tuple[int, np.ndarray, Any]]:
+    """Visual geometry; that of the collisions when the file has no visual at all."""
+    for kind in ("visuals", "collisions"):
+        shapes = []
+        for link in robot.links:
+            if link.name not in place:
+                continue
+            body, placement = place[link.name]
+            for shape in getattr(link, kind):
+                if shape.geometry is not None:
+                    origin = np.eye(4) if shape.origin is None else shape.origin
+                    shapes.append((body, placement @ origin, shape.geometry))
+        if shapes:
+            break
+    if shapes and kind == "collisions":
+        notes["objects without visual geometry (their collision geometry taken)"] += 1
+    return shapes

@@ -1,0 +1,299 @@
+"""Several clouds files into one: the shards of one conversion, or sources that have nothing in common."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dpcli.errors import DataError, UsageError
+from dpcli.path_names import short_names
+from dpcli.prepare.label_map import LabelMap
+from dpcli.prepare.pipeline import Report, already_complete, count_samples
+from dpcli.prepare.shards import Shard, shard_of
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.provenance import record
+from dpcli.runtime.signals import stop_requested
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.file import file_kind, read_positions
+from dpcli.store.journal import sweep
+from dpcli.store.pipes import refuse_repeats
+
+_OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
+
+
+@dataclass
+class Source:
+    """What the index of one file says; its points stay on the disk."""
+
+    path: Path
+    class_names: list[str]
+    length_unit: str
+    seed: int
+    made_by: str
+    names: list[str]
+    labels: list[int]
+    fields: tuple[str, ...]
+    provenance: list[dict[str, Any]]
+    skipped: list[tuple[str, str]]
+    positions: tuple[list[int], list[int]] | None
+    shard: Shard | None = field(default=None)
+    prefix: str = ""  # what goes before its samples' names
+
+    def sample_name(self, index: int) -> str:
+        return self.prefix + self.names[index]
+
+
+def read_source(path: Path) -> Source:
+    """The index of a clouds file; DataError when it is none."""
+    if file_kind(path) != "clouds":
+        raise DataError(
+            f"{path}: holds {file_kind(path)}; merge and split take clouds files, as dpc prepare makes them"
+        )
+    with CloudsReader(path) as reader:
+        root = reader.attributes
+        found = shard_of(reader.provenance[-1]) if reader.provenance else None
+        return Source(
+            path,
+            reader.class_names,
+            reader.length_unit,
+            int(root.get("seed", 0)),
+            str(root.get("source", "")),
+            list(reader.names),
+            reader.labels.tolist(),
+            reader.fields,
+            reader.provenance,
+            reader.skipped,
+            read_positions(reader.file),
+            found[0] if found else None,
+        )
+
+
+class OpenFiles:
+    """Readers by path, only the latest used of them open."""
+
+    def __init__(self) -> None:
+        self._readers: OrderedDict[Path, CloudsReader] = OrderedDict()
+
+    def read(self, path: Path, index: int) -> CloudSequence:
+        if path not in self._readers:
+            self._readers[path] = CloudsReader(path)
+        self._readers.move_to_end(path)
+        sequence = self._readers[path].read(index)
+        while len(self._readers) > _OPEN:
+            self._readers.popitem(last=False)[1].close()
+        return sequence
+
+    def close(self) -> None:
+        for reader in self._readers.values():
+            reader.close()
+
+
+def merge(
+    inputs: Sequence[Path],
+    output: Path,
+    *,
+    labels: LabelMap | None = None,
+    prefix: bool = False,
+    compression: str = "none",
+    force: bool = False,
+    resume: bool = True,
+) -> Report:
+    """Join clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
+
+    All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
+    whole's. Other files follow one another as given; their class lists must agree unless `labels` maps them.
+    prefix: names become FILE/NAME, FOLDER/NAME for files of one name. resume: off where nobody could run it again
+    (a pipe); saves the journal's disk space. UsageError: missing, repeated or mixed shards, `output` or what a stopped
+    run left of it is there and another; DataError: classes, units or fields that disagree, a name twice; Stopped after
+    a stop signal.
+    """
+    refuse_repeats([*inputs, output])
+    sources = [read_source(path) for path in inputs]
+    if all(source.shard for source in sources) and labels is None and not prefix:
+        return _merge_shards(sources, output, force, resume)
+    for source in sources:
+        if source.shard:
+            log.warn(
+                f"{source.path}: is shard {source.shard} of a conversion; joined as any other file, in its own order"
+            )
+    if prefix:
+        for source, name in zip(sources, short_names(inputs)):
+            source.prefix = f"{name}/"
+    return _merge_unlike(sources, output, labels or LabelMap(), compression, force, resume)
+
+
+def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool) -> Report:
+    entry = _whole_entry(sources)
+    places: dict[int, tuple[Source, int]] = {}
+    lost: dict[int, tuple[str, str]] = {}
+    for source in sources:
+        written, skipped = source.positions or ([], [])
+        if (len(written), len(skipped)) != (len(source.names), len(source.skipped)):
+            raise DataError(f"{source.path}: its positions don't fit its samples; make this shard again")
+        places |= {place: (source, index) for index, place in enumerate(written)}
+        lost |= dict(zip(skipped, source.skipped))
+    total = entry["config"].get("items", len(places) + len(lost))
+    if sorted([*places, *lost]) != list(range(total)):
+        raise DataError(f"{output}: the shards hold {len(places) + len(lost)} of {total} places; make them again")
+    if not places:
+        raise DataError(f"{output}: all {len(sources)} shards are empty; their samples were all skipped")
+    first = next(source for source in sources if source.names)
+    samples = [(*places[place], None) for place in sorted(places)]
+    skipped, compression = [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none"))
+    return _write(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
+
+
+def _whole_entry(sources: list[Source]) -> dict[str, Any]:
+    """The provenance that all shards share but for which they are; UsageError unless they are the pieces of one whole."""
+    entries = [shard_of(source.provenance[-1])[1] for source in sources]  # type: ignore[index]
+    first = sources[0]
+    for source, entry in zip(sources, entries):
+        different = [key for key in ("config", "seed", "version") if entry.get(key) != entries[0].get(key)]
+        if different or source.shard.count != first.shard.count:  # type: ignore[union-attr]
+            what = _difference(entries[0], entry) if different else f"{first.shard} and {source.shard}"
+            raise UsageError(f"{source.path}: is a shard of another conversion than {first.path} ({what})")
+    count, seen = first.shard.count, {}  # type: ignore[union-attr]
+    for source in sources:
+        index = source.shard.index  # type: ignore[union-attr]
+        if index in seen:
+            raise UsageError(f"{source.path}: is shard {source.shard}, as {seen[index]} is; each shard once")
+        seen[index] = source.path
+    missing = [f"{index}/{count}" for index in range(count) if index not in seen]
+    if missing:
+        more = f" and {len(missing) - 8} more" if len(missing) > 8 else ""
+        raise UsageError(
+            f"--shard {', '.join(missing[:8])}{more}: missing; convert {'them' if missing[1:] else 'it'} first"
+        )
+    return entries[0]
+
+
+def _difference(one: dict[str, Any], other: dict[str, Any]) -> str:
+    flat = [
+        {**entry.get("config", {}), "seed": entry.get("seed"), "version": entry.get("version")}
+        for entry in (one, other)
+    ]
+    keys = [key for key in {**flat[0], **flat[1]} if flat[0].get(key) != flat[1].get(key)]
+    return ", ".join(f"{key} {flat[0].get(key)} and {flat[1].get(key)}" for key in keys[:3])
+
+
+def _merge_unlike(
+    sources: list[Source], output: Path, labels: LabelMap, compression: str, force: bool, resume: bool
+) -> Report:
+    units = {source.length_unit: source.path for source in sources}
+    if len(units) > 1:
+        (a, one), (b, two), *_ = units.items()
+        raise DataError(f"{two}: its length unit is {b!r}, of {one} it is {a!r}; convert to one unit (--scale) first")
+    class_names, tables = labels.resolve([(source.path, source.class_names) for source in sources])
+    fields = tuple(name for name in sources[0].fields if all(name in source.fields for source in sources))
+    for name in sorted({name for source in sources for name in source.fields} - set(fields)):
+        log.warn(f"{name}: left out, not all of the files have it")
+    _refuse_equal_names(sources)
+    chosen: list[tuple[Source, int, int | None]] = []
+    skipped: list[tuple[str, str]] = []
+    for source, table in zip(sources, tables):
+        skipped += [(source.prefix + name, why) for name, why in source.skipped]
+        for index, label in enumerate(source.labels):
+            if label >= 0 and table[label] is None:
+                why = f"class {source.class_names[label]!r} is left out by the label map"
+                skipped.append((source.sample_name(index), why))
+            else:
+                chosen.append((source, index, table[label] if label >= 0 else -1))
+    config = {
+        "merge": [source.path.name for source in sources],
+        "labels": labels.config,
+        "prefix": any(source.prefix for source in sources),
+        "compression": compression,
+        "sources": [source.provenance for source in sources],
+    }
+    entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
+    pattern = Source(output, class_names, sources[0].length_unit, 0, "merge", [], [], fields, [], [], None)
+    return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
+
+
+def _refuse_equal_names(sources: list[Source]) -> None:
+    seen: dict[str, Path] = {}
+    for source in sources:
+        for index in range(len(source.names)):
+            own = source.sample_name(index)
+            if own in seen:
+                advice = "files and folders of one name" if source.prefix else "--prefix puts the file's name before it"
+                raise DataError(
+                    f"{source.path}: sample {own!r} is in {seen[own]} as well; names identify samples ({advice})"
+                )
+            seen[own] = source.path
+
+
+def _write(
+    output: Path,
+    entry: dict[str, Any],
+    pattern: Source,
+    samples: list[tuple[Source, int, int | None]],
+    skipped: list[tuple[str, str]],
+    *,
+    compression: str,
+    force: bool,
+    resume: bool,
+) -> Report:
+    """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
+    report = Report(skipped=skipped)
+    if not force and already_complete(output, entry):
+        sweep(output)
+        log.info(f"{output}: already complete, made of the same files (--force makes it again)")
+        report.was_complete = True
+        return count_samples(report, output)
+    files = OpenFiles()
+    try:
+        with (
+            stop_requested() as stop,
+            CloudsWriter(
+                output,
+                class_names=pattern.class_names,
+                length_unit=pattern.length_unit,
+                source=pattern.made_by,
+                seed=pattern.seed,
+                fields=pattern.fields,
+                compression=compression,
+                provenance=entry,
+                force=force,
+                resume=resume,
+            ) as writer,
+            Progress("prepare merge", total=len(samples), unit="video") as bar,
+        ):
+            done = copied_before(writer, [source.sample_name(index) for source, index, _ in samples])
+            bar.skip(done)
+            for source, index, label in samples[done:]:
+                sequence = _relabeled(files.read(source.path, index), source, pattern, label)
+                writer.write(sequence)
+                bar.advance(1, frames=sequence.num_frames)
+                stop.check(f"{len(writer)} of {len(samples)} samples are kept")
+            writer.skipped = skipped
+    finally:
+        files.close()
+    return count_samples(report, output)
+
+
+def copied_before(writer: CloudsWriter, names: list[str]) -> int:
+    """How many of the samples, from the first on, a stopped run left; UsageError when it left others, which stay."""
+    done = len(writer.written_names)
+    if writer.written_names != names[:done]:
+        writer.keep = True
+        raise UsageError(
+            f"{writer.path}: a stopped run left {done} other samples for it; go on with that run, write to "
+            "another file, or --force to start over"
+        )
+    if done:
+        log.info(f"continuing: {done} of {len(names)} were copied before")
+    return done
+
+
+def _relabeled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
+    """The sample as the joined file has it: its label, its name, and no field that others lack."""
+    if label is not None:
+        sequence.label = label
+    sequence.name = source.prefix + sequence.name
+    for name in set(source.fields) - set(pattern.fields):
+        setattr(sequence, name, None)
+    return sequence

@@ -1,0 +1,204 @@
+"""One clouds file into its splits, or into the same file with other splits."""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.articulated.object_splits import SPLITS
+from dpcli.prepare.commands.merge import Source, copied_before, read_source
+from dpcli.prepare.pipeline import already_complete
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.provenance import record
+from dpcli.runtime.seeds import generator
+from dpcli.runtime.signals import stop_requested
+from dpcli.store import CloudsReader, CloudsWriter
+from dpcli.store.journal import sweep
+from dpcli.store.pipes import check_output
+
+_DRAW = 5005  # the key of this draw among all that a seed gives
+
+
+@dataclass(frozen=True)
+class SplitChoice:
+    """How samples are divided: one of the three ways, or none, which keeps the splits that the file tells.
+
+    subjects: per split the subject numbers, `{"train": (1, 3)}`; others are test. listed: a CSV `name,split`.
+    fractions: of train, validation and test, drawn from `seed`; stratify: each class in these fractions; by_subject:
+    all samples of a subject fall into one split.
+    """
+
+    subjects: dict[str, tuple[int, ...]] | None = None
+    listed: Path | None = None
+    fractions: tuple[float, float, float] | None = None
+    stratify: bool = True
+    by_subject: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        ways = [way for way in (self.subjects, self.listed, self.fractions) if way is not None]
+        if len(ways) > 1:
+            raise UsageError("--list, --subjects and --fractions were given together; use one")
+        if self.fractions is not None:
+            low, total = min(self.fractions), sum(self.fractions)
+            if low < 0 or abs(total - 1) > 1e-6:
+                raise UsageError(f"--fractions {self.fractions}: expected three numbers from 0 that sum to 1")
+
+    def assign(self, source: Source, splits: Sequence[str], subjects: Sequence[int]) -> list[str]:
+        """The split of each sample, "" for those that go nowhere; DataError when the file lacks what is asked for."""
+        if self.listed is not None:
+            return by_list(source, self.listed)
+        if self.subjects is not None:
+            return by_subject(source, subjects, self.subjects)
+        if self.fractions is not None:
+            if self.by_subject and min(subjects) < 0:
+                raise DataError(f"{source.path}: subjects are not known of all samples; leave --by-subject out")
+            groups = list(subjects) if self.by_subject else list(range(len(splits)))
+            strata = source.labels if self.stratify and not self.by_subject else [0] * len(splits)
+            return by_fraction(groups, strata, self.fractions, self.seed)
+        if not any(splits):
+            raise DataError(f"{source.path}: tells no splits; choose --list, --subjects or --fractions")
+        return list(splits)
+
+
+def by_list(source: Source, path: Path) -> list[str]:
+    """From a CSV of name,split, with or without that header; names of samples that are not there are an error."""
+    try:
+        rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file; expected lines name,split") from None
+    chosen: dict[str, str] = {}
+    for number, row in enumerate(rows, 1):
+        if row[:2] == ["name", "split"] and number == 1:
+            continue
+        if len(row) != 2 or not all(row):
+            raise DataError(f"{path}, line {number}: found {','.join(row)!r}, expected name,split")
+        if row[0] in chosen:
+            raise DataError(f"{path}, line {number}: {row[0]!r} is listed twice")
+        chosen[row[0]] = row[1]
+    unknown = [name for name in chosen if name not in set(source.names)]
+    if unknown:
+        raise DataError(f"{path}: {len(unknown)} names are not in {source.path}, the first is {unknown[0]!r}")
+    return [chosen.get(name, "") for name in source.names]
+
+
+def by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[int, ...]]) -> list[str]:
+    """Named subjects to their split, the others to test; DataError when a subject is unknown or named twice."""
+    where: dict[int, str] = {}
+    for split, numbers in wanted.items():
+        for number in numbers:
+            if where.setdefault(number, split) != split:
+                raise UsageError(f"subject {number} is to be {where[number]} and {split}")
+    absent = sorted(set(where) - set(subjects))
+    if absent or -1 in subjects:
+        found = ",".join(map(str, sorted(set(subjects) - {-1}))) or "none"
+        what = f"subject {absent[0]} is not there" if absent else "the subject of some samples is unknown"
+        raise DataError(f"{source.path}: {what}; subjects of the file: {found}")
+    return [where.get(subject, "test") for subject in subjects]
+
+
+def by_fraction(
+    groups: Sequence[int], strata: Sequence[int], fractions: tuple[float, float, float], seed: int
+) -> list[str]:
+    """A split per sample: equal `groups` stay together, each of `strata` is divided in these fractions.
+
+    Of n groups in a stratum each split gets its share rounded down; the rest goes to the splits that lag most behind
+    their share of all so far. The draw depends on the seed and the strata alone.
+    """
+    members: dict[int, list[int]] = defaultdict(list)
+    for group, stratum in dict(zip(groups, strata)).items():
+        members[stratum].append(group)
+    share, given, where = np.array(fractions), np.zeros(3), {}
+    for stratum in sorted(members):
+        own = members[stratum]
+        sizes = np.floor(share * len(own) + 1e-9).astype(int)
+        while sizes.sum() < len(own):
+            lag = np.where(share > 0, share * (given.sum() + len(own)) - given - sizes, -np.inf)
+            sizes[int(lag.argmax())] += 1
+        given += sizes
+        order = generator(seed, _DRAW, stratum + 1).permutation(len(own))
+        for name, places in zip(SPLITS, np.split(order, np.cumsum(sizes)[:2])):
+            where |= {own[k]: name for k in places}
+    return [where[group] for group in groups]
+
+
+def split(
+    path: Path, output: Path, choice: SplitChoice, *, compression: str = "none", force: bool = False
+) -> dict[str, int]:
+    """Write `output/SPLIT.h5` for each split, or, when `output` ends in .h5, one file whose samples have new splits.
+
+    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams; stopped
+    or killed, it goes on from the last sample when run again.
+    """
+    source = read_source(path)
+    with CloudsReader(path) as reader:
+        splits = choice.assign(source, reader.splits, reader.subjects.tolist())
+        counts = {name: splits.count(name) for name in dict.fromkeys((*SPLITS, *splits)) if name in splits}
+        said = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(choice).items()}
+        inputs = {"clouds": path, **({"list": choice.listed} if choice.listed else {})}
+        entry = record({"split": said, "compression": compression}, choice.seed, inputs)
+        if output.suffix in (".h5", ".hdf5"):
+            _copy(reader, source, splits, output, [name for name in counts if name], entry, compression, force)
+            return counts
+        output.mkdir(parents=True, exist_ok=True)
+        for name in counts:
+            if name:
+                one = {**entry, "config": {**entry["config"], "part": name}}
+                _copy(reader, source, splits, output / f"{_file_name(name)}.h5", [name], one, compression, force)
+    return counts
+
+
+def _file_name(split_name: str) -> str:
+    if "/" in split_name or split_name.startswith("."):
+        raise DataError(f"split {split_name!r} can't be a file name; -o FILE.h5 writes all into one file")
+    return split_name
+
+
+def _copy(
+    reader: CloudsReader,
+    source: Source,
+    splits: list[str],
+    output: Path,
+    wanted: list[str],
+    entry: dict,
+    compression: str,
+    force: bool,
+) -> None:
+    check_output(output, "-o", [source.path])
+    history = [*source.provenance, entry]
+    if not force and already_complete(output, entry):
+        sweep(output)
+        log.info(f"{output}: already complete (--force makes it again)")
+        return
+    chosen = [index for index, name in enumerate(splits) if name in wanted]
+    with (
+        stop_requested() as stop,
+        CloudsWriter(
+            output,
+            class_names=source.class_names,
+            length_unit=source.length_unit,
+            source=source.made_by,
+            seed=source.seed,
+            fields=source.fields,
+            compression=compression,
+            provenance=history,
+            force=force,
+            resume=True,
+        ) as writer,
+        Progress(f"prepare split {output.stem}", total=len(chosen), unit="video") as bar,
+    ):
+        done = copied_before(writer, [reader.names[index] for index in chosen])
+        bar.skip(done)
+        for index in chosen[done:]:
+            sequence = reader.read(index)
+            sequence.split = splits[index]
+            writer.write(sequence)
+            bar.advance(1, frames=sequence.num_frames)
+            stop.check(f"{len(writer)} of {len(chosen)} samples of {output} are kept")
+        writer.skipped = source.skipped

@@ -1,0 +1,77 @@
+"""A video's frames in one `.npz` member, as the peers save them: an object array of clouds, or one regular array."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.safe_pickle import ArrayUnpickler
+
+_MOST_BYTES = 1 << 31  # of a member unpacked; 300 frames of 40,000 points in float64 take 0.3 GB
+
+
+def member_names(path: Path) -> list[str]:
+    """The arrays in an .npz, without reading them; DataError when it is none."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()]
+    except (zipfile.BadZipFile, OSError) as error:
+        raise DataError(f"{path}: not a readable .npz file, perhaps truncated ({error})") from None
+
+
+def read_frames(path: Path, key: str) -> list[np.ndarray]:
+    """Frames (N,3 or more) of numbers, N their own each, from array ``key`` of an .npz; columns 0 to 2 are returned.
+
+    An object array is a pickle: it is read through an allow list of plain arrays. DataError on anything else.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            info = archive.getinfo(f"{key}.npy")
+            if info.file_size > _MOST_BYTES:
+                raise DataError(f"{path}: {key} takes {info.file_size} bytes; expected less than {_MOST_BYTES}")
+            array = _read_array(io.BytesIO(archive.read(info)))
+    except pickle.UnpicklingError as error:
+        raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None
+    except DataError:
+        raise
+    except Exception as error:  # a damaged zip, header or pickle stream raises nearly anything
+        raise DataError(f"{path}: {key} cannot be read ({type(error).__name__}: {error}); copy it again") from None
+    return [_frame(path, key, t, frame) for t, frame in enumerate(_as_frames(path, key, array))]
+
+
+def _read_array(stream: io.BytesIO) -> np.ndarray:
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    _, _, dtype = header(stream)
+    if dtype.hasobject:
+        return ArrayUnpickler(stream, encoding="latin1").load()
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def _as_frames(path: Path, key: str, array: object) -> list:
+    if isinstance(array, np.ndarray) and (array.ndim == 3 or (array.ndim == 1 and array.dtype == object)):
+        return list(array)
+    found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+    raise DataError(f"{path}: {key} is {found}; expected frames (T,) of points (N,3), or numbers (T,N,3)")
+
+
+def _frame(path: Path, key: str, t: int, frame: object) -> np.ndarray:
+    if isinstance(frame, np.ndarray) and frame.dtype == object and frame.ndim == 2:
+        try:  # equal frames in one object array lose their type, not their numbers
+            frame = frame.astype(np.float64)
+        except (TypeError, ValueError):
+            pass
+    good = isinstance(frame, np.ndarray) and frame.dtype.kind in "iuf" and frame.ndim == 2 and frame.shape[1] >= 3
+    if not good:
+        found = f"{frame.dtype} {frame.shape}" if isinstance(frame, np.ndarray) else type(frame).__name__
+        raise DataError(f"{path}: frame {t} of {key} is {found}; expected numbers (points, 3)")
+    points = frame[:, :3]
+    if points.dtype.kind == "f" and not np.isfinite(points).all():
+        raise DataError(f"{path}: frame {t} of {key} holds NaN or infinity; expected finite coordinates")
+    return points.astype(np.float32)

@@ -1,0 +1,60 @@
+"""Animated glTF models into views: one object filmed by virtual cameras, with true tracks and rigid parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from dpcli.errors import DataError
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
+from dpcli.prepare.meshes.filming import Filming, film
+from dpcli.prepare.meshes.gltf import read_gltf
+from dpcli.prepare.meshes.gltf_mesh import bake
+from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
+from dpcli.prepare.views.views_pipeline import Clip
+from dpcli.runtime.progress import log
+from dpcli.runtime.provenance import file_digest
+
+
+@contextmanager
+def _well_formed(path: Path) -> Iterator[None]:
+    """What a damaged file makes of our assumptions (a text for a number, a missing key) becomes a DataError."""
+    try:
+        yield
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+        raise DataError(
+            f"{path}: not built as glTF 2.0 asks ({type(error).__name__}: {error}); export it again"
+        ) from error
+
+
+def list_clips(path: Path) -> list[tuple[str, float]]:
+    """(name, seconds) of every clip of a file; DataError when one is broken or there is none."""
+    with _well_formed(path):
+        file = read_gltf(path)
+        choose_clip(file, None)
+        clips = [read_clip(file, index) for index in range(len(clip_names(file)))]
+    return [(clip.name, clip.end - clip.start) for clip in clips]
+
+
+def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
+    """A clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own units."""
+    with _well_formed(path):
+        file = read_gltf(path)
+        chosen, names = choose_clip(file, clip), clip_names(file)
+        if clip is None and len(names) > 1:
+            log.info(f"{path}: clip {names[0]!r}, the first of {len(names)}; --list names them, --clip chooses")
+        return bake(file, chosen, frames)
+
+
+def animation_clip(path: Path, clip: str | None, frames: int, filming: Filming, jobs: int = 1) -> Clip:
+    """The Clip that `film` makes of `load_animation`."""
+    return film(load_animation(path, clip, frames), filming, jobs)
+
+
+def animation_config(path: Path, clip: str | None, frames: int, filming: Filming) -> dict[str, Any]:
+    """What decides the content, for the file's provenance."""
+    with _well_formed(path):
+        name = clip_names(file := read_gltf(path))[choose_clip(file, clip)]
+    return {"input": path.name, "digest": file_digest(path)[:16], "clip": name, "frames": frames, **filming.config}

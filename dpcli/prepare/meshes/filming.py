@@ -1,0 +1,139 @@
+"""An animated mesh in front of cameras: the pictures of a views file, its true tracks and rigid parts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
+from dpcli.prepare.meshes.bone_parts import carry, choose_points, heaviest_bones, rigid_parts
+from dpcli.prepare.meshes.raycast import FrameCaster
+from dpcli.prepare.views.views_pipeline import Clip
+from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import generator
+from dpcli.runtime.worker_server import start_early
+from dpcli.store.views import ViewsHeader
+
+OBJECT_RADIUS = 0.75  # of the ball around the object; the default camera sees 0.83 whole
+_CHUNK = 4  # frames that a worker gets at a time: the mesh travels with them
+_STILL = 1e-3  # of the object's radius: what moves less than this is no motion
+
+
+@dataclass(frozen=True)
+class Filming:
+    """How an animated mesh is filmed. Angles in degrees; the reference camera stands at azimuth 0.
+
+    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points of
+    ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
+    """
+
+    size: int = 512
+    test_azimuths: tuple[float, ...] = (15.0, -75.0, 105.0, 195.0)
+    train_azimuths: tuple[float, ...] = ()
+    elevation: float = 0.0
+    yaw: float = 0.0
+    travel: bool = True
+    samples: int = 2
+    shading: float = 0.5
+    tracks: int = 4096
+    part_tolerance: float = 0.01
+    min_part: float = 0.01
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        limits = {"elevation": (-90, 90), "shading": (0, 1), "part_tolerance": (0, 1), "min_part": (0, 1)}
+        for key, (low, high) in limits.items():
+            if not low <= getattr(self, key) <= high:
+                raise UsageError(f"--{key.replace('_', '-')} {getattr(self, key)}: expected {low} to {high}")
+        azimuths = [0.0, *self.train_azimuths, *self.test_azimuths]
+        turns = [round(azimuth % 360, 6) for azimuth in azimuths]
+        twice = [azimuth for index, azimuth in enumerate(azimuths) if turns[index] in turns[:index]]
+        if twice:
+            raise UsageError(f"azimuth {twice[0]:g} is there twice; 0 is the reference view, each may be used once")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Everything that decides the pictures, except the seed."""
+        return {key: value for key, value in asdict(self).items() if key != "seed"}
+
+    @property
+    def roles(self) -> list[str]:
+        return ["reference", *["train"] * len(self.train_azimuths), *["test"] * len(self.test_azimuths)]
+
+    def cameras(self) -> np.ndarray:
+        """world_to_camera f64 (V,4,4): the reference, the train and the test views."""
+        azimuths = np.radians([0.0, *self.train_azimuths, *self.test_azimuths])
+        return np.stack([orbit_pose(azimuth, np.radians(self.elevation), DEFAULT_RADIUS) for azimuth in azimuths])
+
+
+def film(mesh: AnimatedMesh, filming: Filming, jobs: int = 1) -> Clip:
+    """A Clip of the mesh, normalized to a ball of radius 0.75 at the origin; its pictures are drawn as they are asked for.
+
+    The pictures don't depend on jobs. DataError when the mesh has no extent; a warning when it doesn't move.
+    """
+    if not np.isfinite(mesh.positions).all():
+        frame = int(np.argmax(~np.isfinite(mesh.positions).all((1, 2))))
+        raise DataError(f"{mesh.name}: vertices of frame {frame} are not finite; repair the model, export it again")
+    corners = mesh.positions[:, np.unique(mesh.triangles)]
+    if not np.ptp(corners.reshape(-1, 3), axis=0).any():
+        raise DataError(f"{mesh.name}: all vertices are one point; expected a mesh with an extent")
+    mesh = normalized(mesh, OBJECT_RADIUS, np.radians(filming.yaw), filming.travel)
+    if np.ptp(mesh.positions, axis=0).max() < _STILL * OBJECT_RADIUS:
+        log.warn(f"{mesh.name}: nothing moves in this clip")
+    track, part = ground_truth(mesh, filming)
+    views = len(filming.roles)
+    intrinsics = np.tile(pinhole(DEFAULT_FOVY, filming.size, filming.size), (views, 1, 1))
+    header = ViewsHeader(
+        mesh.name, intrinsics, filming.cameras(), mesh.time, filming.roles, 0, (filming.size, filming.size)
+    )
+    return Clip(header, partial(_pictures, mesh, header, filming, jobs), track, part)
+
+
+def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """track f32 (T,M,3) and part i16 (M) of `tracks` points; None, None when 0 are asked for."""
+    if not filming.tracks:
+        return None, None
+    points = choose_points(mesh, filming.tracks, generator(filming.seed))
+    track, bone = carry(mesh, points), heaviest_bones(mesh, points)
+    smallest = int(np.ceil(filming.min_part * filming.tracks))
+    tolerance = filming.part_tolerance * OBJECT_RADIUS
+    part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(np.float64), tolerance, smallest)
+    log.info(f"{mesh.name}: {int(part.max()) + 1} rigid parts of {len(np.unique(bone))} bones")
+    return track, part
+
+
+def _pictures(
+    mesh: AnimatedMesh, header: ViewsHeader, filming: Filming, jobs: int
+) -> Iterator[tuple[int, int, np.ndarray]]:
+    starts = range(0, mesh.num_frames, _CHUNK)
+    pieces = ((start, mesh.frames(start, start + _CHUNK)) for start in starts)
+    jobs = min(jobs, len(starts))
+    if jobs > 1:
+        start_early([__name__])
+    work = partial(draw_frames, header.intrinsics, header.world_to_camera, header.size, filming)
+    for (start, _), result in ordered_map(work, pieces, jobs):
+        if isinstance(result, Exception):
+            raise result
+        for frame, pictures in enumerate(result, start):
+            for view, picture in enumerate(pictures):
+                yield view, frame, picture
+
+
+def draw_frames(
+    intrinsics: np.ndarray,
+    world_to_camera: np.ndarray,
+    size: tuple[int, int],
+    filming: Filming,
+    piece: tuple[int, AnimatedMesh],
+) -> list[list[np.ndarray]]:
+    """Pictures u8 (H,W,4) of all views of some frames: [frame][view]. Runs in a worker process."""
+    casters = (FrameCaster(piece[1], frame, filming.shading) for frame in range(piece[1].num_frames))
+    cameras = list(zip(intrinsics, world_to_camera, strict=True))
+    return [[caster.picture(*camera, size, filming.samples) for camera in cameras] for caster in casters]

@@ -1,0 +1,217 @@
+"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and 4).
+
+The container is JSON beside a block of bytes, so the standard library reads it; see `gltf_scene` for what it means.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import json
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from dpcli.errors import DataError
+
+COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_MOST = 1 << 27  # entries: a damaged count must not fill the memory
+_UNDERSTOOD = (
+    "KHR_materials_",
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+    "KHR_lights_punctual",
+    "EXT_texture_webp",
+)
+
+
+@dataclass
+class Gltf:
+    """A glTF file: its JSON and, read when asked for, its buffers.
+
+    `accessor` decodes numbers, `image` gives a texture's encoded bytes. All errors are DataErrors that name the file.
+    """
+
+    path: Path
+    tree: dict[str, Any]
+    binary: bytes | None = None
+    _buffers: dict[int, bytes] = field(default_factory=dict)
+
+    def fail(self, problem: str) -> DataError:
+        return DataError(f"{self.path}: {problem}")
+
+    def items(self, kind: str) -> list[dict[str, Any]]:
+        """The top-level list of this name, such as nodes; [] when absent."""
+        value = self.tree.get(kind, [])
+        if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+            raise self.fail(f"{kind} is not a list of objects; the file is damaged, export it again")
+        return value
+
+    def item(self, kind: str, index: Any) -> dict[str, Any]:
+        """One entry of a top-level list; DataError when the index points at nothing."""
+        entries = self.items(kind)
+        if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(entries):
+            raise self.fail(
+                f"refers to {kind}[{index}], but there are {len(entries)}; the file is damaged, export it again"
+            )
+        return entries[index]
+
+    def accessor(self, index: Any, what: str, width: int | None = None, finite: bool = True) -> np.ndarray:
+        """Numbers of an accessor: (count,) or (count, components), normalized integers as float32 in -1..1.
+
+        what: named in errors. width: components expected, such as 3. finite: refuse NaN and infinite floats.
+        """
+        entry = self.item("accessors", index)
+        dtype, columns = COMPONENTS.get(entry.get("componentType")), WIDTHS.get(entry.get("type"))
+        count = entry.get("count")
+        if dtype is None or columns is None or not isinstance(count, int) or not 1 <= count <= _MOST:
+            raise self.fail(f"{what}: accessor {index} has no valid type or count; export the file again")
+        if width is not None and columns != width:
+            raise self.fail(f"{what}: accessor {index} is {entry['type']}, expected {width} components")
+        if "bufferView" in entry:
+            values = self._elements(entry["bufferView"], entry.get("byteOffset", 0), count, columns, dtype, what)
+        else:
+            values = np.zeros((count, columns), dtype)
+        if "sparse" in entry:
+            values = self._replaced(values, entry["sparse"], what)
+        if dtype is not np.float32 and entry.get("normalized"):
+            values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1)
+        if finite and values.dtype == np.float32 and not np.isfinite(values).all():
+            row = int(np.argmax(~np.isfinite(values).all(1)))
+            raise self.fail(f"{what}: NaN or infinite at entry {row} of {count}; repair the model, export it again")
+        return values[:, 0] if columns == 1 else values
+
+    def _elements(self, view: Any, offset: int, count: int, columns: int, dtype: type, what: str) -> np.ndarray:
+        data, stride = self._view(view)
+        size = np.dtype(dtype).itemsize * columns
+        stride = stride or size
+        if offset < 0 or stride < size or offset + stride * (count - 1) + size > len(data):
+            raise self.fail(
+                f"{what}: needs {offset + stride * (count - 1) + size} bytes of bufferView {view}, which has "
+                f"{len(data)}; the file is truncated or damaged"
+            )
+        values = np.ndarray(
+            (count, columns), np.dtype(dtype).newbyteorder("<"), data, offset, (stride, size // columns)
+        )
+        return values.astype(dtype)
+
+    def _replaced(self, values: np.ndarray, sparse: dict[str, Any], what: str) -> np.ndarray:
+        try:
+            where, what_else, count = sparse["indices"], sparse["values"], sparse["count"]
+            kind, views = COMPONENTS[where["componentType"]], (where["bufferView"], what_else["bufferView"])
+        except (KeyError, TypeError):
+            raise self.fail(f"{what}: a sparse accessor lacks indices or values; export the file again") from None
+        rows = self._elements(views[0], where.get("byteOffset", 0), count, 1, kind, what)[:, 0]
+        if rows.max(initial=0) >= len(values):
+            raise self.fail(f"{what}: a sparse accessor replaces entry {rows.max()} of {len(values)}")
+        values = values.copy()
+        values[rows] = self._elements(
+            views[1], what_else.get("byteOffset", 0), count, values.shape[1], values.dtype.type, what
+        )
+        return values
+
+    def _view(self, index: Any) -> tuple[bytes, int]:
+        entry = self.item("bufferViews", index)
+        data = self._buffer(entry.get("buffer"))
+        start, length = entry.get("byteOffset", 0), entry.get("byteLength", 0)
+        if not (0 <= start and 0 < length and start + length <= len(data)):
+            raise self.fail(
+                f"bufferView {index} needs bytes {start} to {start + length} of a buffer of {len(data)}; "
+                "the file is truncated or damaged"
+            )
+        return data[start : start + length], entry.get("byteStride", 0)
+
+    def _buffer(self, index: Any) -> bytes:
+        if index not in self._buffers:
+            entry = self.item("buffers", index)
+            if "uri" in entry:
+                self._buffers[index] = self._resource(entry["uri"])
+            elif index == 0 and self.binary is not None:
+                self._buffers[index] = self.binary
+            else:
+                raise self.fail(f"buffer {index} has no data; export the file again")
+        return self._buffers[index]
+
+    def _resource(self, uri: str) -> bytes:
+        """Bytes of a data: URI or of a file below the folder; anything else is refused, a file may be hostile."""
+        if uri.startswith("data:"):
+            head, _, body = uri.partition(",")
+            try:
+                return base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode()
+            except (binascii.Error, ValueError):
+                raise self.fail("a data: URI is not valid base64; export the file again") from None
+        folder = self.path.parent.resolve()
+        target = (folder / unquote(uri)).resolve()
+        if "://" in uri or not target.is_relative_to(folder):
+            raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it")
+        try:
+            return target.read_bytes()
+        except OSError as error:
+            raise self.fail(
+                f"its file {uri[:80]!r} cannot be read ({error.strerror}); keep it beside the .gltf"
+            ) from None
+
+    def image(self, index: Any) -> np.ndarray:
+        """Pixels of images[index], u8 (H,W,4), decoded by Pillow."""
+        from PIL import Image, UnidentifiedImageError
+
+        entry = self.item("images", index)
+        data = (
+            self._view(entry["bufferView"])[0] if "bufferView" in entry else self._resource(str(entry.get("uri", "")))
+        )
+        try:
+            with Image.open(io.BytesIO(data)) as picture:
+                return np.array(picture.convert("RGBA"))
+        except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
+            raise self.fail(f"texture {index} ({entry.get('mimeType', 'image')}) cannot be read: {error}") from None
+
+
+def read_gltf(path: Path) -> Gltf:
+    """Open a .glb or .gltf file; DataError unless it is whole, version 2 and free of extensions we can't follow."""
+    try:
+        data = Path(path).read_bytes()
+    except IsADirectoryError:
+        files = sorted(file.name for file in Path(path).glob("*.gl[bt]*"))
+        some = f"name one of its {len(files)} files, such as {files[0]}" if files else "expected a .glb or .gltf file"
+        raise DataError(f"{path}: a folder; {some}") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    text, binary = _split_glb(path, data) if data[:4] == b"glTF" else (data, None)
+    try:
+        tree = json.loads(text)
+        version = str(tree["asset"]["version"])
+    except (ValueError, KeyError, TypeError):
+        raise DataError(f"{path}: not a glTF file (no JSON with an asset version); expected .glb or .gltf") from None
+    if not version.startswith("2"):
+        raise DataError(f"{path}: glTF version {version}; version 2 is read, convert the file")
+    foreign = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_UNDERSTOOD)]
+    if foreign:
+        raise DataError(f"{path}: needs the extension {foreign[0]}, which is not read; export it without compression")
+    return Gltf(Path(path), tree, binary)
+
+
+def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
+    """JSON and binary chunk of a .glb (section 4)."""
+    version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
+    if version != 2 or length > len(data):
+        raise DataError(
+            f"{path}: a .glb of version {version} and {length} bytes, of which {len(data)} are left; "
+            "truncated, or not glTF 2: copy or export it again"
+        )
+    chunks, start = {}, 12
+    while start + 8 <= length:
+        size, kind = struct.unpack_from("<II", data, start)
+        if start + 8 + size > length:
+            raise DataError(f"{path}: a chunk of {size} bytes does not fit into the file; copy or export it again")
+        chunks.setdefault(kind, data[start + 8 : start + 8 + size])
+        start += 8 + size
+    if _JSON not in chunks:
+        raise DataError(f"{path}: a .glb without its JSON chunk; copy or export it again")
+    return chunks[_JSON], chunks.get(_BIN)

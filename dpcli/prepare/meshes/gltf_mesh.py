@@ -1,0 +1,255 @@
+"""Skinned and morphing meshes of a glTF file, baked over a clip into one AnimatedMesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
+from dpcli.prepare.meshes.gltf import Gltf
+from dpcli.prepare.meshes.gltf_material import read_material
+from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, read_clip
+from dpcli.prepare.meshes.skinning import skin, vertex_normals
+from dpcli.runtime.progress import log
+
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
+
+
+@dataclass
+class _Piece:
+    """One primitive of one node, at rest; targets: position deltas f32 (M,V,3) and normal deltas, or None."""
+
+    node: int
+    positions: np.ndarray
+    normals: np.ndarray
+    triangles: np.ndarray
+    uv: np.ndarray
+    color: np.ndarray
+    bones: np.ndarray
+    weights: np.ndarray
+    inverse_bind: dict[int, np.ndarray]
+    material: int
+    targets: np.ndarray | None
+    normal_targets: np.ndarray | None
+
+
+def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
+    """The scene's triangles at `frames` times of a clip; time counts from 0. Bones are the file's nodes.
+
+    What has no skin hangs on its node. Points and lines are passed over. DataError when the file is broken.
+    """
+    parent, curves = node_parents(file), read_clip(file, clip)
+    time = curves.sample_times(frames)
+    poses = node_poses(file, parent, curves, time)
+    pieces = [piece for node in _scene_nodes(file) for piece in _read_node(file, node)]
+    if not pieces:
+        raise file.fail("has no triangles in its scene; expected a mesh with an animation")
+    used = sorted({piece.material for piece in pieces})
+    moved = [_move(file, piece, curves, time, poses) for piece in pieces]
+    starts = np.cumsum([0] + [len(piece.uv) for piece in pieces])
+    joints = max(piece.bones.shape[1] for piece in pieces)
+
+    def joined(key: str, width: int = 0) -> np.ndarray:
+        arrays = [getattr(piece, key) for piece in pieces]
+        if width:
+            arrays = [np.pad(a, ((0, 0), (0, width - a.shape[1]))) for a in arrays]
+        return np.concatenate(arrays)
+
+    seconds = time - time[0] if frames > 1 and time[-1] > time[0] else np.arange(frames, dtype=float)
+    return AnimatedMesh(
+        name=f"{file.path.stem} {curves.name}",
+        time=seconds,
+        positions=np.concatenate([x for x, _ in moved], axis=1),
+        normals=np.concatenate([n for _, n in moved], axis=1),
+        triangles=np.concatenate([piece.triangles + start for piece, start in zip(pieces, starts)]),
+        material=np.concatenate([np.full(len(piece.triangles), used.index(piece.material)) for piece in pieces]),
+        materials=tuple(read_material(file, index) for index in used),
+        color=joined("color"),
+        uv=joined("uv"),
+        bones=joined("bones", joints),
+        weights=joined("weights", joints),
+        bone_pose=poses,
+        bone_parent=parent,
+        bone_name=tuple(node_name(file, index) for index in range(len(parent))),
+    )
+
+
+def _scene_nodes(file: Gltf) -> list[int]:
+    """Nodes of the default scene, parents first; all nodes when the file names no scene."""
+    if not file.items("scenes"):
+        return list(range(len(file.items("nodes"))))
+    order = list(file.item("scenes", file.tree.get("scene", 0)).get("nodes", []))
+    for index in order:  # grows while it is walked; circles are refused before
+        order += file.item("nodes", index).get("children", [])
+    return order
+
+
+def _read_node(file: Gltf, index: int) -> list[_Piece]:
+    node = file.item("nodes", index)
+    if "mesh" not in node:
+        return []
+    primitives = file.item("meshes", node["mesh"]).get("primitives", [])
+    kept = [p for p in primitives if p.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)]
+    if len(kept) < len(primitives):
+        log.detail(f"{file.path}: {len(primitives) - len(kept)} sets of points or lines are left out")
+    skins = _read_skin(file, node["skin"]) if "skin" in node else None
+    return [_read_primitive(file, index, primitive, skins) for primitive in kept]
+
+
+def _read_skin(file: Gltf, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Joints (nodes) i64 (K) and inverse bind matrices f64 (K,4,4)."""
+    entry = file.item("skins", index)
+    joints = np.array(entry.get("joints", []), np.int64)
+    for joint in joints:
+        file.item("nodes", int(joint))
+    if not len(joints):
+        raise file.fail(f"skin {index} has no joints; export the file again")
+    if "inverseBindMatrices" not in entry:
+        return joints, np.tile(np.eye(4), (len(joints), 1, 1))
+    found = file.accessor(entry["inverseBindMatrices"], f"bones of skin {index}", 16).reshape(-1, 4, 4)
+    if len(found) < len(joints):
+        raise file.fail(f"skin {index} has {len(found)} bind matrices for {len(joints)} bones; export the file again")
+    return joints, found[: len(joints)].transpose(0, 2, 1).astype(np.float64)
+
+
+def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) -> _Piece:
+    where = f"mesh of {node_name(file, node)!r}"
+    attributes = entry.get("attributes", {})
+    if "POSITION" not in attributes:
+        raise file.fail(f"{where} has no positions; export the file again")
+    positions = _floats(file, attributes, "POSITION", where, 3)
+    count = len(positions)
+
+    def read(key: str, width: int | None, default: np.ndarray) -> np.ndarray:
+        if key not in attributes:
+            return default
+        values = _floats(file, attributes, key, where, width)
+        if len(values) != count:
+            raise file.fail(f"{where}: {len(values)} {key} for {count} vertices; export the file again")
+        return values
+
+    triangles = _triangles(file, entry, count, where)
+    material = entry.get("material", -1)
+    uv_set = read_material(file, material, header_only=True)
+    color = read("COLOR_0", None, np.ones((count, 4), np.float32))
+    color = np.concatenate([color, np.ones((count, 4 - color.shape[1]), np.float32)], axis=1)
+    bones, weights, inverse_bind = _binding(file, node, attributes, positions, skins, where)
+    targets = entry.get("targets") or None
+    return _Piece(
+        node,
+        positions,
+        read("NORMAL", 3, vertex_normals(positions, triangles)),
+        triangles,
+        read(f"TEXCOORD_{uv_set}", 2, np.zeros((count, 2), np.float32)),
+        color,
+        bones,
+        weights,
+        inverse_bind,
+        material,
+        targets and _deltas(file, targets, "POSITION", count, where),
+        targets and _deltas(file, targets, "NORMAL", count, where),
+    )
+
+
+def _floats(file: Gltf, attributes: dict, key: str, where: str, width: int | None, finite: bool = True) -> np.ndarray:
+    values = file.accessor(attributes[key], f"{key} of {where}", width, finite)
+    return values.reshape(len(values), -1).astype(np.float32)
+
+
+def _deltas(file: Gltf, targets: list[dict], key: str, count: int, where: str) -> np.ndarray:
+    zero = np.zeros((count, 3), np.float32)
+    found = [_floats(file, target, key, f"target of {where}", 3) if key in target else zero for target in targets]
+    if any(len(delta) != count for delta in found):
+        raise file.fail(f"{where}: a morph target has another number of vertices; export the file again")
+    return np.stack(found)
+
+
+def _triangles(file: Gltf, entry: dict[str, Any], count: int, where: str) -> np.ndarray:
+    corners = np.arange(count)
+    if "indices" in entry:
+        corners = file.accessor(entry["indices"], f"indices of {where}", 1).astype(np.int64)
+    if len(corners) and (corners.max() >= count or corners.min() < 0):
+        raise file.fail(f"{where}: a triangle uses vertex {corners.max()} of {count}; the file is damaged")
+    mode = entry.get("mode", _TRIANGLES)
+    if mode == _STRIP:
+        return np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    if mode == _FAN:
+        return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
+    return corners[: len(corners) // 3 * 3].reshape(-1, 3)
+
+
+def _binding(
+    file: Gltf, node: int, attributes: dict, positions: np.ndarray, skins: Any, where: str
+) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
+    """Bones (nodes) i64 (V,J), weights f32 (V,J) that sum to 1, inverse bind matrix of every bone used."""
+    count = len(positions)
+    if skins is None or "JOINTS_0" not in attributes:
+        return np.full((count, 1), node), np.ones((count, 1), np.float32), {node: np.eye(4)}
+    joints, inverse = skins
+    sets = [n for n in range(8) if f"JOINTS_{n}" in attributes and f"WEIGHTS_{n}" in attributes]
+    if not sets:
+        raise file.fail(f"{where} has joints without weights; export the file again")
+    local, weights = (
+        np.concatenate(
+            [_floats(file, attributes, f"{key}_{n}", where, 4, finite=key != "WEIGHTS") for n in sets], axis=1
+        )
+        for key in ("JOINTS", "WEIGHTS")
+    )
+    if len(local) != count or len(weights) != count:
+        raise file.fail(f"{where}: {len(local)} joints and {len(weights)} weights for {count} vertices")
+    local, weights = _repaired(file, local.astype(np.int64), weights, positions, where)
+    if local.max() >= len(joints):
+        raise file.fail(f"{where}: a vertex hangs on bone {local.max()} of {len(joints)}; export the file again")
+    return joints[local], weights, {int(j): m for j, m in zip(joints, inverse)}
+
+
+def _repaired(
+    file: Gltf, local: np.ndarray, weights: np.ndarray, positions: np.ndarray, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joints and weights (V,J), weights normalized, joints of no weight 0.
+
+    Exporters leave a few vertices without weights, or with 0/0 = NaN: they follow the nearest vertex that has some.
+    """
+    total = weights.sum(1)
+    lost = ~(np.isfinite(total) & (total > 1e-6))
+    if lost.mean() > _MOST_LOST:
+        raise file.fail(f"{where}: {lost.sum()} of {len(lost)} vertices have no finite weights; repair the model")
+    if lost.any():
+        from scipy.spatial import cKDTree
+
+        log.warn(f"{file.path}: {where}: {lost.sum()} vertices without finite weights follow their nearest neighbors")
+        near = np.flatnonzero(~lost)[cKDTree(positions[~lost]).query(positions[lost])[1]]
+        local, weights = local.copy(), weights.copy()
+        local[lost], weights[lost] = local[near], weights[near]
+    weights = weights / weights.sum(1, keepdims=True)
+    return np.where(weights > 0, local, 0), weights
+
+
+def _move(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions and normals f32 (T,V,3) of a piece."""
+    positions, normals = piece.positions, piece.normals
+    if piece.targets is not None:
+        amount = _morph_weights(file, piece, clip, time)
+        positions = positions + np.einsum("tm,mva->tva", amount, piece.targets)
+        normals = normals + np.einsum("tm,mva->tva", amount, piece.normal_targets)
+    bind = np.tile(np.eye(4), (poses.shape[1], 1, 1))
+    for bone, inverse in piece.inverse_bind.items():
+        bind[bone] = inverse
+    return skin(positions, normals, piece.bones, piece.weights, poses @ bind)
+
+
+def _morph_weights(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray) -> np.ndarray:
+    """f64 (T,M): the clip's, or else the node's or mesh's own."""
+    count = len(piece.targets)
+    if (piece.node, "weights") in clip.curves:
+        amount = clip.curves[piece.node, "weights"].at(time)
+    else:
+        node = file.item("nodes", piece.node)
+        fixed = node.get("weights") or file.item("meshes", node["mesh"]).get("weights") or [0.0] * count
+        amount = np.tile(np.array(fixed, np.float64), (len(time), 1))
+    if amount.shape[1] != count or not np.isfinite(amount).all():
+        raise file.fail(f"{node_name(file, piece.node)!r}: {amount.shape[1]} weights for {count} morph targets")
+    return amount

@@ -1,0 +1,156 @@
+"""The nodes of a glTF file and its clips: where every node is at every time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.errors import UsageError
+from dpcli.prepare.meshes.gltf import Gltf
+from dpcli.prepare.meshes.skinning import Curve, matrices
+
+_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One animation. curves: (node, translation | rotation | scale | weights) -> Curve. Seconds."""
+
+    name: str
+    start: float
+    end: float
+    curves: dict[tuple[int, str], Curve]
+
+    def sample_times(self, frames: int) -> np.ndarray:
+        """`frames` times f64 (T) from the start on; the end is left out, in a loop it would repeat the first frame."""
+        return self.start + (self.end - self.start) * np.arange(frames) / frames
+
+
+def clip_names(file: Gltf) -> list[str]:
+    """Names of the animations in the file's order; clip N when unnamed."""
+    return [str(entry.get("name") or f"clip {index}") for index, entry in enumerate(file.items("animations"))]
+
+
+def choose_clip(file: Gltf, wanted: str | None) -> int:
+    """Index of a clip by name, or by what follows the last | of it, in any case; None: the first."""
+    names = clip_names(file)
+    if not names:
+        raise file.fail("has no animation: nothing moves in it. Export the model with its clips (see --list)")
+    if wanted is None:
+        return 0
+    if wanted in names:
+        return names.index(wanted)
+    short = [index for index, name in enumerate(names) if name.split("|")[-1].lower() == wanted.lower()]
+    if len(short) != 1:
+        raise UsageError(f"--clip {wanted}: {file.path} has {', '.join(names)}")
+    return short[0]
+
+
+def read_clip(file: Gltf, index: int) -> Clip:
+    """The clip's curves; DataError that names clip, node and key when one is broken."""
+    entry, name = file.item("animations", index), clip_names(file)[index]
+    curves = {}
+    for channel in entry.get("channels", []):
+        target = channel.get("target", {})
+        node, path = target.get("node"), target.get("path")
+        if node is None or path not in (*_REST, "weights"):
+            continue  # what an extension moves; the specification says to pass it over
+        what = f"clip {name!r}, {path} of {node_name(file, node)!r}"
+        try:
+            sampler = entry["samplers"][channel["sampler"]]
+            keys = (sampler["input"], sampler["output"], sampler.get("interpolation", "LINEAR"))
+        except (KeyError, IndexError, TypeError):
+            raise file.fail(f"{what}: its sampler is missing; export the file again") from None
+        curves[node, path] = _read_curve(file, what, path, *keys)
+    if not curves:
+        raise file.fail(f"clip {name!r} moves nothing; choose another with --clip (see --list)")
+    return Clip(
+        name, float(min(c.times[0] for c in curves.values())), float(max(c.times[-1] for c in curves.values())), curves
+    )
+
+
+def _read_curve(file: Gltf, what: str, path: str, times: int, values: int, interpolation: str) -> Curve:
+    times = file.accessor(times, what, 1).astype(np.float64)
+    if (np.diff(times) <= 0).any():
+        raise file.fail(f"{what}: its times do not rise; export the file again")
+    values = file.accessor(values, what).astype(np.float64)
+    groups = (3,) if interpolation == "CUBICSPLINE" else ()
+    width = len(_REST[path]) if path in _REST else values.size // (len(times) * (groups[0] if groups else 1))
+    if values.size != len(times) * max(1, *groups, 1) * width or not width:
+        raise file.fail(f"{what}: {values.size} numbers for {len(times)} keys of {width}; export the file again")
+    values = values.reshape(len(times), *groups, width)
+    quaternions = values[:, 1] if groups else values
+    if path == "rotation" and (np.linalg.norm(quaternions, axis=-1) < 1e-6).any():
+        key = int(np.argmax(np.linalg.norm(quaternions, axis=-1) < 1e-6))
+        raise file.fail(f"{what}: the quaternion of key {key} is zero; repair the model, export it again")
+    return Curve(times, values, interpolation, path == "rotation")
+
+
+def node_name(file: Gltf, index: int) -> str:
+    return str(file.item("nodes", index).get("name") or f"node {index}")
+
+
+def node_parents(file: Gltf) -> np.ndarray:
+    """Parent i64 (N) of every node, -1 for roots; DataError when one has two, or is below itself."""
+    nodes = file.items("nodes")
+    parent = np.full(len(nodes), -1)
+    for index, node in enumerate(nodes):
+        for child in node.get("children", []):
+            file.item("nodes", child)
+            if parent[child] >= 0:
+                raise file.fail(f"node {node_name(file, child)!r} has two parents; export the file again")
+            parent[child] = index
+    if len(parents_first(parent)) < len(nodes):
+        raise file.fail("its nodes form a circle; export the file again")
+    return parent
+
+
+def parents_first(parent: np.ndarray) -> list[int]:
+    """Indices such that a parent comes before its children; those on a circle are left out."""
+    children: dict[int, list[int]] = {}
+    for index, above in enumerate(parent):
+        children.setdefault(int(above), []).append(index)
+    order = list(children.get(-1, []))
+    for index in order:  # grows while it is walked
+        order += children.get(index, [])
+    return order
+
+
+def node_poses(file: Gltf, parent: np.ndarray, clip: Clip, time: np.ndarray) -> np.ndarray:
+    """Node to world f64 (T,N,4,4) at `time` (T)."""
+    local = np.stack([_local(file, index, clip, time) for index in range(len(parent))], axis=1)
+    world = local.copy()
+    for index in parents_first(parent):
+        if parent[index] >= 0:
+            world[:, index] = world[:, parent[index]] @ local[:, index]
+    if not np.isfinite(world).all():
+        bad = int(np.argmax(~np.isfinite(world).all((0, 2, 3))))
+        raise file.fail(f"node {node_name(file, bad)!r} has a transform that is not finite; repair the model")
+    return world
+
+
+def _local(file: Gltf, index: int, clip: Clip, time: np.ndarray) -> np.ndarray:
+    node = file.item("nodes", index)
+    moving = [path for path in _REST if (index, path) in clip.curves]
+    if "matrix" in node:
+        if moving:
+            raise file.fail(
+                f"node {node_name(file, index)!r} is animated but stored as a matrix; export the file again"
+            )
+        return np.tile(_numbers(file, index, "matrix", 16).reshape(4, 4).T, (len(time), 1, 1))
+    values = {}
+    for path, rest in _REST.items():
+        fixed = _numbers(file, index, path, len(rest)) if path in node else np.array(rest)
+        values[path] = clip.curves[index, path].at(time) if path in moving else np.tile(fixed, (len(time), 1))
+    return matrices(values["translation"], values["rotation"], values["scale"])
+
+
+def _numbers(file: Gltf, index: int, key: str, count: int) -> np.ndarray:
+    try:
+        values = np.array(file.item("nodes", index)[key], np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise file.fail(f"{key} of node {node_name(file, index)!r} is not {count} finite numbers; repair the model")
+    return values

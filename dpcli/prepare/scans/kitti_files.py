@@ -1,0 +1,149 @@
+"""The files that KITTI's benchmarks share: calibration, Velodyne scans, 16-bit PNGs; and what the left camera sees."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.depth_files import load_cv2
+from dpcli.prepare.decode.gray_png import decode_gray_png
+from dpcli.prepare.reader import require_folder
+
+COORDINATES = ("published", "camera")
+IMAGE_SIZE = (1242, 375)  # pixels, width and height of most of KITTI's pictures
+
+
+def check_coordinates(name: str) -> None:
+    """UsageError unless it is one of COORDINATES."""
+    if name not in COORDINATES:
+        raise UsageError(f"--coordinates {name}: expected {' or '.join(COORDINATES)}")
+
+
+def oriented(points: np.ndarray, coordinates: str) -> np.ndarray:
+    """Camera points (N,3) (x right, y down, z forward) as f32; ``published``: x left, y up, z forward, a half turn."""
+    return (points * ([-1, -1, 1] if coordinates == "published" else [1, 1, 1])).astype(np.float32)
+
+
+def training_folder(raw: Path, holds: str) -> Path:
+    """``raw``/training, or ``raw`` where it is that folder itself; DataError when neither has the folder ``holds``."""
+    require_folder(raw, f"training/{holds}/ in it, as KITTI distributes it")
+    for folder in (raw / "training", raw):
+        if (folder / holds).is_dir():
+            return folder
+    raise DataError(f"{raw}: no training/{holds}/ in it; expected the folders of KITTI's archives, unpacked together")
+
+
+def require_files(paths: list[Path]) -> str:
+    """The problem of an item whose files are not all there; "" when they are."""
+    missing = [path for path in paths if not path.is_file()]
+    more = f" and {len(missing) - 1} more files of this scene" if len(missing) > 1 else ""
+    return f"{missing[0]}: missing{more}" if missing else ""
+
+
+def read_calibration(path: Path) -> dict[str, np.ndarray]:
+    """``KEY: numbers`` lines -> f64 arrays; lines that hold no numbers, such as calib_time, are passed over."""
+    try:
+        text = path.read_text("utf-8")
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: not text; expected lines such as 'P2: 7.215377e+02 0.0 ...'") from None
+    found = {}
+    for line in text.splitlines():
+        key, colon, rest = line.partition(":")
+        try:
+            values = np.array([float(word) for word in rest.split()])
+        except ValueError:
+            continue
+        if colon and len(values):
+            found[key.strip()] = values
+    return found
+
+
+def calibration_matrix(found: dict[str, np.ndarray], path: Path, key: str) -> np.ndarray:
+    """A 3x4 (12 numbers) or 3x3 (9 numbers) matrix of a calibration file, as f64 (4,4) filled up with the identity."""
+    if key not in found:
+        raise DataError(f"{path}: no line '{key}:'; found {', '.join(sorted(found)) or 'no calibration at all'}")
+    values = found[key]
+    if len(values) not in (9, 12) or not np.isfinite(values).all():
+        raise DataError(f"{path}: {key} has {len(values)} numbers; expected 12 (3x4) or 9 (3x3), all finite")
+    matrix = np.eye(4)
+    matrix[:3, : len(values) // 3] = values.reshape(3, -1)
+    return matrix
+
+
+def read_velodyne(path: Path) -> np.ndarray:
+    """A scan f32 (N,3): x forward, y left, z up, meters. The file: float32 x y z reflectance, little-endian."""
+    data = path.read_bytes()
+    if not data or len(data) % 16:
+        raise DataError(
+            f"{path}: {len(data)} bytes; expected some points of 16 (float32 x y z reflectance); copy it again"
+        )
+    points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3]
+    if not np.isfinite(points).all():
+        raise DataError(f"{path}: {int((~np.isfinite(points)).any(1).sum())} points are NaN or infinite; copy it again")
+    return points
+
+
+def read_png(
+    path: Path, channels: int, size: tuple[int, int] | None = None, bits: tuple[int, ...] = (16,)
+) -> np.ndarray:
+    """An image (H,W) or (H,W,channels) in the file's channel order. DataError unless type and ``size`` (H,W) agree."""
+    data = path.read_bytes()
+    image = decode_gray_png(data)
+    if image is None and data:
+        image = load_cv2().imdecode(np.frombuffer(data, np.uint8), load_cv2().IMREAD_UNCHANGED)
+    if image is None:
+        raise DataError(f"{path}: not a readable PNG (empty or truncated); copy it again")
+    if image.dtype.itemsize * 8 not in bits or (image.shape[2] if image.ndim == 3 else 1) != channels:
+        expected = f"{' or '.join(map(str, bits))} bits, {channels} channel{'s' if channels > 1 else ''}"
+        raise DataError(f"{path}: is {image.dtype} {image.shape}; expected {expected}")
+    if size is not None and image.shape[:2] != size:
+        found = f"{image.shape[1]}x{image.shape[0]}"
+        raise DataError(f"{path}: {found} pixels; the scene's other images have {size[1]}x{size[0]}")
+    return image[..., ::-1] if image.ndim == 3 else image  # OpenCV turns the channels round
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    """Width and height of a PNG from its first 24 bytes; nothing is decoded."""
+    with open(path, "rb") as file:
+        head = file.read(24)
+    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
+        raise DataError(f"{path}: not a PNG (empty, truncated, or of another kind); its size is needed for the crop")
+    return struct.unpack(">II", head[16:24])
+
+
+@dataclass(frozen=True)
+class View:
+    """What of a scan is kept: in the left color camera's picture, farther than ``near`` ahead of the scanner, nearer
+    than ``far`` from the camera (meters; x of the scanner, z of the camera)."""
+
+    near: float = 2.0
+    far: float = 35.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.near < self.far:
+            raise UsageError(f"--near {self.near} --far {self.far}: expected 0 < near < far, meters")
+
+    def crop(
+        self,
+        scan: np.ndarray,  # f32 (N,3)
+        to_camera: np.ndarray,  # f64 (4,4), scanner to rectified camera
+        projection: np.ndarray,  # f64 (4,4), camera to pixels
+        size: tuple[int, int],  # width, height
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Points in camera axes f64 (M,3) and the indices i64 (M) of those kept: 0 <= u < width, 0 <= v < height."""
+        ahead = np.flatnonzero(scan[:, 0] > self.near)
+        points = scan[ahead].astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3]
+        u, v, w = (points @ projection[:3, :3].T + projection[:3, 3]).T
+        inside = (w > 0) & (points[:, 2] < self.far)
+        inside &= (u >= 0) & (u < size[0] * w) & (v >= 0) & (v < size[1] * w)
+        return points[inside], ahead[inside]
+
+
+def compressed(ids: np.ndarray) -> np.ndarray:
+    """Object ids (N), 0 = background -> i16 (N): 0 stays, the others become 1, 2, ... in rising order."""
+    known = np.unique(ids[ids > 0])
+    return np.where(ids > 0, np.searchsorted(known, ids) + 1, 0).astype(np.int16)

@@ -1,0 +1,176 @@
+"""ModelNet40 as PointNet's authors distribute it (modelnet40_ply_hdf5_2048): one cloud per shape, to pretrain with."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.reader import Item, Sample, describe, natural_key, require_folder
+from dpcli.store import CloudSequence
+
+CLASS_NAMES = (
+    "airplane",
+    "bathtub",
+    "bed",
+    "bench",
+    "bookshelf",
+    "bottle",
+    "bowl",
+    "car",
+    "chair",
+    "cone",
+    "cup",
+    "curtain",
+    "desk",
+    "door",
+    "dresser",
+    "flower_pot",
+    "glass_box",
+    "guitar",
+    "keyboard",
+    "lamp",
+    "laptop",
+    "mantel",
+    "monitor",
+    "night_stand",
+    "person",
+    "piano",
+    "plant",
+    "radio",
+    "range_hood",
+    "sink",
+    "sofa",
+    "stairs",
+    "stool",
+    "table",
+    "tent",
+    "toilet",
+    "tv_stand",
+    "vase",
+    "wardrobe",
+    "xbox",
+)
+PUBLISHED = {"train": 9840, "test": 2468}
+_FILE = re.compile(r"ply_data_(train|test)(\d+)\.h5")
+_EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and test_files.txt"
+
+
+def read_file(path: Path, *names: str) -> list[np.ndarray]:
+    """Data sets of an HDF5 file as arrays; DataError when absent, damaged, or kept in another file."""
+    try:
+        with h5py.File(path, "r") as file:
+            for name in names:
+                if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                    found = ", ".join(sorted(file)) or "none"
+                    raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
+                if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
+                    raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
+            return [file[name][()] for name in names]
+    except OSError as error:
+        raise DataError(f"{path}: not a readable HDF5 file, perhaps truncated ({str(error).splitlines()[0]})") from None
+
+
+@lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
+def _clouds(path: Path) -> np.ndarray:
+    (data,) = read_file(path, "data")
+    if data.ndim != 3 or data.shape[2] != 3 or data.dtype.kind != "f":
+        raise DataError(f"{path}: data is {data.dtype} {data.shape}; expected floats (shapes, points, 3)")
+    return data
+
+
+def read_labels(path: Path) -> np.ndarray:
+    """Labels i64 (N) of a file, from 0."""
+    (label,) = read_file(path, "label")
+    if label.dtype.kind not in "iu" or label.size != len(label):
+        raise DataError(f"{path}: label is {label.dtype} {label.shape}; expected whole numbers (shapes, 1)")
+    return label.reshape(-1).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class ModelNet40:
+    """Reader of the folder; a sample is a sequence of one frame."""
+
+    raw: Path
+    length_unit: ClassVar[str] = "unit sphere"
+    fields: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def class_names(self) -> list[str]:
+        path = self.raw / "shape_names.txt"
+        if not path.is_file():
+            return list(CLASS_NAMES)
+        names = path.read_text(errors="replace").split()
+        if len(names) != len(CLASS_NAMES) or len(set(names)) != len(names):
+            raise DataError(f"{path}: {len(names)} names, {len(set(names))} of them different; expected 40")
+        return names
+
+    @property
+    def config(self) -> dict[str, Any]:
+        return {}
+
+    def items(self) -> list[Item]:
+        folder = require_folder(self.raw, _EXPECTED)
+        there = {path.name: path for path in folder.iterdir() if _FILE.fullmatch(path.name)}
+        splits = {name: _FILE.fullmatch(name)[1] for name in there}  # type: ignore[index]
+        listed = {split: _listed(folder / f"{split}_files.txt") for split in PUBLISHED}
+        items: list[Item] = []
+        for name in sorted(there.keys() | {n for names in listed.values() for n in names or ()}, key=natural_key):
+            homes = [split for split, names in listed.items() if name in (names or ())]
+            if not homes and all(names is None for names in listed.values()):
+                homes = [splits[name]]  # copies without the lists: the name tells
+            items += self._shapes(name, there.get(name), homes, folder)
+        if not items:
+            raise DataError(f"{folder}: no {_EXPECTED}")
+        order = {"train": 0, "test": 1, "": 2}
+        return sorted(items, key=lambda item: order[item.split])
+
+    def _shapes(self, name: str, path: Path | None, homes: list[str], folder: Path) -> list[Item]:
+        problem = ""
+        if path is None:
+            problem = f"{folder / name}: listed in {homes[0]}_files.txt, but not there"
+        elif len(homes) != 1:
+            problem = f"{path}: in {'both list files' if homes else 'neither list file'}; expected one"
+        if not problem:
+            try:
+                labels = read_labels(path)
+            except DataError as error:
+                problem = str(error)
+        if problem:
+            return [Item(name, path or folder, homes[0] if homes else "", problem=problem)]
+        stem = name.removesuffix(".h5").removeprefix("ply_data_")
+        return [_item(f"{stem}/{row:04d}", path, homes[0], row, int(label)) for row, label in enumerate(labels)]
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        data, row = _clouds(item.path), item.extra["row"]
+        if row >= len(data):
+            raise DataError(f"{item.path}: data has {len(data)} shapes, label has more; expected as many")
+        if not np.isfinite(data[row]).all():
+            raise DataError(f"{item.path}: shape {row} holds NaN or infinity; expected finite coordinates")
+        return Sample(CloudSequence.from_frames(item.name, [data[row].astype(np.float32)], **describe(item)))
+
+    def summary(self, items: list[Item]) -> list[str]:
+        found = Counter(item.split for item in items if not item.problem)
+        return [f"{split}: {found[split]} of the {count} published shapes found" for split, count in PUBLISHED.items()]
+
+
+def _item(name: str, path: Path, split: str, row: int, label: int) -> Item:
+    problem = ""
+    if not 0 <= label < len(CLASS_NAMES):
+        problem = f"{path}: label {label} of shape {row} is out of range; expected 0 to {len(CLASS_NAMES) - 1}"
+    return Item(name, path, split, label=label, extra={"row": row}, problem=problem)
+
+
+def _listed(path: Path) -> set[str] | None:
+    """File names of a list such as ``data/modelnet40_ply_hdf5_2048/ply_data_train0.h5``; None without the list."""
+    if not path.is_file():
+        return None
+    lines = path.read_text(errors="replace").split("\n")
+    return {line.strip().replace("\\", "/").rpartition("/")[2] for line in lines if line.strip()}

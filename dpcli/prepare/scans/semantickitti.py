@@ -1,0 +1,187 @@
+"""SemanticKITTI (Behley et al. 2019): Velodyne scans of sequences 00 to 10, objects are labeled instances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.reader import Item, Sample, describe, require_folder
+from dpcli.prepare.scans.kitti_files import (
+    IMAGE_SIZE,
+    View,
+    calibration_matrix,
+    check_coordinates,
+    compressed,
+    oriented,
+    read_calibration,
+    read_velodyne,
+)
+from dpcli.store import CloudSequence
+
+# the lower 16 bits of a label; moving ones have numbers of their own
+CLASSES = {
+    "car": (10, 252),
+    "bicycle": (11,),
+    "bus": (13, 257),
+    "motorcycle": (15,),
+    "on-rails": (16, 256),
+    "truck": (18, 258),
+    "other-vehicle": (20, 259),
+    "person": (30, 254),
+    "bicyclist": (31, 253),
+    "motorcyclist": (32, 255),
+}
+LABELED = tuple(f"{number:02}" for number in range(11))
+GROUPS = {"all": LABELED, "without-08": tuple(s for s in LABELED if s != "08"), "only-08": ("08",)}
+VALIDATION = "08"
+
+
+def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Semantic class and full label, i64 (count) each; the file: uint32, class in the lower 16 bits, instance above."""
+    data = path.read_bytes()
+    if len(data) != 4 * count:
+        raise DataError(f"{path}: {len(data)} bytes; expected {4 * count}, 4 for each of the scan's {count} points")
+    label = np.frombuffer(data, "<u4").astype(np.int64)
+    return label & 0xFFFF, label
+
+
+@lru_cache(maxsize=4)
+def read_poses(path: Path) -> np.ndarray:
+    """poses.txt -> f64 (scans,4,4): camera of each scan to the camera of scan 0."""
+    try:
+        rows = [[float(word) for word in line.split()] for line in path.read_text("utf-8").splitlines() if line.strip()]
+    except OSError:
+        raise DataError(f"{path}: not found; --align needs it") from None
+    except ValueError:
+        raise DataError(f"{path}: not lines of 12 numbers") from None
+    if not rows or any(len(row) != 12 for row in rows) or not np.isfinite(rows).all():
+        raise DataError(f"{path}: expected 12 finite numbers a line (a 3x4 matrix), one line for each scan")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = np.reshape(rows, (-1, 3, 4))
+    return poses
+
+
+@dataclass(frozen=True)
+class SemanticKitti:
+    """Reader of sequences/SS/{velodyne,labels,calib.txt,poses.txt}.
+
+    ``group``: which of GROUPS; ``frames`` successive scans are one sample, windows don't overlap; ``align`` moves them
+    to the camera of the sample's first scan; ``objects``: the classes whose instances are parts 1, 2, ..., else 0.
+    """
+
+    raw: Path
+    group: str = "all"
+    frames: int = 1
+    align: bool = False
+    objects: tuple[str, ...] = ("car", "truck")
+    view: View = View()
+    coordinates: str = "published"
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "m"
+    fields: ClassVar[tuple[str, ...]] = ("part",)
+
+    def __post_init__(self) -> None:
+        check_coordinates(self.coordinates)
+        if self.group not in GROUPS:
+            raise UsageError(f"--group {self.group}: expected {', '.join(GROUPS)}")
+        unknown = sorted(set(self.objects) - set(CLASSES))
+        if unknown or not self.objects:
+            raise UsageError(f"--objects {','.join(self.objects)}: expected some of {', '.join(CLASSES)}")
+        if self.frames < 1:
+            raise UsageError(f"--frames {self.frames}: expected 1 or more")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        own = {"group": self.group, "frames": self.frames, "align": self.align, "objects": list(self.objects)}
+        return {**own, "near": self.view.near, "far": self.view.far, "coordinates": self.coordinates}
+
+    def _folders(self) -> list[tuple[str, Path]]:
+        require_folder(self.raw, "dataset/sequences/00 ... as SemanticKITTI is unpacked")
+        for folder in (self.raw / "dataset" / "sequences", self.raw / "sequences", self.raw):
+            found = [(name, folder / name) for name in GROUPS[self.group] if (folder / name / "velodyne").is_dir()]
+            if found:
+                return found
+        wanted = "08" if self.group == "only-08" else "00"
+        raise DataError(
+            f"{self.raw}: no sequences/{wanted}/velodyne/ in it; expected the odometry scans and the labels"
+        )
+
+    def items(self) -> list[Item]:
+        items = []
+        for sequence, folder in self._folders():
+            scans = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
+            for start in range(0, len(scans) - self.frames + 1, self.frames):
+                window = scans[start : start + self.frames]
+                split = "validation" if sequence == VALIDATION else "train"
+                problem = self._problem(folder, window)
+                items.append(
+                    Item(f"{sequence}_{window[0]}", folder, split=split, extra={"scans": window}, problem=problem)
+                )
+        if not items:
+            raise DataError(f"{self.raw}: no sequence holds {self.frames} scans (velodyne/000000.bin ...)")
+        return items
+
+    def _problem(self, folder: Path, window: list[str]) -> str:
+        numbers = [int(name) if name.isdecimal() else -1 for name in window]
+        if numbers != list(range(max(numbers[0], 0), numbers[0] + len(window))):
+            return f"{folder / 'velodyne'}: {window[0]} to {window[-1]} are not {len(window)} successive scans"
+        for name in window:
+            if not (folder / "labels" / f"{name}.label").is_file():
+                return f"{folder / 'labels' / name}.label: missing"
+        return ""
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        path = item.path / "calib.txt"
+        if not path.is_file():
+            raise DataError(f"{path}: missing; the crop to the camera's view needs it")
+        found = read_calibration(path)
+        to_camera, projection = (calibration_matrix(found, path, key) for key in ("Tr", "P2"))
+        kept = [self._scan(item.path, name, to_camera, projection) for name in item.extra["scans"]]
+        motions = self._alignment(item)
+        clouds = [
+            oriented(points @ m[:3, :3].T + m[:3, 3], self.coordinates)
+            for (points, _), m in zip(kept, motions, strict=True)
+        ]
+        sizes = np.cumsum([len(ids) for _, ids in kept])[:-1]
+        part = compressed(np.concatenate([ids for _, ids in kept]))  # over all frames: an object keeps its number
+        if not min(map(len, clouds)):
+            raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
+        sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))
+        return Sample(sequence, {} if part.any() else {"samples without an object": 1})
+
+    def _scan(
+        self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Points in camera axes f64 (M,3) and object ids i64 (M), 0 = background."""
+        scan = read_velodyne(folder / "velodyne" / f"{name}.bin")
+        semantic, label = read_labels(folder / "labels" / f"{name}.label", len(scan))
+        label[~np.isin(semantic, [number for kind in self.objects for number in CLASSES[kind]])] = 0
+        points, index = self.view.crop(scan, to_camera, projection, IMAGE_SIZE)
+        return points, label[index]
+
+    def _alignment(self, item: Item) -> np.ndarray:
+        """f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities without."""
+        numbers = [int(name) for name in item.extra["scans"]]
+        if not self.align:
+            return np.tile(np.eye(4), (len(numbers), 1, 1))
+        poses = read_poses(item.path / "poses.txt")
+        if numbers[-1] >= len(poses):
+            raise DataError(f"{item.path / 'poses.txt'}: {len(poses)} lines, none for scan {item.extra['scans'][-1]}")
+        return np.linalg.inv(poses[numbers[0]]) @ poses[numbers]
+
+    def summary(self, items: list[Item]) -> list[str]:
+        held = sum(len(list((folder / "velodyne").glob("*.bin"))) for _, folder in self._folders())
+        found = [name for name, _ in self._folders()]
+        lines = [f"{len(items)} samples of {self.frames} scans, sequences {', '.join(found)}"]
+        missing = [name for name in GROUPS[self.group] if name not in found]
+        if missing:
+            lines.append(f"sequences not there: {', '.join(missing)}")
+        left = held - len(items) * self.frames
+        if left:
+            lines.append(f"{left} scans at the ends of sequences are left out: fewer than --frames {self.frames}")
+        return lines

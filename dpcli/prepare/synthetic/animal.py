@@ -1,0 +1,64 @@
+"""A made-up animal that moves, filmed like any animated model: data with ground truth when there are none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import UsageError
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
+from dpcli.prepare.meshes.filming import Filming, film
+from dpcli.prepare.meshes.skinning import skin, vertex_normals
+from dpcli.prepare.synthetic import creature
+from dpcli.prepare.synthetic.creature_mesh import make_skin
+from dpcli.prepare.synthetic.gait import MOTIONS, bone_motion, turn_bones
+from dpcli.prepare.views.views_pipeline import Clip
+from dpcli.runtime.seeds import generator
+
+_SHAPE_KEY, _COAT_KEY = 1, 2  # so that another way to paint doesn't change the shape
+_CELLS = 120  # along the longest side of the grid that the skin is cut from
+
+
+def make_animal(motion: str, frames: int, cycles: float = 0.0, seed: int = 0, cells: int = _CELLS) -> AnimatedMesh:
+    """The animal of this seed over `frames` frames; cycles 0: as many as the motion has as a rule.
+
+    Unit: about the length of the body. UsageError on an unknown motion.
+    """
+    if motion not in MOTIONS:
+        raise UsageError(f"--motion {motion}: expected one of {', '.join(MOTIONS)}")
+    if not 0 <= cycles <= 100:
+        raise UsageError(f"--cycles {cycles:g}: expected 0 (the motion's own) to 100")
+    kind, cycles = MOTIONS[motion], cycles or MOTIONS[motion].cycles
+    animal = getattr(creature, kind.kind)(generator(seed, _SHAPE_KEY))
+    body = make_skin(animal, generator(seed, _COAT_KEY), cells)
+    phase = cycles * np.arange(frames) / frames
+    turned = bone_motion(animal, *turn_bones(animal, motion, phase))
+    normals = vertex_normals(body.vertices, body.triangles)
+    positions, normals = skin(body.vertices, normals, body.bones, body.weights, turned)
+    return AnimatedMesh(
+        name=f"{kind.kind} {seed} {motion}",
+        time=phase * kind.period,
+        positions=positions,
+        normals=normals,
+        triangles=body.triangles,
+        material=np.zeros(len(body.triangles), np.int64),
+        materials=(Material(),),
+        color=body.color,
+        uv=np.zeros((len(body.vertices), 2), np.float32),
+        bones=body.bones,
+        weights=body.weights,
+        bone_pose=turned,
+        bone_parent=np.array([bone.parent for bone in animal.bones]),
+        bone_name=tuple(bone.name for bone in animal.bones),
+    )
+
+
+def animal_clip(motion: str, frames: int, cycles: float, filming: Filming, jobs: int = 1) -> Clip:
+    """A Clip of the animal of `filming.seed`, as `film` makes it."""
+    return film(make_animal(motion, frames, cycles, filming.seed), filming, jobs)
+
+
+def animal_config(motion: str, frames: int, cycles: float, filming: Filming) -> dict[str, Any]:
+    """What decides the content, for the file's provenance."""
+    return {"motion": motion, "frames": frames, "cycles": cycles, **filming.config}

@@ -1,0 +1,96 @@
+"""One square crop for a whole clip, so that what moves keeps moving; alpha-correct resizing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.prepare.decode.depth_files import load_cv2
+
+VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
+Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A square of the source picture: left, top (may be negative) and side, in whole pixels."""
+
+    left: int
+    top: int
+    side: int
+
+    def apply(self, rgba: np.ndarray, size: int) -> np.ndarray:
+        """u8 (H,W,4) -> u8 (size,size,4); transparent where the square reaches over the picture."""
+        height, width = rgba.shape[:2]
+        square = np.zeros((self.side, self.side, 4), np.uint8)
+        x0, y0 = max(self.left, 0), max(self.top, 0)
+        x1, y1 = min(self.left + self.side, width), min(self.top + self.side, height)
+        if x1 > x0 and y1 > y0:
+            square[y0 - self.top : y1 - self.top, x0 - self.left : x1 - self.left] = rgba[y0:y1, x0:x1]
+        return resize(square, size)
+
+    def intrinsics(self, camera: np.ndarray, size: int) -> np.ndarray:
+        """f64 (3,3) of the cropped and resized picture: u' = (u - left) size / side; pixel centers at +0.5."""
+        scale = size / self.side
+        move = np.array([[scale, 0, -scale * self.left], [0, scale, -scale * self.top], [0, 0, 1]])
+        return move @ camera
+
+
+def resize(rgba: np.ndarray, size: int) -> np.ndarray:
+    """u8 (S,S,4) -> u8 (size,size,4), on premultiplied colors: transparent pixels don't bleed into the outline."""
+    if rgba.shape[:2] == (size, size):
+        return rgba
+    cv2 = load_cv2()
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    colors = np.dstack([rgba[..., :3] * alpha, alpha])
+    method = cv2.INTER_AREA if size < len(rgba) else cv2.INTER_LINEAR
+    colors = cv2.resize(colors, (size, size), interpolation=method)
+    colors[..., :3] /= np.maximum(colors[..., 3:], 1e-6)
+    colors[..., 3] *= 255
+    result = np.clip(np.round(colors), 0, 255).astype(np.uint8)
+    result[result[..., 3] == 0] = 0
+    return result
+
+
+def visible_box(rgba: np.ndarray, island: float = 0.0) -> Box | None:
+    """The smallest box around the object, None when the picture is empty.
+
+    island: pieces apart that are smaller than this share of the object don't count (leftovers of a segmentation).
+    """
+    seen = rgba[..., 3] >= VISIBLE
+    if island > 0 and seen.any():
+        cv2 = load_cv2()
+        _, label, stats, _ = cv2.connectedComponentsWithStats(seen.astype(np.uint8), connectivity=8)
+        large = stats[:, cv2.CC_STAT_AREA] >= island * seen.sum()
+        large[0] = False
+        seen = large[label] if large.any() else seen
+    columns, rows = np.flatnonzero(seen.any(axis=0)), np.flatnonzero(seen.any(axis=1))
+    if len(columns) == 0:
+        return None
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+
+
+def touches_border(rgba: np.ndarray) -> bool:
+    """Whether the object runs into the picture's border, along at least a hundredth of a side."""
+    solid = rgba[..., 3] > 127
+    runs = [solid[0].sum(), solid[-1].sum(), solid[:, 0].sum(), solid[:, -1].sum()]
+    return max(runs) >= max(2, min(solid.shape) // 100)
+
+
+def union(boxes: list[Box]) -> Box:
+    left, top, right, bottom = np.array(boxes).T
+    return int(left.min()), int(top.min()), int(right.max()), int(bottom.max())
+
+
+def crop_around(box: Box, border: float) -> Crop:
+    """The square around a box that leaves the share `border` of the picture empty along the box's longer side."""
+    left, top, right, bottom = box
+    side = max(int(round(max(right - left, bottom - top) / (1 - border))), 2)
+    return Crop(round((left + right - side) / 2), round((top + bottom - side) / 2), side)
+
+
+def whole_picture(width: int, height: int) -> Crop:
+    """The square that holds the whole picture, centered."""
+    side = max(width, height)
+    return Crop(-((side - width) // 2), -((side - height) // 2), side)

@@ -1,0 +1,321 @@
+"""One clip of an object, filmed or generated, into the pictures that 4D fitting starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
+from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, open_frames, read_rgba
+from dpcli.prepare.reader import require_folder
+from dpcli.prepare.views import matting
+from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
+from dpcli.prepare.views.square_crop import Crop, crop_around, touches_border, union, visible_box, whole_picture
+from dpcli.prepare.views.views_pipeline import Clip, digest_of
+from dpcli.runtime.progress import log
+from dpcli.store.views import ViewsHeader
+
+_LISTED = 8
+_ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen the crop
+_NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """How a clip is read. Angles in degrees here, as typed; `frames` 0 keeps all; `views` is a multi-view folder."""
+
+    frames: int = 32
+    size: int = 512
+    recenter: bool = True
+    border: float = 0.2
+    background: str = "auto"
+    tolerance: float = matting.TOLERANCE
+    holes: str = "auto"
+    mask: Path | None = None
+    fps: float | None = None
+    on_error: str = "stop"
+    name: str = ""
+    elevation: float = 0.0
+    radius: float = DEFAULT_RADIUS
+    fovy: float = float(np.rad2deg(DEFAULT_FOVY))
+    views: Path | None = None
+    views_cameras: Path | None = None
+
+    def check(self) -> None:
+        """UsageError on values that make no sense, before any file is opened."""
+        for option, value, low, high in (
+            ("--border", self.border, 0.0, 0.9),
+            ("--tolerance", self.tolerance, 0.0, 0.5),
+        ):
+            if not low <= value <= high:
+                raise UsageError(f"{option} {value:g}: expected {low:g} to {high:g}")
+        if not (self.radius > 0 and 0 < self.fovy < 180 and abs(self.elevation) <= 90):
+            raise UsageError("--radius > 0, --fovy between 0 and 180 and --elevation within +-90 degrees expected")
+        if self.fps is not None and not 0 < self.fps < 10_000:
+            raise UsageError(f"--fps {self.fps:g}: expected frames per second, above 0")
+        if self.on_error not in ("skip", "stop"):
+            raise UsageError(f"--on-error {self.on_error}: expected skip or stop")
+        if self.holes not in matting.HOLES:
+            raise UsageError(f"--holes {self.holes}: expected {', '.join(matting.HOLES)}")
+        if self.mask and self.background != "auto":
+            raise UsageError("--mask and --background were both given; a mask says by itself what the object is")
+        if self.views_cameras and not self.views:
+            raise UsageError("--views-cameras describes the cameras of --views FOLDER; give both")
+        matting.named_background(self.background)
+
+    def camera(self) -> OrbitCamera:
+        """The reference camera: azimuth 0."""
+        return OrbitCamera(0.0, float(np.deg2rad(self.elevation)), self.radius, float(np.deg2rad(self.fovy)))
+
+
+def video_clip(path: Path, options: VideoOptions) -> Clip:
+    """The clip of a folder, video or GIF. DataError on frames that can't be used; the log says what was chosen."""
+    options.check()
+    frames = open_frames(path)
+    cutter, wanted, crop, size = _survey(frames, options)
+    given, cameras = find_given_views(frames, wanted, options)
+    all_cameras = [options.camera(), *cameras]
+    header = ViewsHeader(
+        options.name or clip_name(path),
+        np.stack([pinhole(camera.fovy, options.size, options.size) for camera in all_cameras]),
+        np.stack([orbit_pose(camera.azimuth, camera.elevation, camera.radius) for camera in all_cameras]),
+        _times(frames, wanted, options.fps),
+        ["reference", *(camera.role for camera in cameras)],
+        0,
+        (options.size, options.size),
+    )
+
+    def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
+        for row, rgba in enumerate(cutter.cut(wanted)):
+            yield 0, row, crop.apply(rgba, options.size)
+        for view, paths in enumerate(given, 1):
+            for row, rgba in enumerate(_given_pictures(paths, options)):
+                yield view, row, rgba
+
+    return Clip(header, pictures)
+
+
+def clip_name(path: Path) -> str:
+    """The file's or folder's name, or that of the folder above when it says nothing (`minions/rgba`)."""
+    path = path.resolve()
+    return path.parent.name if path.is_dir() and path.name.lower() in _NO_NAMES else path.stem
+
+
+def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
+    """Options and digests of everything read, for provenance: equal configurations give equal files."""
+    options.check()
+    config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
+    config["input_digest"] = digest_of(open_frames(path).files)
+    if options.mask:
+        config["mask_digest"] = digest_of(image_paths(require_folder(options.mask, "a mask per frame")))
+    if options.views:
+        folder = require_folder(options.views, "pictures of other views")
+        config["views_digest"] = digest_of(
+            p for one in sorted(folder.iterdir()) if one.is_dir() for p in image_paths(one)
+        )
+    if options.views_cameras:
+        require_cameras = read_cameras(options.views_cameras)
+        config["cameras"] = [asdict(camera) for camera in require_cameras]
+    return config
+
+
+@dataclass
+class Cutter:
+    """Frames with the object cut out: by its own alpha, a mask, a plain background's color, or not at all (keep)."""
+
+    frames: Frames
+    options: VideoOptions
+    mode: str
+    background: np.ndarray | None = None
+    masks: tuple[Path, ...] = ()
+    gaps: dict[int, int] = field(default_factory=dict)  # pixels taken for holes, by frame
+
+    def cut(self, wanted: list[int]) -> Iterator[np.ndarray]:
+        """u8 (H,W,4), straight alpha, of the frames `wanted`, rising."""
+        for index, frame in zip(wanted, self.frames.read(wanted)):
+            if self.mode == "mask":
+                yield matting.with_mask(frame, self.masks[index], self.frames.names[index])
+            elif self.mode == "plain":
+                rgba, gap = matting.key_out(frame[..., :3], self.background, self.options.tolerance, self.options.holes)
+                self.gaps[index] = gap
+                yield rgba
+            elif self.mode == "keep":
+                yield matting.opaque(frame)
+            else:
+                yield matting.clean(frame)
+
+
+def _survey(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
+    """How to cut, which frames, the one crop of them all, and the (width, height) of the source."""
+    wanted = _readable(frames, spread(len(frames), options.frames), options.on_error)
+    warn_gaps(frames, wanted)
+    cutter, (width, height) = _make_cutter(frames, wanted, options)
+    boxes, cut_off, good, empty = [], [], [], []
+    for index, rgba in zip(wanted, cutter.cut(wanted)):
+        box = visible_box(rgba, _ISLAND)
+        if box is None:
+            empty.append(index)
+            continue
+        boxes.append(box)
+        good.append(index)
+        if cutter.mode != "keep" and touches_border(rgba):
+            cut_off.append(index)
+    _report_empty(frames, empty, good, cutter.mode, options.on_error)
+    if cut_off:
+        log.warn(f"{frames.path}: the object leaves the picture in {_named(frames, cut_off)}; what is cut off is lost")
+    if cutter.options.holes == "auto" and any(cutter.gaps.values()):
+        count = sum(gap > 0 for gap in cutter.gaps.values())
+        log.info(f"{frames.path}: gaps in the object are see-through in {count} frames (--holes keep fills them)")
+    if len(good) == 1:
+        log.warn(f"{frames.path}: one frame only; this makes a still object, motion needs two or more")
+    crop = crop_around(union(boxes), options.border) if options.recenter else whole_picture(width, height)
+    if crop.side < options.size / 1.5:
+        log.warn(f"{frames.path}: the object covers few pixels: {crop.side} are enlarged to --size {options.size}")
+    log.info(
+        f"{frames.path}: {len(good)} of {len(frames)} frames, {width}x{height}; object from {_how(cutter)}; "
+        f"square of {crop.side} at ({crop.left}, {crop.top})"
+    )
+    return cutter, good, crop, (width, height)
+
+
+def _how(cutter: Cutter) -> str:
+    if cutter.mode == "plain":
+        return "background " + ",".join(f"{value:.0f}" for value in cutter.background)
+    return {"alpha": "the frames' alpha", "mask": "masks", "keep": "nothing: the background is kept"}[cutter.mode]
+
+
+def spread(total: int, count: int) -> list[int]:
+    """At most `count` of `total` indices, evenly spread from the first to the last; all for 0."""
+    if count == 0 or count >= total:
+        return list(range(total))
+    return np.linspace(0, total - 1, count).round().astype(int).tolist()
+
+
+def _readable(frames: Frames, wanted: list[int], on_error: str) -> list[int]:
+    """Without the images that cannot be read when --on-error is skip."""
+    if on_error == "stop" or not frames.path.is_dir():
+        return wanted
+    good = []
+    for index in wanted:
+        try:
+            read_rgba(frames.files[index])
+            good.append(index)
+        except DataError as error:
+            log.warn(f"left out: {error}")
+    if not good:
+        raise DataError(f"{frames.path}: none of its {len(wanted)} frames can be read")
+    return good
+
+
+def warn_gaps(frames: Frames, wanted: list[int]) -> None:
+    """Say in the log where the numbers of frames jump."""
+    steps = np.diff(frames.numbers)
+    if len(steps) > 1 and (steps != np.median(steps)).any():
+        at = int(np.argmax(steps != np.median(steps)))
+        log.warn(
+            f"{frames.path}: {frames.names[at + 1]} follows {frames.names[at]}: frames seem to be missing; "
+            "times count those that are there as evenly spaced"
+        )
+
+
+def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tuple[Cutter, tuple[int, int]]:
+    """Look at every frame once: one size, alpha or none, what is around the object."""
+    shape, borders, clear = None, [], []
+    for index, frame in zip(wanted, frames.read(wanted)):
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            first, here = f"{shape[1]}x{shape[0]}", f"{frame.shape[1]}x{frame.shape[0]}"
+            raise DataError(
+                f"{frames.path}: {frames.names[index]} is {here}, {frames.names[wanted[0]]} is {first}\n"
+                "One crop serves the whole clip: export all frames at one size"
+            )
+        clear.append(bool((frame[..., 3] < 255).any()))
+        borders.append(matting.border_pixels(frame[..., :3]))
+    size = (shape[1], shape[0])
+    if options.mask:
+        return Cutter(frames, options, "mask", masks=find_masks(frames, options.mask)), size
+    if options.background == "keep":
+        return Cutter(frames, options, "keep"), size
+    if any(clear):
+        if not all(clear):
+            without = [index for index, has in zip(wanted, clear) if not has]
+            raise DataError(f"{frames.path}: {_named(frames, without)} without alpha, though other frames have it")
+        if options.background != "auto":
+            raise UsageError(f"--background {options.background}: the frames have alpha; leave the option out, or keep")
+        return Cutter(frames, options, "alpha"), size
+    names = [f"{frames.path}, {frames.names[index]}" for index in wanted]
+    return Cutter(
+        frames, options, "plain", matting.background_color(borders, names, options.background, options.tolerance)
+    ), size
+
+
+def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
+    """A mask for every frame of the clip: by number where all numbers agree, else in order."""
+    masks = open_frames(require_folder(folder, "a mask per frame, as images"))
+    if set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
+        place = dict(zip(masks.numbers, masks.files))
+        return tuple(place[number] for number in frames.numbers)
+    if len(masks) != len(frames):
+        raise DataError(f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike")
+    return masks.files
+
+
+def _report_empty(frames: Frames, empty: list[int], good: list[int], mode: str, on_error: str) -> None:
+    if not empty:
+        return
+    why = {"plain": "one color only", "mask": "an empty mask", "alpha": "fully transparent"}.get(mode, "empty")
+    if not good:
+        raise DataError(f"{frames.path}: no object in any frame: each is {why}; is --tolerance too large?")
+    text = f"{frames.path}: no object in {_named(frames, empty)} ({why})"
+    if on_error == "stop":
+        raise DataError(f"{text}\nRemove what is empty, or leave it out with --on-error skip")
+    log.warn(f"{text}; left out")
+
+
+def _named(frames: Frames, indices: list[int]) -> str:
+    names = ", ".join(frames.names[index] for index in indices[:_LISTED])
+    more = f" and {len(indices) - _LISTED} more" if len(indices) > _LISTED else ""
+    return f"{len(indices)} {'frame' if len(indices) == 1 else 'frames'}: {names}{more}"
+
+
+def _times(frames: Frames, wanted: list[int], fps: float | None) -> np.ndarray:
+    """Seconds f64 (T) from the first frame that is used."""
+    if fps is None and frames.times is None:
+        log.info(f"{frames.path}: no frame rate; {FOLDER_FPS:g} per second assumed (--fps)")
+    rate = fps or FOLDER_FPS
+    times = np.array([index / rate for index in wanted] if fps or frames.times is None else frames.times)
+    times = times if len(times) == len(wanted) else times[wanted]
+    return times - times[0]
+
+
+def find_given_views(
+    frames: Frames, wanted: list[int], options: VideoOptions
+) -> tuple[list[list[Path]], list[OrbitCamera]]:
+    """Pictures [view][frame] of --views for the frames `wanted`, and their cameras; DataError when some are missing."""
+    if not options.views:
+        return [], []
+    reference = options.camera()
+    cameras = None
+    if options.views_cameras:
+        cameras = read_cameras(options.views_cameras, reference.radius, reference.fovy)
+    found = find_views(options.views, cameras, [frames.numbers[index] for index in wanted], len(frames))
+    return found, cameras or six_views(reference.radius, reference.fovy)
+
+
+def _given_pictures(paths: list[Path], options: VideoOptions) -> Iterator[np.ndarray]:
+    """Square as they come, so only resized; their own alpha, else their plain background cut away."""
+    shape = None
+    for path in paths:
+        rgba = read_rgba(path)
+        shape = shape or rgba.shape
+        if rgba.shape != shape:
+            raise DataError(f"{path}: {rgba.shape[1]}x{rgba.shape[0]}, other frames of this view {shape[1]}x{shape[0]}")
+        rgba = matting.cut_alone(rgba, str(path), options.background, options.tolerance, options.holes)
+        if visible_box(rgba) is None:
+            raise DataError(f"{path}: no object in this view; generate it again or leave its view out")
+        yield whole_picture(rgba.shape[1], rgba.shape[0]).apply(rgba, options.size)

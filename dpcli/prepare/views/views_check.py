@@ -1,0 +1,126 @@
+"""What `--check` looks for in a clip or an ARTEMIS animal beyond its recipe: an index that opens no picture wholly."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.color_frames import Frames, open_frames
+from dpcli.prepare.reader import Item, require_folder
+from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_intrinsics, read_poses
+from dpcli.prepare.views.transforms_json import is_transforms, transforms_config
+from dpcli.prepare.views.video import VideoOptions, clip_name, find_given_views, find_masks, spread, warn_gaps
+
+_PICTURE = re.compile(r"img_(\d{4})(_alpha)?\.(jpg|png)")
+
+
+@dataclass(frozen=True)
+class ArtemisIndex:
+    """The motions of an animal, or only `motion`, each with what it lacks."""
+
+    animal: Path
+    motion: str = ""
+
+    def items(self) -> list[Item]:
+        """One item a motion that is there or that the file `sequences` tells of. DataError when cameras are unknown."""
+        poses, cameras = read_poses(self.animal / "CamPose.inf"), read_intrinsics(self.animal / "Intrinsic.inf")
+        if len(poses) != len(cameras):
+            raise DataError(f"{self.animal}: CamPose.inf has {len(poses)} cameras, Intrinsic.inf {len(cameras)}")
+        images, declared = require_folder(self.animal / "img", "MOTION/FRAME/"), declared_frames(self.animal)
+        there = {path.name for path in images.iterdir() if path.is_dir()}
+        names = [self.motion] if self.motion else sorted(there | declared.keys())
+        return [
+            Item(name, images / name, problem=self._problem(name, declared.get(name, 0), len(poses))) for name in names
+        ]
+
+    def summary(self, items: list[Item]) -> list[str]:
+        return []
+
+    def _problem(self, name: str, declared: int, cameras: int) -> str:
+        if not (self.animal / "img" / name).is_dir():
+            return f"img/{name}: missing" + (f"; sequences tells of its {declared} frames" if declared else "")
+        try:
+            motion = find_motion(self.animal, name)
+        except DataError as error:
+            return str(error)
+        count = len(motion.folders)
+        faults = [f"{count} of the {declared} frames are there"] if count < declared else []
+        lacking = [*_lacking_pictures(motion, cameras), *self._lacking_bones(motion)]
+        if lacking:
+            faults.append(f"{len(lacking)} files are missing, the first: {lacking[0]}")
+        return "; ".join(faults)
+
+    def _lacking_bones(self, motion: Motion) -> Iterator[str]:
+        """Without bones/ an animal has no true tracks, which is allowed; some of them is not."""
+        if (self.animal / "bones").is_dir():
+            for frame in motion.folders:
+                name = f"bones/{motion.name}/Bones_{frame:04d}.inf"
+                if not (self.animal / name).is_file():
+                    yield name
+
+
+def _lacking_pictures(motion: Motion, cameras: int) -> Iterator[str]:
+    """Pictures and masks that a frame lacks of the cameras that any frame shows."""
+    found = {frame: _pictures(folder) for frame, folder in motion.folders.items()}
+    used = sorted({camera for own in found.values() for camera, _ in own if camera < cameras}) or range(cameras)
+    for frame, own in found.items():
+        for camera in used:
+            for mask, ending in ((False, ".jpg"), (True, "_alpha.png")):
+                if (camera, mask) not in own:
+                    yield f"img/{motion.name}/{frame}/img_{camera:04d}{ending}"
+
+
+def _pictures(folder: Path) -> set[tuple[int, bool]]:
+    """(camera, is it the mask) of each file; a folder listing instead of 72 questions."""
+    matches = (_PICTURE.fullmatch(name) for name in os.listdir(folder))
+    return {(int(one[1]), bool(one[2])) for one in matches if one and (one[2] is None or one[3] == "png")}
+
+
+@dataclass(frozen=True)
+class ClipIndex:
+    """The frames of a clip, and whether its masks and further views are there for them."""
+
+    clip: Path
+    options: VideoOptions
+
+    def items(self) -> list[Item]:
+        """One item a frame; of pictures only the head is read. DataError when masks or views lack frames."""
+        if is_transforms(self.clip):
+            transforms_config(self.clip, self.options)  # finds every picture that the lists name
+            return [Item(clip_name(self.clip), self.clip)]
+        frames = open_frames(self.clip)
+        if self.options.mask:
+            find_masks(frames, self.options.mask)
+        find_given_views(frames, spread(len(frames), self.options.frames), self.options)
+        warn_gaps(frames, list(range(len(frames))))
+        if not self.clip.is_dir():
+            return [Item(name, self.clip) for name in frames.names]
+        return list(_frame_items(frames))
+
+    def summary(self, items: list[Item]) -> list[str]:
+        return []
+
+
+def _frame_items(frames: Frames) -> Iterator[Item]:
+    first: tuple[str, tuple[int, int]] | None = None
+    for name, path in zip(frames.names, frames.files, strict=True):
+        size, problem = _picture_size(path)
+        if size and first and size != first[1]:
+            problem = f"{size[0]}x{size[1]}, {first[0]} is {first[1][0]}x{first[1][1]}; export all frames at one size"
+        first = first or ((name, size) if size else None)
+        yield Item(name, path, problem=problem)
+
+
+def _picture_size(path: Path) -> tuple[tuple[int, int] | None, str]:
+    """((width, height), "") of a picture, or (None, what is wrong)."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size, ""
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None, "not a readable image; export this frame again"

@@ -1,0 +1,217 @@
+"""What the tables' programs share: `dpc` commands one after the other, cells done once, markdown.
+
+A cell is one trained and scored network in a folder of its own. A stopped cell continues, a finished one is passed
+over as long as it would be made from the same data by the same words.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from statistics import mean, stdev
+
+from dpcli.evaluate.report.thesis import thesis_tables
+from dpcli.runtime.provenance import file_digest
+
+Dpc = Callable[..., str]
+STOPPED = (75, 130, 143)  # exit codes of a command that was asked to stop
+DASH = "–"
+_FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
+
+
+def dpc(*words: object, threads: int | None = None) -> str:
+    """A command's stdout; ends this program with its exit code when it fails (75: stopped, run again).
+
+    A signal to this program goes on to the command, which saves its work before it ends.
+    """
+    limits = {} if threads is None else {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
+    main = threading.current_thread() is threading.main_thread()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dpcli", *map(str, words)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **limits},
+        start_new_session=main,
+    )
+    before = {}
+    if main:  # elsewhere Python allows no handlers
+        before = {one: signal.signal(one, lambda number, _: process.send_signal(number)) for one in _FORWARDED}
+    try:
+        out, _ = process.communicate()
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+    if process.returncode:
+        code = process.returncode if process.returncode > 0 else 128 - process.returncode
+        print(f"dpc {' '.join(map(str, words))}: exit {code}", file=sys.stderr)
+        sys.exit(code)
+    return out
+
+
+def attempt(work: Callable[[], object], what: str) -> str:
+    """Do what may fail; why it failed, or nothing. Being asked to stop is no failure."""
+    try:
+        work()
+    except SystemExit as ended:
+        if ended.code in STOPPED:
+            raise
+        return f"{what} ended with exit code {ended.code}"
+    return ""
+
+
+def write_text(path: Path, text: str) -> None:
+    """A file that is there is whole, also when two jobs write it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part.write_text(text)
+    os.replace(part, path)
+
+
+def write_json(path: Path, value: object) -> None:
+    write_text(path, json.dumps(value, indent=1) + "\n")
+
+
+def kept(path: Path, key: list) -> dict | None:
+    """What `once` found before by the same key; None when it found nothing, or by another key."""
+    try:
+        before = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return before["found"] if before.get("key") == json.loads(json.dumps(key)) else None
+
+
+def once(path: Path, key: list, work: Callable[[], dict]) -> dict:
+    """What `work` finds, from the JSON file `path` when it was found there before by the same key."""
+    found = kept(path, key)
+    if found is None:
+        found = work()
+        write_json(path, {"key": key, "found": found})
+    return found
+
+
+@lru_cache(maxsize=8)
+def _digest(path: Path, size: int, changed: int) -> str:
+    return file_digest(path)
+
+
+def digest(path: Path) -> str:
+    """Of a file's bytes; read once a program."""
+    told = path.stat()
+    return _digest(path, told.st_size, told.st_mtime_ns)
+
+
+def counted(run: Dpc, scores: Path, split: str = "test") -> dict:
+    """{"samples": n, "correct": {stream: n}} of a scores file; `fused` is its final score."""
+    told = json.loads(run("evaluate", "classification", scores, "--split", split, "--resamples", 0, "--json"))
+    return {"samples": told["denominators"]["samples"], "correct": told["denominators"]["correct"]}
+
+
+class Cell:
+    """One network: trained by `train` words on `clouds`, scored by `predict` words; what is found in `folder`/result.json."""
+
+    def __init__(self, folder: Path, clouds: Path, train: Sequence[object], predict: Sequence[object] = ()) -> None:
+        self.folder, self.clouds = folder, clouds
+        self.train, self.predict = [str(word) for word in train], [str(word) for word in predict]
+        self.model, self.scores, self.result = folder / "model", folder / "scores.h5", folder / "result.json"
+        self.trains = True
+
+    def scored_again(self, name: str, *words: str) -> Cell:
+        """The same network, trained by now, scored with more words; files are called `name`."""
+        other = Cell(self.folder, self.clouds, self.train, [*self.predict, *words])
+        other.scores, other.result = self.folder / f"scores-{name}.h5", self.folder / f"result-{name}.json"
+        other.trains = False
+        return other
+
+    @property
+    def key(self) -> list:
+        return [digest(self.clouds), self.train, self.predict]
+
+    def known(self) -> dict | None:
+        """What was found before, without doing anything."""
+        return kept(self.result, self.key) if self.result.exists() else None
+
+    def run(self, run: Dpc) -> dict:
+        """Train, predict and count, each only as far as it isn't done."""
+        return once(self.result, self.key, lambda: self._work(run))
+
+    def _work(self, run: Dpc) -> dict:
+        print(f"tables: {self.scores}", file=sys.stderr)
+        if self.trains:
+            run("classify", "train", self.clouds, "-o", self.model, *self.train)
+        run(
+            "classify",
+            "predict",
+            self.clouds,
+            "--model",
+            self.model,
+            "-o",
+            self.scores,
+            "--split",
+            "test",
+            *self.predict,
+        )
+        return counted(run, self.scores)
+
+
+def cut(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
+    """A program's own words, and those after `--`, which go to `dpc classify train`."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    where = words.index("--") if "--" in words else len(words)
+    return words[:where], words[where + 1 :]
+
+
+def numbers(text: str) -> list[int]:
+    """`0,1,2` as whole numbers; ends the program with a sentence otherwise."""
+    try:
+        return [int(word) for word in text.replace(" ", ",").split(",") if word]
+    except ValueError:
+        print(f"{text!r}: expected whole numbers such as 0,1,2", file=sys.stderr)
+        sys.exit(2)
+
+
+def shares(found: Sequence[dict], stream: str) -> list[float]:
+    """Percent right of each run that has the stream."""
+    return [100 * one["correct"][stream] / one["samples"] for one in found if stream in one["correct"]]
+
+
+def some(number: int, thing: str) -> str:
+    """'1 clip', '8 clips'."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def spread(values: Sequence[float], digits: int = 2) -> str:
+    """`mean ± sd` over runs, n - 1 in the denominator; the value alone for one run, a dash for none."""
+    known = [value for value in values if math.isfinite(value)]
+    if not known:
+        return DASH
+    middle = f"{mean(known):.{digits}f}"
+    return f"{middle} ± {stdev(known):.{digits}f}" if len(known) > 1 else middle
+
+
+def beside(theirs: float | None, ours: Sequence[float]) -> str:
+    """`thesis / ours`."""
+    return f"{DASH if theirs is None else f'{theirs:.2f}'} / {spread(ours)}"
+
+
+def samples(found: Sequence[dict]) -> str:
+    """The denominator of all runs: one number, or the several that occur."""
+    return ", ".join(str(n) for n in sorted({one["samples"] for one in found})) or DASH
+
+
+def thesis_rows(number: str) -> tuple[dict, ...]:
+    """Rows of a table of the thesis: method, setting, values, own."""
+    return next(table.rows for table in thesis_tables() if table.number == number)
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

@@ -1,0 +1,92 @@
+"""The processes that share one training run, as torchrun starts them; a run without torchrun is one process."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.distributed as dist
+
+from dpcli.errors import DpcError, UsageError
+from dpcli.runtime.progress import log
+
+_LOST = ("Connection closed", "Connection reset", "Broken pipe", "peer", "NCCL", "Timed out", "timed out")
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process's number among `count`; the first one alone writes files and talks."""
+
+    rank: int = 0
+    count: int = 1
+    local_rank: int = 0  # among those of this machine: which GPU is whose
+
+    @property
+    def first(self) -> bool:
+        return self.rank == 0
+
+    def place(self, device: torch.device) -> torch.device:
+        """The device of this process: each its own GPU."""
+        return torch.device("cuda", self.local_rank) if device.type == "cuda" and self.count > 1 else device
+
+    def sums(self, values: Sequence[float], device: torch.device) -> list[float]:
+        """Element-wise sums over all processes (collective: every process must call it)."""
+        if self.count == 1:
+            return list(values)
+        # gloo sums float64; so does nccl, on the GPU
+        totals = torch.tensor(values, dtype=torch.float64, device=device)
+        dist.all_reduce(totals)
+        return totals.tolist()
+
+    def wait(self) -> None:
+        """Until every process has come here."""
+        if self.count > 1:
+            dist.barrier()
+
+
+def from_environment() -> Processes:
+    """What torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. UsageError when they are no numbers."""
+    try:
+        return Processes(
+            *(
+                int(os.environ.get(name, default))
+                for name, default in (("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_RANK", "0"))
+            )
+        )
+    except ValueError:
+        raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is no number; start with torchrun, or unset them") from None
+
+
+@contextmanager
+def process_group(device: torch.device) -> Iterator[Processes]:
+    """Join the other processes for the length of a block: NCCL between GPUs, gloo between CPUs."""
+    processes = from_environment()
+    if processes.count == 1:
+        yield processes
+        return
+    if not processes.first:
+        log.level = 0
+    if device.type == "cuda":
+        torch.cuda.set_device(processes.local_rank)
+    kind = "nccl" if device.type == "cuda" else "gloo"
+    try:
+        dist.init_process_group(kind)
+    except (RuntimeError, ValueError) as error:
+        raise DpcError(
+            f"process {processes.rank} of {processes.count} could not reach the others: {str(error).splitlines()[0]};"
+            f" start them with torchrun, and name the network to use in {kind.upper()}_SOCKET_IFNAME if there are several"
+        ) from None
+    try:
+        yield processes
+    except RuntimeError as error:
+        if not any(word in str(error) for word in _LOST):
+            raise
+        raise DpcError(
+            f"process {processes.rank} of {processes.count} lost the others ({str(error).splitlines()[0]});"
+            " run again to continue from the last epoch that was saved"
+        ) from None
+    finally:
+        dist.destroy_process_group()

@@ -1,0 +1,220 @@
+"""`dpc segment estimate-flow`: scene flow of every frame, as a field of a clouds file or as its points (thesis A.1.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.runtime import provenance
+from dpcli.runtime.device import choose_device, cpu_count
+from dpcli.runtime.memory import keep_freed_memory
+from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.seeds import generator
+from dpcli.runtime.signals import stop_requested
+from dpcli.segment.flow.estimate import METHODS, estimate_flow
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, input_file, output_file
+from dpcli.store.sequence import POINT_FIELDS
+
+REACH = 99  # percentile of norms that stands for the largest: a few wrong matches must not decide the scale
+_KEY = 7006  # of the random draws of points
+_NO_MOTION = 1e-9  # of the cloud's reach: below this flow is rounding, and no factor makes it a cloud
+_WORTH_WORKERS = 200  # frames; fewer are done by one process before a second has started
+
+
+@dataclass(frozen=True)
+class FlowOfSequence:
+    """What to do with each sequence; picklable, for worker processes. points: drawn from each frame, 0 = all."""
+
+    flow: str
+    points: int = 512
+    as_points: bool = False
+    seed: int = 0
+    device: str = "cpu"
+
+    def fields(self, given: Sequence[str]) -> list[str]:
+        """Of the result: those given beside the flow; where flow vectors are the points, only the time."""
+        if self.as_points:
+            return [name for name in given if name == "time"]
+        return [*(name for name in given if name != "scene_flow"), "scene_flow"]
+
+    def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
+        """The sequence of that number in its file: some points of each frame, and their flow."""
+        index, sequence = numbered
+        drawn = draw_points(sequence, self.points, generator(self.seed, _KEY, index))
+        whole = [sequence.frame(t) for t in range(sequence.num_frames)]
+        drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
+        if self.as_points:
+            drawn.points, drawn.scene_flow = flow_as_points(drawn), None
+        return drawn
+
+
+def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) -> CloudSequence:
+    """At most `points` random points of each frame in their own order, with their fields; 0 keeps all."""
+    starts, counts = sequence.frame_offsets[:-1], np.diff(sequence.frame_offsets)
+    keep = [
+        start + (np.sort(rng.choice(count, points, replace=False)) if 0 < points < count else np.arange(count))
+        for start, count in zip(starts, counts)
+    ]
+    rows = np.concatenate(keep).astype(np.int64)
+    taken = {name: getattr(sequence, name)[rows] for name in POINT_FIELDS if getattr(sequence, name) is not None}
+    offsets = np.concatenate([[0], np.cumsum([len(own) for own in keep])]).astype(np.int64)
+    return CloudSequence(
+        sequence.name,
+        sequence.points[rows],
+        offsets,
+        sequence.split,
+        sequence.label,
+        sequence.subject,
+        sequence.camera,
+        time=sequence.time,
+        pose=sequence.pose,
+        **taken,
+    )
+
+
+def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, device: str = "cpu") -> np.ndarray:
+    """Flow f32 (P,3) of the points drawn from the frames `whole`: to the next frame, in the last frame to the one before.
+
+    icp and nearest look for the points in the whole next frame (icp in 1,024 of its points at most), a trained
+    estimator in the points drawn from it, as it was trained. Zero in a single frame and toward a frame without points.
+    """
+    frames = [drawn.frame(t) for t in range(drawn.num_frames)]
+    targets = whole if flow in METHODS else frames
+    last = len(frames) - 1
+    found = [_flow(frames[t], targets[t + 1 if t < last else t - 1], flow, device) for t in range(last + 1) if last]
+    return np.concatenate(found).astype(np.float32, copy=False) if last else np.zeros_like(drawn.points)
+
+
+def _flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) -> np.ndarray:
+    if min(len(points), len(target)) == 0:
+        return np.zeros_like(points)
+    pair = (torch.from_numpy(np.ascontiguousarray(cloud))[None] for cloud in (points, target))
+    return estimate_flow(*pair, method=flow, device=device)[0].numpy()
+
+
+def flow_as_points(sequence: CloudSequence) -> np.ndarray:
+    """Flow f32 (P,3) scaled to the range of the coordinates (thesis A.1.5.2), forward in time in the last frame as well.
+
+    One factor a sequence: the 99th percentile of the flow's norms becomes that of the distances of all points from
+    their mean. The largest norm counts where that percentile is 0; flow below 1e-9 of the distances becomes 0.
+    """
+    flow = sequence.scene_flow.astype(np.float64)
+    if sequence.num_frames > 1:
+        flow[sequence.frame_offsets[-2] :] *= -1
+    wanted = np.percentile(np.linalg.norm(sequence.points - sequence.points.mean(0, dtype=np.float64), axis=1), REACH)
+    norms = np.linalg.norm(flow, axis=1)
+    reach = np.percentile(norms, REACH)
+    if reach <= _NO_MOTION * wanted:
+        reach = norms.max()
+    factor = wanted / reach if reach > _NO_MOTION * wanted else 0.0
+    return np.float32(flow * factor)
+
+
+def run_flow_estimate(
+    data: str,
+    output: str,
+    *,
+    flow: str,
+    points: int,
+    as_points: bool,
+    split: str,
+    seed: int,
+    device: str,
+    jobs: int | None,
+    force: bool,
+) -> None:
+    """`dpc segment estimate-flow`; running again continues where a stopped or killed run ended."""
+    weights = flow_weights(flow)
+    with input_file(data) as path, output_file(output) as target:
+        reader = CloudsReader(path)
+        chosen = [i for i, name in enumerate(reader.splits) if split == "all" or name == split]
+        if not chosen:
+            raise DataError(f"{data}: no sequence of split {split!r}; it has {sorted(set(reader.splits))}")
+        config = {"flow": "estimator" if weights else flow, "points": points, "as_points": as_points, "split": split}
+        inputs = {"clouds": path} | ({"flow": weights} if weights else {})
+        history = [*reader.provenance, provenance.record(config, seed, inputs)]
+        device = str(choose_device(device)) if weights else "cpu"
+        work = FlowOfSequence(flow, points, as_points, seed, device)
+        if force or not _already_there(target, history[-1]):
+            keep_freed_memory()
+            with CloudsWriter(
+                target,
+                class_names=reader.class_names,
+                length_unit=reader.length_unit,
+                seed=seed,
+                source=reader.path.name if data != "-" else "stdin",
+                provenance=history,
+                fields=work.fields(reader.fields),
+                force=force,
+                resume=output != "-",
+            ) as writer:
+                frames = int(reader.frame_counts[chosen].sum())
+                _estimate_all(reader, chosen, work, writer, _processes(jobs, work, frames))
+    if output != "-":
+        print(f"{output}: flow of {len(chosen)} sequences, {int(reader.frame_counts[chosen].sum())} frames")
+
+
+def flow_weights(flow: str) -> Path | None:
+    """The file of a trained estimator, checked before any work; None for a method that needs none."""
+    if flow in METHODS:
+        return None
+    if not Path(flow).exists():
+        raise UsageError(f"--flow {flow}: expected {', '.join(METHODS)}, or a trained estimator's file or folder")
+    from dpcli.runtime.safetensors_file import find_weights
+    from dpcli.segment.flow.model_file import load_flow_model
+
+    load_flow_model(flow)
+    return find_weights(flow, Path(__file__).parents[1] / "flow" / "weights", "dpc segment flow", "--flow")
+
+
+def _processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
+    """Rigid bodies are found on one core: if that takes long, by a process for each. The other methods use all anyway."""
+    if work.device != "cpu":
+        return 1  # one process on an accelerator
+    return jobs or (cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1)
+
+
+def _already_there(target: Path, entry: dict) -> bool:
+    """Whether `target` holds the flow of this very work; UsageError when it holds something else."""
+    if not target.exists():
+        return False
+    try:
+        with CloudsReader(target) as reader:
+            before = reader.provenance[-1:]
+    except DataError as error:
+        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
+    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
+        raise UsageError(f"{target}: holds the flow of other data or choices; use another -o, or --force to replace it")
+    log.info(f"{target}: already complete, made from the same data (--force makes it again)")
+    return True
+
+
+def _estimate_all(
+    reader: CloudsReader, chosen: list[int], work: FlowOfSequence, writer: CloudsWriter, jobs: int
+) -> None:
+    done = len(writer.written_names)
+    read = [name for name in work.fields(reader.fields) if name in reader.fields and name != "scene_flow"]
+    todo = ((index, reader.read(index, fields=read)) for index in chosen[done:])
+    with (
+        stop_requested() as stop,
+        Progress("segment estimate-flow", len(chosen), "sequence") as bar,
+        closing(ordered_map(work, todo, jobs)) as results,
+    ):
+        bar.skip(done)
+        try:
+            for _, result in results:
+                if isinstance(result, Exception):
+                    raise result
+                writer.write(result)
+                bar.advance(1, frames=result.num_frames)
+                stop.check(f"{len(writer)} of {len(chosen)} sequences are kept beside the output")
+        except DpcError as error:
+            writer.keep = not isinstance(error, DataError)  # a lost worker says nothing about what is written
+            raise

@@ -1,0 +1,237 @@
+"""Few rigid bodies that explain two frames: the classical start of the flow. Propose motions, verify, keep what pays.
+
+One motion is fitted to the whole first. Then, as long as it pays: regions that are badly explained are moved by ICP
+from many starts that articulated things make likely (turned about their own edges, shifted along their axes), every
+motion found is tried on the whole cloud, and the best one becomes a further body. The energy counts both clouds' badly
+explained points and the borders between bodies, so that a motion pays only if it explains more than it costs (in the
+spirit of PEARL, Isack and Boykov 2012).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dpcli.segment.flow import motion_proposals as starts
+from dpcli.segment.flow.kernels_icp import assign_kernel, energy_kernel
+from dpcli.segment.flow.target_surface import Surface
+
+_IDENTITY = np.eye(3, 4)
+
+
+@dataclass(frozen=True)
+class BodySearch:
+    """What the search may do. Lengths are in spacings of the points, or in diameters of the first cloud."""
+
+    most: int = 6  # bodies
+    scale: float = 1.25  # spacings: a residual of this counts one half
+    share: float = 0.15  # of point-to-point distance in a residual, besides point to plane
+    border: float = 0.3  # cost of a point whose neighbors are all in other bodies
+    tear: float = 0.5  # share of it that grows with the gap between the two motions
+    far: float = 0.1  # cost of a point's distance from where the first body would take it
+    normal: float = 0.3  # how much patches care about the normal
+    extra: float = 0.05  # cost of a point outside the first body
+    gain: float = 0.02  # least fall of the energy for a further body, as a share of a point's worst
+    regions: int = 8  # tried per round
+    kept: int = 4  # motions kept of a region's
+    patches: tuple[int, ...] = (16, 6)
+    polish: tuple[float, ...] = (1.0, 0.5, 0.5)
+    second_looks: int = 1
+    tried: int = 16  # motions tried on the whole per round
+
+
+@dataclass
+class Bodies:
+    """label i64 (N): body of each source point; motion f64 (K,3,4): x_target = R x_source + t; body 0 came first."""
+
+    label: np.ndarray
+    motion: np.ndarray
+    energy: float = 0.0
+    cost: np.ndarray = field(default_factory=lambda: np.zeros((1, 0)))  # saturated residuals (K,N)
+
+
+def find_bodies(source: np.ndarray, target: np.ndarray, search: BodySearch | None = None) -> Bodies:
+    """Bodies of source (N,3) and their motions onto target (M,3), by points alone; N, M >= 9, diameter about 1."""
+    return _Search(Surface(source), Surface(target), search or BodySearch()).run()
+
+
+class _Search:
+    def __init__(self, source: Surface, target: Surface, options: BodySearch) -> None:
+        self.source, self.target, self.options = source, target, options
+        self.points = source.points.astype(np.float64)
+        spacing = max(source.spacing, 0.5 * target.spacing, 1e-4)
+        self.scale, self.reach = options.scale * spacing, 2 * source.spacing + 1e-4
+        tensor = np.einsum("ni,nj->nij", source.normals, source.normals).reshape(-1, 9)
+        feature = np.concatenate([source.points, options.normal * tensor], 1)
+        self.patches = [starts.voronoi(feature, count) for count in options.patches]
+
+    def run(self) -> Bodies:
+        found = self._grown(self._whole())
+        for _ in range(self.options.second_looks):
+            if len(found.motion) > 1:
+                found = self._grown(self._pruned(self._replaced(found)))
+        return self._polished(self._pruned(found))
+
+    def _grown(self, bodies: Bodies) -> Bodies:
+        """With further bodies, as long as they pay."""
+        while len(bodies.motion) < self.options.most:
+            better = self._one_more(bodies)
+            if better is None or better.energy > bodies.energy - self.options.gain:
+                break
+            bodies = better
+        return bodies
+
+    def _replaced(self, bodies: Bodies) -> Bodies:
+        """With other motions for the bodies after the first, where the energy falls."""
+        for k in range(1, len(bodies.motion)):
+            for motion in self._alternatives(bodies, k):
+                cost, motions = bodies.cost.copy(), bodies.motion.copy()
+                cost[k], motions[k] = self._cost(motion), motion
+                tried = self._refit(self._bodies(self._assign(bodies.label, cost), motions, cost))
+                if tried.energy < bodies.energy:
+                    bodies = tried
+        return _compact(bodies)
+
+    def _alternatives(self, bodies: Bodies, k: int) -> np.ndarray:
+        """Motions (H,3,4) of body k's points that ICP ends at when it starts from the first body's."""
+        region = np.flatnonzero(bodies.label == k)
+        if len(region) < 8:
+            return np.zeros((0, 3, 4))
+        points = self.points[region] @ bodies.motion[0, :, :3].T + bodies.motion[0, :, 3]
+        first = starts.compose(starts.articulated(points, np.zeros((0, 3))), bodies.motion[0])
+        part = np.ascontiguousarray(self.source.columns[:, region])
+        ends, score = self.target.icp_many(part, first, 12, 0.08, self.reach, self.options.share, self.scale)
+        chosen = starts.distinct(ends, score, self.points[region], 0.03, self.options.kept)
+        return ends[[h for h in chosen if score[h] < 0.6]]
+
+    def _pruned(self, bodies: Bodies) -> Bodies:
+        """Without bodies whose points the others explain nearly as well."""
+        while len(bodies.motion) > 1:
+            fewer = [self._without(bodies, k) for k in range(len(bodies.motion))]
+            best = min(fewer, key=lambda tried: tried.energy)
+            if best.energy > bodies.energy + self.options.gain:
+                break
+            bodies = best
+        return bodies
+
+    def _without(self, bodies: Bodies, k: int) -> Bodies:
+        cost = np.delete(bodies.cost, k, 0)
+        label = np.where(bodies.label == k, cost.argmin(0), bodies.label - (bodies.label > k))
+        return _compact(self._bodies(self._assign(label, cost), np.delete(bodies.motion, k, 0), cost))
+
+    def _polished(self, bodies: Bodies) -> Bodies:
+        """Refitted, ever tighter, as long as the energy falls."""
+        for tight in self.options.polish:
+            refined = self._refit(bodies, tight)
+            if refined.energy < bodies.energy:
+                bodies = _compact(refined)
+        return bodies
+
+    def _saturated(self, squared: np.ndarray) -> np.ndarray:
+        return squared / (squared + self.scale**2)
+
+    def _cost(self, motion: np.ndarray) -> np.ndarray:
+        return self._saturated(self.target.residuals(self.source.columns, motion, self.options.share))
+
+    def _whole(self) -> Bodies:
+        """One motion for all, the best of those found from a few small turns."""
+        turns = starts.turn(np.tile(np.eye(3), (2, 1)), np.repeat([-0.2, 0.2], 3), self.points.mean(0))
+        nobody = np.zeros(len(self.points), np.int64)
+        ends, _ = self.target.icp_many(
+            self.source.columns, np.concatenate([_IDENTITY[None], turns]), 15, 0.1, 0.03, self.options.share, self.scale
+        )
+        tries = [self._bodies(nobody, motion[None], self._cost(motion)[None]) for motion in ends]
+        best = min(tries, key=lambda bodies: round(bodies.energy, 9))
+        motion = self.target.icp(self.source.columns, best.motion[0], 20, 0.04, 0.012)
+        return self._bodies(nobody, motion[None], self._cost(motion)[None])
+
+    def _bodies(self, label: np.ndarray, motion: np.ndarray, cost: np.ndarray) -> Bodies:
+        """With its energy: both clouds' mean saturated residuals, the borders, and the way from the first body."""
+        options = self.options
+        energy = energy_kernel(
+            self.points,
+            self.source.normals,
+            label,
+            motion,
+            cost,
+            self.source.neighbors,
+            self.target.columns,
+            options.share,
+            self.scale,
+            options.tear,
+            options.border,
+            options.far,
+        )
+        return Bodies(label, motion, energy, cost)
+
+    def _assign(self, label: np.ndarray, cost: np.ndarray) -> np.ndarray:
+        """Each point to the body that explains it and its neighbors best, neighbors preferring the same (ICM)."""
+        label = label.copy()
+        assign_kernel(cost, self.source.neighbors, label, self.options.extra, self.options.border, 6)
+        return label
+
+    def _one_more(self, now: Bodies) -> Bodies | None:
+        """The best of all ways found to add a body, refined; None where no motion explains a region better."""
+        proposals = sorted(self._proposals(now), key=lambda item: item[0])[: self.options.tried]
+        best = None
+        for _, motion, region in proposals:
+            label = now.label.copy()
+            label[region] = len(now.motion)
+            cost = np.concatenate([now.cost, self._cost(motion)[None]])
+            tried = self._bodies(self._assign(label, cost), np.concatenate([now.motion, motion[None]]), cost)
+            if best is None or tried.energy < best.energy:
+                best = tried
+        if best is None:
+            return None
+        for _ in range(2):
+            refined = self._refit(best)
+            if refined.energy >= best.energy:
+                break
+            best = refined
+        return _compact(best)
+
+    def _refit(self, bodies: Bodies, tight: float = 1.0) -> Bodies:
+        motions = []
+        for k, motion in enumerate(bodies.motion):
+            own = np.ascontiguousarray(self.source.columns[:, bodies.label == k])
+            few = own.shape[1] < 6
+            reach = tight * self.reach
+            motions.append(motion if few else self.target.icp(own, motion, 10, 1.2 * reach, 0.5 * reach))
+        cost = np.stack([self._cost(motion) for motion in motions])
+        return self._bodies(self._assign(bodies.label, cost), np.stack(motions), cost)
+
+    def _proposals(self, now: Bodies) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """(gain, motion, region): ICP of every badly explained region from every start; the best few of each."""
+        own = now.motion[now.label]
+        moved = np.einsum("nij,nj->ni", own[:, :, :3], self.points) + own[:, :, 3]
+        normals = np.einsum("nij,nj->ni", own[:, :, :3], self.source.normals)
+        seen = self._saturated(self.target.covered_by(moved, normals, self.options.share))
+        lonely = starts.centers(self.target.points[seen > 0.5])
+        current = now.cost[now.label, np.arange(len(now.label))]
+        proposals = []
+        for region in self._regions(current):
+            body = np.bincount(now.label[region]).argmax()
+            first = starts.compose(starts.articulated(moved[region], lonely), now.motion[body])
+            part = np.ascontiguousarray(self.source.columns[:, region])
+            ends, score = self.target.icp_many(part, first, 12, 0.08, self.reach, self.options.share, self.scale)
+            gain = score - current[region].mean()
+            for h in starts.distinct(ends, gain, self.points[region], 0.03, self.options.kept):
+                if gain[h] < -0.05:
+                    proposals.append((gain[h] * len(region), ends[h], region))
+        return proposals
+
+    def _regions(self, current: np.ndarray) -> list[np.ndarray]:
+        """Where the cost is high: connected badly explained points, and patches of two sizes; the worst first."""
+        around = 0.5 * current + 0.5 * current[self.source.neighbors].mean(1)
+        regions = [r for level in (0.35, 0.55) for r in starts.components(around > level, self.source.neighbors)]
+        regions += [np.flatnonzero(patch == k) for patch in self.patches for k in range(patch.max() + 1)]
+        regions = [region for region in regions if len(region) >= 8 and around[region].mean() > around.mean()]
+        excess = [(around[region] - around.mean()).sum() / np.sqrt(len(region)) for region in regions]
+        return [regions[i] for i in np.argsort(np.negative(excess), kind="stable")[: self.options.regions]]
+
+
+def _compact(bodies: Bodies) -> Bodies:
+    """Without bodies that own no point."""
+    used, label = np.unique(bodies.label, return_inverse=True)
+    return Bodies(label.reshape(-1), bodies.motion[used], bodies.energy, bodies.cost[used])

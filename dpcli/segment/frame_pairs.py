@@ -1,0 +1,126 @@
+"""Training pairs: two neighboring frames of a sequence, thinned to the network's number of points and to size 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import generator
+from dpcli.store import CloudSequence, CloudsReader
+
+MOTION_FIELDS = ("pose", "scene_flow")  # what may tell the true motion, the better one first
+_FRAME_KEY = 7001  # keeps these generators apart from those of epochs
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Frames `first` and `first + 1` of a sequence; `number` counts all pairs of a source."""
+
+    number: int
+    sequence: int
+    first: int
+
+
+@dataclass
+class LoadedPair:
+    """points f32 (2,N,3) in units of the sequence's diameter, centered; part i64 (2,N) (-1 unknown); flow f32 (2,N,3), the
+    true one each way, None without poses and scene_flow."""
+
+    points: np.ndarray
+    part: np.ndarray
+    flow: np.ndarray | None
+
+
+def sequence_scale(frames: list[np.ndarray]) -> float:
+    """1 / (twice the largest distance of a point from its frame's mean): a sequence times this has diameter 1 or less."""
+    reach = max((float(np.linalg.norm(f - f.mean(0), axis=1).max()) for f in frames if len(f)), default=0.0)
+    return 0.5 / reach if reach > 0 else 1.0
+
+
+def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
+    """Indices i64 (wanted) into `count` points: without repeats where there are enough, all of them and repeats else."""
+    if count >= wanted:
+        return rng.permutation(count)[:wanted]
+    return np.concatenate([rng.permutation(count), rng.integers(0, count, wanted - count)])
+
+
+class PairSource:
+    """All pairs of adjacent frames with points of some sequences. A frame's points are drawn once: its flow belongs to them."""
+
+    def __init__(self, reader: CloudsReader, sequences: list[int], points: int, seed: int) -> None:
+        self.reader, self.points, self.seed = reader, points, seed
+        sizes = np.split(reader.frame_sizes, np.cumsum(reader.frame_counts)[:-1])
+        spots = [(s, f) for s in sequences for f in range(len(sizes[s]) - 1)]
+        both = [(s, f) for s, f in spots if sizes[s][f : f + 2].all()]
+        if not both:
+            without = ", all with a frame without points" if spots else ""
+            raise DataError(
+                f"{reader.path}: no two frames that follow each other in {len(sequences)} sequences to train on{without}"
+            )
+        if len(both) < len(spots):
+            log.warn(
+                f"{reader.path}: {len(spots) - len(both)} of {len(spots)} pairs of frames left out: one has no points"
+            )
+        self.pairs = [Pair(n, s, f) for n, (s, f) in enumerate(both)]
+        truth = next((name for name in MOTION_FIELDS if name in reader.fields), None)
+        self.fields = [name for name in ("part", truth) if name in reader.fields]
+
+    def load(self, pair: Pair) -> LoadedPair:
+        """One pair."""
+        frames = [pair.first, pair.first + 1]
+        sample = self.reader.read(pair.sequence, frames, self.fields)
+        clouds = [sample.frame(t) for t in range(2)]
+        picks = [
+            choose_points(len(c), self.points, generator(self.seed, _FRAME_KEY, pair.sequence, f))
+            for c, f in zip(clouds, frames)
+        ]
+        parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
+        points = np.stack([cloud[pick] for cloud, pick in zip(clouds, picks)])
+        flow = self._flow(pair, sample, points, parts, picks)
+        scale = sequence_scale(clouds)
+        center = np.float32(points.mean((0, 1)))
+        return LoadedPair(
+            np.float32((points - center) * scale), parts, None if flow is None else np.float32(flow * scale)
+        )
+
+    def _flow(
+        self, pair: Pair, sample: CloudSequence, points: np.ndarray, parts: np.ndarray, picks: list[np.ndarray]
+    ) -> np.ndarray | None:
+        """The true flow (2,N,3) of the chosen points, each way."""
+        if sample.pose is not None:
+            return np.stack([true_flow(points[t], parts[t], sample.pose[t], sample.pose[1 - t]) for t in range(2)])
+        if sample.scene_flow is None:
+            return None
+        forth, back = np.split(sample.scene_flow, [sample.frame_offsets[1]])
+        if pair.first + 2 < self.reader.frame_counts[pair.sequence]:  # scene_flow leads on, to a third frame
+            back = backward_flow(sample.frame(0), forth, sample.frame(1))
+        return np.stack([forth[picks[0]], back[picks[1]]])
+
+
+def backward_flow(points: np.ndarray, flow: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Flow (M,3) of `others`, the next frame's points, back: minus that of the point (N,3) which its flow leads nearest."""
+    from scipy.spatial import cKDTree
+
+    return -flow[cKDTree(points + flow).query(others)[1]]
+
+
+def frame_parts(sample: CloudSequence, t: int) -> np.ndarray:
+    """Part ids i64 of frame t, -1 where unknown."""
+    bounds = slice(sample.frame_offsets[t], sample.frame_offsets[t + 1])
+    count = bounds.stop - bounds.start
+    return np.full(count, -1) if sample.part is None else sample.part[bounds].astype(np.int64)
+
+
+def true_flow(points: np.ndarray, part: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Flow (N,3) of points whose parts have the poses source (parts,4,4), to the poses target. Unknown parts move as 0."""
+    motion = (target @ np.linalg.inv(source))[np.clip(part, 0, None)]
+    return np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
+
+
+def epoch_order(source: PairSource, epoch: int, most: int | None) -> list[Pair]:
+    """The epoch's pairs, shuffled; at most `most`, another draw each epoch."""
+    order = generator(source.seed, 7002, epoch).permutation(len(source.pairs))
+    return [source.pairs[i] for i in order[:most]]

@@ -1,0 +1,297 @@
+"""Training a part network on pairs of frames, without labels or with them.
+
+A run can be stopped or killed at any step and continued to the same result: what a step does depends on (seed, epoch,
+step) and on the saved state alone, and the flows it corrects are saved with that state.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import chain, cycle, islice
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dpcli.errors import UsageError
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.signals import StopRequest
+from dpcli.segment.flow.rigid_groups import rigid_groups
+from dpcli.segment.frame_pairs import LoadedPair, Pair, PairSource, epoch_order
+from dpcli.segment.network.model_file import save_model
+from dpcli.segment.network.part_network import PartNetwork
+from dpcli.segment.training.flow_store import FlowStore
+from dpcli.segment.training.losses import supervised_loss
+from dpcli.segment.training.objective import Batch, Objective, pair_loss, turn_randomly
+
+_SAVE_EVERY = 100  # steps between checkpoints: their flows are what memory holds
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long and how fast. A pair gives two frames to each step."""
+
+    epochs: int = 10
+    pairs_per_epoch: int | None = 1000  # None: all
+    batch: int = 8
+    learning_rate: float = 1e-3  # Adam's; cosine to zero after a short warm-up
+    weight_decay: float = 1e-4
+    augment: bool = True  # every pair turned at random
+    validation_pairs: int = 48
+
+    def __post_init__(self) -> None:
+        for option, value, least in (("--epochs", self.epochs, 1), ("--batch", self.batch, 1)):
+            if value < least:
+                raise UsageError(f"{option} {value}: expected {least} or more")
+        if not self.learning_rate > 0:
+            raise UsageError(f"--lr {self.learning_rate}: expected a number above 0")
+
+    def rate(self, step: int, steps: int) -> float:
+        """Learning rate of one step of `steps`."""
+        warm = max(1, min(100, steps // 10))
+        if step < warm:
+            return self.learning_rate * (step + 1) / warm
+        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(steps - warm, 1)))
+
+
+Estimate = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
+
+
+class Trainer:
+    """Trains one network. `estimate` gives the first flow, forth and back, of two frames (N,3)."""
+
+    def __init__(
+        self,
+        model: PartNetwork,
+        folder: RunFolder,
+        schedule: Schedule,
+        objective: Objective,
+        training: PairSource,
+        validation: PairSource | None,
+        estimate: Estimate | None,
+        notes: dict,
+        device: torch.device,
+        stop: StopRequest,
+        seed: int,
+        flows_of: Path | None = None,
+    ) -> None:
+        self.model, self.folder, self.schedule, self.objective = model.to(device), folder, schedule, objective
+        self.training, self.validation, self.estimate = training, validation, estimate
+        self.notes, self.device, self.stop, self.seed, self.flows_of = notes, device, stop, seed, flows_of
+        self.epoch, self.step, self.best = 0, 0, math.inf
+        self.sums: dict[str, list[float]] = {}
+        self.spent = 0.0
+        self.optimizer = torch.optim.AdamW(
+            model.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
+        )
+        self.checking: list[Batch] | None = None
+
+    def run(self) -> None:
+        """From wherever the folder's state says to the last epoch."""
+        state = self.folder.load_state()
+        shape = (len(self.training.pairs), self.training.points)
+        self.flows = FlowStore(self.folder.path, *shape, state is None, self.flows_of)
+        if state is not None:
+            self._restore(state)
+        over = self.epoch >= self.schedule.epochs  # run again: what is there has been finished
+        total = self.schedule.epochs * self._steps() * self.schedule.batch
+        with Progress("train parts", total, "pair") as bar:
+            bar.skip((self.epoch * self._steps() + self.step) * self.schedule.batch)
+            while self.epoch < self.schedule.epochs:
+                self._run_epoch(bar)
+        if self.validation is None and not (over and self.folder.file("best.safetensors").exists()):
+            save_model(self.folder.file("best.safetensors"), self.model, self.notes)
+
+    def _steps(self) -> int:
+        """Steps of an epoch: whole batches, the few pairs left over come in another epoch's order."""
+        return max(len(epoch_order(self.training, 0, self.schedule.pairs_per_epoch)) // self.schedule.batch, 1)
+
+    def _run_epoch(self, bar: Progress) -> None:
+        self.model.train()
+        started = time.monotonic()
+        steps, rate = self._steps(), 0.0
+        chosen = self._epoch_pairs(steps)
+        while self.step < steps:
+            pairs = list(islice(chosen, self.schedule.batch))
+            rate = self._step(pairs, self.epoch * steps + self.step, steps * self.schedule.epochs)
+            self.step += 1
+            shown = {key: self._mean(key) for key in ("loss", "flow_error") if key in self.sums}
+            bar.note(epoch=f"{self.epoch + 1}/{self.schedule.epochs}", **shown)
+            bar.advance(len(pairs))
+            if self.step % _SAVE_EVERY == 0 or self.stop.requested:
+                self.spent += time.monotonic() - started
+                started = time.monotonic()
+                self._save()
+            self.stop.check(f"saved at epoch {self.epoch + 1}, step {self.step}")
+        self._end_epoch(rate, started)
+
+    def _epoch_pairs(self, steps: int) -> Iterator[Pair]:
+        """The epoch's pairs from `self.step` on. While the cold start lasts, only those whose flow shows several bodies:
+        the others, half of them or more in slow scenes, have nothing to say to it."""
+        cold = self.objective.cold_start > 0 and not self.objective.supervised
+        cold = cold and self.epoch < self.objective.cold_until * self.schedule.epochs
+        skip = self.step * self.schedule.batch
+        order = epoch_order(self.training, self.epoch, None)
+        picked = (pair for pair in order if not cold or self._telling(pair))
+        for count, pair in enumerate(chain(picked, cycle(order))):  # too few telling pairs: any, once more
+            if count >= skip:
+                yield pair
+
+    def _telling(self, pair: Pair) -> bool:
+        if self.flows.telling(pair.number) is None:
+            self._flow(pair, torch.from_numpy(self.training.load(pair).points))
+        return bool(self.flows.telling(pair.number))
+
+    def _step(self, pairs: list[Pair], step: int, steps: int) -> float:
+        loaded = [self.training.load(pair) for pair in pairs]
+        batch = self._batch(pairs, loaded)
+        rotation = None
+        if self.schedule.augment:
+            rng = torch.Generator().manual_seed(
+                int(np.random.SeedSequence([self.seed, 7003, step]).generate_state(1)[0])
+            )
+            batch.points, rotation = turn_randomly(batch.points, rng)
+            batch.flow = batch.flow @ rotation.mT
+        rate = self.schedule.rate(step, steps)
+        outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1))
+        self._optimize(outcome.loss, rate)
+        if outcome.flow is not None:
+            self._keep_flow(pairs, outcome.flow if rotation is None else outcome.flow @ rotation)
+        self._count({"loss": float(outcome.loss.detach()), **outcome.terms})
+        return rate
+
+    def _optimize(self, loss: torch.Tensor, rate: float) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 5.0)
+        if torch.isfinite(norm):
+            self.optimizer.step()
+
+    def _batch(self, pairs: list[Pair], loaded: list[LoadedPair]) -> Batch:
+        """Points, labels and the flows as they stand, estimated now where a pair is new."""
+        batch, flow = self._assemble(loaded, lambda i, frames: self._flow(pairs[i], frames))
+        self._compare(flow, loaded)
+        return batch
+
+    def _assemble(
+        self, loaded: list[LoadedPair], estimate: Callable[[int, torch.Tensor], torch.Tensor]
+    ) -> tuple[Batch, torch.Tensor]:
+        """A batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames of pair i)."""
+        points = torch.from_numpy(np.stack([pair.points for pair in loaded]))  # [B, 2, N, 3]
+        if self.objective.supervised:
+            flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
+        else:
+            flow = torch.stack([estimate(i, frames) for i, frames in enumerate(points)])
+        part = torch.from_numpy(np.stack([pair.part for pair in loaded]))
+        return Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))), flow
+
+    def _flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
+        known = self.flows.get(pair.number)
+        if known is None:
+            known = torch.stack(self.estimate(*frames))
+            self.flows.put_first(pair.number, known, bool((rigid_groups(frames, known) > 0).any()))
+        return known
+
+    def _keep_flow(self, pairs: list[Pair], flow: torch.Tensor) -> None:
+        for pair, both in zip(pairs, flow.cpu().unflatten(0, (2, -1)).transpose(0, 1)):
+            self.flows.put(pair.number, both)
+
+    def _compare(self, flow: torch.Tensor, loaded: list[LoadedPair]) -> None:
+        """For the log only, and only where the data know the truth: how far the flow in use is from it."""
+        if all(pair.flow is not None for pair in loaded):
+            truth = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
+            self._count({"flow_error": float((flow - truth).norm(dim=-1).mean())})
+
+    def _count(self, values: dict[str, float]) -> None:
+        for key, value in values.items():
+            entry = self.sums.setdefault(key, [0.0, 0.0])
+            entry[0], entry[1] = entry[0] + value, entry[1] + 1
+
+    def _mean(self, key: str) -> float | None:
+        total, count = self.sums.get(key, (0.0, 0.0))
+        return total / count if count else None
+
+    def _end_epoch(self, rate: float, started: float) -> None:
+        row = {key: self._mean(key) for key in self.sums}
+        if self.validation is not None:
+            row |= self.validate()
+        self.epoch, self.step = self.epoch + 1, 0
+        seconds = self.spent + time.monotonic() - started
+        pairs = self._steps() * self.schedule.batch
+        row |= {"epoch": self.epoch, "pairs": pairs, "learning_rate": rate, "seconds": round(seconds, 2)}
+        log.detail(" ".join(f"{key} {value:.4g}" for key, value in row.items() if value is not None))
+        self.folder.log(row)
+        self.sums, self.spent = {}, 0.0
+        if self.validation is not None and row["validation_loss"] <= self.best:
+            self.best = row["validation_loss"]
+            save_model(self.folder.file("best.safetensors"), self.model, self.notes)
+        save_model(self.folder.file("last.safetensors"), self.model, self.notes)
+        self._save()
+        self.folder.draw_curves()
+
+    @torch.no_grad()
+    def validate(self) -> dict[str, float | None]:
+        """How well masks agree with the bodies that held-out pairs' first flow shows (with labels: the loss), and, where
+        labels are known, the mean Rand index, for people to watch; nothing is chosen by it."""
+        self.model.eval()
+        if self.checking is None:
+            self.checking = self._validation_batches()
+        losses, scores = [], []
+        for batch in self.checking:
+            mask = self.model(batch.points).mask
+            bodies = (
+                batch.part if self.objective.supervised else rigid_groups(batch.points, batch.flow, most=mask.shape[-1])
+            )
+            telling = bodies.amax(1) > 0
+            if telling.any():
+                losses += [float(supervised_loss(mask[telling], bodies[telling]))] * int(telling.sum())
+            if (batch.part >= 0).all():
+                labels = mask.argmax(-1)
+                scores += [rand_index(a, b) for a, b in zip(labels, batch.part)]
+        loss = float(np.mean(losses)) if losses else 0.0
+        return {"validation_loss": loss, "validation_rand_index": float(np.mean(scores)) if scores else None}
+
+    def _validation_batches(self) -> list[Batch]:
+        assert self.validation is not None
+        pairs = epoch_order(self.validation, 0, self.schedule.validation_pairs)
+        batches = []
+        for start in range(0, len(pairs), self.schedule.batch):
+            loaded = [self.validation.load(pair) for pair in pairs[start : start + self.schedule.batch]]
+            batches.append(self._assemble(loaded, lambda _, frames: torch.stack(self.estimate(*frames)))[0])
+        return batches
+
+    def _save(self) -> None:
+        self.folder.save_state(
+            {
+                "epoch": self.epoch,
+                "step": self.step,
+                "best": self.best,
+                "sums": self.sums,
+                "spent": self.spent,
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "flows": self.flows.pending(),
+            }
+        )
+        self.flows.flush()
+
+    def _restore(self, state: dict) -> None:
+        for key in ("epoch", "step", "best", "sums", "spent"):
+            setattr(self, key, state[key])
+        self.model.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.flows.restore(state["flows"])
+        where = f"epoch {self.epoch + 1} of {self.schedule.epochs}, step {self.step}"
+        self.folder.tell_continuing(where if self.epoch < self.schedule.epochs else None)
+
+
+def rand_index(labels: torch.Tensor, truth: torch.Tensor) -> float:
+    """Share of ordered point pairs (itself included) on which two labelings (N) agree about same or different."""
+    same = labels[:, None] == labels
+    return float((same == (truth[:, None] == truth)).float().mean())

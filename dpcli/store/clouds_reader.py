@@ -1,0 +1,185 @@
+"""Reading a `clouds` file: validated once, then only the frames asked for."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.store.file import open_store, read_provenance, read_skipped, read_strings, root_attributes
+from dpcli.store.sequence import POINT_FIELDS, CloudSequence
+
+OPTIONAL = ("time", "color", "part", "track", "scene_flow", "pose")
+
+
+class CloudsReader:
+    """Lazy access to the sequences of a `clouds` (or `parts`) file.
+
+    The index (names, labels, offsets) is read and checked on opening: a few dozen bytes a sample. The HDF5 handles are
+    opened on first use in each process and never pickled, so a DataLoader may hand the reader to its workers. Those of
+    data sets are kept: finding one again for each sequence takes longer than reading it.
+    Raises DataError when the file is not what the contract says.
+    """
+
+    kinds: tuple[str, ...] = ("clouds", "parts")
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._file: h5py.File | None = None
+        self._process = 0  # that opened the handles; after a fork the child opens its own
+        self._sets: dict[str, h5py.Dataset] = {}
+        with open_store(self.path, self.kinds) as file:
+            self._load_index(file)
+
+    def _load_index(self, file: h5py.File) -> None:
+        self.attributes = root_attributes(file)
+        self.provenance = read_provenance(file)
+        self.skipped = read_skipped(file)
+        self.class_names = read_strings(file, "class_names")
+        self.length_unit = str(file.attrs.get("length_unit", ""))
+        self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
+        self.labels, self.subjects, self.cameras = (self._column(file, key) for key in ("label", "subject", "camera"))
+        self.num_points = len(self._data(file, "points", (3,)))
+        self._sequence_offsets = self._offsets(file, "sequence_offsets", None)
+        frames = int(self._sequence_offsets[-1])
+        self._frame_offsets = self._offsets(file, "frame_offsets", self.num_points)
+        if frames != len(self._frame_offsets) - 1:
+            raise DataError(
+                f"{self.path}: sequence_offsets end at {frames}, but there are {len(self._frame_offsets) - 1} frames"
+            )
+        if not len(self.names) == len(self.splits) == len(self._sequence_offsets) - 1:
+            raise DataError(f"{self.path}: {len(self.names)} names for {len(self._sequence_offsets) - 1} sequences")
+        if self.class_names and len(self.labels) and self.labels.max() >= len(self.class_names):
+            worst = int(self.labels.argmax())
+            raise DataError(
+                f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {len(self.class_names)} classes"
+            )
+        self.fields = tuple(key for key in OPTIONAL if key in file)
+        for key in self.fields:
+            rows = self.num_points if key in POINT_FIELDS else frames
+            if len(file[key]) != rows:
+                raise DataError(f"{self.path}: {key} has {len(file[key])} rows, expected {rows}")
+
+    def _data(self, file: h5py.File, name: str, tail: tuple[int, ...]) -> h5py.Dataset:
+        if name not in file:
+            raise DataError(f"{self.path}: data set {name!r} is missing; the file is incomplete, make it again")
+        if file[name].shape[1:] != tail:
+            raise DataError(
+                f"{self.path}: {name} has shape {file[name].shape}, expected (n{''.join(f', {d}' for d in tail)})"
+            )
+        return file[name]
+
+    def _column(self, file: h5py.File, name: str) -> np.ndarray:
+        column = self._data(file, name, ())[:]
+        if len(column) != len(self.names):
+            raise DataError(f"{self.path}: {name} has {len(column)} rows for {len(self.names)} names")
+        return column
+
+    def _offsets(self, file: h5py.File, name: str, end: int | None) -> np.ndarray:
+        offsets = self._data(file, name, ())[:]
+        if len(offsets) == 0 or offsets[0] != 0 or np.any(np.diff(offsets) < 0):
+            raise DataError(f"{self.path}: {name} must start at 0 and never fall")
+        if end is not None and offsets[-1] != end:
+            raise DataError(f"{self.path}: {name} ends at {offsets[-1]}, but there are {end} points")
+        return offsets
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def frame_counts(self) -> np.ndarray:
+        """Frames of each sequence, i64 (S)."""
+        return np.diff(self._sequence_offsets)
+
+    @property
+    def frame_sizes(self) -> np.ndarray:
+        """Points of each frame, i64 (F)."""
+        return np.diff(self._frame_offsets)
+
+    @property
+    def point_counts(self) -> np.ndarray:
+        """Points of each sequence, i64 (S)."""
+        return np.diff(self._frame_offsets[self._sequence_offsets])
+
+    @property
+    def file(self) -> h5py.File:
+        """The open handle of this process."""
+        if self._file is None or self._process != os.getpid() or not self._file.id.valid:
+            self._sets = {}
+            self._file, self._process = open_store(self.path, self.kinds), os.getpid()
+        return self._file
+
+    def _set(self, name: str) -> h5py.Dataset:
+        """A data set of the file, found once in each process."""
+        file = self.file
+        if name not in self._sets:
+            self._sets[name] = file[name]
+        return self._sets[name]
+
+    def read(
+        self, index: int, frames: slice | Sequence[int] | None = None, fields: Sequence[str] | None = None
+    ) -> CloudSequence:
+        """Sequence `index`, or only some of its frames (repeats allowed), with all optional fields or those named.
+
+        Touches only what it needs: one contiguous read from the first to the last frame asked for.
+        DataError when a value is NaN or infinite.
+        """
+        first = int(self._sequence_offsets[index])
+        count = int(self._sequence_offsets[index + 1]) - first
+        wanted = (
+            np.arange(count)[frames if frames is not None else slice(None)]
+            if not isinstance(frames, Sequence)
+            else np.asarray(frames)
+        )
+        if len(wanted) == 0 or wanted.min() < 0 or wanted.max() >= count:
+            raise DataError(f"{self.path}: frames {frames} of {self.names[index]!r}, which has {count} frames")
+        low, high = int(wanted.min()), int(wanted.max()) + 1
+        offsets = self._frame_offsets[first + low : first + high + 1]
+        span = slice(int(offsets[0]), int(offsets[-1]))
+        picks = None if len(wanted) == high - low and (np.diff(wanted) == 1).all() else wanted - low
+        sizes = np.diff(offsets) if picks is None else np.diff(offsets)[picks]
+        values = {}
+        for key in ("points", *(self.fields if fields is None else fields)):
+            if key in ("time", "pose"):
+                values[key] = self._set(key)[first + low : first + high][wanted - low]
+            else:
+                values[key] = _pick(self._set(key)[span], offsets - offsets[0], picks)
+        if not np.isfinite(values["points"]).all():
+            raise DataError(
+                f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
+            )
+        return CloudSequence(
+            self.names[index],
+            values.pop("points"),
+            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            self.splits[index],
+            int(self.labels[index]),
+            int(self.subjects[index]),
+            int(self.cameras[index]),
+            **values,
+        )
+
+    def close(self) -> None:
+        if self._file is not None and self._process == os.getpid():
+            self._file.close()
+        self._file, self._sets = None, {}
+
+    def __enter__(self) -> CloudsReader:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict:
+        return {**self.__dict__, "_file": None, "_sets": {}}
+
+
+def _pick(values: np.ndarray, offsets: np.ndarray, picks: np.ndarray | None) -> np.ndarray:
+    """Rows of the frames `picks`, in that order."""
+    if picks is None:
+        return values
+    return np.concatenate([values[offsets[t] : offsets[t + 1]] for t in picks])

@@ -1,0 +1,195 @@
+"""Writing a `clouds` file, one sample in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.store.file import STRING, write_positions, write_skipped
+from dpcli.store.journal import Placed
+from dpcli.store.resumable_writer import ResumableWriter
+from dpcli.store.sequence import POINT_FIELDS, CloudSequence
+from dpcli.store.whole_chunks import WholeChunks
+
+COMPRESSIONS = ("none", "lzf", "gzip")
+POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence
+PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
+_PER_SAMPLE = {"name": STRING, "split": STRING, "label": np.int32, "subject": np.int32, "camera": np.int32}
+_INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
+_FIELDS = ("time", *POINT_FIELDS, "pose")  # the order in which they are made, whoever names them: equal bytes
+_FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
+
+
+class CloudsWriter(ResumableWriter):
+    """Context manager that writes sequences to `path`; `ResumableWriter` says what it leaves when it is stopped.
+
+    A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
+    the samples of a compressed file.
+    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose). Set before the
+    block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
+    kept in the file; a shard may be empty.
+    """
+
+    kind = "clouds"
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        class_names: Sequence[str] = (),
+        length_unit: str = "m",
+        source: str = "",
+        seed: int = 0,
+        fields: Sequence[str] = (),
+        compression: str = "none",
+        provenance: dict | Sequence[dict] | None = None,
+        force: bool = False,
+        resume: bool = False,
+    ) -> None:
+        super().__init__(
+            path,
+            class_names=class_names,
+            length_unit=length_unit,
+            source=source,
+            seed=seed,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        )
+        if compression not in COMPRESSIONS:
+            raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
+        unknown = set(fields) - set(_FIELDS)
+        if unknown:
+            raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
+        self.fields, self.compression = tuple(name for name in _FIELDS if name in fields), compression
+        self.skipped: list[tuple[str, str]] = []
+        self.positions: tuple[list[int], list[int]] | None = None
+        self._names: set[str] = set()
+        self._frames = self._points = self._unflushed = 0
+        self._index: dict[str, list] = {name: [] for name in _INDEX}
+        self._data: dict[str, h5py.Dataset] = {}
+        self._chunks: WholeChunks | None = None
+        self._placed: Placed | None = None
+        self._open(force)
+
+    def _create(self) -> None:
+        file = self._file
+        self._create_floats("points", 3)
+        for name in ("frame_offsets", "sequence_offsets"):
+            file.create_dataset(name, data=np.zeros(1, np.int64), maxshape=(None,), chunks=(4096,), **PACKED)
+        for name, dtype in _PER_SAMPLE.items():
+            file.create_dataset(
+                name, (0,), dtype, maxshape=(None,), chunks=(1024,), **({} if dtype is STRING else PACKED)
+            )
+        for name in self.fields:
+            self._create_field(file, name)
+
+    def _create_floats(self, name: str, width: int) -> None:
+        """A data set of f32 (rows, width), uncompressed unless --compression says otherwise."""
+        filters = {} if self.compression == "none" else {"compression": self.compression, "shuffle": True}
+        rows = max(1, POINTS_PER_CHUNK * 3 // width)
+        self._file.create_dataset(name, (0, width), np.float32, maxshape=(None, width), chunks=(rows, width), **filters)
+
+    def _create_field(self, file: h5py.File, name: str) -> None:
+        if name == "time":
+            file.create_dataset(name, (0,), np.float64, maxshape=(None,), chunks=(4096,), **PACKED)
+        elif name in POINT_FIELDS:
+            dtype, shape = POINT_FIELDS[name]
+            chunks = (POINTS_PER_CHUNK, *shape)
+            file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunks, **PACKED)
+        # pose is created with the first sample, which tells the number of parts
+
+    def write(self, sequence: CloudSequence) -> None:
+        """Append one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
+        self._check(sequence)
+        self._append_sequence(sequence)
+        self._note(sequence)
+
+    def _note(self, sequence: CloudSequence, *said: Any) -> None:
+        """From here on the sample counts as written; `said`: what else `write` was given."""
+        self._record([sequence, *said], self._placed)
+        self._placed = None
+        self._names.add(sequence.name)
+
+    def _write_again(self, given: list[Any]) -> str:
+        self.write(*given)
+        return given[0].name
+
+    def _check(self, sequence: CloudSequence) -> None:
+        sequence.validate(len(self.class_names))
+        if sequence.name in self._names:
+            raise DataError(f"sample {sequence.name!r}: the name appears twice; names identify samples")
+        missing = [name for name in self.fields if getattr(sequence, name) is None]
+        if missing:
+            raise DataError(f"sample {sequence.name!r}: no {', '.join(missing)}, though the other samples have it")
+        if "pose" in self.fields and "pose" in self._file:
+            own, others = sequence.pose.shape[1], self._file["pose"].shape[1]
+            if own != others:
+                raise DataError(
+                    f"sample {sequence.name!r}: pose has {own} parts, earlier samples have {others}; pad to the largest"
+                )
+
+    def _append_sequence(self, sequence: CloudSequence) -> None:
+        self._append("points", sequence.points)
+        for name in self.fields:
+            self._append(name, getattr(sequence, name))
+        self._append("frame_offsets", sequence.frame_offsets[1:] + self._points)
+        self._append("sequence_offsets", [self._frames + sequence.num_frames])
+        for name in _PER_SAMPLE:
+            self._append(name, [getattr(sequence, name)])
+        self._points += len(sequence.points)
+        self._frames += sequence.num_frames
+
+    def _append(self, name: str, values: np.ndarray | list) -> None:
+        if name in self._index:
+            self._index[name].extend(values)
+            return
+        if name == "pose" and name not in self._file:
+            shape = values.shape[1:]
+            self._file.create_dataset(
+                name, (0, *shape), np.float64, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
+            )
+        if name == "points" and self.compression == "none":
+            self._append_whole_chunks(values)
+        else:
+            self._extend(name, values)
+        self._unflushed += getattr(values, "nbytes", 0)
+        if self._unflushed > _FLUSH_BYTES:
+            self._atomic.flush()
+            self._unflushed = 0
+
+    def _append_whole_chunks(self, points: np.ndarray) -> None:
+        self._chunks = self._chunks or WholeChunks(self._file["points"])
+        places = self._chunks.append(points)
+        self._placed = (points, places) if points.dtype == np.float32 else None
+
+    def _extend(self, name: str, values: np.ndarray | list) -> None:
+        if name not in self._data:  # kept open: closing would write its unfinished chunk, each time
+            self._data[name] = self._file[name]
+        data = self._data[name]
+        start = len(data)
+        data.resize(start + len(values), axis=0)
+        data[start:] = values
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __enter__(self) -> CloudsWriter:
+        return self
+
+    def _complete(self) -> None:
+        if not len(self) and self.positions is None:
+            raise DataError(f"{self.path}: not one good sample to write; nothing was written")
+        if self._chunks:
+            self._chunks.finish()
+        for name, values in self._index.items():
+            if values:
+                self._extend(name, values)
+        write_skipped(self._file, self.skipped)
+        write_positions(self._file, self.positions)
+        self._file.flush()

@@ -1,0 +1,174 @@
+"""Writing a file that is whole or not there, by a writer that may be stopped or killed and go on later.
+
+What every such writer does around its samples: the unfinished file, the journal, and which of them stays when it ends
+early. What a sample is and where it goes is its subclass's.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from dpcli.config_diff import differences
+from dpcli.errors import DpcError, Stopped, UsageError
+from dpcli.store.file import AtomicFile, write_root
+from dpcli.store.journal import Journal, Placed, data_suffix, journal_path, second_path
+
+
+class ResumableWriter(ABC):
+    """Context manager that writes `path` through a file beside it renamed when whole.
+
+    Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
+    written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
+    the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
+    is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists, or what another provenance kept for
+    it, and `force` is off.
+
+    A subclass calls `_open` at the end of its constructor and `_record` for each sample that is written, and says in
+    `_complete` what is left to write and in `_write_again` how a sample comes back from the journal.
+    """
+
+    kind = ""
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        class_names: Sequence[str],
+        length_unit: str,
+        source: str,
+        seed: int,
+        provenance: dict | Sequence[dict] | None,
+        force: bool,
+        resume: bool,
+    ) -> None:
+        if Path(path).exists() and not force:
+            raise UsageError(f"{path}: exists already; --force replaces it")
+        self.path, self.resume, self.keep = Path(path), resume, False
+        self.class_names, self._root = list(class_names), {"length_unit": length_unit, "source": source, "seed": seed}
+        self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
+        self.written_names: list[str] = []
+        self._journal: Journal | None = None
+
+    def _about(self) -> dict[str, Any]:
+        """What decides whether a journal is of this very work: not the words of the command, which may be spelled otherwise."""
+        work = [{key: value for key, value in entry.items() if key != "command"} for entry in self.provenance]
+        return {"kind": self.kind, "provenance": work}
+
+    def _create(self) -> None:  # noqa: B027 (not every subclass has any)
+        """The data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
+
+    @abstractmethod
+    def _write_again(self, given: list[Any]) -> str:
+        """Write a sample as `_record` was told of it; its name."""
+
+    @abstractmethod
+    def _complete(self) -> None:
+        """Write into the HDF5 file what is still missing."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Samples written so far."""
+
+    def _open(self, force: bool) -> None:
+        before = None
+        if (
+            self.resume and self.path.parent.is_dir() and not self.path.is_dir()
+        ):  # AtomicFile explains what is wrong otherwise
+            before = Journal(journal_path(self.path), self._about())
+        try:
+            if before and before.other and not force:
+                raise self._kept_of(before.other, before.about)
+            self._atomic = AtomicFile(self.path, suffix=data_suffix(before.data_name) if before else ".part")
+            self._file = self._atomic.file
+            self._create()
+            if before:
+                self._continue(before, force)
+        except BaseException as error:
+            self._give_up(before)
+            self._leave(type(error), error, None)
+            raise
+
+    def _kept_of(self, other: dict[str, Any], mine: dict[str, Any]) -> UsageError:
+        """What was kept is of other work; it stays."""
+        old, new = ({**about, **(about.get("provenance") or [{}])[-1], "provenance": None} for about in (other, mine))
+        some = [textwrap.shorten(one, 100, placeholder=" ...") for one in differences(old, new)[:3]]
+        said = "; ".join(some) or "an earlier step of its files differs"
+        return UsageError(
+            f"{self.path}: what a stopped run kept for it is of other work ({said}); run that command again to go on with it,"
+            " write to another file, or --force to start over"
+        )
+
+    def _continue(self, before: Journal, force: bool) -> None:
+        """Write what an earlier run had written, if it was the same work."""
+        if force or not before.data_name:
+            self._journal = before
+            before.begin(self._atomic.part, self._atomic.handle)
+            before.remove_others(self._atomic.part.name)
+            return
+        self._journal = Journal(second_path(before.path), self._about())
+        self._journal.begin(self._atomic.part, self._atomic.handle)
+        for given in before.samples():
+            self.written_names.append(self._write_again(given))
+        self._journal.replace(before)
+
+    def _give_up(self, before: Journal | None) -> None:
+        """Opening failed: nothing of the earlier run may be lost."""
+        if self._journal not in (None, before):
+            self._journal.path.unlink(missing_ok=True)
+            self._journal.close()
+        self._journal = None
+        if before and before.was_there:
+            before.keep()
+        elif before:
+            before.discard()
+
+    def _record(self, given: list[Any], placed: Placed | None = None) -> None:
+        """From here on the sample counts as written. given, placed: as `Journal.append`."""
+        if self._journal:
+            self._journal.append(given, placed)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self._finish()
+        else:
+            self._leave(kind, error, trace)
+
+    def _leave(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing stays but, after a stop, the journal."""
+        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
+        kept = bool(self._journal and stopped and len(self))
+        if hasattr(self, "_atomic"):
+            try:
+                self._atomic.failed(kind, error, trace, keep=kept)
+            finally:
+                self._leave_journal(kept)
+
+    def _leave_journal(self, kept: bool) -> None:
+        if self._journal and kept:
+            self._journal.keep()
+        elif self._journal:
+            self._journal.discard()
+
+    def _finish(self) -> None:
+        try:
+            self._complete()
+            # last, since a stream knows only at its end how many frames its provenance has to name
+            write_root(self._file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
+        except BaseException as error:
+            self._leave(type(error), error, None)
+            raise
+        try:
+            self._atomic.commit()
+        except DpcError:  # the HDF5 file is gone, and with it what the journal points to
+            self._leave_journal(kept=False)
+            raise
+        self._leave_journal(kept=False)

@@ -1,0 +1,518 @@
+"""`dpc evaluate report`: one page that needs nothing, says nothing false, and lets nothing from a file become markup."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from dpcli.cli.evaluate.report import register
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
+from dpcli.evaluate.report.blocks import interval_text, sort_key, table, text_of
+from dpcli.evaluate.report.clouds import Cloud, _renamed, packed
+from dpcli.evaluate.report.text import latex
+from dpcli.evaluate.report.thesis import chosen_tables, thesis_tables
+from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
+from tests.support.browser import needs_browser, open_page
+
+_FLAGS = "--disable-gpu --virtual-time-budget=3000 --window-size=700,600 --enable-logging=stderr".split()
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
+NAMES = ["wave", f"b {EVIL}", "50% & #1_{x}"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("report")
+
+
+@pytest.fixture(scope="module")
+def scores(folder) -> Path:
+    path, noise = folder / "scores.h5", np.random.default_rng(0)
+    history = {"command": f"dpc prepare msraction3d RAW {EVIL}", "seed": 3}
+    with ScoresWriter(path, class_names=NAMES, provenance=history, streams=("static", "dynamic")) as writer:
+        for index in range(30):
+            row = noise.normal(size=3) + 1.5 * np.eye(3)[index % 3]
+            writer.write(f"v{index}", row, label=index % 3, split="test", streams={"static": row, "dynamic": -row})
+    return path
+
+
+@pytest.fixture(scope="module")
+def truth(folder) -> Path:
+    """Two rigid bodies; `bad` is a sequence whose parts the prediction has all wrong."""
+    path = folder / "truth.h5"
+    with CloudsWriter(path, fields=("part", "pose"), length_unit="meter") as writer:
+        for name in ("bad", "good", "fine", "well"):
+            writer.write(_sequence(name))
+    return path
+
+
+@pytest.fixture(scope="module")
+def parts(folder, truth) -> Path:
+    path = folder / "parts.h5"
+    with PartsWriter(path, num_parts=2, length_unit="meter", provenance={"command": "dpc segment predict"}) as writer:
+        for name in ("bad", "good", "fine", "well"):
+            sequence = _sequence(name)
+            sequence.pose = None
+            if name == "bad":
+                sequence.part = np.tile([0, 1], len(sequence.part) // 2).astype(np.int16)
+            hard = np.eye(2, dtype=np.float32)[sequence.part]
+            writer.write(sequence, hard, np.array([[0, 1]]), np.tile(np.eye(4), (1, 2, 1, 1)), [np.zeros((40, 3))])
+    return path
+
+
+def _sequence(name: str) -> CloudSequence:
+    points = np.random.default_rng(len(name)).normal(size=(40, 3)).astype(np.float32)
+    part = np.repeat([0, 1], 20).astype(np.int16)
+    pose = np.tile(np.eye(4), (2, 2, 1, 1))
+    pose[1, 1, 0, 3] = 0.5  # body 1 moves by half a meter
+    moved = points + np.where(part == 1, 0.5, 0.0)[:, None].astype(np.float32) * np.array([1, 0, 0], np.float32)
+    return CloudSequence(name, np.concatenate([points, moved]), np.array([0, 40, 80]), part=np.tile(part, 2), pose=pose)
+
+
+@pytest.fixture(scope="module")
+def page(scores, parts, truth) -> str:
+    return report_html(arrange(collect([str(scores), str(parts)], truth), title=f"A {EVIL}"))
+
+
+class _Reader(HTMLParser):
+    """Tags with attributes, and the text of everything that isn't script or style."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict]] = []
+        self.words, self._inside = [], ""
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self._inside = tag
+
+    def handle_endtag(self, tag):
+        self._inside = ""
+
+    def handle_data(self, data):
+        if self._inside not in ("script", "style"):
+            self.words.append(data)
+
+
+def test_nothing_from_a_file_becomes_markup_and_nothing_is_fetched(page):
+    read = _Reader(page)
+    assert [tag for tag, _ in read.tags].count("script") == 1
+    assert not any(name.startswith("on") for _, attributes in read.tags for name in attributes)
+    assert all(own.get("src", "data:").startswith("data:") for _, own in read.tags)
+    assert not any(tag in ("link", "iframe", "object", "embed", "base", "form") for tag, _ in read.tags)
+    assert EVIL in "".join(read.words) and EVIL not in page
+    assert not re.search(r"https?://|@import|url\(|fetch\(|XMLHttpRequest", page)
+    assert "default-src 'none'" in page and len(page) < 2e6
+    # the check can fail: the same page with its escapes undone has another script
+    broken = _Reader(page.replace("&lt;", "<").replace("&gt;", ">"))
+    assert [tag for tag, _ in broken.tags].count("script") > 1
+
+
+def test_equal_inputs_give_equal_bytes(scores, parts, truth, page):
+    again = report_html(arrange(collect([str(scores), str(parts)], truth), title=f"A {EVIL}"))
+    assert again == page
+    assert not re.search(r"20\d\d-\d\d-\d\d", page)
+
+
+def test_the_page_has_the_numbers_of_the_command(scores, parts, truth, page):
+    from dpcli.evaluate.classification.protocol import evaluate_classification
+    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+
+    report, found = evaluate_classification(scores), evaluate_segmentation(parts, truth)
+    words = "".join(_Reader(page).words)
+    assert f"{100 * report.main.accuracy:.1f} %" in words and f"{report.main.correct}/{report.main.samples}" in words
+    assert f"{100 * found.main.ap:.1f} %" in words and f"{100 * found.main.miou:.1f} %" in words
+    cells = re.findall(r'<td class="[^"]*(?:right|wrong)" style="--s:([\d.]+)">(\d+)</td>', page)
+    counts = sorted(report.main.confusion[report.main.confusion > 0].tolist())
+    assert sorted(int(count) for _, count in cells) == counts
+    assert "dpc prepare msraction3d RAW" in words and "dpc segment predict" in words
+    assert "worst: bad, frame" in words and "End-point error of the frame pairs (meter)" in words
+
+
+def test_files_and_their_json_make_the_same_sections(scores, folder):
+    from dpcli.evaluate.bootstrap import Resampling
+    from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
+    from dpcli.store import ScoresReader
+
+    found = as_json(
+        evaluate_classification(scores, resampling=Resampling()), str(scores), ScoresReader(scores).provenance
+    )
+    (folder / "one.json").write_text(json.dumps(found))
+    direct, printed = (arrange(collect([str(own)])) for own in (scores, folder / "one.json"))
+    assert report_html(direct) == report_html(printed)
+    piped = collect(["-"], stdin=BytesIO(json.dumps(found).encode()))
+    assert piped.results[0].found == json.loads(json.dumps(found))
+
+
+def test_motion_beside_the_thesis_is_at_its_threshold():
+    """Ours at tau 0.05 must not stand beside the thesis's numbers at 0.01."""
+    found = {
+        "task": "motion",
+        "input": "m.h5",
+        "provenance": [{"command": "dpc prepare sapien X"}],
+        "metrics": {"epe3d": 0.02, "accs": 0.9, "thresholds": [{"tau": 0.01, "accs": 0.4}, {"tau": 0.05, "accs": 0.9}]},
+        "units": {"epe3d": "meter", "accs": "fraction"},
+    }
+    report = arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode())))
+    row = report.beside[0].rows[0]
+    assert report.beside[0].key == "table-B.3" and [own.text for own in row[3:5]] == ["2.00", "40.00"]
+    found["metrics"].pop("thresholds")
+    report = arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode())))
+    assert report.beside[0].rows[0][4].text == "-"
+
+
+def test_video_beside_the_thesis_is_of_the_reference_view():
+    """The thesis's PSNR is of the reference view; our mean over all views must not stand beside it."""
+    found = {
+        "task": "video",
+        "input": "v.h5",
+        "metrics": {"psnr": 20.0, "ssim": 0.9, "per_role": {"reference": {"psnr": 25.0}}},
+        "units": {"psnr": "dB", "ssim": "1"},
+    }
+    row = (
+        arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode()), pictures=False), beside=["table-5.1"])
+        .beside[0]
+        .rows[0]
+    )
+    assert [own.text for own in row[3:5]] == ["25.00", "-"] and "reference" in row[2].text
+
+
+def test_comparisons_and_runs_have_a_row_for_each_metric():
+    pair = {
+        "task": "compare",
+        "input": ["a.h5", "b.h5"],
+        "units": {"accuracy": "fraction"},
+        "provenance": [[{"command": "A"}], [{"command": "B"}]],
+        "metrics": {"accuracy": {"a": 0.9, "b": 0.8, "difference": 0.1, "p": 0.03, "interval": [0.02, 0.2], "ties": 7}},
+        "intervals": {"resamples": 2000, "metrics": {"accuracy": [0.02, 0.2]}},
+        "mcnemar": {"only_a": 4, "only_b": 1, "p": 0.4},
+        "most_changed": {"accuracy": [{"name": "v7", "a": 1.0, "b": 0.0}]},
+    }
+    runs = {
+        "task": "runs",
+        "input": ["a", "b"],
+        "runs": ["seed 0", "seed 1"],
+        "units": {"accuracy": "fraction"},
+        "metrics": {"accuracy": {"mean": 0.85, "sd": 0.05, "n": 2, "interval": [0.4, 1.0], "values": [0.8, 0.9]}},
+    }
+    report = arrange(collect(["-"], stdin=BytesIO("\n".join(map(json.dumps, (pair, runs))).encode())))
+    first, second = report.sections
+    row = [own.text for own in first.blocks[0].rows[0]]
+    assert row == ["accuracy", "90.0 %", "80.0 %", "10.0 %", "0.03", "2.0 to 20.0 %", "7"] and first.commands == [
+        "A",
+        "B",
+    ]
+    assert (first.headline.value.text, first.headline.interval) == ("10.0 %", "2.0 to 20.0 %")
+    assert [own.key for own in first.blocks[1:]] == ["McNemar's exact test", "samples that differ most, by accuracy"]
+    assert [[own.text for own in row] for row in second.blocks[1].rows] == [["seed 0", "80.0 %"], ["seed 1", "90.0 %"]]
+
+
+def test_every_row_of_the_thesis_is_whole():
+    tables = thesis_tables()
+    assert len({own.number for own in tables}) == len(tables) == 15
+    for own in tables:
+        assert all(len(row["values"]) == len(own.metrics) == len(own.units) for row in own.rows)
+        for row in own.numbers():
+            assert row.table and row.method and row.metric and row.unit and np.isfinite(row.value)
+    value = {(row.table, row.method, row.setting, row.metric): row.value for own in tables for row in own.numbers()}
+    assert value["3.4", "Kinet", "Point Cloud, 24 frames", "accuracy"] == 93.27
+    assert (
+        value["4.2", "thesis", "unsupervised", "ap"] == 63.8 and value["4.2", "thesis", "supervised", "epe3d"] == 3.86
+    )
+    assert value["5.1", "MotionStruct4D", "", "psnr"] == 30.68
+
+
+def test_the_rows_of_the_thesis_equal_its_text(shared_data):
+    """Every value of the file stands in the thesis, digit for digit."""
+    text = shared_data.parent / "thesis.txt"
+    if not text.is_file():
+        pytest.skip("the thesis's text is not here")
+    printed = {float(number) for number in re.findall(r"\d+\.?\d*", text.read_text("utf-8"))}
+    wrong = [row for own in thesis_tables() for row in own.numbers() if row.value not in printed]
+    assert not wrong
+
+
+def test_tables_are_chosen_by_data_or_by_name(scores):
+    found = {"task": "classification", "provenance": [{"command": "dpc prepare msraction3d RAW"}]}
+    named = {
+        "task": "classification",
+        "metrics": {
+            "per_class": [
+                {"name": name.upper()} for name in ("high arm wave", "side boxing", "tennis serve", "golf swing")
+            ]
+        },
+    }
+    other = {"task": "classification", "provenance": [{"command": "dpc prepare synthetic gestures"}]}
+    assert (
+        [own.id for own in chosen_tables([], [found])]
+        == ["table-3.4"]
+        == [own.id for own in chosen_tables([], [named])]
+    )
+    assert chosen_tables([], [other]) == [] == chosen_tables(["none"], [found])
+    assert [own.id for own in chosen_tables(["table-3.1"], [other])] == ["table-3.1"]
+    with pytest.raises(UsageError, match="table-9.9.*expected none or some of table-3.1"):
+        chosen_tables(["table-9.9"], [])
+    rows = arrange(collect([str(scores)])).beside[0].rows
+    assert {own[0].mark for own in rows[:3]} == {"ours"} and {own[0].mark for own in rows[3:]} == {"thesis"}
+    assert all(own[1].text.startswith("thesis") for own in rows[3:])
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("93.5 %", 93.5),
+        ("1,024", 1024),
+        ("-0.5 dB", -0.5),
+        ("89.6 to 96.0 %", 89.6),
+        ("-", None),
+        ("", None),
+        ("wave", None),
+        ("nan", None),
+        ("inf", None),
+        ("12\u00b0", 12),
+    ],
+)
+def test_sort_keys(text, value):
+    assert sort_key(text) == value
+
+
+def test_numbers_are_written_with_their_units():
+    assert text_of(0.9351, "fraction") == "93.5 %" and text_of(None) == "-" and text_of(30.675, "dB").startswith("30.6")
+    assert interval_text([0.896, 0.96], "fraction") == "89.6 to 96.0 %"
+    assert interval_text({"low": 1.0, "high": 2.5}) == "1 to 2.5" and interval_text([1]) == interval_text(None) == ""
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b"\x00\xff\x01", "neither text nor HDF5"),
+        (b"hello there\n", "line 1 is not JSON"),
+        (b'{"task": "a"}\n{"task": ', "line 2 is not JSON"),
+        (b"[1, 2]", "object 1: a int, no result"),
+        (b'{"metrics": {}}', "no text `task`"),
+        (b'{"task": "a", "metrics": 3}', "metrics is a int"),
+        (b'{"task": "a", "metrics": {"x": NaN}}', "not JSON"),
+        (b'{"task": "a", "provenance": ["x"]}', "provenance is not a list"),
+        (b'{"task": "classification", "metrics": {"confusion": [[1, 2]]}}', "confusion has shape (1, 2)"),
+        (b'{"task": "classification", "metrics": {"streams": {"a": 3}}}', "can't be shown"),
+    ],
+)
+def test_what_is_no_result_is_said(tmp_path, content, words):
+    path = tmp_path / "x.json"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=re.escape(words)) as caught:
+        arrange(collect([str(path)]))
+    assert str(path) in str(caught.value)
+
+
+def test_what_is_missing_is_said(parts, truth, tmp_path):
+    with pytest.raises(UsageError, match="no results to report"):
+        collect([])
+    with pytest.raises(UsageError, match="add --truth"):
+        collect([str(parts)])
+    with pytest.raises(DataError, match="no such file"):
+        collect([str(tmp_path / "none.json")])
+    with pytest.raises(DataError, match="holds 'clouds'"):
+        collect([str(truth)])
+    with pytest.raises(UsageError, match="only once"):
+        collect(["-", "-"])
+
+
+def test_unknown_tasks_are_shown_and_duplicates_named(tmp_path):
+    found = {
+        "task": "weather",
+        "input": "w",
+        "metrics": {"rain": 3.25, "days": [{"name": "Mon", "rain": 1.5}], "hours": [1, 2, 4]},
+        "units": {"rain": "mm"},
+        "intervals": {"rain": [3, 3.5]},
+    }
+    path = tmp_path / "w.jsonl"
+    path.write_text("\n".join(json.dumps(own) for own in (found, found, found | {"input": "v"})))
+    report = arrange(collect([str(path)]))
+    assert [own.title for own in report.sections] == ["w", "v"] and "shown once" in report.left_out[0]
+    words = " ".join(_Reader(report_html(report)).words)
+    assert "rain (mm)" in words and "3 to 3.5" in words and "Mon" in words and "hours by frame" in words
+
+
+_LEAVES = (
+    st.none()
+    | st.booleans()
+    | st.integers(-9, 99)
+    | st.text(max_size=6)
+    | st.floats(allow_nan=False, allow_infinity=False)
+)
+_METRICS = st.recursive(
+    _LEAVES,
+    lambda own: st.lists(own, max_size=4) | st.dictionaries(st.text(max_size=5), own, max_size=4),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(_METRICS, st.sampled_from(["classification", "segmentation", "video", "x"]))
+def test_any_object_is_shown_or_refused_with_a_sentence(metrics, task):
+    data = json.dumps({"task": task, "metrics": metrics}).encode()
+    try:
+        report = arrange(collect(["-"], stdin=BytesIO(data), pictures=False))
+    except DataError:
+        return
+    assert isinstance(metrics, dict) and len(report.sections) == 1
+    read = _Reader(report_html(report))
+    assert [tag for tag, _ in read.tags].count("script") == 1
+    if "nan" not in data.decode().lower():
+        assert not re.search(r"\bnan\b", " ".join(read.words).lower())
+    report_markdown(report), report_latex(report)
+
+
+@pytest.mark.parametrize(
+    "metrics",
+    [
+        {"": [{}]},
+        {"a": [{}, {}]},
+        {"": {"": {}}},
+        {"a": {"b": {}}},
+        {"a": [{"b": {}}]},
+        {"a": []},
+        {"m": {"mean": 1.0, "values": []}},
+        {"m": {"mean": {}}},
+        {"": {"mean": {}}},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("more", [{}, {"mcnemar": {}, "runs": [""]}, {"mcnemar": {"p": {}}, "runs": ["", ""]}], ids=str)
+def test_records_without_a_column_are_no_table(metrics, more):
+    data = json.dumps({"task": "x", "metrics": metrics, **more}).encode()
+    report = arrange(collect(["-"], stdin=BytesIO(data), pictures=False))
+    assert report_html(report) and report_markdown(report) and report_latex(report)
+
+
+def test_markdown_escapes_and_lines_up(scores):
+    text = report_markdown(arrange(collect([str(scores)]), title="a|b"))
+    assert text.startswith("# a\\|b\n") and "\\</script\\>" in text and "<script>" not in re.sub(r"`[^`]*`", "", text)
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.M):
+        lines = [re.sub(r"\\.", "", line) for line in block.splitlines()]
+        assert len({line.count("|") for line in lines}) == 1
+
+
+def test_latex_escapes():
+    assert latex("a_b 50% & #1 {x} $ ~ ^ \\") == (
+        r"a\_b 50\% \& \#1 \{x\} \$ \textasciitilde{} \textasciicircum{} \textbackslash{}"
+    )
+
+
+def test_latex_tables_are_whole(scores):
+    text = report_latex(arrange(collect([str(scores)])))
+    tables = re.findall(r"\\begin\{tabular\}\{([lr]+)\}(.*?)\\end\{tabular\}", text, re.S)
+    assert len(tables) >= 4 and text.count(r"\begin{table}") == text.count(r"\end{table}") == len(tables)
+    for columns, body in tables:
+        rows = [line for line in body.splitlines() if line.endswith(r"\\")]
+        assert all(len(re.findall(r"(?<!\\)&", row)) == len(columns) - 1 for row in rows)
+        assert body.count(r"\toprule") == body.count(r"\bottomrule") == 1
+    bare = re.sub(r"\\[%&#_${}]", "", re.sub(r"^%.*$", "", text, flags=re.M))
+    assert "%" not in bare and "#" not in bare and "_" not in bare
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
+def test_latex_compiles(scores, tmp_path):
+    text = report_latex(arrange(collect([str(scores)])))
+    document = (
+        "\\documentclass{article}\\usepackage{booktabs}\\usepackage[T1]{fontenc}\\begin{document}\n"
+        + text
+        + "\\end{document}"
+    )
+    (tmp_path / "t.tex").write_text(document, "utf-8")
+    done = subprocess.run(
+        ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"], cwd=tmp_path, capture_output=True
+    )
+    assert done.returncode == 0, done.stdout[-800:]
+
+
+def test_a_cloud_is_packed_up_to_rounding():
+    points = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
+    truth, part = np.array([-1, 0, 1, 2, 0, 1, 300]), np.array([0, -1, 1, 2, 0, 1, 2])
+    data = packed(Cloud(points, truth, part, np.array([np.nan, 0, 1, 2, 4, 0.5, 3]), "m"))
+    steps = np.frombuffer(data[:42], "<u2").reshape(3, 7).T / 65535
+    side = np.ptp(points, axis=0).max()
+    np.testing.assert_allclose((steps - steps[0]) * side, points - points[0], atol=side / 60000)
+    rest = np.frombuffer(data[42:], np.uint8).reshape(3, 7)
+    assert rest[0].tolist() == [0, 1, 2, 3, 1, 2, 255] and rest[1].tolist() == [1, 0, 2, 3, 1, 2, 3]
+    assert rest[2].tolist() == [0, 0, 64, 128, 255, 32, 191]
+
+
+def test_predicted_parts_take_the_names_of_the_true_ones():
+    truth, part = np.array([0, 0, 0, 1, 1, 5, -1]), np.array([7, 7, 3, 3, 3, 9, -1])
+    assert _renamed(truth, part).tolist() == [0, 0, 1, 1, 1, 5, -1]
+    assert _renamed(truth, np.array([2, 2, 2, 2, 2, 4, 6])).tolist() == [0, 0, 0, 0, 0, 5, 8]
+    assert _renamed(truth, np.full(7, -1)).tolist() == [-1] * 7
+
+
+def test_a_video_has_its_pictures_in_the_page(tmp_path):
+    ours, theirs = tmp_path / "ours.npy", tmp_path / "theirs.npy"
+    frames = np.random.default_rng(2).integers(0, 255, (3, 24, 24, 3), np.uint8)
+    np.save(theirs, frames)
+    np.save(ours, 255 - frames)
+    report = arrange(collect([f"{ours}={theirs}"]))
+    text = report_html(report)
+    assert re.search(r'<img alt="view [^"]*frames 0, 1, 2" [^>]*src="data:image/jpeg;base64,/9j/', text)
+    bare = arrange(collect([f"{ours}={theirs}"], pictures=False))
+    assert "<img" not in report_html(bare) and bare.summary.rows[0][3] == report.summary.rows[0][3]
+    found = collect([f"{ours}={theirs}"], pictures=False).results[0].found
+    ours.unlink()
+    gone = collect(["-"], stdin=BytesIO(json.dumps(found).encode()))
+    assert "not where the object says" in gone.results[0].notes[0]
+
+
+def test_the_command(scores, tmp_path):
+    app = typer.Typer()
+    register(app)
+    app.command("other")(lambda: None)  # two commands: the name is needed
+    run = lambda *args: CliRunner().invoke(app, ["report", *map(str, args)])  # noqa: E731
+    page = tmp_path / "r.html"
+    assert run(scores, "-o", page, "--title", "T").exit_code == 0 and "<title>T</title>" in page.read_text("utf-8")
+    assert isinstance(run(scores, "-o", page).exception, UsageError)  # exists
+    assert run(scores, "-o", page, "--force").exit_code == 0
+    assert run(scores, "--markdown").stdout.startswith("# Results")
+    assert run(scores, "-o", tmp_path / "r.tex").exit_code == 0 and r"\toprule" in (tmp_path / "r.tex").read_text(
+        "utf-8"
+    )
+    wrong = (
+        (scores,),
+        (scores, "--markdown", "--latex"),
+        (scores, "-o", tmp_path / "r.pdf"),
+        (scores, "--markdown", "--beside", "x"),
+    )
+    assert all(isinstance(run(*args).exception, UsageError) for args in wrong)
+    assert isinstance(run(scores, "-o", tmp_path / "no" / "r.html").exception, DataError)
+    assert os.listdir(tmp_path) and not list(tmp_path.glob(".*.part"))
+
+
+@needs_browser
+def test_a_browser_opens_and_sorts_the_page(page, tmp_path):
+    """Ascending and descending by a number, and the missing last both ways; no script of a file has run."""
+    made = table("S", ("name", "x"), [["a", "10 %"], ["b", "9 %"], ["c", "-"], ["d", "100 %"]], key="toy")
+    from dpcli.evaluate.report.page import _table
+
+    path = tmp_path / "page.html"
+    path.write_text(page.replace("<main>", "<main>" + _table(made)), "utf-8")
+    for direction, order in (("ascending", "badc"), ("descending", "dabc")):
+        html, said = open_page(f"{path.as_uri()}#sort=toy:1:{direction}", tmp_path, *_FLAGS)
+        assert 'data-state="ready"' in html and "CONSOLE" not in said
+        toy = re.search(r'data-key="toy">(.*?)</table>', html, re.S)[1]
+        assert "".join(re.findall(r'<th scope="row">(\w)</th>', toy)) == order
+        assert f'aria-sort="{direction}"' in toy and "<button" in toy
+        assert "<img" not in html

@@ -1,0 +1,499 @@
+"""`dpc evaluate video`: sources, views, protocols, roles, mismatches, output forms, scenes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from dpcli.cli.evaluate import app as evaluate
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
+from dpcli.evaluate.video.image_metrics import PSNR_CAP, psnr, ssim, ssim_reference
+from dpcli.evaluate.video.protocol import PROTOCOLS, parse_metrics
+from dpcli.evaluate.video.sources import open_source
+from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
+from dpcli.store.gaussians import write_scene
+from dpcli.store.views import ViewsHeader, ViewsWriter
+from tests.support.scenes import toy_scene
+
+ROLES = ("reference", "train", "test", "test")
+FRAMES, WIDTH, HEIGHT = 3, 32, 24
+
+
+def clip(seed: int = 0, noise: float = 0, views: int = 4, frames: int = FRAMES, width: int = WIDTH) -> np.ndarray:
+    """rgba u8 (V,T,H,W,4): a disc that walks; noise sigma grows with the view's number."""
+    y, x = np.mgrid[:HEIGHT, :width] + 0.5
+    made = np.empty((views, frames, HEIGHT, width, 4), np.uint8)
+    rng = np.random.default_rng(seed)
+    for v in range(views):
+        for t in range(frames):
+            color = 120 + 60 * np.sin(x[..., None] / 3 + y[..., None] / (2 + v) + np.arange(3))
+            color = color + rng.normal(0, noise * (1 + v), color.shape)
+            made[v, t, ..., :3] = np.clip(color, 0, 255)
+            made[v, t, ..., 3] = 255 * np.clip(9 - np.hypot(x - 12 - 2 * t, y - 11 - v), 0, 1)
+    return made
+
+
+def header(roles: tuple[str, ...] = ROLES, frames: int = FRAMES, width: int = WIDTH, turn: float = 0.0) -> ViewsHeader:
+    count = len(roles)
+    poses = np.stack([orbit_pose(0.4 * view + turn, 0.1) for view in range(count)])
+    lenses = np.tile(pinhole(DEFAULT_FOVY, width, HEIGHT), (count, 1, 1))
+    return ViewsHeader(
+        "disc", lenses, poses, np.arange(frames) / 10, list(roles), roles.index("reference"), (width, HEIGHT)
+    )
+
+
+def write(path: Path, rgba: np.ndarray, head: ViewsHeader | None = None, **fields: np.ndarray) -> Path:
+    with ViewsWriter(path, head or header(), **fields) as writer:
+        for v, t in np.ndindex(rgba.shape[:2]):
+            writer.add(v, t, rgba[v, t])
+    return path
+
+
+def write_folder(folder: Path, frames: np.ndarray, name: str = "{}.png") -> Path:
+    folder.mkdir(parents=True)
+    for t, frame in enumerate(frames):
+        Image.fromarray(frame).save(folder / name.format(t))
+    return folder
+
+
+def white(rgba: np.ndarray, background: float = 1.0) -> np.ndarray:
+    """Composite in float64, by hand."""
+    alpha = rgba[..., 3:] / 255
+    return alpha * rgba[..., :3] / 255 + (1 - alpha) * background
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    return write(tmp_path / "truth.h5", clip())
+
+
+@pytest.fixture
+def said(tmp_path: Path) -> Path:
+    return write(tmp_path / "said.h5", clip(1, noise=6))
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(evaluate.app, ["video", *(str(a) for a in arguments)])
+
+
+def numbers(report: VideoReport, name: str) -> list[float]:
+    return [getattr(view.metrics, name) for view in report.views]
+
+
+@pytest.mark.parametrize("background", ["white", "black"])
+def test_the_numbers_of_every_view_by_hand(said: Path, truth: Path, background: str) -> None:
+    report = evaluate_video(said, truth, background=background)
+    ours, theirs = (white(c, background == "white") for c in (clip(1, noise=6), clip()))
+    for v in range(4):
+        errors = ((ours[v] - theirs[v]) ** 2).mean((1, 2, 3))
+        assert numbers(report, "psnr")[v] == pytest.approx(np.mean(-10 * np.log10(errors)), abs=1e-4)
+        masks = clip()[v, ..., 3] >= 128
+        inside = [((ours[v, t] - theirs[v, t]) ** 2)[masks[t]].mean() for t in range(FRAMES)]
+        assert numbers(report, "psnr_foreground")[v] == pytest.approx(np.mean(-10 * np.log10(inside)), abs=1e-4)
+        expected = np.mean([ssim_reference(ours[v, t], theirs[v, t]) for t in range(FRAMES)])
+        assert numbers(report, "ssim")[v] == pytest.approx(expected, abs=5e-6)
+    assert numbers(report, "psnr") == sorted(numbers(report, "psnr"), reverse=True)
+
+
+def test_means_of_roles_and_of_all(said: Path, truth: Path) -> None:
+    found = json.loads(run(said, "--truth", truth, "--json").stdout)
+    views = found["metrics"]["per_view"]
+    assert [(view["view"], view["role"]) for view in views] == list(zip("0123", ROLES))
+    each = np.array([view["psnr"] for view in views])
+    assert found["metrics"]["psnr"] == pytest.approx(each.mean())
+    roles = found["metrics"]["per_role"]
+    assert {role: own["psnr"] for role, own in roles.items()} == pytest.approx(
+        {"reference": each[0], "test": each[2:].mean(), "train": each[1]}
+    )
+    assert found["denominators"] == {"views": 4, "frames": 12, "pixels": WIDTH * HEIGHT}
+    assert found["protocol"]["background"] == "white" and found["protocol"]["data_range"] == 1.0
+    assert found["units"]["psnr"] == "dB" and found["left_out"] == []
+
+
+def test_equal_videos_are_capped_and_counted(truth: Path) -> None:
+    result = run(truth, "--truth", truth)
+    assert "12 frames are equal and count as 100 dB" in result.stdout
+    report = evaluate_video(truth, truth)
+    assert set(numbers(report, "psnr")) == {PSNR_CAP} and set(numbers(report, "ssim")) == {1.0}
+    assert [view.metrics.worst for view in report.views] == [-1] * 4
+
+
+def test_thesis_rounds_and_takes_the_reference_only(said: Path, truth: Path) -> None:
+    report = evaluate_video(said, truth, protocol="thesis")
+    assert [(view.title, view.role) for view in report.views] == [("0", "reference")]
+    ours, theirs = (np.floor(white(c[0]) * 255 + 0.5) for c in (clip(1, noise=6), clip()))
+    each = [psnr(ours[t], theirs[t], data_range=255) for t in range(FRAMES)]
+    assert numbers(report, "psnr") == pytest.approx([np.mean(each)], abs=1e-3)
+
+
+def test_consistent4d_resizes_and_takes_the_range_of_each_frame(said: Path, truth: Path) -> None:
+    report = evaluate_video(said, truth, protocol="consistent4d", metrics=("psnr", "ssim"))
+    assert [view.role for view in report.views] == ["test", "test"]
+    pairs = []
+    for t in range(FRAMES):
+        eight = [np.floor(white(c[2, t]) * 255 + 0.5).astype(np.uint8) for c in (clip(1, noise=6), clip())]
+        pairs.append([np.asarray(Image.fromarray(picture).resize((512, 512))) for picture in eight])
+    by_hand = [psnr(a.astype(float), b.astype(float), data_range=float(np.ptp(b))) for a, b in pairs]
+    assert report.views[0].metrics.psnr == pytest.approx(np.mean(by_hand), abs=0.02)
+    ranges = [float(max(np.ptp(a), np.ptp(b))) for a, b in pairs]
+    similar = [ssim(a, b, data_range=r, border="reflect") for (a, b), r in zip(pairs, ranges)]
+    assert report.views[0].metrics.ssim == pytest.approx(np.mean(similar), abs=1e-4)
+    fixed = np.mean([psnr(a, b, data_range=255) for a, b in pairs])
+    assert fixed > report.views[0].metrics.psnr + 0.1  # the truth's own range is smaller
+
+
+def test_consistent4d_compares_sizes_that_differ_and_a_blank_truth_has_no_psnr(tmp_path: Path, truth: Path) -> None:
+    large = [np.asarray(Image.fromarray(frame).resize((64, 48))) for frame in clip()[0]]
+    flat, larger = write_folder(tmp_path / "flat", clip()[0]), write_folder(tmp_path / "large", np.stack(large))
+    with pytest.raises(DataError, match="is 64x48, but 32x24"):
+        evaluate_video(larger, flat)
+    assert evaluate_video(larger, flat, protocol="consistent4d").views[0].metrics.psnr > 25
+    blank = clip()
+    blank[..., 3] = 0
+    nothing = write(tmp_path / "blank.h5", blank)
+    found = json.loads(
+        run(truth, "--truth", nothing, "--protocol", "consistent4d", "--metrics", "psnr,ssim", "--json").stdout
+    )
+    assert found["metrics"]["psnr"] is None and 0 < found["metrics"]["ssim"] < 1
+
+
+def test_protocols_differ_where_they_say(said: Path, truth: Path) -> None:
+    found = {name: json.loads(run(said, "--truth", truth, "--protocol", name, "--json").stdout) for name in PROTOCOLS}
+    assert len({json.dumps(one["protocol"]) for one in found.values()}) == len(PROTOCOLS)
+    assert found["dpc"]["metrics"]["psnr"] == found["torchmetrics"]["metrics"]["psnr"]
+    assert found["dpc"]["metrics"]["ssim"] != found["torchmetrics"]["metrics"]["ssim"]
+    with pytest.raises(UsageError, match="--protocol svd: expected dpc, thesis, consistent4d, disco, torchmetrics"):
+        evaluate_video(said, truth, protocol="svd")
+    with pytest.raises(UsageError, match="--background red"):
+        evaluate_video(said, truth, background="red")
+
+
+@pytest.mark.parametrize("name", ["{}.png", "{:03d}_rgba.png", "frame_{:04d}.webp"])
+def test_a_folder_of_any_naming_is_the_same_video(tmp_path: Path, name: str) -> None:
+    one = write(tmp_path / "one.h5", clip(views=1, frames=12), header(("reference",), 12))
+    noisy = clip(1, noise=6, views=1, frames=12)
+    expected = evaluate_video(write(tmp_path / "noisy.h5", noisy, header(("reference",), 12)), one)
+    if name.endswith("webp"):
+        (tmp_path / "f").mkdir()
+        for t, frame in enumerate(noisy[0]):
+            Image.fromarray(frame).save(tmp_path / "f" / name.format(t), lossless=True, exact=True)
+    else:
+        write_folder(tmp_path / "f", noisy[0], name)
+    assert numbers(evaluate_video(tmp_path / "f", one), "psnr") == numbers(expected, "psnr")
+
+
+def test_folders_of_views_match_by_name(tmp_path: Path, truth: Path, said: Path) -> None:
+    noisy = clip(1, noise=6)
+    for folder, names in (
+        ("a", ("0", "1", "2", "3")),
+        ("b", ("reference", "train_0", "eval_0", "eval_1")),
+        ("c", ("view_00", "view_01", "view_02", "view_03")),
+    ):
+        for view, name in enumerate(names):
+            write_folder(tmp_path / folder / name, noisy[view])
+        found = evaluate_video(tmp_path / folder, truth)
+        assert numbers(found, "ssim") == numbers(evaluate_video(said, truth), "ssim"), folder
+    both = evaluate_video(tmp_path / "b", tmp_path / "b")  # folders on both sides
+    assert [view.role for view in both.views].count("reference") == 1 and len(both.views) == 4
+    tests = evaluate_video(tmp_path / "b", tmp_path / "b", protocol="consistent4d")
+    assert "reference" not in [view.title for view in tests.views]
+
+
+def test_a_lone_folder_is_the_reference(tmp_path: Path, truth: Path) -> None:
+    flat = write_folder(tmp_path / "flat", clip()[0])
+    with pytest.raises(DataError, match="flat: has no view '1', '2', '3' of .*truth.h5; .*--intersect"):
+        evaluate_video(flat, truth)
+    report = evaluate_video(flat, truth, intersect=True)
+    assert numbers(report, "psnr") == [PSNR_CAP] and report.left_out[0].names == ["1", "2", "3"]
+    assert len(evaluate_video(flat, truth, protocol="thesis").views) == 1  # the others aren't asked for
+
+
+def test_arrays_of_bytes_and_floats(tmp_path: Path, truth: Path) -> None:
+    noisy = clip(1, noise=6)
+    expected = numbers(evaluate_video(write(tmp_path / "noisy.h5", noisy), truth), "psnr")
+    np.save(tmp_path / "bytes.npy", noisy)
+    np.save(tmp_path / "floats.npy", (noisy / 255).astype(np.float32))
+    np.save(tmp_path / "opaque.npy", white(noisy).astype(np.float32))
+    for name in ("bytes", "floats", "opaque"):
+        assert numbers(evaluate_video(tmp_path / f"{name}.npy", truth), "psnr") == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_video_file_is_opaque(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    frames = np.floor(white(clip(views=1))[0] * 255 + 0.5).astype(np.uint8)
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 10, (WIDTH, HEIGHT))
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+    one = write(tmp_path / "one.h5", clip(views=1), header(("reference",)))
+    report = evaluate_video(tmp_path / "a.avi", one)
+    assert report.views[0].metrics.psnr > 38 and any("has no alpha" in note for note in report.notes)
+    turned = evaluate_video(one, tmp_path / "a.avi")
+    assert turned.names == ("psnr", "ssim")  # without alpha nobody knows the object
+    with pytest.raises(DataError, match="no alpha, so nobody knows"):
+        evaluate_video(one, tmp_path / "a.avi", metrics=("psnr_foreground",))
+
+
+def test_views_are_matched_by_camera(tmp_path: Path, truth: Path, said: Path) -> None:
+    other = write(tmp_path / "other.h5", clip(), header(turn=0.1))
+    with pytest.raises(DataError, match="has no view '0', '1', '2', '3' of"):
+        evaluate_video(other, truth)
+    head, order = header(), [2, 0]
+    head.intrinsics, head.world_to_camera = head.intrinsics[order], head.world_to_camera[order]
+    head.role, head.reference = ["test", "reference"], 1
+    some = write(tmp_path / "some.h5", clip(1, noise=6)[order], head)
+    report = evaluate_video(some, truth, intersect=True)
+    assert [view.title for view in report.views] == ["0", "2"]
+    clean = clip()[order]
+    again = evaluate_video(write(tmp_path / "clean.h5", clean, head), truth, intersect=True)
+    assert numbers(again, "psnr") == [PSNR_CAP, PSNR_CAP]  # the right pictures were put together
+    with pytest.raises(DataError, match="another camera"):
+        lone = [write(tmp_path / f"{turn}.h5", clip(views=1), header(("reference",), turn=turn)) for turn in (0.0, 0.3)]
+        evaluate_video(*lone)
+
+
+def test_the_first_difference_is_named(tmp_path: Path, truth: Path) -> None:
+    short = write(tmp_path / "short.h5", clip(frames=2), header(frames=2))
+    with pytest.raises(DataError, match="view '0' has 2 frames, 3 in .*the first without a partner is frame 2"):
+        evaluate_video(short, truth)
+    report = evaluate_video(short, truth, intersect=True)
+    assert [view.metrics.frames for view in report.views] == [2] * 4
+    assert [(entry.reason, entry.names) for entry in report.left_out][0] == (
+        "frames of view '0' that one side lacks",
+        ["2"],
+    )
+    for view in range(4):
+        write_folder(tmp_path / "f" / str(view), clip()[view])
+    Image.fromarray(clip()[1, 2, :20]).save(tmp_path / "f" / "1" / "2.png")
+    with pytest.raises(DataError, match="view '1', frame 2 is 32x20, but 32x24"):
+        evaluate_video(tmp_path / "f", truth)
+
+
+def test_colors_saved_in_0_to_1_are_noticed(tmp_path: Path, truth: Path) -> None:
+    dim = clip()
+    dim[..., :3] = np.round(dim[..., :3] / 255)
+    with pytest.raises(DataError, match="no value above 1; colors in 0..1 were saved"):
+        evaluate_video(write(tmp_path / "dim.h5", dim), truth)
+    np.save(tmp_path / "loud.npy", clip().astype(np.float32))
+    with pytest.raises(DataError, match="frame 0 has values up to 255; floats are taken as 0..1"):
+        evaluate_video(tmp_path / "loud.npy", truth)
+
+
+def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> None:
+    values = (clip(1, noise=6) / 255).astype(np.float32)
+    whole = tmp_path / "whole.npy"
+    np.save(whole, values)
+    values[2, 1, 3, 4:6] = np.nan
+    values[3, 0, 3, 4, 1] = np.inf
+    np.save(tmp_path / "nan.npy", values)
+    with pytest.raises(DataError, match=r"2 frames with NaN or infinite pixels, the first view 2 frame 1 \(2 pixels\)"):
+        evaluate_video(tmp_path / "nan.npy", truth)
+    result = run(tmp_path / "nan.npy", "--truth", truth, "--json", "--intersect")
+    found = json.loads(result.stdout)  # NaN would be refused
+    assert found["left_out"] == [
+        {
+            "reason": "frames in which the prediction has NaN or infinite pixels",
+            "count": 2,
+            "names": ["view 2 frame 1 (2 pixels)", "view 3 frame 0 (1 pixels)"],
+        }
+    ]
+    assert found["denominators"]["frames"] == 10
+    assert (
+        numbers(evaluate_video(tmp_path / "nan.npy", truth, intersect=True), "psnr")[:2]
+        == numbers(evaluate_video(whole, truth), "psnr")[:2]
+    )
+    np.save(tmp_path / "all.npy", np.full_like(values, np.nan))
+    with pytest.raises(DataError, match="every frame has NaN"):
+        evaluate_video(tmp_path / "all.npy", truth, intersect=True)
+    with pytest.raises(DataError, match="nan.npy: view '2', frame 1: 2 pixels are NaN"):
+        evaluate_video(whole, tmp_path / "nan.npy")
+
+
+def test_masks_without_an_object(tmp_path: Path, truth: Path) -> None:
+    some = clip()
+    some[0, 1, ..., 3] = 0
+    part = write(tmp_path / "part.h5", some)
+    result = run(truth, "--truth", part)
+    assert "1 frames without an object in the truth" in result.stdout
+    assert "Predicted pictures without an object (alpha 0 everywhere): 1." in run(part, "--truth", truth).stdout
+    some[..., 3] = 0
+    none = write(tmp_path / "none.h5", some)
+    with pytest.raises(DataError, match="no frame has an object"):
+        evaluate_video(truth, none)
+    assert len(evaluate_video(truth, none, metrics=("psnr", "ssim")).views) == 4
+
+
+def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> None:
+    with pytest.raises(DataError, match="32x24; ms_ssim needs at least 176 pixels"):
+        evaluate_video(said, truth, metrics=("ms_ssim",))
+    assert parse_metrics("ssim, psnr") == ("psnr", "ssim") and parse_metrics(None) is None
+    for wrong in ("psnr,lpip", "", ","):
+        with pytest.raises(
+            UsageError, match="expected some of psnr,psnr_foreground,ssim,ms_ssim,lpips,.*,parts,tracks"
+        ):
+            parse_metrics(wrong)
+    with pytest.raises(DataError, match="--metrics parts needs a gaussians file and a views file, not a views file"):
+        evaluate_video(said, truth, metrics=("parts",))
+
+
+def test_two_videos_are_compared_view_by_view(said: Path, truth: Path, tmp_path: Path) -> None:
+    worse = write(tmp_path / "worse.h5", clip(2, noise=12))
+    command = ["compare", str(said), str(worse), "--truth", str(truth), "--metrics", "psnr,ssim", "--json"]
+    found = json.loads(CliRunner().invoke(evaluate.app, command).stdout)
+    expected = [np.mean(numbers(evaluate_video(path, truth), "psnr")) for path in (said, worse)]
+    change = found["metrics"]["psnr"]
+    assert [change["a"], change["b"]] == pytest.approx(expected) and change["a_better"] == 4
+    with pytest.raises(UsageError, match="a video holds no truth"):
+        raise CliRunner().invoke(evaluate.app, ["compare", str(said), str(worse)]).exception
+    runs = CliRunner().invoke(evaluate.app, ["runs", str(said), str(worse), "--truth", str(truth), "--json"])
+    assert json.loads(runs.stdout)["metrics"]["psnr"]["mean"] == pytest.approx(np.mean(expected))
+
+
+def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "0.png").write_bytes(b"\x89PNG\r\n\x1a\nrest")
+    (tmp_path / "bad.mp4").write_bytes(b"not a film")
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
+    np.save(tmp_path / "ints.npy", np.zeros((2, 8, 8, 3), np.int32))
+    for name, what in (
+        ("empty", "no images"),
+        ("bad", "not a readable image"),
+        ("bad.mp4", "not a readable video"),
+        ("bad.npy", "not a readable .npy"),
+        ("ints.npy", "int32"),
+        ("absent.h5", "no such file"),
+    ):
+        with pytest.raises(DataError, match=what):
+            open_source(tmp_path / name)
+    scene = tmp_path / "scene.h5"
+    write_scene(scene, toy_scene())
+    with pytest.raises(DataError, match="can't be the truth"):
+        evaluate_video(truth, scene)
+    flat = write_folder(tmp_path / "flat", clip()[0])
+    with pytest.raises(DataError, match="a folder of images has no cameras to render"):
+        evaluate_video(scene, flat)
+
+
+def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path, tmp_path: Path) -> None:
+    strip = tmp_path / "strip.png"
+    result = run(said, "--truth", truth, "--markdown", "--picture", strip)
+    assert result.exit_code == 0
+    rows = [line for line in result.stdout.splitlines() if line.startswith("|")]
+    assert any(row.startswith("| mean of 2 | test | 6 |") for row in rows)
+    intervals = [row for row in rows if row.startswith("| PSNR (dB) |")]
+    low, high = (float(end) for end in intervals[0].split("|")[3].split(" - "))
+    each = numbers(evaluate_video(said, truth), "psnr")
+    assert min(each) <= low < np.mean(each) < high <= max(each)  # four views, resampled
+    assert "over white" in result.stdout and "data range 1.0" in result.stdout
+    with Image.open(strip) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    first = pixels[18 : 18 + 24, 4 : 4 + 32]  # truth of view 0, frame 0: pictures smaller than a cell keep their size
+    assert np.abs(first / 255 - white(clip()[0, 0]))[10:, 10:].max() < 0.01  # but for the frame's number
+    assert isinstance(run(said, "--truth", truth, "--picture", tmp_path / "no" / "x.png").exception, DataError)
+    assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)
+
+
+def test_a_pipe_is_read(dpc, said: Path, truth: Path) -> None:
+    piped = dpc("evaluate", "video", "-", "--truth", truth, "--json", stdin=said.read_bytes())
+    assert piped.returncode == 0, piped.stderr.decode()
+    assert json.loads(piped.stdout)["metrics"] == json.loads(run(said, "--truth", truth, "--json").stdout)["metrics"]
+    wrong = dpc("evaluate", "video", said, "--truth", truth, "--protocol", "svd")
+    assert wrong.returncode == 2 and wrong.stdout == b"" and b"--protocol svd" in wrong.stderr
+
+
+def scene_views(folder: Path, size: int = 64) -> tuple[Path, Path]:
+    """A scene file, and the views file it renders to, with true tracks and parts on its Gaussians."""
+    import torch
+
+    from dpcli.ops.splatting.rasterization import rasterization
+
+    scene = toy_scene(size=size)
+    write_scene(folder / "scene.h5", scene)
+    cameras = scene.camera_world_to_camera, scene.camera_intrinsics
+    head = ViewsHeader("toy", cameras[1], cameras[0], scene.time, ["reference", "test"], 0, (size, size))
+    with ViewsWriter(folder / "views.h5", head, track=scene.frame_mean, part=scene.part) as writer:
+        for v, t in np.ndindex(2, scene.num_frames):
+            given = (
+                scene.frame_mean[t],
+                scene.frame_quaternion[t],
+                scene.scale,
+                scene.opacity,
+                scene.sh,
+                cameras[0][v : v + 1],
+                cameras[1][v : v + 1],
+            )
+            tensors = [torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in given]
+            color, alpha, _ = rasterization(*tensors, size, size, sh_degree=scene.sh_degree)
+            straight = torch.cat([color / alpha.clamp_min(1e-6), alpha], -1)[0].clamp(0, 1)
+            writer.add(v, t, (straight * 255 + 0.5).to(torch.uint8).numpy())
+    return folder / "scene.h5", folder / "views.h5"
+
+
+def test_parts_and_tracks_need_no_pictures(tmp_path: Path) -> None:
+    scene, path = toy_scene(size=24), tmp_path / "scene.h5"
+    write_scene(path, scene)
+    head = ViewsHeader(
+        "toy",
+        scene.camera_intrinsics,
+        scene.camera_world_to_camera,
+        scene.time,
+        ["reference", "test"],
+        0,
+        (24, 24),
+        "m",
+    )
+    views = write(
+        tmp_path / "v.h5", np.zeros((2, 5, 24, 24, 4), np.uint8), head, track=scene.frame_mean, part=scene.part
+    )
+    found = json.loads(run(path, "--truth", views, "--metrics", "tracks,parts", "--json").stdout)
+    assert found["metrics"]["parts"]["adjusted_rand_index"] > 0.97 and "psnr" not in found["metrics"]
+    assert found["metrics"]["tracks"]["epe"] < 1e-5 < 0.05 < found["metrics"]["tracks"]["epe_no_motion"]
+    assert found["units"]["epe"] == "m" and found["denominators"]["tracks"] == {"points": 300, "frames": 4}
+    text = run(path, "--truth", views, "--metrics", "parts,tracks").stdout
+    assert "k-means on positions" in text and "no motion" in text and "EPE (m)" in text and "PSNR" not in text
+
+
+def test_a_scene_is_rendered_at_the_truths_cameras_and_times(tmp_path: Path) -> None:
+    scene, views = scene_views(tmp_path)
+    found = json.loads(run(scene, "--truth", views, "--json").stdout)
+    assert all(view["psnr"] > 45 and view["ssim"] > 0.99 for view in found["metrics"]["per_view"])  # 8-bit rounding
+    assert found["metrics"]["parts"]["adjusted_rand_index"] > 0.97 and found["metrics"]["tracks"]["epe"] < 1e-5
+
+
+def test_a_scene_that_stands_still_or_belongs_to_another_clip(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    scene, views = scene_views(tmp_path)
+    toy = toy_scene()
+    still = replace(toy, frame_mean=np.tile(toy.frame_mean[:1], (5, 1, 1)))
+    write_scene(tmp_path / "still.h5", still)
+    right, wrong = (evaluate_video(path, views, metrics=("psnr",)) for path in (scene, tmp_path / "still.h5"))
+    assert wrong.mean()["psnr"] < right.mean()["psnr"] - 15 and wrong.views[0].metrics.worst == 4
+    write_scene(tmp_path / "long.h5", replace(toy, time=toy.time * 0.5))
+    with pytest.raises(DataError, match="holds 0 to 0.5 s, but .* has frames from 0 to 1 s"):
+        evaluate_video(tmp_path / "long.h5", views)
+    bare = write(tmp_path / "bare.h5", clip(views=1), header(("reference",)))
+    with pytest.raises(DataError, match="bare.h5: no surface parts in it"):
+        evaluate_video(scene, bare, metrics=("parts",))
+
+
+def test_real_frames_against_themselves_made_worse(shared_data: Path, tmp_path: Path) -> None:
+    folder = shared_data / "video" / "consistent4d" / "roaring_t-rex"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    images = sorted(folder.rglob("*.png"))[:2]
+    frames = [np.asarray(Image.open(path).convert("RGBA")) for path in images]
+    write_folder(tmp_path / "truth", np.stack(frames))
+    write_folder(tmp_path / "said", np.stack([np.roll(frame, 1, axis=1) for frame in frames]))
+    report = evaluate_video(tmp_path / "said", tmp_path / "truth", protocol="consistent4d")
+    assert (
+        20 < report.views[0].metrics.psnr < 45
+        and report.views[0].metrics.psnr_foreground < report.views[0].metrics.psnr
+    )

@@ -1,0 +1,177 @@
+"""Every option of the commands below with odd values: none may end as a bug. `make fuzz`, or
+
+    python -m tests.fuzz.fuzz_options FOLDER [--only WORD]
+
+makes small data in FOLDER, then runs each command again and again in processes of their own, with 14 GB and a minute at
+most. Prints what ended by a trace, a signal or the sentence that asks for --debug, and exits with 1 if anything did. A
+command that runs into its minute did what it was asked for (10^11 steps).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import typer
+
+from dpcli.cli import app as cli
+from tests.generate4d.test_fit import toy_views
+from tests.support.commands import exit_code
+
+SECONDS, MEMORY, FILE = 60, 14 << 30, 300 << 20
+ODD = {
+    "int": ("-1", "0", "1", "99999999999"),
+    "float": ("nan", "inf", "-1", "0", "1e300"),
+    "": ("", "foo", "nan", "-1", "0", ","),
+}
+LEFT_OUT = ("--help", "--output", "--force", "--json")
+DATA = """
+prepare synthetic gestures -o gestures.h5 --videos-per-class 2 --subjects 2 --frames 18 --points 200
+prepare synthetic articulated -o objects.h5 --objects 2 --sequences-per-object 1
+classify train gestures.h5 -o model --preset tiny --epochs 1 --epochs-dynamic 1
+classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
+segment predict objects.h5 -o parts.h5 --flow nearest --split all
+generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --dense-steps 1 --sparse-steps 1
+"""
+COMMANDS = """
+info gestures.h5
+prepare synthetic gestures -o out/g.h5 --videos-per-class 1 --subjects 2 --frames 4 --size 40 --jobs 1
+prepare synthetic articulated -o out/a.h5 --objects 1 --sequences-per-object 1 --jobs 1
+prepare synthetic animal -o out/an.h5 --size 32 --frames 3 --train-azimuths 90 --azimuths 45
+prepare depth depth.npy -o out/d.h5 --fov 60 --jobs 1
+prepare clouds clouds -o out/c.h5 --jobs 1
+prepare split gestures.h5 -o out/s.h5
+prepare merge gestures.h5 -o out/m.h5
+classify train gestures.h5 -o out/model --preset tiny --epochs 1 --epochs-dynamic 1
+classify predict gestures.h5 --model model -o out/p.h5 --clips-per-video 1
+classify fuse scores.h5 -o out/f.h5
+classify profile --preset tiny
+classify explain pac gestures.h5 --model model -o out/pac.h5
+classify explain tsne gestures.h5 --model model -o out/tsne.h5 --clips-per-video 1
+segment train objects.h5 -o out/parts --flow nearest --points 48 --batch 2 --epochs 1 --pairs-per-epoch 2
+segment predict objects.h5 -o out/parts.h5 --flow nearest
+segment flow objects.h5 -o out/flow --steps 1 --batch 1
+segment estimate-flow objects.h5 -o out/ef.h5 --flow nearest
+segment profile
+generate4d fit views.h5 -o out/scene.h5 --preset tiny --size 16 --dense-steps 1 --sparse-steps 1
+generate4d render scene.h5 -o out/r.png
+generate4d export scene.h5 --as ply -o out/ply
+generate4d view scene.h5 -o out/v.html
+evaluate classification scores.h5
+evaluate segmentation parts.h5 --truth objects.h5
+evaluate motion parts.h5 --truth objects.h5
+evaluate video scene.h5 --truth views.h5
+evaluate compare scores.h5 scores.h5
+evaluate runs scores.h5 scores.h5
+"""
+
+
+def ended(words: Sequence[str]) -> tuple[int, str]:
+    return forked(lambda: exit_code(*words))
+
+
+def forked(work: Callable[[], int]) -> tuple[int, str]:
+    """Exit code (a signal's number negative) and stderr of the work in a fork of this process, which starts no threads."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        nothing = os.open(os.devnull, os.O_RDWR)
+        for number, target in ((0, nothing), (1, nothing), (2, writing)):
+            os.dup2(target, number)
+        sys.stdout, sys.stderr = (open(number, "w", buffering=1, closefd=False) for number in (1, 2))
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (FILE, FILE))
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        signal.alarm(SECONDS)
+        code = 99
+        try:
+            code = work()
+        except BaseException:
+            traceback.print_exc()
+        os._exit(code)
+    os.close(writing)
+    with open(reading, "rb") as pipe:
+        said = pipe.read().decode(errors="replace")
+    status = os.waitpid(child, 0)[1]
+    return os.waitstatus_to_exitcode(status), said
+
+
+def options_of(words: Sequence[str]) -> list[Any]:
+    """Those with two dashes, of the command that the words begin with."""
+    command, depth = typer.main.get_command(cli.application()), 0
+    while getattr(command, "commands", None):
+        command, depth = command.commands[words[depth]], depth + 1
+    return [one for one in command.params if one.opts[-1].startswith("--")]
+
+
+def odd(words: Sequence[str]) -> Iterator[list[str]]:
+    """The command with each option in turn at each odd value."""
+    for one in options_of(words):
+        if one.opts[-1] in LEFT_OUT or getattr(one, "is_flag", False):
+            continue
+        kind = next(kind for kind in ODD if kind in str(one.type_descriptor.annotation))
+        name, width = one.opts[-1], max(one.nargs, 1)
+        rest = list(words)
+        while name in rest:
+            at = rest.index(name)
+            del rest[at : at + 1 + width]
+        for value in ODD[kind]:
+            yield [*rest, name, *[value] * width]
+
+
+def is_bug(code: int, said: str) -> bool:
+    return "a bug, or" in said or "Traceback" in said or (code < 0 and code != -signal.SIGALRM)
+
+
+def forced(line: str) -> list[str]:
+    words = line.split()
+    return [*words, "--force"] if any(one.opts[-1] == "--force" for one in options_of(words)) else words
+
+
+def make_data(folder: Path) -> None:
+    (folder / "out").mkdir(parents=True, exist_ok=True)
+    (folder / "clouds").mkdir(exist_ok=True)
+    os.chdir(folder)
+    rng = np.random.default_rng(0)
+    np.save("depth.npy", rng.integers(1000, 2000, (5, 24, 32)).astype(np.uint16))
+    for frame in range(3):
+        np.save(f"clouds/{frame}.npy", rng.random((50, 3), np.float32))
+    forked(lambda: bool(toy_views(Path("views.h5"), train=1)) - 1)
+    for line in DATA.strip().splitlines():
+        code, said = ended(forced(line))
+        assert code == 0, (line, said)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--only", default="", help="only commands that begin so")
+    asked = parser.parse_args()
+    make_data(asked.folder)
+    calls = bugs = 0
+    for line in COMMANDS.strip().splitlines():
+        if not line.startswith(asked.only):
+            continue
+        code, said = ended(forced(line))
+        assert code == 0, (line, said)
+        for words in odd(forced(line)):
+            code, said = ended(words)
+            calls += 1
+            if is_bug(code, said):
+                bugs += 1
+                print(f"{' '.join(words)}\n    {code}: {said.strip().splitlines()[-1]}", flush=True)
+        print(f"{calls} calls, {bugs} bugs after: {line}", flush=True)
+    return 1 if bugs else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,355 @@
+"""Pictures of a scene: camera paths, times, colors, trails, and the files they end in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+from dpcli.cli.generate4d.output import render
+from dpcli.draw.animation import output_kind, write_pictures
+from dpcli.draw.palette import PALETTE, part_colors
+from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, plan
+from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colors
+from dpcli.generate4d.out.render import Look, Renderer, render_views, sheet
+from dpcli.ops.cameras import orbit_of, orbit_pose
+from dpcli.store import ViewsHeader, ViewsReader
+from dpcli.store.gaussians import GaussianScene, write_scene
+from tests.support.scenes import toy_scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> GaussianScene:
+    return toy_scene(per_part=120, size=48)
+
+
+@pytest.fixture(scope="module")
+def renderer(scene) -> Renderer:
+    return Renderer(scene)
+
+
+# --- where the camera is, what time it is
+
+
+def test_the_reference_path_is_the_input_frame_by_frame(scene):
+    shots = plan(scene, "reference")
+    assert [shot.time for shot in shots] == pytest.approx(scene.time[:5].tolist(), abs=1e-6)
+    assert all((shot.world_to_camera == scene.camera_world_to_camera[0]).all() for shot in shots)
+    assert (shots[0].intrinsics == scene.camera_intrinsics[0]).all() and shots[0].size == (48, 48)
+
+
+def test_a_turntable_loops_in_space_and_time(scene):
+    shots = plan(scene, "turntable", Lens(elevation=0.2))
+    azimuths = np.unwrap([orbit_of(shot.world_to_camera)[0] for shot in shots])
+    steps = np.diff(azimuths)
+    np.testing.assert_allclose(steps, 2 * np.pi / len(shots), atol=1e-9)
+    assert orbit_of(shots[7].world_to_camera)[1:] == pytest.approx((0.2, 2.0))
+    assert default_rate(scene, "turntable") == 24 and clip_rate(scene) == 4
+    loop = scene.num_frames / clip_rate(scene)  # 1.25 s: three times in about four seconds
+    assert len(shots) == round(3 * loop * 24)
+    np.testing.assert_allclose(instants(scene, 31, 24)[-1], scene.time[0], atol=1e-6)  # begins again after 1.25 s
+
+
+@pytest.mark.parametrize(("rate", "shown"), [(1, 1), (60, 60), (25, 25), (240, 60), (1e5, 60), (0.25, 1), (1e-4, 1)])
+def test_a_slow_or_fast_clip_shows_every_frame(rate, shown):
+    """Once around, at the rate `shown`; only below 1 and above 60 that is not real time."""
+    clip = toy_scene(per_part=5, frames=8)
+    clip = replace(clip, time=3 + np.arange(8) / rate)
+    assert clip_rate(clip) == pytest.approx(shown)
+    assert [clip.time.searchsorted(shot.time, "right") - 1 for shot in plan(clip, "reference")] == list(range(8))
+    np.testing.assert_allclose([shot.time for shot in plan(clip, "fixed")], clip.time, atol=1e-6 / rate)
+    step = round(default_rate(clip, "turntable") / shown)  # pictures a frame
+    times = np.array([shot.time for shot in plan(clip, "turntable")])
+    assert len(times) % (8 * step) == 0  # whole loops
+    np.testing.assert_allclose(times[: 7 * step], 3 + np.arange(7 * step) / step / rate, atol=1e-6 / rate)
+    assert len(plan(clip, "fixed", fps=120)) == round(8 * 120 / shown)
+
+
+@pytest.mark.parametrize(("path", "azimuth", "elevation"), [("swing", 70, 0), ("orbit", 360, 40), ("fixed", 0, 0)])
+def test_paths_reach_as_far_as_they_should(scene, path, azimuth, elevation):
+    places = np.rad2deg([orbit_of(shot.world_to_camera)[:2] for shot in plan(scene, path, Lens(radius=3.0), frames=72)])
+    reach = np.ptp(np.unwrap(places[:, 0], period=360)), np.ptp(places[:, 1])
+    assert reach == pytest.approx((azimuth * (71 / 72 if path == "orbit" else 1), elevation), abs=0.5)
+
+
+def test_size_and_field_of_view(scene):
+    wide = replace(scene, size=(96, 48))
+    for lens, size in ((Lens(), (96, 48)), (Lens(size=192), (192, 96)), (Lens(size=192, fovy=1.0), (192, 96))):
+        shot = plan(wide, "fixed", lens, frames=1)[0]
+        assert shot.size == size
+        focal = 48 / math.tan(0.5) if lens.fovy else scene.camera_intrinsics[0, 1, 1] * size[1] / 48
+        assert shot.intrinsics[1, 1] == pytest.approx(focal)
+
+
+def test_a_still_instant_and_a_scene_of_one_frame(scene):
+    assert [shot.time for shot in plan(scene, "fixed", time=0.3)] == [0.3]
+    assert {shot.time for shot in plan(scene, "turntable", time=0.3)} == {0.3}
+    one = toy_scene(per_part=5, frames=1)
+    assert len(plan(one, "reference")) == 1 and len(plan(one, "turntable")) == 120
+
+
+def test_wrong_cameras_are_refused(scene):
+    for wrong, says in (
+        (lambda: Lens(radius=0), "--radius 0"),
+        (lambda: Lens(fovy=math.pi), "--fovy 180"),
+        (lambda: Lens(elevation=2), "--elevation 114"),
+        (lambda: Lens(size=4), "--size 4"),
+        (lambda: plan(scene, "spiral"), "--path spiral: expected one of turntable"),
+        (lambda: Look("shape"), "--color shape"),
+    ):
+        with pytest.raises(UsageError, match=says):
+            wrong()
+
+
+# --- what is drawn
+
+
+def _blue(picture: np.ndarray) -> np.ndarray:
+    """Center (x, y) of the blue part."""
+    rows, columns = np.nonzero(picture[..., 2].astype(int) - picture[..., 0] > 120)
+    return np.array([columns.mean(), rows.mean()]) + 0.5
+
+
+def test_things_are_where_the_camera_sees_them_at_every_time(scene, renderer):
+    for time in (0.0, 0.6, 1.0):
+        shot = plan(scene, "fixed", time=time)[0]
+        camera = scene.at(time)[0][scene.part == 1] @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
+        expected = (camera @ shot.intrinsics.T)[:, :2] / camera[:, 2:]
+        assert np.linalg.norm(_blue(renderer.picture(shot)) - expected.mean(0)) < 1.0
+
+
+def test_backgrounds_and_transparency_agree(scene, renderer):
+    shot = plan(scene, "fixed", time=0.5)[0]
+    clear = renderer.picture(shot, Look(background=None)).astype(float)
+    alpha = clear[..., 3:] / 255
+    for ground in ((255, 255, 255), (0, 0, 0), (10, 200, 30)):
+        solid = renderer.picture(shot, Look(background=ground))
+        assert (solid[0, 0] == ground).all()
+        np.testing.assert_allclose(solid, clear[..., :3] * alpha + np.array(ground) * (1 - alpha), atol=1.6)
+    assert clear[0, 0].tolist() == [0, 0, 0, 0] and clear[..., 3].max() > 250
+
+
+def test_part_rigid_and_depth_colors(scene, renderer):
+    shot = plan(scene, "fixed", time=0.0)[0]
+    middles = [tuple(np.array([24, 24]) + [0, side]) for side in (-8, 8)]
+    for part, place in enumerate(middles):
+        by_part = renderer.picture(shot, Look("part"))[place]
+        assert np.abs(by_part.astype(int) - PALETTE[part]).max() < 12
+    weightless = Renderer(replace(scene, rigid_weight=np.zeros_like(scene.rigid_weight)))
+    assert np.abs(weightless.picture(shot, Look("rigid"))[middles[0]].astype(int) - WEIGHTS[0]).max() < 12
+    aside = plan(scene, "fixed", Lens(azimuth=1.2), time=0.0)[0]  # from the blue box's side: blue is nearer
+    depth, color = renderer.picture(aside, Look("depth")).astype(int), renderer.picture(aside)
+    near = color[..., 2].astype(int) - color[..., 0] > 150
+    far = color[..., 0].astype(int) - color[..., 2] > 150
+    assert depth[near].sum(1).mean() > depth[far].sum(1).mean() + 60
+
+
+def test_trails_follow_control_points_and_start_where_they_were(scene, renderer):
+    shot = plan(scene, "fixed", time=1.0)[0]
+    plain, drawn = (renderer.picture(shot, Look(trajectories=on)) for on in (False, True))
+    changed = (plain != drawn).any(-1)
+    assert 10 < changed.sum() < 0.3 * changed.size
+    bare = Renderer(toy_scene(per_part=120, size=48, controls=0))  # then Gaussians draw them
+    assert (bare.picture(shot, Look(trajectories=True)) != plain).any()
+    assert renderer.picture(shot, Look(trajectories=True, background=None)).shape == (48, 48, 4)
+
+
+def test_color_tables():
+    assert part_colors(np.array([-1, 0, 14])).tolist() == [[128] * 3, PALETTE[0].tolist(), PALETTE[0].tolist()]
+    np.testing.assert_array_equal(weight_colors(np.linspace(0, 1, 9)), WEIGHTS)
+    assert weight_colors(np.array([-1.0, 2.0])).tolist() == [WEIGHTS[0].tolist(), WEIGHTS[-1].tolist()]
+    assert [parse_background(text) for text in ("white", "1,2,3", "none")] == [(255, 255, 255), (1, 2, 3), None]
+    for text in ("gray", "1,2", "1,2,256"):
+        with pytest.raises(UsageError, match="--background"):
+            parse_background(text)
+
+
+# --- where it ends
+
+
+def _moving(count: int = 6, shape: tuple[int, int] = (31, 40)) -> list[np.ndarray]:
+    pictures = [np.full((*shape, 3), 255, np.uint8) for _ in range(count)]
+    for number, picture in enumerate(pictures):
+        picture[8:24, 4 * number : 4 * number + 12] = [200, 30, 40]
+    return pictures
+
+
+def test_a_video_plays_back(tmp_path):
+    import cv2
+
+    write_pictures(tmp_path / "a.mp4", iter(_moving()), fps=12.5)
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(12.5)
+    frames = [picture[..., ::-1] for ok, picture in iter(video.read, (False, None)) if ok]
+    assert len(frames) == 6 and frames[0].shape == (32, 40, 3)  # an even height
+    for read, own in zip(frames, _moving()):
+        assert np.abs(read[:31].astype(int) - own).mean() < 10
+
+
+def test_a_video_without_the_encoder_package(tmp_path, monkeypatch, capsys):
+    import sys
+
+    import cv2
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    write_pictures(tmp_path / "a.mp4", iter(_moving()), fps=10)
+    assert "imageio-ffmpeg" in capsys.readouterr().err
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 6
+
+
+def test_animation_folder_and_picture(tmp_path):
+    from PIL import Image
+
+    write_pictures(tmp_path / "a.gif", iter(_moving()), fps=10)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.n_frames, image.info["duration"], image.info["loop"], image.size) == (6, 100, 0, (40, 31))
+    write_pictures(tmp_path / "all", iter(_moving()), fps=10)
+    assert [path.name for path in sorted((tmp_path / "all").iterdir())] == [f"{i:04d}.png" for i in range(6)]
+    write_pictures(tmp_path / "a.png", iter(_moving()), fps=10)
+    for path, number in ((tmp_path / "all" / "0003.png", 3), (tmp_path / "a.png", 0)):
+        np.testing.assert_array_equal(np.asarray(Image.open(path)), _moving()[number])
+
+
+def test_nothing_half_made_stays(tmp_path):
+    def breaking():
+        yield from _moving(2)
+        raise DataError("no more")
+
+    for name in ("a.mp4", "a.gif", "all"):
+        with pytest.raises(DataError, match="no more"):
+            write_pictures(tmp_path / name, breaking(), fps=10)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a.png").write_bytes(b"mine")
+    with pytest.raises(UsageError, match="--force"):
+        write_pictures(tmp_path / "a.png", iter(_moving()), fps=10)
+    assert (tmp_path / "a.png").read_bytes() == b"mine"
+    with pytest.raises(UsageError, match="ends in .mp4, .gif, .png"):
+        output_kind(Path("a.avi"))
+    write_pictures(tmp_path / "frames", iter(_moving()), fps=10)
+    write_pictures(tmp_path / "frames", iter(_moving()), fps=10, force=True)
+    (tmp_path / "frames" / "thesis.tex").write_bytes(b"mine")
+    with pytest.raises(UsageError, match="other things, too, such as thesis.tex"):
+        write_pictures(tmp_path / "frames", iter(_moving()), fps=10, force=True)
+    assert (tmp_path / "frames" / "thesis.tex").read_bytes() == b"mine"
+    with pytest.raises(DpcError, match="does not exist"):
+        write_pictures(tmp_path / "no" / "a.png", iter(_moving()), fps=10)
+
+
+def test_a_views_file_has_the_pictures_of_its_cameras(scene, renderer, tmp_path):
+    poses = np.stack([orbit_pose(0.0, 0.0), orbit_pose(1.0, 0.3)])
+    header = ViewsHeader(
+        "toy", scene.camera_intrinsics, poses, np.array([0.0, 0.4]), ["reference", "test"], 0, (48, 48)
+    )
+    render_views(renderer, header, tmp_path / "v.h5")
+    with ViewsReader(tmp_path / "v.h5") as reader:
+        assert (reader.num_views, reader.num_frames, reader.header.role) == (2, 2, ["reference", "test"])
+        shot = replace(
+            plan(scene, "fixed", time=0.4)[0], world_to_camera=poses[1], intrinsics=scene.camera_intrinsics[1]
+        )
+        np.testing.assert_array_equal(reader.rgba(1, 1), renderer.picture(shot, Look(background=None)))
+
+
+def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path):
+    from typer.testing import CliRunner
+
+    app = typer.Typer()
+    app.command()(render)
+    write_scene(tmp_path / "s.h5", scene)
+    header = ViewsHeader(
+        "toy",
+        scene.camera_intrinsics,
+        scene.camera_world_to_camera,
+        np.array([1.0]),
+        ["reference", "test"],
+        0,
+        (48, 48),
+    )
+    render_views(renderer, header, tmp_path / "v.h5")
+    words = [str(tmp_path / "s.h5"), "--device", "cpu", "--cameras", str(tmp_path / "v.h5"), "-o"]
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "p.h5"), "--color", "part", "--trajectories"])
+    assert done.exit_code == 0, done.exception
+    shot = plan(scene, "reference", time=1.0)[0]
+    with ViewsReader(tmp_path / "p.h5") as reader:
+        np.testing.assert_array_equal(reader.rgba(0, 0), renderer.picture(shot, Look("part", None, True)))
+        assert reader.provenance[-1]["config"] == {"cameras": True, "color": "part", "trajectories": True}
+    for more, says in (
+        (["--background", "black"], "--background: not with --cameras"),
+        (["--path", "swing"], "--path: not with"),
+        (["--frames", "3", "--fps", "9"], "--frames, --fps: not with"),
+        (["--azimuth", "0", "--time", "0"], "--azimuth, --time:"),
+        (["--size", "32"], "--size: not with"),
+    ):
+        refused = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *more])
+        assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
+    assert not (tmp_path / "q.h5").exists()
+    sheet_words = [
+        "--picture",
+        str(tmp_path / "sheet.png"),
+        "--columns",
+        "1",
+        "--size",
+        "16",
+        "--time",
+        "0",
+        "--background",
+        "black",
+    ]
+    done = CliRunner().invoke(
+        app, [*words, str(tmp_path / "q.h5"), *sheet_words]
+    )  # what a sheet has use for is its own
+    assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
+
+
+def test_a_sheet_has_its_pictures_in_rows(renderer):
+    pictures = _moving(3)
+    page = sheet([("front", pictures), ("back", pictures[::-1])], ["0 s", "1 s", "2 s"])
+    np.testing.assert_array_equal(page[22 : 22 + 31, 96 : 96 + 40], pictures[0])
+    np.testing.assert_array_equal(page[22 + 35 : 22 + 66, 96 + 88 : 96 + 128], pictures[0])
+    with pytest.raises(DataError, match="at least one"):
+        sheet([], [])
+
+
+def test_the_command_draws_and_refuses(scene, tmp_path):
+    import cv2
+    from typer.testing import CliRunner
+
+    app = typer.Typer()
+    app.command()(render)
+    write_scene(tmp_path / "s.h5", scene)
+    words = [str(tmp_path / "s.h5"), "--device", "cpu", "-o"]
+    done = CliRunner().invoke(
+        app,
+        [
+            *words,
+            str(tmp_path / "a.mp4"),
+            "--path",
+            "swing",
+            "--size",
+            "32",
+            "--frames",
+            "7",
+            "--color",
+            "part",
+            "--trajectories",
+            "--picture",
+            str(tmp_path / "sheet.png"),
+            "--columns",
+            "3",
+        ],
+    )
+    assert done.exit_code == 0, done.exception
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 7
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (22 + 4 * (32 + 4), 96 + 3 * (32 + 4))
+    for more, says in (
+        ([str(tmp_path / "b.mp4"), "--background", "none"], "has no transparency"),
+        ([str(tmp_path / "b.mp4"), "--cameras", str(tmp_path / "s.h5")], "-o FILE.h5"),
+        ([str(tmp_path / "a.mp4")], "--force"),
+    ):
+        refused = CliRunner().invoke(app, [*words, *more])
+        assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
+    assert not (tmp_path / "b.mp4").exists()

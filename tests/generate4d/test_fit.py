@@ -1,0 +1,228 @@
+"""`dpc generate4d fit` as people run it: it learns, stops and continues, says what is wrong."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.errors import DataError, UsageError
+from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
+from dpcli.ops.splatting.rasterization import rasterization
+from dpcli.store.gaussians import read_scene
+from dpcli.store.views import ViewsHeader, ViewsWriter
+
+SIZE, FRAMES = 48, 6
+
+
+def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) -> Path:
+    """A red blob that stands and a blue one that swings around it, seen by a reference and further cameras."""
+    rng = np.random.default_rng(0)
+    cloud = rng.standard_normal((2, 60, 3)) * [[[0.12, 0.25, 0.12]], [[0.2, 0.08, 0.08]]]
+    azimuths = np.deg2rad([0, *(90 * (1 + i) for i in range(train)), *(45 + 90 * i for i in range(test))])
+    roles = ["reference", *["train"] * train, *["test"] * test]
+    poses = np.stack([orbit_pose(a, 0.0) for a in azimuths])
+    intrinsics = np.stack([pinhole(DEFAULT_FOVY, SIZE, SIZE)] * len(poses))
+    header = ViewsHeader("toy", intrinsics, poses, np.arange(FRAMES) / 8, roles, 0, (SIZE, SIZE))
+    color = torch.tensor([[0.9, 0.2, 0.1]] * 60 + [[0.1, 0.3, 0.9]] * 60)
+    with ViewsWriter(path, header) as writer:
+        for frame in range(FRAMES):
+            turn = np.pi / 2 * frame / FRAMES
+            rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+            blue = (cloud[1] + [0.4, 0, 0]) @ rotation.T
+            points = torch.from_numpy(np.concatenate([cloud[0], blue])).float()
+            with torch.no_grad():
+                rgb, alpha, _ = rasterization(
+                    points,
+                    torch.tensor([[1.0, 0, 0, 0]]).repeat(120, 1),
+                    torch.full((120, 3), 0.05),
+                    torch.full((120,), 0.9),
+                    color,
+                    torch.from_numpy(poses).float(),
+                    torch.from_numpy(intrinsics).float(),
+                    SIZE,
+                    SIZE,
+                )
+            rgba = torch.cat([rgb / alpha.clamp(min=1e-3), alpha], -1).clamp(0, 1) * (0 if empty else 255)
+            for view in range(len(poses)):
+                writer.add(view, frame, rgba[view].round().byte().numpy())
+    return path
+
+
+def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
+    views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
+    done = dpc(
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--dense-steps",
+        60,
+        "--sparse-steps",
+        60,
+        "--picture",
+        tmp_path / "sheet.png",
+    )
+    assert done.returncode == 0, done.stderr
+    result = read_scene(scene)
+    assert result.num_frames == FRAMES and result.num_parts == 3 and len(result.control_point) == 24
+    rows = json.loads((tmp_path / "scene.fit" / "log.json").read_text())
+    assert result.metrics["psnr_reference"] > 22 and result.metrics["psnr_reference"] > rows[0]["psnr"] + 2
+    assert {row["stage"] for row in rows} == {"dense", "sparse"}
+    assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
+    assert (tmp_path / "sheet.png").stat().st_size > 1000
+    assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
+    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--dense-steps", 60, "--sparse-steps", 60)
+    assert same.returncode == 0 and "finished" in same.stderr.decode()
+    again = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
+    assert again.returncode == 2 and "--force" in again.stderr.decode()
+
+
+def test_given_views_make_the_side_right(tmp_path, dpc_here, one_thread):
+    """The same steps with and without two more views: the picture from a camera that neither has seen is better with them."""
+    views = toy_views(tmp_path / "views.h5", train=3, test=2)
+    values = {}
+    for prior in ("none", "views"):
+        scene = tmp_path / f"with_{prior}.h5"
+        steps = ("--dense-steps", 50, "--sparse-steps", 30)
+        done = dpc_here("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", prior, *steps)
+        assert done.returncode == 0, done.stderr
+        scored = dpc_here("evaluate", "video", scene, "--truth", views, "--metrics", "psnr", "--json")
+        assert scored.returncode == 0, scored.stderr
+        values[prior] = json.loads(scored.stdout)["metrics"]["per_role"]["test"]["psnr"]
+    assert values["views"] > values["none"] + 1.0, values
+
+
+def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc):
+    views = toy_views(tmp_path / "views.h5")
+    options = ("--preset", "tiny", "--dense-steps", "60", "--sparse-steps", "60", "--device", "cpu")
+    whole = dpc("generate4d", "fit", views, "-o", tmp_path / "whole.h5", *options)
+    assert whole.returncode == 0, whole.stderr
+    command = [sys.executable, "-m", "dpcli", "generate4d", "fit", str(views), "-o", str(tmp_path / "cut.h5"), *options]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    log = tmp_path / "cut.fit" / "log.json"
+    deadline = time.monotonic() + 120
+    while not log.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 75 and "run the same command again" in process.stderr.read()
+    assert not (tmp_path / "cut.h5").exists() and (tmp_path / "cut.fit" / "state.pt").exists()
+    rest = subprocess.run(command, capture_output=True, text=True)
+    assert rest.returncode == 0, rest.stderr
+    one, two = read_scene(tmp_path / "whole.h5"), read_scene(tmp_path / "cut.h5")
+    np.testing.assert_array_equal(one.frame_mean, two.frame_mean)
+    np.testing.assert_array_equal(one.part_probability, two.part_probability)
+
+
+def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc_here):
+    views = toy_views(tmp_path / "views.h5")
+    steps = ("--preset", "tiny", "--dense-steps", 8, "--sparse-steps", 8)
+    scenes = {}
+    for name, switches in {"a": ("--no-rigid", "--no-sparse"), "c": ("--no-fusion", "--no-sparse"), "e": ()}.items():
+        done = dpc_here("generate4d", "fit", views, "-o", tmp_path / f"{name}.h5", *steps, *switches)
+        assert done.returncode == 0, done.stderr
+        scenes[name] = read_scene(tmp_path / f"{name}.h5")
+    assert len(scenes["a"].control_point) == 0 and len(scenes["e"].control_point) == 24
+    assert (scenes["a"].rigid_weight == 0).all() and (scenes["c"].rigid_weight == 1).all()
+    assert 0 < scenes["e"].rigid_weight.mean() < 1
+
+
+def test_what_is_wrong_is_said(tmp_path, dpc_here):
+    views, blank = toy_views(tmp_path / "views.h5"), toy_views(tmp_path / "blank.h5", empty=True)
+    for code, words, arguments in (
+        (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
+        (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
+        (2, "--prior magic", (views, "-o", tmp_path / "a.h5", "--prior", "magic")),
+        (2, "--preset slow", (views, "-o", tmp_path / "a.h5", "--preset", "slow")),
+        (2, "--run FOLDER", (views, "-o", "-", "--preset", "tiny")),
+        (3, "not an HDF5 file", (__file__, "-o", tmp_path / "a.h5")),
+    ):
+        done = dpc_here("generate4d", "fit", *arguments)
+        assert done.returncode == code and words in done.stderr.decode(), done.stderr
+        assert b"Traceback" not in done.stderr and not (tmp_path / "a.h5").exists()
+
+
+def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
+    from dpcli.generate4d.fit import COLUMNS
+    from dpcli.runtime.run_folder import RunFolder
+
+    with RunFolder(tmp_path / "scene.fit", {"config": 1}, columns=COLUMNS):
+        pass
+    with pytest.raises(UsageError, match="another configuration"):
+        RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
+    with pytest.raises(
+        UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*d absent, now 2, and 1 more\)"
+    ):
+        RunFolder(tmp_path / "scene.fit", {"config": {"a": 1, "b": {"c": None, "d": 2, "e": 3}}}, columns=COLUMNS)
+    RunFolder(tmp_path / "scene.fit", {"config": 1, "newer": None}, columns=COLUMNS)  # a setting that nobody sets
+    done = dpc_here(
+        "generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny"
+    )
+    assert done.returncode == 2 and b"another configuration" in done.stderr
+
+
+def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
+    import imageio.v3 as imageio
+
+    views, scene = toy_views(tmp_path / "views.h5", train=1), tmp_path / "scene.h5"
+    words = (
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--prior",
+        "views",
+        "--dense-steps",
+        20,
+        "--sparse-steps",
+        20,
+    )
+    assert dpc_here(*words, "--picture", tmp_path / "first.png").returncode == 0
+    before = scene.read_bytes()
+    done = dpc_here(*words, "--picture", tmp_path / "later.png")
+    assert done.returncode == 0 and b"finished" in done.stderr and scene.read_bytes() == before
+    first, later = (imageio.imread(tmp_path / name).astype(int) for name in ("first.png", "later.png"))
+    assert first.shape == (5 * SIZE, 5 * SIZE, 3) and np.abs(first - later).max() <= 1
+
+
+def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monkeypatch):
+    views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
+    words = (
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--size",
+        16,
+        "--dense-steps",
+        1,
+        "--sparse-steps",
+        1,
+    )
+    for name, said in (("no/x.png", b"the folder"), ("x.foo", b"unknown kind '.foo'"), ("", b"unknown kind ''")):
+        done = dpc_here(*words, "--picture", tmp_path / name if name else "")
+        assert done.returncode in (2, 3) and said in done.stderr and not (tmp_path / "scene.fit").exists()
+
+    def full(model, targets, path: Path) -> None:
+        if path.name == "sheet.png":  # not the previews while it learns
+            raise DataError(f"{path}: no space left")
+
+    monkeypatch.setattr("dpcli.generate4d.commands.fit.write_preview", full)
+    done = dpc_here(*words, "--picture", tmp_path / "sheet.png")
+    assert done.returncode == 3 and read_scene(scene).num_frames == FRAMES

@@ -1,0 +1,110 @@
+"""Nearest neighbors: the definition with its ties, scipy's tree, ragged batches, and every backend alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from dpcli.ops import knn, knn_reference
+from tests.support.ops_helpers import BACKENDS, KINDS, SEEDS, backend, brute_knn, cloud
+
+
+def assert_knn(function, query: np.ndarray, points: np.ndarray, k: int) -> None:
+    """The checker: `function` (called as dpcli.ops.knn) finds what the definition does."""
+    squared, index = function(torch.from_numpy(query)[None], torch.from_numpy(points)[None], k)
+    assert squared.dtype == torch.float32 and index.dtype == torch.int64
+    for m in range(len(query)):
+        assert (squared[0, m].tolist(), index[0, m].tolist()) == brute_knn(query[m], points, k)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@settings(deadline=None, max_examples=60)
+@given(seed=SEEDS, kind=KINDS, count=st.integers(1, 200), rows=st.integers(1, 12), k=st.integers(1, 70))
+def test_matches_the_definition(name: str, seed: int, kind: str, count: int, rows: int, k: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = cloud(rng, count, kind=kind)
+    query = np.concatenate([points[rng.integers(0, count, rows)], cloud(rng, rows, kind="grid")])
+    with backend(name):
+        assert_knn(knn, query, points, k)
+
+
+def test_checker_rejects_broken_twins() -> None:
+    rng = np.random.default_rng(0)
+    points, query = cloud(rng, 100, kind="grid"), cloud(rng, 5, kind="grid")
+
+    def last_of_ties(query: torch.Tensor, points: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+        squared, index = knn_reference(query, points.flip(1), k)
+        return squared, points.shape[1] - 1 - index
+
+    def rooted(query: torch.Tensor, points: torch.Tensor, k: int) -> tuple[torch.Tensor, torch.Tensor]:
+        squared, index = knn_reference(query, points, k)
+        return squared.sqrt(), index
+
+    assert_knn(knn_reference, query, points, 9)
+    for broken in (last_of_ties, rooted):
+        with pytest.raises(AssertionError):
+            assert_knn(broken, query, points, 9)
+
+
+@pytest.mark.parametrize("kind", ["random", "grid", "far"])
+@pytest.mark.parametrize(("count", "k"), [(33, 3), (3000, 16), (3000, 100)])
+def test_kernel_equals_reference_on_many_buckets(kind: str, count: int, k: int) -> None:
+    rng = np.random.default_rng(count + k)
+    points, query = (torch.from_numpy(cloud(rng, 2, n, kind=kind)) for n in (count, 300))
+    for ours, reference in zip(knn(query, points, k), knn_reference(query, points, k), strict=True):
+        assert torch.equal(ours, reference)
+
+
+def test_agrees_with_scipy() -> None:
+    rng = np.random.default_rng(3)
+    points, query = cloud(rng, 5000, kind="random"), cloud(rng, 200, kind="random")
+    squared, index = knn(torch.from_numpy(query)[None], torch.from_numpy(points)[None], 8)
+    distance, theirs = cKDTree(points).query(query, 8)
+    np.testing.assert_allclose(squared[0].sqrt().numpy(), distance, rtol=1e-5)
+    assert (index[0].numpy() == theirs).mean() > 0.999  # float64 may order near-ties otherwise
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_ragged_batch_never_finds_padding(name: str) -> None:
+    rng = np.random.default_rng(4)
+    points, query = (torch.from_numpy(cloud(rng, 3, n, kind="random")) for n in (80, 20))
+    lengths = torch.tensor([80, 2, 41])
+    with backend(name):
+        squared, index = knn(query, points, 5, lengths=lengths)
+        for b, length in enumerate(lengths.tolist()):
+            alone = knn(query[b : b + 1], points[b : b + 1, :length], 5)
+            assert torch.equal(squared[b], alone[0][0]) and torch.equal(index[b], alone[1][0])
+    assert torch.equal(index[1, :, 2:], index[1, :, :1].expand(-1, 3))  # two points: the nearest repeats
+
+
+def test_far_outliers_are_found_last() -> None:
+    """Squares that overflow to infinity still count as distances, larger than all others."""
+    points = cloud(np.random.default_rng(5), 70, kind="random")
+    points[[3, 60]] = 1e30
+    query = points[:4].copy()
+    with np.errstate(over="ignore"):
+        for name in BACKENDS:
+            with backend(name):
+                assert_knn(knn, query, points, 70)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize(
+    ("position", "value", "message"),
+    [
+        (0, torch.zeros(2, 3), "query must have shape"),
+        (0, torch.full((1, 2, 3), float("nan")), "query holds NaN"),
+        (0, torch.zeros(2, 2, 3), "one batch"),
+        (1, torch.zeros(1, 0, 3), "N >= 1"),
+        (2, 0, "k must"),
+    ],
+)
+def test_rejects(name: str, position: int, value: object, message: str) -> None:
+    arguments = [torch.zeros(1, 2, 3), torch.zeros(1, 5, 3), 3]
+    arguments[position] = value
+    with backend(name), pytest.raises(ValueError, match=message):
+        knn(*arguments)

@@ -1,0 +1,350 @@
+"""Depth videos of any container: all 16 bits arrive, geometry, background, labels, and bad inputs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.actions.depth import DepthVideos, background_depth
+from dpcli.prepare.decode.depth_files import read_depth_video, read_image, video_frames
+from dpcli.prepare.decode.pinhole_camera import Intrinsics
+from dpcli.prepare.labels import labels_of_folders, read_labels
+from dpcli.prepare.pipeline import convert_item
+from dpcli.prepare.thinning import Thinning
+from dpcli.runtime.seeds import generator
+from tests.support.prepare_helpers import write_video
+
+RNG = np.random.default_rng(0)
+CAMERA = Intrinsics(20.0, 21.0, 15.5, 11.5)
+
+
+def depth16(seed: int = 0, frames: int = 4, shape: tuple[int, int] = (24, 32)) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 65536, (frames, *shape)).astype(np.uint16)
+
+
+def write_pngs(folder, frames):
+    folder.mkdir(parents=True)
+    for t, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"depth_{t + 8}.png"), frame)  # 8, 9, 10, 11: natural order, not that of letters
+    return folder
+
+
+def read(path, **options):
+    reader = DepthVideos((path,), **options)
+    return reader.read(reader.items()[0], RNG).sequence
+
+
+@pytest.mark.parametrize("kind", ["png", "mkv", "avi", "npy"])
+def test_all_sixteen_bits_arrive_in_order(tmp_path, kind):
+    frames = depth16()
+    if kind == "png":
+        path = write_pngs(tmp_path / "video", frames)
+    elif kind == "npy":
+        path = tmp_path / "video.npy"
+        np.save(path, frames)
+    else:
+        path = write_video(tmp_path / f"video.{kind}", frames)
+    found = read_depth_video(path).frames
+    assert found.dtype == np.uint16
+    np.testing.assert_array_equal(found, frames)
+    np.testing.assert_array_equal(read_depth_video(path, stride=3).frames, frames[::3])
+    np.testing.assert_allclose(read(path, intrinsics=CAMERA).points[:, 2].max(), frames.max() / 1000, rtol=1e-6)
+
+
+def test_eight_bits(tmp_path):
+    frames = (depth16() >> 8).astype(np.uint8)
+    path = write_video(tmp_path / "v.avi", frames, fps=10)
+    np.testing.assert_array_equal(read_depth_video(path).frames, frames)
+    sequence = read(path)
+    np.testing.assert_allclose(sequence.points[:, 2], frames[frames > 0] / 100, rtol=1e-6)
+    np.testing.assert_allclose(sequence.time, np.arange(4) / 10)
+    inverted = read(path, invert=True, depth_scale=50)
+    levels = frames[(frames > 0) & (frames < 255)]
+    np.testing.assert_allclose(inverted.points[:, 2], (255 - levels.astype(float)) / 50, rtol=1e-6)
+
+
+def test_geometry_near_far_and_scale(tmp_path):
+    frames = depth16()
+    np.save(tmp_path / "v.npy", frames)
+    sequence = read(tmp_path / "v.npy", intrinsics=CAMERA, depth_scale=5000, near=2.0, far=9.0)
+    meters = frames / 5000
+    kept = (meters >= 2) & (meters <= 9)
+    assert len(sequence.points) == kept.sum()
+    x, y, z = sequence.points.astype(float).T
+    _, rows, columns = np.nonzero(kept)
+    np.testing.assert_allclose(z, meters[kept], rtol=1e-6)
+    np.testing.assert_allclose(x / z * 20 + 15.5, columns, atol=1e-3)
+    np.testing.assert_allclose(y / z * 21 + 11.5, rows, atol=1e-3)
+
+
+def test_field_of_view_spans_the_image():
+    camera = Intrinsics.from_field_of_view(90, 64, 48)
+    edge = (63.5 - camera.cx) / camera.fx  # the outer rim of the last pixel
+    assert np.degrees(np.arctan(edge)) == pytest.approx(45)
+    assert camera.fx == camera.fy and camera.cy == 23.5
+
+
+def test_float_depths_are_meters_and_their_nan_is_nothing(tmp_path):
+    frames = np.full((2, 3, 4), 1.5, np.float32)
+    frames[0, 0, 0], frames[1, 2, 3] = np.nan, np.inf
+    np.save(tmp_path / "v.npy", frames)
+    sequence = read(tmp_path / "v.npy")
+    assert np.diff(sequence.frame_offsets).tolist() == [11, 11]
+    assert (sequence.points[:, 2] == 1.5).all()
+
+
+@pytest.mark.parametrize(
+    "kind, meters", [("<u2", 1.5), ("<i2", 1.5), ("<i4", 1.5), ("<u4", 1.5), ("<f4", 1500.0), ("<f8", 1500.0)]
+)
+def test_whole_numbers_are_millimeters_whatever_their_width(tmp_path, kind, meters):
+    np.save(tmp_path / "v.npy", np.full((2, 8, 8), 1500, kind))
+    np.testing.assert_allclose(read(tmp_path / "v.npy").points[:, 2], meters, rtol=1e-6)
+
+
+def test_a_video_of_a_color_map_is_no_depth_and_gray_ones_are(tmp_path):
+    rng = np.random.default_rng(0)
+    gray = cv2.GaussianBlur(rng.integers(0, 255, (6, 48, 64)).astype(np.uint8).transpose(1, 2, 0), (7, 7), 0).transpose(
+        2, 0, 1
+    )
+    for codec, name in (("mp4v", "lossy.mp4"), ("FFV1", "exact.avi"), ("MJPG", "jpeg.avi")):
+        for colored in (False, True):
+            writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter_fourcc(*codec), 10.0, (64, 48))
+            for frame in gray:
+                writer.write(cv2.applyColorMap(frame, cv2.COLORMAP_JET) if colored else np.dstack([frame] * 3))
+            writer.release()
+            if colored:
+                with pytest.raises(DataError, match=f"{name}: frame 0 is colored"):
+                    list(video_frames(tmp_path / name))
+            else:
+                assert len(list(video_frames(tmp_path / name))) == 6
+
+
+def test_a_tiff_of_several_pages_is_refused(tmp_path):
+    frames = depth16(frames=3)
+    cv2.imwrite(str(tmp_path / "one.tiff"), frames[0])
+    np.testing.assert_array_equal(read_image(tmp_path / "one.tiff"), frames[0])
+    cv2.imwritemulti(str(tmp_path / "many.tiff"), list(frames))
+    with pytest.raises(DataError, match="many.tiff: holds 3 pages; expected one depth image a file"):
+        read_image(tmp_path / "many.tiff")
+
+
+def test_val_in_a_table_is_validation_as_the_folder_is(tmp_path):
+    (tmp_path / "labels.csv").write_text("name,label,split\na,0,val\nb,1,train\nc,1,mine\n")
+    assert [row.split for row in read_labels(tmp_path / "labels.csv").rows.values()] == ["validation", "train", "mine"]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 9))
+def test_background_median_against_plain_loops(seed, frames):
+    rng = np.random.default_rng(seed)
+    depth = rng.integers(1, 20, (frames, 3, 4)) * (rng.random((frames, 3, 4)) < 0.6)
+    found = background_depth(depth.astype(np.float32), "median")
+    for row in range(3):
+        for column in range(4):
+            seen = sorted(v for v in depth[:, row, column] if v > 0)
+            assert found[row, column] == (seen[(len(seen) - 1) // 2] if seen else 0)
+
+
+@pytest.mark.parametrize("kind", ["median", "first"])
+def test_background_removal_leaves_what_moves(tmp_path, kind):
+    frames = np.full((9, 10, 20), 3000, np.uint16)
+    for t in range(1, 9):
+        frames[t, 4:6, 2 * t : 2 * t + 2] = 2000
+    np.save(tmp_path / "v.npy", frames)
+    sequence = read(tmp_path / "v.npy", background=kind, intrinsics=CAMERA)
+    assert sequence.num_frames == 8  # the first frame shows nothing but the background
+    assert (sequence.points[:, 2] == 2).all() and len(sequence.points) == 8 * 4
+    np.testing.assert_allclose(sequence.time[0], 1 / 30)
+
+
+def test_folders_of_videos_with_labels(tmp_path):
+    raw = tmp_path / "raw"
+    write_pngs(raw / "a b" / "vidéo 10", depth16(1))
+    write_pngs(raw / "a b" / "vidéo 9", depth16(2))
+    np.save(raw / "c.npy", depth16(3))
+    table = tmp_path / "labels.csv"
+    table.write_text("name,label,subject,split\nc.npy,wave,3,train\na b/vidéo 9,jump,4,test\n")
+    reader = DepthVideos((raw,), labels=table)
+    found = [(i.name, i.label, i.subject, i.split) for i in reader.items()]
+    assert found == [("a b/vidéo 9", 0, 4, "test"), ("a b/vidéo 10", -1, -1, ""), ("c.npy", 1, 3, "train")]
+    assert reader.class_names == ["jump", "wave"]
+    assert "1 without a label" in reader.summary(reader.items())[-1]
+
+
+def test_labels_from_folders(tmp_path):
+    for name in ("wave/2.npy", "wave/10.npy", "a clap/deep/1.npy"):
+        (tmp_path / "own" / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / "own" / name, depth16())
+    reader = DepthVideos((tmp_path / "own",), label_from_folder=True)
+    assert reader.class_names == ["a clap", "wave"]
+    found = [(i.name, i.label, i.split) for i in reader.items()]
+    assert found == [("a clap/deep/1.npy", 0, ""), ("wave/2.npy", 1, ""), ("wave/10.npy", 1, "")]
+    assert reader.read(reader.items()[1], np.random.default_rng(0)).sequence.label == 1
+    with pytest.raises(
+        DataError, match=r"'2.npy' lies in no folder of its class; --label-from-folder expects CLASS/VIDEO"
+    ):
+        DepthVideos((tmp_path / "own" / "wave",), label_from_folder=True).items()
+    with pytest.raises(UsageError, match="use one"):
+        DepthVideos((tmp_path,), label_from_folder=True, labels=tmp_path / "x.csv")
+    assert "label_from_folder" in reader.config and "label_from_folder" not in DepthVideos((tmp_path,)).config
+
+
+@pytest.mark.parametrize(
+    ("names", "layout", "expected"),
+    [
+        (["train/a/1", "val/b/2", "test/a/3"], "CLASS/VIDEO", [(0, "train"), (1, "validation"), (0, "test")]),
+        (["train/a", "test/b"], "CLASS/VIDEO", [(1, ""), (0, "")]),  # two classes of these names
+        (["train/a", "test/b"], "CLASS", [(0, "train"), (1, "test")]),
+        (["train/a/1", "b/a/2"], "CLASS/VIDEO", [(1, ""), (0, "")]),
+        (["a", "b/x"], "CLASS", [(0, ""), (1, "")]),
+    ],
+)
+def test_folders_of_splits_hold_those_of_classes(names, layout, expected):
+    table = labels_of_folders(Path("own"), names, layout)
+    assert [(table.rows[name].label, table.rows[name].split) for name in names] == expected
+
+
+@pytest.mark.parametrize("odd", ["test/a", "train/b", "other/a/2"])
+def test_a_stray_sample_does_not_make_classes_of_the_splits(odd):
+    with pytest.raises(DataError, match=rf"own: '{odd}': not SPLIT/CLASS/VIDEO, as 'train/a/1' and 2 in all are"):
+        labels_of_folders(Path("own"), ["train/a/1", "test/a/3", odd], "CLASS/VIDEO")
+    with pytest.raises(DataError, match="own: 'train': not SPLIT/CLASS"):
+        labels_of_folders(Path("own"), ["train/a", "train"], "CLASS")
+
+
+def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
+    for name in ("train/a/1.npy", "train/b/1.npy", "test/a/1.npy", "test/b/1.npy"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        np.save(tmp_path / name, depth16())
+    reader = DepthVideos((tmp_path,), label_from_folder=True)
+    assert reader.class_names == ["a", "b"] and {item.split for item in reader.items()} == {"train", "test"}
+    cv2.imwrite(str(tmp_path / "test" / "b" / "thumb.png"), depth16()[0])
+    with pytest.raises(DataError, match="'test/b': not SPLIT/CLASS/VIDEO"):
+        DepthVideos((tmp_path,), label_from_folder=True).items()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name,label\na,-1\n", "labels.csv:2: label -1 is out of range"),
+        ("name,label\na,1\na,2\n", "labels.csv:3: 'a' appears twice"),
+        ("name,label\na,1,2\n", "labels.csv:2: 'a,1,2'; expected name,label"),
+        ("name,label\na\n", "labels.csv:2"),
+        ("name,color\na,1\n", "labels.csv:1: columns name,color"),
+        ("name,label\na,1\nb,two\n", "some labels are numbers and some are words"),
+        ("name,label,subject\na,1,x\n", "labels.csv:2: subject 'x'"),
+        ("", "no rows"),
+    ],
+)
+def test_bad_label_tables(tmp_path, text, message):
+    (tmp_path / "labels.csv").write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_labels(tmp_path / "labels.csv")
+
+
+def test_a_label_for_no_video_is_refused(tmp_path):
+    np.save(tmp_path / "v.npy", depth16())
+    (tmp_path / "labels.csv").write_text("v.npy,0\nw.npy,1\n")
+    with pytest.raises(DataError, match="names 'w.npy', which is not among the samples"):
+        DepthVideos((tmp_path,), labels=tmp_path / "labels.csv").items()
+
+
+def save_png(path, image):
+    path.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(path), image)
+    return path.parent
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda d: save_png(d / "v" / "1.png", np.zeros((4, 5), np.uint16)), "none of its 1 frames has a valid depth"),
+        (lambda d: save_png(d / "v" / "1.png", np.arange(60, dtype=np.uint8).reshape(4, 5, 3)), "a color image"),
+        (lambda d: (np.save(d / "v.npy", np.zeros((0, 4, 5), np.uint16)), d / "v.npy")[1], "empty video"),
+        (lambda d: (np.save(d / "v.npy", np.ones((4, 5, 6, 7))), d / "v.npy")[1], "expected numbers \\(frames, height"),
+        (lambda d: (np.save(d / "v.npy", np.array([None])), d / "v.npy")[1], "not a readable .npy"),
+        (lambda d: ((d / "v.avi").write_bytes(b""), d / "v.avi")[1], "not a readable video"),
+        (lambda d: ((d / "v.txt").write_bytes(b""), d / "v.txt")[1], "unknown kind"),
+    ],
+)
+def test_bad_videos(tmp_path, make, message):
+    with pytest.raises(DataError, match=message):
+        read(make(tmp_path))
+
+
+def test_bad_images_are_named(tmp_path):
+    folder = write_pngs(tmp_path / "v", depth16())
+    whole = (folder / "depth_9.png").read_bytes()
+    (folder / "depth_9.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"depth_9.png: not a readable image"):
+        read(folder)
+    cv2.imwrite(str(folder / "depth_9.png"), np.ones((3, 3), np.uint16))
+    with pytest.raises(DataError, match=r"depth_9.png: 3x3 uint16; the first image is 32x24 uint16"):
+        read(folder)
+
+
+def test_a_truncated_video_gives_the_frames_it_has(tmp_path):
+    path = write_video(tmp_path / "v.avi", depth16(frames=20))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = list(video_frames(path))
+    assert 0 < len(found) < 20
+    np.testing.assert_array_equal(found[0], depth16(frames=20)[0])
+
+
+def test_folders_without_videos(tmp_path):
+    with pytest.raises(DataError, match="no depth video in it"):
+        DepthVideos((tmp_path,)).items()
+    with pytest.raises(DataError, match="no such file or folder"):
+        DepthVideos((tmp_path / "none",)).items()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"near": 2, "far": 1},
+        {"background": "magic"},
+        {"depth_scale": 0},
+        {"fps": -1},
+        {"fov": 60, "intrinsics": CAMERA},
+    ],
+)
+def test_impossible_options(tmp_path, options):
+    with pytest.raises(UsageError):
+        DepthVideos((tmp_path,), **options)
+
+
+def test_intrinsics_files(tmp_path):
+    path = tmp_path / "k.json"
+    path.write_text(json.dumps({"fx": 1, "fy": 2, "cx": 3, "cy": 4}))
+    assert Intrinsics.from_json(path) == Intrinsics(1, 2, 3, 4)
+    path.write_text(json.dumps({"intrinsic_matrix": [1, 0, 0, 0, 2, 0, 3, 4, 1], "width": 9}))
+    assert Intrinsics.from_json(path) == Intrinsics(1, 2, 3, 4)
+    for bad in ("{", "[]", '{"fx": 1}', '{"fx": "a", "fy": 2, "cx": 3, "cy": 4}', '{"intrinsic_matrix": [1]}'):
+        path.write_text(bad)
+        with pytest.raises(DataError, match="k.json"):
+            Intrinsics.from_json(path)
+
+
+def test_points_chosen_before_they_are_made_are_those_chosen_after(tmp_path):
+    """Random thinning asks for the number of points only; then the reader needn't make the others. Same draws, same bits."""
+    rng = np.random.default_rng(0)
+    depth = np.where(rng.random((6, 24, 32)) < rng.random((6, 1, 1)), rng.integers(400, 3000, (6, 24, 32)), 0)
+    depth[2] = 0  # dropped
+    depth[3, :, 5:] = 0  # fewer points than are wanted
+    np.save(tmp_path / "v.npy", depth.astype(np.uint16))
+    for options in ({}, {"near": 0.8, "far": 2.5}):
+        reader = DepthVideos((tmp_path / "v.npy",), fov=60, **options)
+        (item,) = reader.items()
+        for thinning in (Thinning(150), Thinning(150, "voxel"), Thinning(0)):
+            late = thinning.apply(reader.read(item, generator(5, 0)).sequence, generator(5, 0))
+            early = convert_item(reader, thinning, 5, (0, item)).sequence
+            assert np.array_equal(late.points, early.points) and np.array_equal(late.frame_offsets, early.frame_offsets)
+    asked = []
+    reader.read(item, generator(5, 0), lambda count: asked.append(count) or slice(0, 1))
+    assert len(asked) == 6 and asked[2] == 0, "a frame was not asked for: its draw would be another frame's"

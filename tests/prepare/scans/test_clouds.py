@@ -1,0 +1,242 @@
+"""Point cloud files: all formats give equal points, invalid points are dropped and counted, bad files are named."""
+
+from __future__ import annotations
+
+import sys
+
+import laspy
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.cloud_files import read_cloud
+from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.prepare.scans.clouds import CloudFolders
+
+RNG = np.random.default_rng(0)
+POINTS = np.random.default_rng(1).normal(size=(40, 3)).astype(np.float32)
+COLOR = np.random.default_rng(2).integers(0, 256, (40, 3)).astype(np.uint8)
+
+
+def save(path, points=POINTS, color=None):
+    """Write one cloud in the format of the path's suffix."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix
+    if suffix in (".ply", ".pcd"):
+        open3d = load_open3d()
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.astype(float)))
+        if color is not None:
+            cloud.colors = open3d.utility.Vector3dVector(color / 255)
+        open3d.io.write_point_cloud(str(path), cloud)
+    elif suffix == ".npy":
+        np.save(path, points)
+    elif suffix == ".npz":
+        np.savez(path, points=points, **({} if color is None else {"colors": color}))
+    elif suffix == ".bin":
+        np.hstack([points, np.ones((len(points), 1))]).astype("<f4").tofile(path)
+    elif suffix == ".las":
+        save_las(path, points, color)
+    else:
+        table = points if color is None else np.hstack([color, points])
+        header = "" if color is None else "red,green,blue,x,y,z"
+        delimiter = "," if suffix == ".csv" else " "
+        np.savetxt(path, table, delimiter=delimiter, header=header, comments="")
+    return path
+
+
+def save_las(path, points, color=None, scale=1e-6):
+    las = laspy.create(point_format=2 if color is not None else 0)
+    las.header.scales, las.header.offsets = [scale] * 3, np.floor(points.min(0).astype(float))
+    las.x, las.y, las.z = points.T.astype(float)
+    if color is not None:
+        las.red, las.green, las.blue = color.T.astype(np.uint16) * 257
+    las.write(str(path))
+
+
+def read(folder, **options):
+    reader = CloudFolders(folder, **options)
+    return reader.read(reader.items()[0], RNG)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".bin", ".csv", ".las", ".xyz", ".txt"])
+def test_every_format_gives_the_same_points(tmp_path, suffix):
+    for number in (10, 9):  # natural order: frame9 first
+        save(tmp_path / "seq" / f"frame{number}{suffix}", POINTS + (number - 9))
+    sample = read(tmp_path / "seq")
+    assert sample.sequence.name == "seq" and sample.sequence.num_frames == 2 and sample.notes == {}
+    np.testing.assert_allclose(sample.sequence.frame(0), POINTS, atol=2e-6)
+    np.testing.assert_allclose(sample.sequence.frame(1), POINTS + 1, atol=2e-6)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".csv", ".las"])
+def test_colors_are_kept(tmp_path, suffix):
+    save(tmp_path / "seq" / f"0{suffix}", color=COLOR)
+    reader = CloudFolders(tmp_path / "seq", fps=5)
+    sequence = reader.read(reader.items()[0], RNG).sequence
+    assert reader.fields == ("time", "color")
+    np.testing.assert_array_equal(sequence.color, COLOR)
+    np.testing.assert_allclose(sequence.points, POINTS, atol=2e-6)
+
+
+def test_a_frame_without_the_others_colors_is_refused(tmp_path):
+    save(tmp_path / "0.ply", color=COLOR)
+    save(tmp_path / "1.ply")
+    with pytest.raises(DataError, match=r"1.ply: no colors"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".bin", ".csv", ".xyz"])
+def test_points_with_nan_are_dropped_with_their_colors_and_counted(tmp_path, suffix):
+    points = POINTS.copy()
+    points[3, 1], points[7] = np.nan, np.inf
+    color = None if suffix in (".npy", ".bin", ".xyz") else COLOR
+    save(tmp_path / f"0{suffix}", points, color)
+    sample = read(tmp_path)
+    valid = np.delete(np.arange(40), [3, 7])
+    assert sample.notes == {"points with NaN or infinity dropped": 2}
+    np.testing.assert_allclose(sample.sequence.points, POINTS[valid], atol=2e-6)
+    if color is not None:
+        np.testing.assert_array_equal(sample.sequence.color, COLOR[valid])
+
+
+def test_frames_of_nan_only(tmp_path):
+    save(tmp_path / "a" / "0.npy", np.full((5, 3), np.nan, np.float32))
+    with pytest.raises(DataError, match="none of its 1 frames"):
+        read(tmp_path / "a")
+    save(tmp_path / "a" / "1.npy")
+    sample = read(tmp_path / "a", fps=10)
+    assert sample.notes["frames without points dropped"] == 1
+    np.testing.assert_allclose(sample.sequence.time, [0.1])
+
+
+def test_folders_of_folders_with_labels_from_their_names(tmp_path):
+    for folder in ("walk/s2", "walk/s10", "run/s1"):
+        save(tmp_path / folder / "0.npy")
+    reader = CloudFolders(tmp_path, label_from_folder=True)
+    assert reader.class_names == ["run", "walk"]
+    assert [(i.name, i.label) for i in reader.items()] == [("run/s1", 0), ("walk/s2", 1), ("walk/s10", 1)]
+
+
+def test_folders_of_splits_above_those_of_classes(tmp_path):
+    for folder in ("train/walk/s1", "train/run/s1", "test/walk/s2"):
+        save(tmp_path / folder / "0.npy")
+    reader = CloudFolders(tmp_path, label_from_folder=True)
+    assert reader.class_names == ["run", "walk"]
+    assert [(i.label, i.split) for i in reader.items()] == [(1, "test"), (0, "train"), (1, "train")]
+
+
+def test_a_label_table_beside_the_data_is_no_cloud(tmp_path):
+    save(tmp_path / "a" / "0.npy")
+    (tmp_path / "labels.csv").write_text("a,2\n")
+    reader = CloudFolders(tmp_path, labels=tmp_path / "labels.csv")
+    assert [(i.name, i.label) for i in reader.items()] == [("a", 2)]
+
+
+def test_map_coordinates_keep_their_millimeters(tmp_path):
+    base = np.array([500_000.0, 5_800_000.0, 100.0])
+    save_las(tmp_path / "0.las", POINTS.astype(float) + base, scale=1e-4)
+    save_las(tmp_path / "1.las", POINTS.astype(float) + base + [1, 0, 0], scale=1e-4)
+    sample = read(tmp_path)
+    assert sample.notes == {"sequences shifted to their first frame's corner for precision": 1}
+    a, b = sample.sequence.frame(0), sample.sequence.frame(1)
+    np.testing.assert_allclose(a - a[0], POINTS - POINTS[0], atol=3e-4)
+    np.testing.assert_allclose(b - a, np.broadcast_to([1, 0, 0], a.shape), atol=3e-4)
+
+
+def test_scale_stride_and_columns(tmp_path):
+    for t in range(5):
+        np.hstack([POINTS + t, np.zeros((40, 2))]).astype("<f4").tofile(tmp_path / f"{t}.bin")
+    sequence = read(tmp_path, bin_columns=5, scale=1000.0, stride=2, fps=10).sequence
+    np.testing.assert_allclose(sequence.frame(2), (POINTS + 4) / 1000, rtol=1e-5)
+    np.testing.assert_allclose(sequence.time, [0, 0.2, 0.4])
+
+
+def test_a_recording_in_millimeters_keeps_its_sensor(tmp_path):
+    """What counts as far away is meters: 12 m of a scan in millimeters are not."""
+    np.save(tmp_path / "0.npy", np.float32([[0, 0, 2000], [1000, 1000, 3000], [0, 1000, 12_000]]))
+    sample = read(tmp_path, scale=1000.0)
+    assert sample.notes == {}
+    np.testing.assert_allclose(sample.sequence.points, [[0, 0, 2], [1, 1, 3], [0, 1, 12]], rtol=1e-6)
+
+
+def test_kitti_scans(shared_data):
+    folder = shared_data / "lidar" / "kitti_consecutive"
+    sample = read(folder)
+    files = sorted(folder.glob("*.bin"))
+    assert sample.sequence.num_frames == len(files) == 4
+    np.testing.assert_array_equal(sample.sequence.frame(0), np.fromfile(files[0], "<f4").reshape(-1, 4)[:, :3])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".bin", ".las"])
+def test_truncated_files_are_named(tmp_path, suffix):
+    path = save(tmp_path / f"0{suffix}")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-7])
+    with pytest.raises(DataError, match=f"0{suffix}: .*(truncated|not a readable)"):
+        read_cloud(path)
+    path.write_bytes(b"")
+    with pytest.raises(DataError, match=f"0{suffix}: the file is empty"):
+        read_cloud(path)
+
+
+def test_truncated_ply_as_text_and_one_with_faces(tmp_path):
+    open3d = load_open3d()
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS.astype(float)))
+    open3d.io.write_point_cloud(str(tmp_path / "0.ply"), cloud, write_ascii=True)
+    lines = (tmp_path / "0.ply").read_text().splitlines(keepends=True)
+    (tmp_path / "0.ply").write_text("".join(lines[:-3]))
+    with pytest.raises(DataError, match="says 40 points, it has room for 37"):
+        read_cloud(tmp_path / "0.ply")
+    mesh = open3d.geometry.TriangleMesh.create_sphere()
+    open3d.io.write_triangle_mesh(str(tmp_path / "1.ply"), mesh)
+    np.testing.assert_allclose(read_cloud(tmp_path / "1.ply").points, np.asarray(mesh.vertices))
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("0.csv", "a,b,c\n1,2,3\n", "0.csv:1: columns a, b, c; expected x, y and z"),
+        ("0.csv", "x,y,z\n1,2,word\n", "0.csv: .*expected numbers"),
+        ("0.csv", "1,2\n3,4\n", "shape \\(2, 2\\)"),
+        ("0.csv", "x,y,z,r,g,b\n1,2,3,4,5,256\n", "expected 0 to 255"),
+        ("0.ply", "not a ply", "no number of points in its header"),
+        ("0.xyz", "1 2 3\n4 5\n", "0.xyz: .*expected numbers in columns"),
+    ],
+)
+def test_bad_text_files(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DataError, match=message):
+        read_cloud(tmp_path / name)
+
+
+def test_arrays_of_other_kinds(tmp_path):
+    np.save(tmp_path / "0.npy", np.ones((3, 2)))
+    with pytest.raises(DataError, match="expected numbers \\(points, 3 or more\\)"):
+        read_cloud(tmp_path / "0.npy")
+    np.save(tmp_path / "1.npy", np.array([{"pickled": 1}], object))
+    with pytest.raises(DataError, match="not a readable .npy"):
+        read_cloud(tmp_path / "1.npy")
+    np.savez(tmp_path / "2.npz", other=np.ones((3, 3)))
+    with pytest.raises(DataError, match="arrays other; expected one called points"):
+        read_cloud(tmp_path / "2.npz")
+
+
+def test_folders_without_clouds(tmp_path):
+    (tmp_path / "readme.md").touch()
+    with pytest.raises(DataError, match="no point clouds"):
+        CloudFolders(tmp_path).items()
+    with pytest.raises(UsageError, match="use one"):
+        CloudFolders(tmp_path, label_from_folder=True, labels=tmp_path / "x.csv")
+    save(tmp_path / "0.npy")
+    with pytest.raises(DataError, match="expects CLASS/SEQUENCE/frames"):
+        CloudFolders(tmp_path, label_from_folder=True).items()
+
+
+def test_a_missing_open3d_is_explained(monkeypatch):
+    from dpcli.errors import DpcError
+
+    load_open3d.cache_clear()
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(DpcError, match="pip install open3d libusb-package"):
+        load_open3d()
+    load_open3d.cache_clear()

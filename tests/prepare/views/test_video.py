@@ -1,0 +1,589 @@
+"""`prepare video`: frames in every naming, cut-outs, one crop for a clip, further views, and what bad clips are told."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from dpcli.errors import DataError, UsageError
+from dpcli.ops.cameras import orbit_of
+from dpcli.prepare.decode.color_frames import _frame_times, _lasts, frame_numbers, open_frames
+from dpcli.prepare.views import matting
+from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
+from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip
+from dpcli.prepare.views.video import VideoOptions, spread, video_clip
+from dpcli.store import ViewsReader
+
+RED = (200, 40, 30)
+
+
+def disc(center: tuple[float, float], radius: float, size: tuple[int, int] = (64, 48), color=RED) -> np.ndarray:
+    """u8 (H,W,4): a disc with an exact soft edge (4 x 4 samples a pixel)."""
+    width, height = size
+    y, x = (np.mgrid[: 4 * height, : 4 * width] + 0.5) / 4
+    inside = ((x - center[0]) ** 2 + (y - center[1]) ** 2 <= radius**2).astype(float)
+    alpha = inside.reshape(height, 4, width, 4).mean(axis=(1, 3))
+    rgba = np.zeros((height, width, 4), np.uint8)
+    rgba[alpha > 0, :3] = color
+    rgba[..., 3] = np.round(255 * alpha)
+    return rgba
+
+
+def on(rgba: np.ndarray, background=(255, 255, 255)) -> np.ndarray:
+    alpha = rgba[..., 3:] / 255
+    return np.round(rgba[..., :3] * alpha + np.array(background) * (1 - alpha)).astype(np.uint8)
+
+
+def moving(frames: int = 4, **options) -> list[np.ndarray]:
+    return [disc((20 + 5 * k, 24), 8, **options) for k in range(frames)]
+
+
+def save(folder: Path, pictures: list[np.ndarray], pattern: str = "{}.png") -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, picture in enumerate(pictures):
+        path = folder / pattern.format(number)
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(picture).save(path)
+    return folder
+
+
+def read(clip) -> dict[tuple[int, int], np.ndarray]:
+    return {(view, frame): rgba for view, frame, rgba in clip.pictures()}
+
+
+def centroid(rgba: np.ndarray) -> np.ndarray:
+    """Middle of the alpha, pixels (x, y), pixel centers at +0.5."""
+    weight = rgba[..., 3].astype(float)
+    y, x = np.mgrid[: len(rgba), : rgba.shape[1]] + 0.5
+    return np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
+
+
+SMALL = VideoOptions(size=64)
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    ["{}.png", "{}_rgba.png", "{:03d}.png", "{:03}_rgba.png", "frame_{:04d}.png", "4_cam2_{}.webp", "v1-{}-2.png"],
+)
+def test_every_naming_is_ordered_by_its_number(tmp_path, pattern):
+    pictures = [disc((20 + 2 * k, 24), 8) for k in range(12)]
+    frames = open_frames(save(tmp_path / "clip", pictures, pattern))
+    assert frames.numbers == tuple(range(12))
+    for picture, found in zip(pictures, frames.read(range(12)), strict=True):
+        np.testing.assert_array_equal(picture[..., 3], found[..., 3])
+
+
+@given(st.lists(st.integers(0, 10**6), unique=True, min_size=2, max_size=30), st.sampled_from(["", "7_", "a3b"]))
+def test_numbers_survive_any_prefix_and_suffix(numbers, prefix):
+    assert frame_numbers([f"{prefix}{number}_rgba" for number in numbers]) == numbers
+
+
+@pytest.mark.parametrize(
+    "stems",
+    [
+        [f"1305031102.{675304 + 77 * k:06d}" for k in range(4)] + [f"1305031103.{1000 + 77 * k:06d}" for k in range(4)],
+        [f"{h:02d}-{m:02d}-{s:02d}" for h, m, s in ((9, 59, 58), (9, 59, 59), (10, 0, 0), (10, 0, 1), (10, 1, 0))],
+        [f"{k:03d}_{noise}" for k, noise in enumerate((77, 3, 500, 41))],
+    ],
+)
+def test_names_of_several_numbers_are_read_from_left_to_right(tmp_path, stems):
+    pictures = [disc((20 + 2 * k, 24), 8) for k in range(len(stems))]
+    (tmp_path / "clip").mkdir()
+    for k in np.random.default_rng(0).permutation(len(stems)):
+        Image.fromarray(pictures[k]).save(tmp_path / "clip" / f"{stems[k]}.png")
+    frames = open_frames(tmp_path / "clip")
+    assert [name[:-4] for name in frames.names] == stems and frames.numbers == tuple(range(len(stems)))
+    assert frame_numbers(stems[::-1]) == list(range(len(stems)))[::-1]
+
+
+def test_frame_times_follow_the_stamps_where_a_rate_cannot():
+    steady = np.arange(12) / 29.97
+    np.testing.assert_array_equal(_frame_times(np.round(steady, 3), 29.97), steady)  # milliseconds only
+    np.testing.assert_array_equal(_frame_times(np.zeros(12), 29.97), steady)  # a container without stamps
+    assert _frame_times(np.zeros(12), None) is None
+    uneven = np.array([0.5, 0.55, 0.6, 0.9, 1.2, 1.5])
+    np.testing.assert_allclose(_frame_times(uneven, 4.0), uneven - 0.5)
+    np.testing.assert_allclose(_frame_times(uneven, None), uneven - 0.5)
+    assert _lasts(uneven - 0.5, 1.3) and not _lasts(uneven - 0.5, 3.0) and not _lasts(np.zeros(1), 3.0)
+
+
+def uneven_video(path: Path, kept: str = "lt(n,10)+not(mod(n,6))") -> Path:
+    """Two seconds at 20 frames a second of which ffmpeg drops some: the first half second whole, then every sixth."""
+    import imageio_ffmpeg
+
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-f",
+        "lavfi",
+        "-i",
+        "testsrc=size=64x48:rate=20:duration=2",
+    ]
+    subprocess.run([*command, "-vf", f"select='{kept}'", "-fps_mode", "vfr", str(path)], check=True, timeout=60)
+    return path
+
+
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.webm", "clip.mp4"])
+def test_a_recording_of_uneven_rate_keeps_its_times(tmp_path, name):
+    frames = open_frames(uneven_video(tmp_path / name))
+    expected = [n / 20 for n in range(40) if n < 10 or n % 6 == 0]
+    np.testing.assert_allclose(frames.times, expected, atol=2e-3)
+    assert len(list(frames.read(range(len(expected))))) == len(expected)
+
+
+@pytest.mark.parametrize("name", ["clip.mkv", "clip.webm"])
+def test_half_a_recording_is_told(tmp_path, name):
+    path = uneven_video(tmp_path / name, "1")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(DataError, match="frames can be decoded; it is truncated or damaged|not a readable video"):
+        open_frames(path)
+
+
+def test_gif_and_video_give_the_same_frames_as_the_folder(tmp_path):
+    import cv2
+
+    pictures = [on(picture) for picture in moving(5)]
+    folder = save(tmp_path / "clip", pictures)
+    stills = [Image.fromarray(picture) for picture in pictures]
+    stills[0].save(tmp_path / "clip.gif", save_all=True, append_images=stills[1:], duration=[100, 100, 200, 100, 100])
+    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 10.0, (64, 48))
+    for picture in pictures:
+        writer.write(picture[..., ::-1])
+    writer.release()
+    expected = list(open_frames(folder).read([0, 2, 4]))
+    for name, times in (("clip.gif", (0, 0.1, 0.2, 0.4, 0.5)), ("clip.avi", (0, 0.1, 0.2, 0.3, 0.4))):
+        frames = open_frames(tmp_path / name)
+        assert len(frames) == 5 and np.allclose(frames.times, times)
+        for want, have in zip(expected, frames.read([0, 2, 4]), strict=True):
+            assert np.abs(want.astype(int) - have).max() <= (12 if name.endswith("gif") else 1)  # gif: 256 colors
+    clip = video_clip(tmp_path / "clip.gif", VideoOptions(frames=3, size=32))
+    np.testing.assert_allclose(clip.header.time, [0, 0.2, 0.5])
+
+
+def test_alpha_comes_back_from_a_plain_background():
+    truth = disc((30.3, 24.6), 14)
+    for background in ((255, 255, 255), (0, 0, 0), (20, 160, 60)):
+        rgba, gaps = matting.key_out(on(truth, background), np.array(background, np.float32))
+        assert gaps == 0
+        assert np.abs(rgba[..., 3].astype(int) - truth[..., 3]).max() <= 20  # a faint share below the tolerance is lost
+        assert np.abs(rgba[..., 3].astype(int) - truth[..., 3]).mean() < 0.5
+        seen = rgba[..., 3] > 60
+        assert np.abs(rgba[seen][:, :3].astype(int) - RED).max() <= 12  # no fringe of the background
+        assert np.abs(on(rgba, background).astype(int) - on(truth, background)).max() <= 15
+
+
+def test_holes_only_where_the_background_shines_through():
+    picture = on(disc((32, 24), 20))
+    picture[11:13, 31:33] = 255  # a small highlight
+    picture[20:30, 18:26] = 246  # an eye: bright, but not the background's white
+    picture[20:30, 38:46] = 255  # a gap
+    white = np.full(3, 255, np.float32)
+    expected = {"keep": (255, 255, 255, 0), "auto": (255, 255, 0, 80), "cut": (0, 0, 0, 164)}
+    for holes, (highlight, eye, gap, pixels) in expected.items():
+        rgba, count = matting.key_out(picture, white, holes=holes)
+        assert (rgba[12, 32, 3], rgba[24, 22, 3], rgba[24, 42, 3], count) == (highlight, eye, gap, pixels), holes
+
+
+def test_the_plain_background_is_found_beside_an_object_that_touches_the_border():
+    rng = np.random.default_rng(0)
+    picture = np.clip(rng.normal((90, 120, 200), 2, (40, 60, 3)), 0, 255).astype(np.uint8)
+    picture[10:, 20:40] = RED
+    color = matting.plain_background([matting.border_pixels(picture)], ["a"], matting.TOLERANCE)
+    np.testing.assert_allclose(color, (90, 120, 200), atol=1.5)
+    busy = rng.integers(0, 256, (40, 60, 3), np.uint8)
+    with pytest.raises(DataError, match="not plain"):
+        matting.plain_background([matting.border_pixels(busy)], ["a"], matting.TOLERANCE)
+
+
+def test_one_crop_keeps_the_motion(tmp_path):
+    folder = save(tmp_path / "clip", moving(4))
+    clip = video_clip(folder, VideoOptions(size=50, border=0.2))
+    found = read(clip)
+    crop = crop_around((12, 16, 43, 32), 0.2)  # discs from x = 12 to 43
+    assert crop.side == round(31 / 0.8)
+    scale = 50 / crop.side
+    for frame in range(4):
+        expected = (np.array([20 + 5 * frame, 24]) - (crop.left, crop.top)) * scale
+        np.testing.assert_allclose(centroid(found[0, frame]), expected, atol=0.1)
+    boxes = np.array([visible_box(picture) for picture in found.values()])
+    assert boxes[:, 2].max() - boxes[:, 0].min() == pytest.approx(0.8 * 50, abs=2)
+    whole = read(video_clip(folder, VideoOptions(size=64, recenter=False)))
+    np.testing.assert_array_equal(whole[0, 2][8:56], moving(4)[2])  # 64 x 48 padded to a square, not resampled
+
+
+@given(st.integers(-20, 40), st.integers(-20, 40), st.integers(5, 60), st.integers(5, 60))
+def test_intrinsics_follow_the_crop(left, top, side, size):
+    crop, camera = Crop(left, top, side), np.array([[50.0, 0, 31], [0, 55.0, 23], [0, 0, 1]])
+    point = np.array([0.3, -0.2, 2.0])
+    u, v = (camera @ point)[:2] / 2
+    np.testing.assert_allclose(
+        (crop.intrinsics(camera, size) @ point)[:2] / 2, [(u - left) * size / side, (v - top) * size / side], atol=1e-9
+    )
+
+
+def test_pictures_follow_the_same_crop_as_intrinsics():
+    picture, crop = disc((30.5, 20.25), 9), Crop(12, 4, 36)
+    camera = np.array([[1.0, 0, 30.5], [0, 1.0, 20.25], [0, 0, 1]])  # the axis looks at the disc's middle
+    for size in (18, 36, 72):
+        np.testing.assert_allclose(centroid(crop.apply(picture, size)), crop.intrinsics(camera, size)[:2, 2], atol=0.05)
+
+
+def test_resizing_does_not_bleed_hidden_colors():
+    picture = disc((24, 24), 12, (48, 48))
+    picture[picture[..., 3] == 0, :3] = (0, 255, 0)
+    for size in (20, 100):
+        small = resize(picture, size)
+        assert np.abs(small[small[..., 3] > 30][:, :3].astype(int) - RED).max() <= 2
+
+
+def test_a_stray_piece_does_not_widen_the_crop():
+    picture = disc((40, 24), 12)
+    alone = visible_box(picture, 0.01)
+    picture[2:4, 2:3] = 255
+    assert visible_box(picture, 0.01) == alone != visible_box(picture)
+
+
+def test_masks_cut_a_busy_background(tmp_path):
+    rng = np.random.default_rng(0)
+    busy = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(3)]
+    discs = moving(3)
+    folder = save(tmp_path / "clip", busy, "{:02d}.png")
+    gray = save(tmp_path / "gray", [picture[..., 3] for picture in discs], "m_{}.png")
+    ids = save(tmp_path / "ids", [(picture[..., 3] > 127).astype(np.uint8) for picture in discs])
+    for masks in (gray, ids):
+        found = read(video_clip(folder, VideoOptions(size=64, recenter=False, mask=masks)))
+        for frame in range(3):
+            strong = discs[frame][..., 3] > 200
+            np.testing.assert_array_equal(found[0, frame][8:56][strong][:, :3], busy[frame][strong])
+            assert found[0, frame][8:56][discs[frame][..., 3] < 8].max() == 0
+    save(tmp_path / "short", [discs[0][..., 3]])
+    save(tmp_path / "wide", [np.zeros((10, 10), np.uint8)] * 3)
+    save(tmp_path / "inverse", [255 - picture[..., 3] for picture in discs])
+    save(tmp_path / "empty", [np.zeros((48, 64), np.uint8)] * 3)
+    for name, message in (
+        ("short", "1 masks for 3 frames"),
+        ("wide", "10x10.*64x48"),
+        ("inverse", "inverted"),
+        ("empty", "an empty mask"),
+        ("none", "does not exist"),
+    ):
+        with pytest.raises(DataError, match=message):
+            video_clip(folder, VideoOptions(size=64, mask=tmp_path / name))
+
+
+def bad_clip(tmp_path: Path, kind: str) -> Path:
+    rng = np.random.default_rng(0)
+    clips = {
+        "busy": [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(2)],
+        "sizes": [disc((20, 20), 8), disc((20, 20), 8, (50, 48))],
+        "white": [np.full((48, 64, 3), 255, np.uint8)] * 2,
+        "one empty": [*moving(2), np.zeros((48, 64, 4), np.uint8)],
+        "mixed": [disc((20, 20), 8), np.full((48, 64, 4), 255, np.uint8)],
+        "nothing": [],
+    }
+    if kind in clips:
+        return save(tmp_path / "clip", clips[kind])
+    if kind == "corrupt png":
+        folder = save(tmp_path / "clip", moving(3))
+        (folder / "1.png").write_bytes((folder / "1.png").read_bytes()[:60])
+        return folder
+    path = tmp_path / {"corrupt mp4": "a.mp4", "corrupt gif": "a.gif", "text": "a.txt", "image": "a.png"}[kind]
+    path.write_bytes(b"\0\0\0 ftypisom" + b"x" * 500)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("busy", "not plain.*\n.*--mask FOLDER"),
+        ("sizes", "1.png is 50x48, 0.png is 64x48"),
+        ("white", "no object in any frame.*one color only"),
+        ("one empty", r"no object in 1 frame: 2.png \(fully transparent\)\n.*--on-error skip"),
+        ("mixed", "1 frame: 1.png without alpha"),
+        ("nothing", "no frames"),
+        ("corrupt png", "1.png: not a readable image"),
+        ("corrupt mp4", "not a readable video|no frame can be decoded"),
+        ("corrupt gif", "not a readable animation"),
+        ("text", "unknown kind"),
+        ("image", "one image; expected its folder"),
+    ],
+)
+def test_bad_clips_are_told_what_to_do(tmp_path, kind, message):
+    with pytest.raises(DataError, match=message):
+        video_clip(bad_clip(tmp_path, kind), SMALL)
+
+
+@pytest.mark.parametrize(("kind", "left"), [("one empty", [0, 1]), ("corrupt png", [0, 2])])
+def test_skip_leaves_bad_frames_out_and_keeps_the_times(tmp_path, kind, left):
+    clip = video_clip(bad_clip(tmp_path, kind), VideoOptions(size=32, on_error="skip", fps=10))
+    np.testing.assert_allclose(clip.header.time, np.array(left) / 10)
+    assert len(read(clip)) == 2
+
+
+def test_a_truncated_video_is_refused(tmp_path):
+    import cv2
+
+    path = tmp_path / "a.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 16.0, (64, 48))
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        writer.write(rng.integers(0, 256, (48, 64, 3), np.uint8))
+    writer.release()
+    assert len(open_frames(path)) == 30
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(DataError, match="a.mp4"):
+        open_frames(path)
+
+
+def test_warnings_name_the_frames(tmp_path, capsys):
+    pictures = [disc((x, 24), 8) for x in (20, 2, 60)]
+    video_clip(save(tmp_path / "leaving", pictures), SMALL)
+    assert "leaves the picture in 2 frames: 1.png, 2.png" in capsys.readouterr().err
+    video_clip(save(tmp_path / "single", pictures[:1]), SMALL)
+    assert "one frame only" in capsys.readouterr().err
+    gap = save(tmp_path / "gap", pictures[:1] * 5)
+    (gap / "2.png").unlink()
+    video_clip(gap, SMALL)
+    assert "3.png follows 1.png" in capsys.readouterr().err
+
+
+def test_keep_takes_the_whole_picture(tmp_path):
+    busy = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    found = read(video_clip(save(tmp_path / "c", [busy] * 2), VideoOptions(size=64, background="keep", recenter=False)))
+    np.testing.assert_array_equal(found[0, 1][8:56, :, :3], busy)
+    assert (found[0, 1][8:56, :, 3] == 255).all() and found[0, 1][:8].max() == 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"border": 1.0},
+        {"background": "pink"},
+        {"background": "1,2"},
+        {"background": "300,0,0"},
+        {"fps": 0.0},
+        {"holes": "some"},
+        {"radius": 0.0},
+        {"elevation": 91.0},
+        {"mask": Path("m"), "background": "white"},
+        {"views_cameras": Path("c.json")},
+        {"on_error": "go"},
+        {"tolerance": 0.7},
+    ],
+)
+def test_wrong_options_are_wrong_use(options):
+    with pytest.raises(UsageError):
+        VideoOptions(**options).check()
+
+
+@given(st.integers(1, 500), st.integers(0, 100))
+def test_frames_are_spread_from_the_first_to_the_last(total, count):
+    chosen = spread(total, count)
+    assert len(chosen) == (min(count, total) or total) == len(set(chosen)) and chosen == sorted(chosen)
+    assert chosen[0] == 0 and (chosen[-1] == total - 1 or len(chosen) == 1)
+
+
+def six(folder: Path, frames: range) -> Path:
+    for frame in frames:
+        save(folder / f"{frame}_rgba", [disc((16 + view, 16 + frame), 9, (32, 32)) for view in range(6)])
+    return folder
+
+
+def test_views_of_stag4d_and_of_a_camera_file(tmp_path):
+    folder = save(tmp_path / "ref", moving(3), "{}_rgba.png")
+    views = six(tmp_path / "zero123", range(3))
+    clip = video_clip(folder, VideoOptions(size=32, views=views, elevation=10.0))
+    angles = np.rad2deg([orbit_of(pose)[:2] for pose in clip.header.world_to_camera])
+    expected = [(0, 10), (30, 30), (90, -20), (150, 30), (210, -20), (270, 30), (330, -20)]
+    np.testing.assert_allclose((angles - expected + 180) % 360, 180, atol=1e-9)
+    assert clip.header.role == ["reference"] + ["train"] * 6
+    found = read(clip)
+    for view in range(6):  # only resized: no crop of their own
+        np.testing.assert_allclose(centroid(found[view + 1, 2]), (16 + view, 18), atol=0.05)
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(
+        json.dumps([{"azimuth": 90, "elevation": 0, "radius": 3}, {"azimuth": 180, "elevation": 5, "role": "test"}])
+    )
+    by_view = tmp_path / "by_view"
+    for view in range(2):
+        save(by_view / f"eval_{view}", [disc((10 + view, 16 + frame), 7, (32, 32)) for frame in range(3)])
+    clip = video_clip(folder, VideoOptions(size=32, views=by_view, views_cameras=cameras))
+    assert clip.header.role == ["reference", "train", "test"]
+    assert orbit_of(clip.header.world_to_camera[1])[2] == pytest.approx(3)
+    np.testing.assert_allclose(centroid(read(clip)[2, 1]), (11, 17), atol=0.05)
+
+
+def test_views_belong_to_the_frames_that_are_used(tmp_path):
+    folder = save(tmp_path / "ref", moving(6))
+    clip = video_clip(folder, VideoOptions(frames=3, size=32, views=six(tmp_path / "views", range(6))))
+    found = read(clip)
+    for row, frame in enumerate(spread(6, 3)):
+        np.testing.assert_allclose(centroid(found[1, row]), (16, 16 + frame), atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        ("{}", "list of cameras"),
+        ("[]", "list of cameras"),
+        ("[1", "not readable JSON"),
+        ('[{"azimuth": 1}]', "camera 0"),
+        ('[{"azimuth": 1, "elevation": "x"}]', "finite number"),
+        ('[{"azimuth": 1, "elevation": NaN}]', "finite number"),
+        ('[{"azimuth": 1, "elevation": 1, "fov": 3}]', "camera 0"),
+        ('[{"azimuth": 1, "elevation": 1, "role": "reference"}]', "train or test"),
+        ('[{"azimuth": 1, "elevation": 95}]', "-90"),
+        ('[{"azimuth": 1, "elevation": 1}]', "3 folders of 6 pictures"),
+    ],
+)
+def test_bad_cameras_of_views(tmp_path, cameras, message):
+    path = tmp_path / "cameras.json"
+    path.write_text(cameras)
+    folder, views = save(tmp_path / "ref", moving(3)), six(tmp_path / "views", range(3))
+    with pytest.raises(DataError, match=message):
+        video_clip(folder, VideoOptions(size=32, views=views, views_cameras=path))
+
+
+def test_views_without_cameras_frames_or_objects(tmp_path):
+    folder = save(tmp_path / "ref", moving(3))
+    for frame in range(3):
+        save(tmp_path / "four" / str(frame), [disc((16, 16), 9, (32, 32))] * 4)
+    with pytest.raises(DataError, match="--views-cameras"):
+        video_clip(folder, VideoOptions(size=32, views=tmp_path / "four"))
+    with pytest.raises(DataError, match="no pictures of frame 0"):
+        video_clip(folder, VideoOptions(size=32, views=six(tmp_path / "late", range(1, 4))))
+    with pytest.raises(DataError, match="no folders inside"):
+        video_clip(folder, VideoOptions(size=32, views=folder))
+    views = six(tmp_path / "hollow", range(3))
+    Image.fromarray(np.zeros((32, 32, 4), np.uint8)).save(views / "1_rgba" / "4.png")
+    with pytest.raises(DataError, match="4.png: no object in this view"):
+        read(video_clip(folder, VideoOptions(size=32, views=views)))
+
+
+# ---- transforms_*.json -------------------------------------------------------------------------------------------------
+
+
+def blender_folder(folder: Path, cameras: int = 3, frames: int = 3, moving_camera: bool = False) -> tuple[Path, list]:
+    """A ball at (0.5, -0.3, 1) of radius 0.4 that rises, seen by still cameras in Blender's world (z up, OpenGL axes)."""
+    angle_x, width, height, rows, poses = 0.7, 64, 48, [], []
+    focal = 0.5 * width / np.tan(angle_x / 2)
+    for view in range(cameras):
+        for frame in range(frames):
+            azimuth = 0.4 + 1.7 * view + (0.2 * frame if moving_camera else 0)
+            place = np.array([4 * np.cos(azimuth), 4 * np.sin(azimuth), 2.0])
+            back = place / np.linalg.norm(place)
+            right = np.cross([0, 0, 1], back) / np.linalg.norm(np.cross([0, 0, 1], back))
+            pose = np.eye(4)
+            pose[:3] = np.column_stack([right, np.cross(back, right), back, place])
+            ball = np.array([0.2, -0.1, 0.1 + 0.1 * frame])
+            x, y, z = pose[:3, :3].T @ (ball - place)
+            center = (width / 2 + focal * x / -z, height / 2 - focal * y / -z)
+            name = f"train/r_{view}_{frame}"
+            (folder / "train").mkdir(parents=True, exist_ok=True)
+            Image.fromarray(disc(center, 0.4 * focal / -z)).save(folder / f"{name}.png")
+            rows.append({"file_path": f"./{name}", "time": frame / (frames - 1), "transform_matrix": pose.tolist()})
+        poses.append(pose)
+    (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle_x, "frames": rows}))
+    return folder, poses
+
+
+def test_known_cameras_are_turned_into_our_world_exactly(tmp_path):
+    folder, poses = blender_folder(tmp_path / "scene")
+    assert is_transforms(folder) and not is_transforms(tmp_path)
+    clip = transforms_clip(folder, VideoOptions(size=64, fps=10))
+    header = clip.header
+    np.testing.assert_allclose(header.time, [0, 0.1, 0.2])
+    fewer = transforms_clip(folder, VideoOptions(size=64, fps=10, frames=2)).header
+    np.testing.assert_allclose(fewer.time, [0, 0.2])  # as long a clip, of fewer pictures
+    azimuths = np.rad2deg([orbit_of(pose)[0] for pose in header.world_to_camera])
+    assert abs(azimuths[0]) < 1e-6
+    assert all(orbit_of(pose)[1] > 0 for pose in header.world_to_camera)  # Blender's up became ours
+    # the ball's middle, found from all cameras in our world, is one point: rays through the centroids meet
+    found = read(clip)
+    heights = []
+    for frame in range(3):
+        rays, centers = [], []
+        for view in range(3):
+            u = np.array([*centroid(found[view, frame]), 1])
+            ray = header.world_to_camera[view, :3, :3].T @ np.linalg.inv(header.intrinsics[view]) @ u
+            rays.append(ray / np.linalg.norm(ray))
+            centers.append(-header.world_to_camera[view, :3, :3].T @ header.world_to_camera[view, :3, 3])
+        across = np.eye(3) - np.einsum("vi,vj->vij", rays, rays)
+        point = np.linalg.solve(across.sum(0), np.einsum("vij,vj->i", across, np.array(centers)))
+        off = [np.linalg.norm(a @ (point - c)) for a, c in zip(across, centers)]
+        assert max(off) < 0.02 and np.linalg.norm(point) < 0.4
+        heights.append(point[1])
+    assert (np.diff(heights) > 0.05).all()  # what rises in the scene rises along +y
+
+
+def test_a_moving_camera_is_told_apart(tmp_path):
+    folder, _ = blender_folder(tmp_path / "scene", cameras=1, moving_camera=True)
+    with pytest.raises(DataError, match="the camera moves"):
+        transforms_clip(folder, SMALL)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("camera_angle_x"), "views without cameras"),
+        (lambda d: d["frames"][0].pop("time"), "a still scene"),
+        (lambda d: d["frames"][0].pop("transform_matrix"), "no 'transform_matrix'"),
+        (lambda d: d["frames"][0].update(file_path="train/none"), "no such image"),
+        (lambda d: d["frames"][0].update(file_path="../../x"), "outside the folder"),
+        (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4 x 4"),
+        (lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "not a camera-to-world"),
+        (lambda d: d.update(frames=[]), "no frames"),
+    ],
+)
+def test_bad_transforms(tmp_path, change, message):
+    folder, _ = blender_folder(tmp_path / "scene", cameras=1)
+    data = json.loads((folder / "transforms_train.json").read_text())
+    change(data)
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    with pytest.raises(DataError, match=message):
+        transforms_clip(folder, SMALL)
+
+
+# ---- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, dpc):
+    folder = save(tmp_path / "clip", moving(3))
+    out = tmp_path / "clip.h5"
+    assert dpc("prepare", "video", folder, "--size", 32, "-o", out).returncode == 0
+    with ViewsReader(out) as reader:
+        assert reader.header.size == (32, 32) and reader.header.name == "clip"
+        assert reader.provenance[0]["config"]["size"] == 32
+    before = out.read_bytes()
+    again = dpc("prepare", "video", folder, "--size", 32, "-o", out)
+    assert again.returncode == 0 and b"already complete" in again.stderr and out.read_bytes() == before
+    other = dpc("prepare", "video", folder, "--size", 48, "-o", out)
+    assert other.returncode == 2 and b"size 32 (now 48)" in other.stderr
+    save(folder, moving(4))
+    assert dpc("prepare", "video", folder, "--size", 32, "-o", out).returncode == 2  # another input
+    piped = dpc("prepare", "video", folder, "--size", 32, "-o", "-")
+    assert piped.returncode == 0 and piped.stdout.startswith(b"\x89HDF")
+    bad = dpc("prepare", "video", tmp_path, "-o", tmp_path / "b.h5")
+    assert bad.returncode == 3 and b"no frames" in bad.stderr and not (tmp_path / "b.h5").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "frames"), [("consistent4d/roaring_t-rex", 32), ("actionmesh/kangaroo", 16), ("l4gm/lifting1_fg.mp4", 300)]
+)
+def test_real_clips(shared_data, name, frames):
+    path = shared_data / "video" / name
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    assert len(open_frames(path)) == frames
+    clip = video_clip(path, VideoOptions(frames=4, size=128))
+    for rgba in read(clip).values():
+        share = (rgba[..., 3] > 127).mean()
+        assert 0.05 < share < 0.6 and rgba[0].max() == rgba[-1].max() == 0

@@ -1,0 +1,189 @@
+"""The folder of a training run: what --force may delete and when, who may write, a full disk, a run that is over."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dpcli.store import ScoresReader
+from dpcli.store.file import open_store
+from tests.classify.commands.test_train_predict import gestures
+
+ROOT = Path(__file__).resolve().parents[2]
+TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "none")
+SHORT = (*TRAIN, "--epochs", "1", "--epochs-dynamic", "0")
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return gestures(tmp_path_factory.mktemp("data") / "clouds.h5", videos=8)
+
+
+@pytest.fixture
+def finished(data, tmp_path, dpc_here) -> Path:
+    """A folder with a trained model."""
+    done = dpc_here("classify", "train", data, "-o", tmp_path / "run", *SHORT)
+    assert done.returncode == 0, done.stderr.decode()
+    return tmp_path / "run"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def start(*words: object, limit: int | None = None) -> subprocess.Popen:
+    """`dpc` as a process of its own; limit: bytes that a file of it may have."""
+
+    def limited() -> None:
+        if limit is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "dpcli", *map(str, words)],
+        cwd=ROOT,
+        text=True,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=limited,
+    )
+
+
+def wait_for(come: Callable[[], bool], process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 240
+    while not come() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert come() and process.poll() is None, process.communicate()
+
+
+def test_a_command_that_fails_deletes_no_model(data, finished, tmp_path, dpc_here):
+    """--force empties the folder only once everything else is there, checked and read."""
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "best.safetensors").write_bytes(b"no weights")
+    (tmp_path / "link.safetensors").symlink_to(finished / "best.safetensors")
+    before = contents(finished)
+    assert ".lock" not in before and "best.safetensors" in before
+    for more, code, said in (
+        (("--init", finished), 2, f"--init {finished}/best.safetensors: lies in the folder of -o"),
+        (("--static-from", finished / "best.safetensors"), 2, "--static-from"),
+        (("--init", tmp_path / "link.safetensors"), 2, "lies in the folder of -o"),
+        (("--init", "nosuch"), 2, "--init nosuch: no such file"),
+        (("--static-from", "nosuch"), 2, "--static-from nosuch: no such file"),
+        (("--static-from", other), 3, "not a complete safetensors file"),
+        (("--backbone", "nosuch:Cls"), 2, "nosuch"),
+        (("--accumulate", 99), 2, "--accumulate 99"),
+        (("--seed", 2**64), 2, "--seed"),
+    ):
+        done = dpc_here("classify", "train", data, "-o", finished, *SHORT, "--force", *more)
+        assert done.returncode == code and said in done.stderr.decode(), (more, done.stderr)
+        assert b"--model" not in done.stderr and b"Traceback" not in done.stderr
+        assert contents(finished) == before, more
+
+
+def test_weights_without_a_configuration_are_not_overwritten(data, finished, dpc_here):
+    (finished / "config.json").unlink()
+    before = contents(finished)
+    words = ("classify", "train", data, "-o", finished, *SHORT)
+    refused = dpc_here(*words)
+    assert refused.returncode == 2 and contents(finished) == before
+    assert b"best.safetensors" in refused.stderr and b"config.json" in refused.stderr and b"--force" in refused.stderr
+    assert dpc_here(*words, "--force").returncode == 0 and (finished / "config.json").exists()
+
+
+@pytest.mark.parametrize("more", [(), ("--force",)])
+def test_a_second_training_into_a_folder_is_refused(data, tmp_path, dpc_here, more):
+    """Until the first one ends, however: a kill leaves no lock that holds, and the run continues."""
+    folder = tmp_path / "run"
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 3000, "--epochs-dynamic", 0)
+    first = start(*words)
+    try:
+        wait_for((folder / "state.pt").exists, first)
+        second = dpc_here(*words, *more)
+        assert (
+            second.returncode == 1 and f"{folder}: cannot write (another dpc is writing it)".encode() in second.stderr
+        )
+        assert first.poll() is None and (folder / "state.pt").exists() and (folder / "config.json").exists()
+    finally:
+        first.kill()
+        first.communicate()
+    saved = (folder / "state.pt").stat().st_mtime_ns
+    third = start(*words)
+    wait_for(lambda: (folder / "state.pt").stat().st_mtime_ns > saved, third)
+    third.send_signal(signal.SIGTERM)
+    said = third.communicate(timeout=240)[1]
+    assert third.returncode == 75 and "continuing" in said and not (folder / ".lock").exists()
+
+
+@pytest.mark.parametrize(("limit", "name"), [(30_000, "last.safetensors"), (700_000, "state.pt")])
+def test_a_full_disk_ends_with_a_sentence_and_the_run_goes_on(data, finished, tmp_path, dpc_here, limit, name):
+    weights, state = ((finished / file).stat().st_size for file in ("last.safetensors", "state.pt"))
+    assert 30_000 < weights < 700_000 < state, "the limits no longer fall between the sizes of the files"
+    folder = tmp_path / "full"
+    words = ("classify", "train", data, "-o", folder, *SHORT)
+    full = start(*words, limit=limit)
+    said = full.communicate(timeout=240)[1]
+    assert full.returncode == 1 and f"{folder / name}: the file size limit is reached; make room" in said, said
+    assert "bug" not in said and "Traceback" not in said and "last saved state" not in said
+    assert not [path.name for path in folder.iterdir() if path.name.startswith(".")]
+    assert dpc_here(*words).returncode == 0 and (folder / "best.safetensors").exists()
+
+
+def test_a_disk_that_fills_up_keeps_the_last_state(data, tmp_path, dpc_here):
+    folder = tmp_path / "run"
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 40, "--epochs-dynamic", 0)
+    first = start(*words)
+    wait_for((folder / "state.pt").exists, first)
+    first.send_signal(signal.SIGTERM)
+    assert first.wait(timeout=240) == 75, first.stderr.read()
+    before = (folder / "state.pt").read_bytes()
+    full = start(*words, limit=700_000)
+    said = full.communicate(timeout=240)[1]
+    assert full.returncode == 1 and "run the same command again: it continues from the last saved state" in said, said
+    assert (folder / "state.pt").read_bytes() == before
+    again = dpc_here(*words)
+    assert again.returncode == 0 and b"continuing" in again.stderr
+    assert [row["epoch"] for row in json.loads((folder / "log.json").read_text())] == list(range(1, 41))
+
+
+def test_a_model_of_a_run_without_weights_yet(data, finished, tmp_path, dpc_here):
+    words = ("classify", "predict", data, "--model", finished, "-o", tmp_path / "s.h5")
+    (finished / "best.safetensors").unlink()
+    early = dpc_here(*words).stderr.decode()
+    assert (
+        "no best.safetensors yet" in early and f"{finished}/last.safetensors" in early and "no such file" not in early
+    )
+    (finished / "last.safetensors").unlink()
+    none = dpc_here(*words)
+    assert none.returncode == 2 and b"no best.safetensors yet" in none.stderr and b"to continue it" in none.stderr
+
+
+def test_a_finished_training_says_so(data, finished, dpc_here):
+    before = contents(finished)
+    again = dpc_here("classify", "train", data, "-o", finished, *SHORT)
+    assert again.returncode == 0 and b"best.safetensors" in again.stdout and contents(finished) == before
+    assert b"is finished already" in again.stderr and b"--force" in again.stderr and b"continuing" not in again.stderr
+
+
+def test_the_largest_seed_trains_and_is_kept_in_files(data, tmp_path, dpc_here):
+    largest, run = 2**63 - 1, tmp_path / "run"
+    assert dpc_here("classify", "train", data, "-o", run, *SHORT, "--seed", largest).returncode == 0
+    done = dpc_here("classify", "predict", data, "--model", run, "-o", tmp_path / "s.h5", "--seed", largest)
+    assert done.returncode == 0 and ScoresReader(tmp_path / "s.h5").provenance[-1]["seed"] == largest, done.stderr
+    with open_store(tmp_path / "s.h5") as file:
+        assert int(file.attrs["seed"]) == largest
+    above = dpc_here("classify", "predict", data, "--model", run, "-o", tmp_path / "t.h5", "--seed", largest + 1)
+    assert above.returncode == 2 and b"--seed" in above.stderr and str(largest).encode() in above.stderr
