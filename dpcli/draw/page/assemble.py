@@ -46,22 +46,25 @@ def as_base64(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 9)).decode("ascii")
 
 
-def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], blocks: Sequence[bytes] = ()) -> str:
+def data_blocks(blocks: Sequence[bytes]) -> str:
+    """Return binary data as elements with the ids data0, data1, ...; a script unpacks one when it needs it."""
+    return "\n".join(
+        f'<script type="text/plain" id="data{at}">{as_base64(block)}</script>' for at, block in enumerate(blocks)
+    )
+
+
+def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], data: str = "") -> str:
     """Return a page about one file.
 
     header: values for the script, among them `title`. name: of the page: NAME.html is its middle, and the style sheet knows it.
-    script: names of the page's own scripts, in their order. blocks: binary data, one element each, which the script unpacks when
-    it needs them.
+    script: names of the page's own scripts, in their order. data: HTML of the elements that hold further data.
     """
-    data = "\n".join(
-        f'<script type="text/plain" id="data{at}">{as_base64(block)}</script>' for at, block in enumerate(blocks)
-    )
     return filled(
         source_text(_TEMPLATE),
         {
             "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE) + source_text(_DATA_STYLE), "BODY": name,
-            "MAIN": source_text(f"web/{name}.html"),
-            "HEADER": as_json(header), "DATA": data, "SCRIPT": script_text([*SHARED, *(f"web/{one}.js" for one in script)]),
+            "MAIN": source_text(f"web/{name}.html"), "HEADER": as_json(header), "DATA": data,
+            "SCRIPT": script_text([*SHARED, *(f"web/{one}.js" for one in script)]),
         },
     )  # fmt: skip
 

@@ -30,14 +30,19 @@ def film_page(
 
     Pictures are reduced so that their longer side has at most `side` pixels, and stored as WebP.
     """
-    shown = [{"title": view.title, "pictures": [_webp(picture, side) for picture in view.pictures]} for view in views]
+    titles, strips = [], []
+    for at, view in enumerate(views):
+        titles.append(view.title)
+        pictures = "".join(f'<img alt="" src="{_webp(picture, side)}">' for picture in view.pictures)
+        strips.append(f'<div id="view{at}" hidden>{pictures}</div>')
     header = facts.header() | {
-        "views": shown, "frames": list(frames), "frame_count": frame_count, "time": time.tolist(), "rate": frame_rate(time),
+        "views": titles, "frames": list(frames), "frame_count": frame_count, "time": time.tolist(), "rate": frame_rate(time),
     }  # fmt: skip
-    return data_page(header, "film", script=("film",))
+    return data_page(header, "film", script=("film",), data="\n".join(strips))
 
 
 def _webp(rgba: np.ndarray, side: int) -> str:
+    """Return the address, `data:...`, of a picture: letters, digits and + / = only, so it may stand in an attribute."""
     from PIL import Image
 
     picture = Image.fromarray(rgba)

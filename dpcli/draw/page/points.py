@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.draw.page.assemble import data_page
+from dpcli.draw.page.assemble import data_blocks, data_page
 from dpcli.draw.palette import UNKNOWN, part_colors
 
 SCRIPTS = ("clip", "points_gl", "points_canvas", "floor", "points")
@@ -91,7 +91,7 @@ def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np
     blocks = [_packed(sequence) for sequence in sequences]
     for about, block in zip(header["sequences"], blocks):
         about["bytes"] = len(block)
-    return data_page(header, "points", script=SCRIPTS, blocks=blocks)
+    return data_page(header, "points", script=SCRIPTS, data=data_blocks(blocks))
 
 
 def _looks(sequences: Sequence[PageSequence]) -> list[str]:

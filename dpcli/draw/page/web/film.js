@@ -6,13 +6,11 @@ class FilmPage extends Player {
     this.header = header;
   }
 
-  async start() {
+  start() {
     const { header } = this;
     fillHead(header);
     fillAbout(header, "space plays · ← → step · + − size of the pictures · b light or dark · ? this panel. A click on a picture goes to its frame.");
-    this.rows = header.views.map((view) => this.row(view));
-    const loaded = (picture) => picture.complete || new Promise((done) => { picture.onload = picture.onerror = done; });
-    await Promise.all(this.rows.flatMap((row) => row.pictures.map(loaded)));
+    this.rows = header.views.map((title, view) => this.row(title, [...$(`view${view}`).children]));
     this.listenToBar();
     const toggleTheme = followTheme(() => {});
     $("theme").onclick = toggleTheme;
@@ -33,22 +31,20 @@ class FilmPage extends Player {
     this.change(given.has("frame") || given.has("play") ? { play: given.get("play") === "1" } : {});
   }
 
-  row({ title, pictures }) {
+  row(title, pictures) {
     const row = made("section", "", { class: "camera", "aria-label": title }), strip = made("div", "", { class: "strip" });
     const screen = made("canvas", "", { class: "screen", role: "img", "aria-label": `${title}: the frame that is shown` }), [name, ...rest] = title.split(" · ");
-    const images = pictures.map((source, frame) => {
-      const button = made("button", "", { title: `frame ${this.header.frames[frame]}` }), image = made("img", "", { alt: "" });
-      image.src = source;
-      button.append(image, made("span", this.header.frames[frame]));
+    for (const [frame, picture] of pictures.entries()) {
+      const number = this.header.frames[frame], button = made("button", "", { title: `frame ${number}` });
+      button.append(picture, made("span", number));
       button.onclick = () => this.change({ time: frame, play: false });
       strip.append(button);
-      return image;
-    });
+    }
     const head = made("h2", `camera ${name}`);
     head.append(made("span", rest.join(" · ")));
     row.append(head, screen, strip);
     $("strips").append(row);
-    return { screen, strip, pictures: images };
+    return { screen, strip, pictures };
   }
 
   get frameNumber() { return Math.min(Math.floor(this.state.time + 1e-6), this.timeline.end); }
@@ -75,4 +71,4 @@ class FilmPage extends Player {
 }
 
 window.page = new FilmPage(JSON.parse($("header").textContent));
-window.page.start();
+window.addEventListener("load", () => window.page.start());  // all pictures are there
