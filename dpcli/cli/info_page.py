@@ -87,7 +87,7 @@ def _short_unit(unit: str) -> str:
 
 
 def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[int]:
-    """The sequences to show: those named (by name, else by number), else some of each class."""
+    """Return the sequences to show: those named (by name, else by number), else some of each class."""
     from dpcli.draw.contact_sheet import spread_samples
     from dpcli.errors import DataError
 
@@ -110,7 +110,7 @@ def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[i
 
 
 def _sequence(reader: CloudsReader, row: int, frames: list[int], most: int, axes: np.ndarray) -> PageSequence:
-    """Reads one frame at a time and keeps `most` points of it."""
+    """Read a sequence one frame at a time and keep `most` points of each."""
     from dpcli.draw.page.points import PageSequence, spread
 
     fields = [name for name in ("part", "color", "time") if name in reader.fields]
@@ -134,13 +134,8 @@ def _sequence(reader: CloudsReader, row: int, frames: list[int], most: int, axes
 def _cloud_words(reader: CloudsReader, kind: str) -> str:
     sizes = reader.frame_sizes
     about = "" if len(set(sizes.tolist())) < 2 else "about "
-    usual = f"{about}{int(np.median(sizes)) if len(sizes) else 0:,}"
-    words = [
-        kind,
-        _many(len(reader), "sequence"),
-        _many(int(reader.frame_counts.sum()), "frame"),
-        f"{usual} points a frame",
-    ]
+    usual = f"{about}{_many(int(np.median(sizes)) if len(sizes) else 0, 'point')} a frame"
+    words = [kind, _many(len(reader), "sequence"), _many(int(reader.frame_counts.sum()), "frame"), usual]
     return " · ".join([*words, *([_many(len(reader.class_names), "class")] if reader.class_names else [])])
 
 
@@ -150,7 +145,7 @@ def _many(count: int, word: str) -> str:
 
 
 def _left_out(reader: CloudsReader, frames: dict[int, list[int]], most: int, chosen: bool) -> list[str]:
-    """Sentences about sequences, frames and points of the file that the page doesn't show."""
+    """Return sentences about the sequences, frames and points of the file that the page doesn't show."""
     notes = []
     if len(frames) < len(reader):
         how = "" if chosen else "; --samples N or --sequence NAME shows others"

@@ -71,19 +71,23 @@ function listenToKeys(table) {
   });
 }
 
-// The panel about the file: facts, the commands that made it, keys; `?` and the button open and close it.
-function fillAbout(header, keys) {
-  const panel = $("about"), table = made("table"), add = (...elements) => panel.append(...elements);
-  for (const [name, value] of header.facts) {
+function tableOf(rows) {
+  const table = made("table");
+  for (const [name, value] of rows) {
     const row = made("tr");
     row.append(made("th", name, { scope: "row" }), made("td", value));
     table.append(row);
   }
-  const close = made("button", "close", { class: "close" });
+  return table;
+}
+
+// The panel about the file: keys [key, what it does], facts, the commands that made it; `?` and the button open and close it.
+function fillAbout(header, keys) {
+  const panel = $("about"), close = made("button", "close", { class: "close" });
   close.onclick = () => { panel.hidden = true; };
-  add(close, made("h2", "Keys"), made("p", keys), made("h2", "This file"), table);
-  if (header.history.length) add(made("h2", "Commands"));
-  for (const entry of header.history) add(made("code", entry.command));
+  panel.append(close, made("h2", "Keys"), tableOf([...keys, ["b", "light or dark"], ["?", "this panel"]]), made("h2", "This file"), tableOf(header.facts));
+  if (header.history.length) panel.append(made("h2", "Commands that made it"));
+  for (const entry of header.history) panel.append(made("code", entry.command));
   $("open-about").onclick = () => { panel.hidden = !panel.hidden; };
 }
 

@@ -81,7 +81,7 @@ class Clip {
   // How far a point's dot reaches, such that neighbors on a surface nearly touch.
   get reach() {
     const [a, b] = this.half.map((value) => 2 * value).sort((one, two) => two - one);
-    return Math.min(Math.max(0.55 * Math.sqrt(a * b / this.usual), 0.004), 0.03);
+    return Math.min(Math.max(0.55 * Math.sqrt(a * b / this.usual), 0.1 / Math.sqrt(this.usual), 0.004), 0.03);
   }
 
   // Half the side of the ground, and of its squares, whose size is round in the file's unit.

@@ -1,5 +1,12 @@
 // The page of views: a screen and a strip of frames for each camera. #frame=3&play=0&theme=dark sets its state.
 
+const KEYS = [
+  ["space", "play or stop"],
+  ["← →", "a frame back or on"],
+  ["click", "go to that frame"],
+  ["+ −", "larger or smaller pictures"],
+];
+
 class FilmPage extends Player {
   constructor(header) {
     super(new Timeline(header.frames.map((_, frame) => frame), header.rate, 1));
@@ -9,7 +16,7 @@ class FilmPage extends Player {
   start() {
     const { header } = this;
     fillHead(header);
-    fillAbout(header, "space plays · ← → step · + − size of the pictures · b light or dark · ? this panel. A click on a picture goes to its frame.");
+    fillAbout(header, KEYS);
     this.rows = header.views.map((title, view) => this.row(title, [...$(`view${view}`).children]));
     this.listenToBar();
     const toggleTheme = followTheme(() => {});

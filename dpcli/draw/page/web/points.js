@@ -3,6 +3,17 @@
 
 const LOOKS = { part: "part", color: "stored color", label: "label", height: "height", time: "time" };
 const UPS = ["−y", "+y", "+z", "−z", "+x", "−x"];
+const KEYS = [
+  ["space", "play or stop"],
+  ["← →", "a frame back or on"],
+  ["[ ]", "the sequence before or after, as the page keys do"],
+  ["1 … 5", "what the colors tell"],
+  [", .", "smaller or larger points"],
+  ["+ −", "nearer or farther, as the wheel or a pinch"],
+  ["drag", "turn; with shift, or two fingers: move"],
+  ["r", "the first view"],
+  ["u", "another axis upright"],
+];
 const FOVY = 32 * DEGREE, GROUND = { light: [252, 252, 253], dark: [22, 26, 34] };
 
 class PointsPage extends Stage {
@@ -30,7 +41,7 @@ class PointsPage extends Stage {
   async start() {
     const { header } = this;
     fillHead(header);
-    fillAbout(header, "space plays · ← → step · [ ] or page keys other sequence · 1 to 5 color · , . size of points · + − zoom · r resets the view · u which axis is up · b light or dark · ? this panel. Drag turns, wheel or pinch zooms, shift-drag or two fingers move.");
+    fillAbout(header, KEYS);
     for (const look of header.looks) {
       const button = made("button", LOOKS[look], { "data-color": look, title: header.looks.indexOf(look) + 1 });
       button.onclick = () => this.change({ color: look });

@@ -1,5 +1,10 @@
 // The page of an embedding: dots of samples in a plane for each stream; the nearest to the pointer is told in all of them.
 
+const KEYS = [
+  ["pointer", "tells the sample below it"],
+  ["click", "hides or shows a class"],
+];
+
 class ScatterPage {
   constructor(header) {
     Object.assign(this, { header, hidden: new Set(), near: -1 });
@@ -9,7 +14,7 @@ class ScatterPage {
 
   start() {
     fillHead(this.header);
-    fillAbout(this.header, "b light or dark · ? this panel. The pointer tells the sample below it; a click on a class hides or shows it.");
+    fillAbout(this.header, KEYS);
     const toggleTheme = followTheme(() => this.draw());
     $("theme").onclick = toggleTheme;
     for (const one of this.header.classes) $("legend").append(this.entry(one));

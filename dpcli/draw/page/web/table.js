@@ -1,6 +1,12 @@
 // The page of scores: sorting, searching, and the best classes of a sample.
 // #sort=probability&down=1&which=wrong&search=wave&theme=dark sets its state.
 
+const KEYS = [
+  ["/", "search"],
+  ["a w g", "all, wrong or right samples"],
+  ["click", "a column sorts; a row shows its best classes, as Enter does"],
+];
+
 class ScoresPage {
   constructor(header) {
     Object.assign(this, { header, sort: null, down: false, which: "all", search: "" });
@@ -50,7 +56,7 @@ class ScoresPage {
   start() {
     const { header } = this;
     fillHead(header);
-    fillAbout(header, "/ search · a all · w wrong · g right · b light or dark · ? this panel. A click on a column sorts by it, a click on a row tells its best classes; Tab and Enter do the same.");
+    fillAbout(header, KEYS);
     const toggleTheme = followTheme(() => {});
     $("theme").onclick = toggleTheme;
     for (const [stream, [right, known]] of Object.entries(header.tally)) if (known) $("tally").append(this.tile(stream, right, known));
