@@ -30,7 +30,7 @@ def write_info_page(
     number. view: axes that point right, down and away. UsageError for a wrong choice, DataError when the page can't be written.
     """
     from dpcli.draw.page.assemble import write_page
-    from dpcli.store.pipes import check_target
+    from dpcli.runtime.whole_file import check_target
 
     check_target(page, "--page", PAGES)
     if kind not in ("clouds", "parts") and (chosen or view):

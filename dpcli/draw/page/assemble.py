@@ -12,8 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from dpcli.errors import DataError
-from dpcli.runtime.whole_file import whole_file
+from dpcli.runtime.whole_file import write_whole
 
 _MARK = re.compile(r"<!--([A-Z]+)-->")
 # shared/ is in every page, the scene viewer's too; web/ is of the pages about a file, which have one template and one style sheet.
@@ -72,9 +71,5 @@ def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], da
 def write_page(page: str, path: Path) -> int:
     """Write a page whole or not at all; return its size in bytes. DataError when it can't be written."""
     content = page.encode("utf-8", "replace")
-    try:
-        with whole_file(path) as part:
-            part.write_bytes(content)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+    write_whole(path, content)
     return len(content)

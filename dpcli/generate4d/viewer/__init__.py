@@ -1,4 +1,4 @@
-"""One HTML file that shows a scene: page, scripts and quantised data in it; no server, no network."""
+"""One HTML file that shows a scene: page, scripts and quantized data in it; no server, no network."""
 
 from __future__ import annotations
 
