@@ -33,7 +33,7 @@ help:
 	@echo "make table-3.4 MSRACTION=folder accuracy on 4 to 24 frames, three seeds; over an hour on 2 cores"
 	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; days"
 	@echo "make figure-3.8 MSRACTION=folder parameters, FLOPs, accuracy of three backbones (= table-A.1)"
-	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/tables.md says more of all of these"
+	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/reproduce.md says more of all of these"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
@@ -73,7 +73,7 @@ demo: $(READY)
 test: $(READY)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
-# Chapter 3 and appendix A (docs/tables.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
+# Chapter 3 and appendix A (docs/reproduce.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
 # PRESET quick or thesis; SEEDS; BUDGET: words for `dpc classify train`, such as "--epochs 40 --batch 16"; CLIPS per video
 # at prediction; PREPARE: words for `dpc prepare`. Table 3.4: the other lengths go on from the network of FROM frames (none:
 # each on its own), by MORE, words for `dpc classify train`.

@@ -19,4 +19,8 @@ def _settings(value: object, path: str = "") -> dict[str, str]:
         return {}
     if not isinstance(value, dict):
         return {path: json.dumps(value, sort_keys=True)}
-    return {name: one for key, item in value.items() for name, one in _settings(item, f"{path}.{key}" if path else key).items()}
+    return {
+        name: one
+        for key, item in value.items()
+        for name, one in _settings(item, f"{path}.{key}" if path else key).items()
+    }

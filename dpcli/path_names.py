@@ -17,7 +17,9 @@ def utf8_path(path: Path, library: str) -> str:
     """The path for a library that takes only UTF-8 (OpenCV's videos crash otherwise). DataError when it is none."""
     text = str(path)
     if as_utf8(text) != text:
-        raise DataError(f"{as_utf8(text)}: the path holds bytes that are not UTF-8, and {library} can't open it; rename it")
+        raise DataError(
+            f"{as_utf8(text)}: the path holds bytes that are not UTF-8, and {library} can't open it; rename it"
+        )
     return text
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -85,26 +84,6 @@ def test_what_is_imported_is_declared_and_nothing_more() -> None:
     foreign = {name for name in used - {"dpcli"} if name not in sys.stdlib_module_names}
     found = {canonicalize_name(DISTRIBUTION.get(name, name)) for name in foreign}
     assert found - optional == declared and found <= declared | optional
-
-
-def test_rooms_import_only_what_they_may() -> None:
-    """design.md section 1: the levels meet through files, the lower rooms know nothing of the upper ones."""
-    low = {"store", "ops", "runtime"}
-    common = {"differences", "errors", "lock", "paths", "streams"}  # files, not rooms: what any room may meet
-    allowed = {
-        "store": set(),
-        "ops": set(),
-        "runtime": set(),
-        "prepare": low,
-        "classify": low,
-        "segment": low,
-        "generate4d": low,
-        "evaluate": low,  # ops: a scene is rendered to be compared
-    }
-    for room, others in allowed.items():
-        for path in (ROOT / "dpcli" / room).rglob("*.py"):
-            found = set(re.findall(r"(?:from|import) dpcli\.(\w+)", path.read_text())) - {room, *common}
-            assert found <= others, f"{path.relative_to(ROOT)} imports {sorted(found - others)}"
 
 
 @pytest.fixture(scope="module")

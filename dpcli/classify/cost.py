@@ -45,7 +45,7 @@ def _paper_total(model: Kinet) -> float:
 def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
     """Multiply-adds of the matrix products of one clip (B=1), by stream, and of the fits (counted by hand).
 
-    Neighbour search, batch norm, activations and the small inverses are not in it; each is named in `uncounted`.
+    Neighbor search, batch norm, activations and the small inverses are not in it; each is named in `uncounted`.
     """
     from torch.utils.flop_counter import FlopCounterMode
 
@@ -88,7 +88,7 @@ def _fit_macs(model: Kinet, stages: list[Stage]) -> int:
 
 
 def latency(model: Kinet, points: torch.Tensor, device: torch.device, repeats: int = 5) -> dict[str, float]:
-    """Milliseconds of one clip (B=1): neighbour search, both streams, all; medians."""
+    """Milliseconds of one clip (B=1): neighbor search, both streams, all; medians."""
     rows = []
     with torch.inference_mode():
         for _ in range(repeats + 1):
@@ -101,7 +101,7 @@ def latency(model: Kinet, points: torch.Tensor, device: torch.device, repeats: i
             marks.append(_now(device))
             rows.append([1000 * (b - a) for a, b in zip(marks, marks[1:])] + [1000 * (marks[-1] - marks[0])])
     medians = torch.tensor(rows[1:]).median(0).values.tolist()
-    return dict(zip(("neighbours", "static", "dynamic", "total"), (round(value, 2) for value in medians)))
+    return dict(zip(("neighbors", "static", "dynamic", "total"), (round(value, 2) for value in medians)))
 
 
 def _now(device: torch.device) -> float:
@@ -120,24 +120,35 @@ def measure(model: Kinet, device: torch.device, with_steps: bool = False) -> dic
     before = peak_memory()
     counts = macs(model, points)
     result = {
-        "variant": config.variant, "backbone": config.backbone, "classes": config.num_classes,
+        "variant": config.variant,
+        "backbone": config.backbone,
+        "classes": config.num_classes,
         "clip": [config.num_frames, config.points_per_frame],
-        "parameters": {"total": count_parameters(model), "static": count_parameters(model.static),
-                       "dynamic": count_parameters(model.dynamic),
-                       **{f"static_{name}": count_parameters(part) for name, part in model.static.named_children()},
-                       **{f"dynamic_{k}": count_parameters(getattr(model.dynamic, k)) for k in ("units", "merge", "head")}},
-        "paper_style_parameters": {"total": round(_paper_total(model), 3), "static": round(paper_parameters(model.static), 3),
-                                   "rule": "weights + Adam moments + moving statistics, / 2^20 (thesis table A.1); in the"
-                                           " total the static stream is frozen"},
+        "parameters": {
+            "total": count_parameters(model),
+            "static": count_parameters(model.static),
+            "dynamic": count_parameters(model.dynamic),
+            **{f"static_{name}": count_parameters(part) for name, part in model.static.named_children()},
+            **{f"dynamic_{k}": count_parameters(getattr(model.dynamic, k)) for k in ("units", "merge", "head")},
+        },
+        "paper_style_parameters": {
+            "total": round(_paper_total(model), 3),
+            "static": round(paper_parameters(model.static), 3),
+            "rule": "weights + Adam moments + moving statistics, / 2^20 (thesis table A.1); in the"
+            " total the static stream is frozen",
+        },
         "macs_per_clip": counts,
-        "paper_style_gflops": {"static": round(2 * counts["static_as_written"] / 2**30, 2),
-                               "total": round(2 * (counts["static_as_written"] + counts["dynamic"]) / 2**30, 2),
-                               "rule": "2 x multiply-adds of the layers as written, / 2^30"},
-        "uncounted": "neighbour search, batch norm, activations, pooling, the small inverses",
+        "paper_style_gflops": {
+            "static": round(2 * counts["static_as_written"] / 2**30, 2),
+            "total": round(2 * (counts["static_as_written"] + counts["dynamic"]) / 2**30, 2),
+            "rule": "2 x multiply-adds of the layers as written, / 2^30",
+        },
+        "uncounted": "neighbor search, batch norm, activations, pooling, the small inverses",
         "latency_ms": latency(model, points, device),
         "peak_memory_mb": _peak(device, before),
-        "device": str(device), "threads": torch.get_num_threads(),
-    }  # fmt: skip
+        "device": str(device),
+        "threads": torch.get_num_threads(),
+    }
     if with_steps:
         result |= steps(model, device)
     return result
@@ -210,13 +221,17 @@ def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool 
         thin = min(_sparse_products(step) for _ in range(_STEPS)) if sparse else 0.0
     finally:
         torch.set_num_threads(threads)
-    parts = {"matrix_products": inside, "sparse_products": thin, "neighbours": grouping}
+    parts = {"matrix_products": inside, "sparse_products": thin, "neighbors": grouping}
     parts["other"] = alone - sum(parts.values())
     return {
-        "batch": batch, "threads": threads, "seconds": round(seconds, 4), "seconds_on_one_thread": round(alone, 4),
-        "matrix_products_share": round(inside / alone, 3), "sparse_products_share": round(thin / alone, 3),
+        "batch": batch,
+        "threads": threads,
+        "seconds": round(seconds, 4),
+        "seconds_on_one_thread": round(alone, 4),
+        "matrix_products_share": round(inside / alone, 3),
+        "sparse_products_share": round(thin / alone, 3),
         "ms_per_clip": {name: round(1000 * value / batch, 2) for name, value in parts.items()},
-    }  # fmt: skip
+    }
 
 
 def _profiled(step: Callable[[], tuple[float, float]]) -> tuple[tuple[float, float], float]:
@@ -297,6 +312,7 @@ def _step_lines(name: str, step: dict[str, Any]) -> list[str]:
     return [
         f"{name:<13} {step['batch'] / step['seconds']:.3g} clips/s: {step['seconds']} s for {step['batch']} clips with"
         f" {step['threads']} threads, {step['seconds_on_one_thread']} s with one,",
-        f"              of which {dense:.0f} % in matrix products" + (f" and {sparse:.0f} % in sparse ones" if sparse else ""),
+        f"              of which {dense:.0f} % in matrix products"
+        + (f" and {sparse:.0f} % in sparse ones" if sparse else ""),
         f"  per clip    {parts} ms",
     ]

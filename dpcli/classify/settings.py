@@ -15,9 +15,21 @@ from dpcli.errors import UsageError
 from dpcli.runtime.device import cpu_count
 from dpcli.runtime.mixed_precision import wanted
 
-_RELEASE = {key: getattr(KinetConfig.release(), key) for key in
-            ("variant", "group_size", "xyz_group", "time_input", "weighting", "merge", "guard", "fusion", "grouping",
-             "static_temporal_radius")}  # fmt: skip
+_RELEASE = {
+    key: getattr(KinetConfig.release(), key)
+    for key in (
+        "variant",
+        "group_size",
+        "xyz_group",
+        "time_input",
+        "weighting",
+        "merge",
+        "guard",
+        "fusion",
+        "grouping",
+        "static_temporal_radius",
+    )
+}
 
 
 def network_config(

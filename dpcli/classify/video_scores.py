@@ -32,9 +32,14 @@ def batches(source: ClipSource, clips: list[Clip], size: int) -> Iterator[tuple[
 
 @torch.inference_mode()
 def predict_videos(
-    model: Kinet, source: ClipSource, clips_per_video: int | None, batch: int, device: torch.device,
-    streams: Sequence[str] = STREAMS, done: Container[int] = (),
-) -> Iterator[VideoScores]:  # fmt: skip
+    model: Kinet,
+    source: ClipSource,
+    clips_per_video: int | None,
+    batch: int,
+    device: torch.device,
+    streams: Sequence[str] = STREAMS,
+    done: Container[int] = (),
+) -> Iterator[VideoScores]:
     """Scores of every video of `source` that isn't `done`, in order, one video in memory at a time.
 
     streams: those that were trained; with the static one alone, its scores are the fused ones. done: numbers of sequences.

@@ -28,7 +28,7 @@ os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 # asked for is set up; `dpc --help` loads none.
 ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
-    "classify": "Recognise actions and gestures (Kinet).",
+    "classify": "Recognize actions and gestures (Kinet).",
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
     "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
@@ -38,7 +38,11 @@ ROOMS = {
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
-_FULL = {errno.ENOSPC: "no space left on the device", errno.EDQUOT: "disk quota exceeded", errno.EFBIG: "file too large"}
+_FULL = {
+    errno.ENOSPC: "no space left on the device",
+    errno.EDQUOT: "disk quota exceeded",
+    errno.EFBIG: "file too large",
+}
 
 
 def _version(wanted: bool) -> None:
@@ -62,7 +66,7 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-        help="Dynamic point clouds: recognise actions, find rigid parts and their motions, rebuild a scene in 4D.",
+        help="Dynamic point clouds: recognize actions, find rigid parts and their motions, rebuild a scene in 4D.",
         epilog="Anywhere on the line: -q (errors only), -v (more), --debug (traces).",
     )
     dpc.callback()(_root)
@@ -213,7 +217,13 @@ def _keeping_inputs(command: Any) -> Any:
         for name, value in values.items():
             if name not in written:
                 for one in value if isinstance(value, (list, tuple)) else [value]:
-                    inputs += [str(one), *one.split(",")] if isinstance(one, str) else [str(one)] if isinstance(one, Path) else []
+                    inputs += (
+                        [str(one), *one.split(",")]
+                        if isinstance(one, str)
+                        else [str(one)]
+                        if isinstance(one, Path)
+                        else []
+                    )
         for name, option in written.items():
             if values.get(name) and str(values[name]) != "-":
                 check_output(Path(values[name]), option, inputs)

@@ -20,7 +20,10 @@ _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
 
 def info(
     file: Annotated[
-        str, typer.Argument(help="File of any kind, or - for a pipe; or a model: .safetensors, a training folder, a shipped name.")
+        str,
+        typer.Argument(
+            help="File of any kind, or - for a pipe; or a model: .safetensors, a training folder, a shipped name."
+        ),
     ],
     as_object: Json = False,
     picture: Picture = None,
@@ -42,7 +45,9 @@ def info(
     model = locate_weights(file, sorted(Path(__file__).parents[1].glob("*/weights")))
     if model is not None and model.suffix == SUFFIX:
         if picture is not None:
-            raise UsageError(f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png")
+            raise UsageError(
+                f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png"
+            )
         _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
         return
     with input_file(file) as path:
@@ -104,10 +109,15 @@ def _show(found: dict[str, Any]) -> None:
 def _show_model(told: dict[str, Any]) -> None:
     from rich.console import Console
 
-    console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+    console = Console(
+        file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH
+    )
     made = f"dpc {told['version']}, " if told["version"] else ""
-    lines = [("file", told["file"]), ("kind", f"model, {told['format'] or 'of another program'}, {made}{told['bytes'] / 1e6:.3g} MB"),
-             ("weights", f"{told['weights']:,} numbers in {told['tensors']} tensors, {', '.join(told['types'])}")]  # fmt: skip
+    lines = [
+        ("file", told["file"]),
+        ("kind", f"model, {told['format'] or 'of another program'}, {made}{told['bytes'] / 1e6:.3g} MB"),
+        ("weights", f"{told['weights']:,} numbers in {told['tensors']} tensors, {', '.join(told['types'])}"),
+    ]
     if told["card"]:
         lines.append(("card", told["card"]))
     for key, value in told["header"].items():
@@ -134,8 +144,13 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     if "counts" in found:
         counts = (f"{count:,} {name.replace('_', ' ')}" for name, count in found["counts"].items())
         lines.append(("counts", ", ".join(counts)))
-    for key, unit in (("frames_per_sequence", ""), ("points_per_frame", ""), ("parts_per_sequence", ""),
-                      ("pairs_per_sequence", ""), ("frame_interval", " s")):  # fmt: skip
+    for key, unit in (
+        ("frames_per_sequence", ""),
+        ("points_per_frame", ""),
+        ("parts_per_sequence", ""),
+        ("pairs_per_sequence", ""),
+        ("frame_interval", " s"),
+    ):
         if found.get(key):
             spread = " / ".join(f"{found[key][name]:.6g}" for name in ("min", "median", "max"))
             lines.append((key.replace("_", " "), f"{spread}{unit} (min / median / max)"))
@@ -182,9 +197,14 @@ def _view_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _scene_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
     parts = ", ".join(f"{part}: {count:,}" for part, count in found["gaussians_per_part"].items())
-    lines = [("size", f"{found['size'][0]}x{found['size'][1]} pixels"), ("duration", f"{found['duration']:.4g} s"),
-             ("Gaussians by part", parts)]  # fmt: skip
-    return lines + [(name, str(value)) for name, value in found["metrics"].items() if isinstance(value, (int, float, str))]
+    lines = [
+        ("size", f"{found['size'][0]}x{found['size'][1]} pixels"),
+        ("duration", f"{found['duration']:.4g} s"),
+        ("Gaussians by part", parts),
+    ]
+    return lines + [
+        (name, str(value)) for name, value in found["metrics"].items() if isinstance(value, (int, float, str))
+    ]
 
 
 def _class_table(found: dict[str, Any]) -> Any:

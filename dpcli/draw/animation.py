@@ -63,10 +63,25 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
         if writer is None:
             size = picture.shape[1::-1]
             writer = imageio_ffmpeg.write_frames(
-                str(path), size, fps=fps, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=1, quality=None,
-                output_params=["-crf", str(_QUALITY), "-preset", "veryfast", "-threads", "2", "-movflags", "+faststart"],
+                str(path),
+                size,
+                fps=fps,
+                codec="libx264",
+                pix_fmt_out="yuv420p",
+                macro_block_size=1,
+                quality=None,
+                output_params=[
+                    "-crf",
+                    str(_QUALITY),
+                    "-preset",
+                    "veryfast",
+                    "-threads",
+                    "2",
+                    "-movflags",
+                    "+faststart",
+                ],
                 ffmpeg_log_level="error",
-            )  # fmt: skip
+            )
             writer.send(None)
         writer.send(np.ascontiguousarray(picture))
     if writer is not None:

@@ -17,7 +17,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader
 
 CAMERA_VIEW = "xyz"  # right, down, away: OpenCV camera axes
-IMAGE_VIEW = "yx-z"  # row, column and a depth that grows towards the viewer
+IMAGE_VIEW = "yx-z"  # row, column and a depth that grows toward the viewer
 _HEIGHT = 150  # pixels of a cell
 _GAP, _TITLE, _HEADER = 4, 18, 20
 _BACKGROUND, _INK, _FAINT = (17, 20, 26), (226, 230, 236), (130, 138, 150)
@@ -27,11 +27,11 @@ _FAR = np.float32(np.inf)
 
 @dataclass(frozen=True)
 class Raster:
-    """Pixels of a cell, and where the row's points lie: centre (2) and scale in pixels per unit."""
+    """Pixels of a cell, and where the row's points lie: center (2) and scale in pixels per unit."""
 
     width: int
     height: int
-    centre: np.ndarray
+    center: np.ndarray
     scale: float
 
 
@@ -67,7 +67,7 @@ def spread_samples(labels: np.ndarray, count: int) -> list[int]:
 
 
 def contact_sheet(reader: CloudsReader, path: Path, samples: int = 8, frames: int = 8, view: str | None = None) -> None:
-    """Write the sheet to `path`. Colour: the file's own, else the rigid part, else depth (bright = near).
+    """Write the sheet to `path`. Color: the file's own, else the rigid part, else depth (bright = near).
 
     The scale is the same within a row. Reads only the frames it shows. DataError when the picture can't be written.
     """
@@ -92,7 +92,7 @@ def _row_title(reader: CloudsReader, index: int) -> str:
 
 
 def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centre and extent (2) of what is seen, without the farthest thousandth on each side (stray points)."""
+    """Center and extent (2) of what is seen, without the farthest thousandth on each side (stray points)."""
     low, high = np.percentile(points[:, :2], [0.1, 99.9], axis=0)
     return (low + high) / 2, np.maximum((high - low) * 1.1, 1e-6)
 
@@ -104,16 +104,16 @@ def _cell_width(rows: list[np.ndarray]) -> int:
 
 
 def _draw_row(points: np.ndarray, sequence: CloudSequence, width: int) -> list[np.ndarray]:
-    centre, extent = _box(points)
-    raster = Raster(width, _HEIGHT, centre, float(min(width / extent[0], _HEIGHT / extent[1])))
-    colours = _colours(points, sequence)
+    center, extent = _box(points)
+    raster = Raster(width, _HEIGHT, center, float(min(width / extent[0], _HEIGHT / extent[1])))
+    colors = _colors(points, sequence)
     offsets = sequence.frame_offsets
     spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-    return [draw_frame(points[span], colours[span], raster) for span in spans]
+    return [draw_frame(points[span], colors[span], raster) for span in spans]
 
 
-def _colours(points: np.ndarray, sequence: CloudSequence) -> np.ndarray:
-    """Colour of each point, u8 (P,3)."""
+def _colors(points: np.ndarray, sequence: CloudSequence) -> np.ndarray:
+    """Color of each point, u8 (P,3)."""
     if sequence.color is not None:
         return sequence.color
     from matplotlib import colormaps
@@ -127,15 +127,15 @@ def _colours(points: np.ndarray, sequence: CloudSequence) -> np.ndarray:
     return table[(depth * 255).astype(int)]
 
 
-def draw_frame(points: np.ndarray, colours: np.ndarray, raster: Raster) -> np.ndarray:
-    """Image u8 (H,W,3) of points f32 (N,3) (right, down, away) with colours u8 (N,3).
+def draw_frame(points: np.ndarray, colors: np.ndarray, raster: Raster) -> np.ndarray:
+    """Image u8 (H,W,3) of points f32 (N,3) (right, down, away) with colors u8 (N,3).
 
     Each point is a small square, the nearest wins, and relief is shaded.
     """
     height, width = raster.height, raster.width
     image = np.empty((height, width, 3), np.uint8)
     image[:] = _BACKGROUND
-    pixels = np.floor((points[:, :2] - raster.centre) * raster.scale + np.array([width, height]) / 2).astype(np.int64)
+    pixels = np.floor((points[:, :2] - raster.center) * raster.scale + np.array([width, height]) / 2).astype(np.int64)
     size = _dot_size(pixels)
     order = np.argsort(-points[:, 2], kind="stable")  # far to near: of several writes to a pixel the last one stays
     offsets = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2) - size // 2
@@ -143,7 +143,7 @@ def draw_frame(points: np.ndarray, colours: np.ndarray, raster: Raster) -> np.nd
     source = np.repeat(order, len(offsets))
     inside = ((spread >= 0) & (spread < [width, height])).all(axis=1)
     columns, rows, source = spread[inside, 0], spread[inside, 1], source[inside]
-    image[rows, columns] = colours[source]
+    image[rows, columns] = colors[source]
     depth = np.full((height, width), _FAR, np.float32)
     depth[rows, columns] = points[source, 2] * np.float32(raster.scale)
     return _relief(*_fill_gaps(image, depth))
@@ -170,7 +170,7 @@ def _fill_gaps(image: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _relief(image: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Darken pixels that lie behind their neighbours (eye-dome lighting, Boucheny 2009), so that shape shows."""
+    """Darken pixels that lie behind their neighbors (eye-dome lighting, Boucheny 2009), so that shape shows."""
     padded = np.pad(depth, 1, constant_values=_FAR)
     drop = np.zeros_like(depth)
     drawn = np.isfinite(depth)

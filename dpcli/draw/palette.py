@@ -1,22 +1,34 @@
-"""One colour per rigid part, the same in every picture."""
+"""One color per rigid part, the same in every picture."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Okabe & Ito's colours without black (Color Universal Design, 2008), then Tol's muted ones that differ from them
+# Okabe & Ito's colors without black (Color Universal Design, 2008), then Tol's muted ones that differ from them
 PALETTE = np.array(
     [
-        [0, 114, 178], [230, 159, 0], [0, 158, 115], [204, 121, 167], [86, 180, 233], [213, 94, 0], [240, 228, 66],
-        [136, 34, 85], [51, 34, 136], [153, 153, 51], [68, 170, 153], [170, 68, 153], [17, 119, 51], [221, 204, 119],
+        [0, 114, 178],
+        [230, 159, 0],
+        [0, 158, 115],
+        [204, 121, 167],
+        [86, 180, 233],
+        [213, 94, 0],
+        [240, 228, 66],
+        [136, 34, 85],
+        [51, 34, 136],
+        [153, 153, 51],
+        [68, 170, 153],
+        [170, 68, 153],
+        [17, 119, 51],
+        [221, 204, 119],
     ],
     np.uint8,
-)  # fmt: skip
+)
 UNKNOWN = (128, 128, 128)  # of part -1
 
 
-def part_colours(part: np.ndarray) -> np.ndarray:
-    """Colour u8 (N,3) of part ids (N): the same id has the same colour everywhere; -1 is grey, others repeat after 14."""
-    colours = PALETTE[np.maximum(part, 0) % len(PALETTE)]
-    colours[np.asarray(part) < 0] = UNKNOWN
-    return colours
+def part_colors(part: np.ndarray) -> np.ndarray:
+    """Color u8 (N,3) of part ids (N): the same id has the same color everywhere; -1 is gray, others repeat after 14."""
+    colors = PALETTE[np.maximum(part, 0) % len(PALETTE)]
+    colors[np.asarray(part) < 0] = UNKNOWN
+    return colors

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.draw.palette import part_colours
+from dpcli.draw.palette import part_colors
 from dpcli.errors import DataError
 from dpcli.store import CloudSequence
 
@@ -21,7 +21,7 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: n
 
     Binary, little-endian, PLY 1.0 (Turk 1994). DataError on shapes that don't fit, or when it can't be written.
     """
-    colors = part_colours(part) if colors is None else colors
+    colors = part_colors(part) if colors is None else colors
     count = len(points)
     if points.shape != (count, 3) or colors.shape != (count, 3) or part.shape != (count,):
         raise DataError(f"{path}: points {points.shape}, colors {colors.shape} and part {part.shape} don't fit")
@@ -37,7 +37,7 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: n
 
 
 def write_ply_frames(folder: Path, sequence: CloudSequence) -> list[Path]:
-    """Write every frame of a sequence, coloured by part, as 0000.ply, 0001.ply, ... in `folder`, which is made."""
+    """Write every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which is made."""
     if sequence.part is None:
         raise DataError(f"sample {sequence.name!r} has no parts to write; `dpc segment predict` finds them")
     try:

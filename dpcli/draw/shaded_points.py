@@ -27,28 +27,28 @@ def view_matrix(azimuth: float, elevation: float, up: str = "z") -> np.ndarray:
 
 def draw_balls(
     points: np.ndarray,  # [N, 3]
-    colours: np.ndarray,  # [N, 3]
+    colors: np.ndarray,  # [N, 3]
     size: tuple[int, int],
-    centre: np.ndarray,  # [2]
+    center: np.ndarray,  # [2]
     scale: float,
     background: tuple[int, int, int],
     depth: tuple[float, float] | None = None,
 ) -> np.ndarray:  # [H, W, 3]
-    """Image u8 (H,W,3) of points (right, down, away) with colours u8 (N,3), orthographic; the nearest ball wins.
+    """Image u8 (H,W,3) of points (right, down, away) with colors u8 (N,3), orthographic; the nearest ball wins.
 
-    size: width and height in pixels; centre: the (right, down) in the middle; scale: pixels per unit; depth: the
+    size: width and height in pixels; center: the (right, down) in the middle; scale: pixels per unit; depth: the
     nearest and farthest "away" for the fading, by default the points' own. The radius follows from the density.
     """
     width, height = size[0] * FINE, size[1] * FINE
     canvas = np.full((height, width, 3), background, np.float32)
     if len(points) == 0:
         return _mean_pixels(canvas)
-    place = (points[:, :2] - centre) * (scale * FINE) + np.array([width, height]) / 2
+    place = (points[:, :2] - center) * (scale * FINE) + np.array([width, height]) / 2
     radius = ball_radius(place, height)
     order = np.argsort(-points[:, 2], kind="stable")  # far to near: of several writes to a pixel the last one stays
     disc, light = _ball(radius)
     pixels = np.floor(place[order]).astype(np.int64)[:, None] + disc  # [N, disc, 2]
-    paint = _faded(colours[order], points[order, 2], background, depth)[:, None] * light[:, None]
+    paint = _faded(colors[order], points[order, 2], background, depth)[:, None] * light[:, None]
     inside = ((pixels >= 0) & (pixels < [width, height])).all(-1)
     columns, rows = pixels[inside].T
     canvas[rows, columns] = paint[inside]
@@ -63,7 +63,7 @@ def ball_radius(place: np.ndarray, height: int) -> float:
 
 
 def _ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (K,2) of a ball around its centre's, and the light on each, f32 (K), 0..1."""
+    """Pixels (K,2) of a ball around its center's, and the light on each, f32 (K), 0..1."""
     reach = int(radius)
     offsets = np.stack(np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)), -1).reshape(-1, 2)
     offsets = offsets[(offsets**2).sum(1) <= radius**2]
@@ -74,12 +74,12 @@ def _ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _faded(
-    colours: np.ndarray, away: np.ndarray, background: tuple[int, int, int], depth: tuple[float, float] | None
+    colors: np.ndarray, away: np.ndarray, background: tuple[int, int, int], depth: tuple[float, float] | None
 ) -> np.ndarray:
-    """Colours f32 (N,3), mixed with the background the more the farther away."""
+    """Colors f32 (N,3), mixed with the background the more the farther away."""
     near, far = depth or (float(away.min()), float(away.max()))
     share = _FOG * np.clip((away - near) / max(far - near, 1e-9), 0, 1)[:, None]
-    return (colours * (1 - share) + np.array(background) * share).astype(np.float32)
+    return (colors * (1 - share) + np.array(background) * share).astype(np.float32)
 
 
 def _mean_pixels(canvas: np.ndarray) -> np.ndarray:

@@ -46,6 +46,6 @@ def views_sheet(reader: ViewsReader, path: Path, samples: int = 8, frames: int =
 
 def view_title(reader: ViewsReader, view: int) -> str:
     """Such as `2 train · azimuth 90, elevation -20`; angles of the camera's place in degrees."""
-    x, y, z = reader.header.camera_centres()[view]
+    x, y, z = reader.header.camera_centers()[view]
     azimuth, elevation = np.rad2deg(np.arctan2(x, z)), np.rad2deg(np.arctan2(y, np.hypot(x, z)))
     return f"{view} {reader.header.role[view]} · azimuth {azimuth + 0.0:.0f}, elevation {elevation + 0.0:.0f}"

@@ -42,8 +42,9 @@ class Resampling:
         """Interval of each metric over `samples` samples; empty when `resamples` is 0."""
         if self.resamples == 0:
             return {}
-        return bootstrap(metric, samples, generator(self.seed), resamples=self.resamples,
-                         confidence=self.confidence, method=method)  # fmt: skip
+        return bootstrap(
+            metric, samples, generator(self.seed), resamples=self.resamples, confidence=self.confidence, method=method
+        )
 
 
 @dataclass(frozen=True)
@@ -91,8 +92,10 @@ def left_out_once(metric: Weighted, samples: int, groups: np.ndarray | None = No
     if units > _MOST_LEFT_OUT:
         return None
     rows = max(1, _BLOCK // samples)
-    return _joined(metric((groups != np.arange(start, min(start + rows, units))[:, None]).astype(np.float64))
-                   for start in range(0, units, rows))  # fmt: skip
+    return _joined(
+        metric((groups != np.arange(start, min(start + rows, units))[:, None]).astype(np.float64))
+        for start in range(0, units, rows)
+    )
 
 
 def _joined(parts: Iterator[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -123,10 +126,15 @@ def bootstrap(
     found = replicates(metric, samples, rng, resamples, groups)
     jackknife = left_out_once(metric, samples, groups) if method == "bca" else None
     return {
-        key: interval(estimate[key], found[key], confidence, bca=method == "bca",
-                      jackknife=None if jackknife is None else jackknife[key])
+        key: interval(
+            estimate[key],
+            found[key],
+            confidence,
+            bca=method == "bca",
+            jackknife=None if jackknife is None else jackknife[key],
+        )
         for key in estimate
-    }  # fmt: skip
+    }
 
 
 def interval(

@@ -28,7 +28,7 @@ class FitConfig:
     most_gaussians: int = 80_000
     parts: int = 8
     control_points: int = 512
-    neighbours: int = 8  # control points that move a Gaussian
+    neighbors: int = 8  # control points that move a Gaussian
     width: int = 256
     depth: int = 8
     partition: str = "static"  # or "time": a part may gain and lose points while the clip plays (M^tau of the thesis)
@@ -48,7 +48,7 @@ class FitConfig:
     temporal_weight: float = 10.0
     spatial_weight: float = 0.1
     spatial_radius: float = 0.1
-    spatial_neighbours: int = 10
+    spatial_neighbors: int = 10
     control: float = 10.0
     arap: float = 10.0
     thickness: float = 100.0  # --prior none: depth stays where the silhouette's inflation put it
@@ -59,7 +59,7 @@ class FitConfig:
     rate_opacity: float = 0.05
     rate_scale: float = 0.005
     rate_quaternion: float = 0.005
-    rate_colour: float = 0.01
+    rate_color: float = 0.01
     rate_radius: float = 0.005
     rate_network: tuple[float, float] = (2e-4, 2e-6)
     rate_rigid: float = 0.01
@@ -75,12 +75,22 @@ class FitConfig:
     inversion: float = 0.5  # probability of a black background
 
     def __post_init__(self) -> None:
-        for name, low in (("size", 16), ("dense_steps", 1), ("sparse_steps", 0), ("batch", 1), ("parts", 1),
-                          ("control_points", 1), ("neighbours", 1), ("gaussians", 16)):  # fmt: skip
+        for name, low in (
+            ("size", 16),
+            ("dense_steps", 1),
+            ("sparse_steps", 0),
+            ("batch", 1),
+            ("parts", 1),
+            ("control_points", 1),
+            ("neighbors", 1),
+            ("gaussians", 16),
+        ):
             if getattr(self, name) < low:
                 raise UsageError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected {low} or more")
         if self.most_gaussians < self.gaussians:
-            raise UsageError(f"--most-gaussians {self.most_gaussians}: expected at least the {self.gaussians} of the start (--gaussians)")
+            raise UsageError(
+                f"--most-gaussians {self.most_gaussians}: expected at least the {self.gaussians} of the start (--gaussians)"
+            )
         if self.start not in STARTS:
             raise UsageError(f"--start {self.start}: expected one of {', '.join(STARTS)}")
         if self.partition not in ("static", "time"):
@@ -99,14 +109,37 @@ class FitConfig:
 PRESETS = {
     "thesis": FitConfig(size=512, start="sphere", seeds=False),
     "quick": FitConfig(
-        dense_steps=600, sparse_steps=2000, batch=2, gaussians=6000, most_gaussians=12_000, width=96, depth=4,
-        rate_mean=(2e-3, 2e-4), rate_network=(2e-3, 2e-4), rate_rigid=2e-3, rate_scale=0.01, grow_share=0.15,
+        dense_steps=600,
+        sparse_steps=2000,
+        batch=2,
+        gaussians=6000,
+        most_gaussians=12_000,
+        width=96,
+        depth=4,
+        rate_mean=(2e-3, 2e-4),
+        rate_network=(2e-3, 2e-4),
+        rate_rigid=2e-3,
+        rate_scale=0.01,
+        grow_share=0.15,
     ),
     "tiny": FitConfig(
-        size=48, dense_steps=20, sparse_steps=20, batch=1, gaussians=300, most_gaussians=400, width=16, depth=2, parts=3,
-        control_points=24, rate_mean=(2e-3, 2e-4), rate_network=(2e-3, 2e-4), rate_rigid=2e-3, grow_every=10, coarse=(),
+        size=48,
+        dense_steps=20,
+        sparse_steps=20,
+        batch=1,
+        gaussians=300,
+        most_gaussians=400,
+        width=16,
+        depth=2,
+        parts=3,
+        control_points=24,
+        rate_mean=(2e-3, 2e-4),
+        rate_network=(2e-3, 2e-4),
+        rate_rigid=2e-3,
+        grow_every=10,
+        coarse=(),
     ),
-}  # fmt: skip
+}
 
 
 def preset(name: str, **changes: object) -> FitConfig:
@@ -118,6 +151,8 @@ def preset(name: str, **changes: object) -> FitConfig:
     if unknown:
         raise UsageError(f"unknown setting {unknown[0]!r} of a fit; expected one of {', '.join(sorted(known))}")
     given = {key: value for key, value in changes.items() if value is not None}
-    if "most_gaussians" in given and "gaussians" not in given:  # the preset's start may be more than what is allowed now
+    if (
+        "most_gaussians" in given and "gaussians" not in given
+    ):  # the preset's start may be more than what is allowed now
         given["gaussians"] = min(PRESETS[name].gaussians, int(given["most_gaussians"]))
     return replace(PRESETS[name], **given)

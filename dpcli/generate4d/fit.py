@@ -18,7 +18,7 @@ from dpcli.generate4d.config import FitConfig
 from dpcli.generate4d.priors.camera_sampling import novel_cameras
 from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
 from dpcli.generate4d.scene.control_points import ControlPoints
-from dpcli.generate4d.scene.identification import ball_neighbours, spatial_loss, temporal_loss
+from dpcli.generate4d.scene.identification import ball_neighbors, spatial_loss, temporal_loss
 from dpcli.generate4d.scene.initialization import hull, in_sphere, inflated, spread_seeds
 from dpcli.generate4d.scene.losses import arap_loss, picture_loss, roundness_loss, thickness_loss
 from dpcli.generate4d.scene.model import Instant, Model4D
@@ -36,16 +36,23 @@ class Fit:
     """One fit. `preview(model, step)` is called now and then and once at the end."""
 
     def __init__(
-        self, targets: Targets, config: FitConfig, folder: RunFolder, stop: StopRequest, seed: int,
-        prior: object | None = None, device: torch.device | None = None,
-        preview: Callable[[Model4D, int], None] | None = None, regularise: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        targets: Targets,
+        config: FitConfig,
+        folder: RunFolder,
+        stop: StopRequest,
+        seed: int,
+        prior: object | None = None,
+        device: torch.device | None = None,
+        preview: Callable[[Model4D, int], None] | None = None,
+        regularize: bool = True,
+    ) -> None:
         self.targets, self.config, self.folder, self.stop, self.seed = targets, config, folder, stop, seed
-        self.prior, self.preview, self.regularise = prior, preview, regularise
+        self.prior, self.preview, self.regularize = prior, preview, regularize
         self.device = device or torch.device("cpu")
         self.step, self.spent = 0, 0.0
         self.control_reference: Tensor | None = None  # [T, K, 3] p-bar of C.13
-        self._neighbours: Tensor | None = None
+        self._neighbors: Tensor | None = None
         self._notes: dict = {}
         self.recent: dict[str, list[float]] = {}
         self.times = targets.times().to(self.device)
@@ -74,15 +81,15 @@ class Fit:
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, 4001]))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(np.random.SeedSequence([self.seed, 4002]).generate_state(1)[0]))
-            mean, colour = self._first_points(rng)
+            mean, color = self._first_points(rng)
             sphere = self._start_kind() == "sphere"
-            gaussians = CanonicalGaussians(mean, colour, opacity=0.05 if sphere else 0.5)
+            gaussians = CanonicalGaussians(mean, color, opacity=0.05 if sphere else 0.5)
             self.model = Model4D(gaussians, self.config)
             field = self.model.field
             if self.config.seeds:
                 field.start_parts(mean, spread_seeds(mean, self.config.parts))
             else:
-                field.update_centres(mean)
+                field.update_centers(mean)
         self.model.to(self.device)
         self.optimizer = self._new_optimizer()
 
@@ -98,13 +105,17 @@ class Fit:
             return torch.from_numpy(points), torch.full((len(points), 3), 0.5)
         view, frame = targets.reference, targets.widest_frame()
         if kind == "inflate":
-            points, colours = inflated(
-                targets.picture(view, frame), targets.intrinsics[view], targets.world_to_camera[view], config.gaussians, rng
+            points, colors = inflated(
+                targets.picture(view, frame),
+                targets.intrinsics[view],
+                targets.world_to_camera[view],
+                config.gaussians,
+                rng,
             )
         else:
             pictures = [targets.picture(index, frame) for index in range(targets.num_views)]
-            points, colours = hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
-        return torch.from_numpy(points), torch.from_numpy(colours)
+            points, colors = hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
+        return torch.from_numpy(points), torch.from_numpy(colors)
 
     # ---- one step ------------------------------------------------------------------------------------------------
 
@@ -113,8 +124,8 @@ class Fit:
         if self.step == config.sparse_from:
             self._begin_sparse()
         if self.step % _REFRESH_EVERY == 0:
-            self.model.refresh_neighbours()
-            self._neighbours = None
+            self.model.refresh_neighbors()
+            self._neighbors = None
         views, frames = self._pick(rng)
         self._set_rates()
         instant = self.model.at(self.times[frames])
@@ -162,7 +173,9 @@ class Fit:
                 return factor
         return 1
 
-    def _picture_terms(self, instant: Instant, views: list[int], frames: list[int], rng: torch.Generator) -> tuple[Tensor, float]:
+    def _picture_terms(
+        self, instant: Instant, views: list[int], frames: list[int], rng: torch.Generator
+    ) -> tuple[Tensor, float]:
         config = self.config
         wanted, intrinsics, poses = (t.to(self.device) for t in self.targets.at(views, frames, self._shrink()))
         height, width = wanted.shape[1:3]
@@ -180,7 +193,9 @@ class Fit:
         white = wanted[..., :3] + 1 - wanted[..., 3:]
         shown = rendered + (1 - alpha) * (1 - background[:, None, None])
         with torch.no_grad():
-            errors = [float((shown[i] - white[i]).square().mean()) for i, v in enumerate(views) if v == self.targets.reference]
+            errors = [
+                float((shown[i] - white[i]).square().mean()) for i, v in enumerate(views) if v == self.targets.reference
+            ]
         return config.reconstruction * torch.stack(terms).mean(), float(np.mean(errors)) if errors else math.nan
 
     def _prior_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
@@ -188,7 +203,9 @@ class Fit:
         size = min(max(self.targets.size), 256)
         cameras, poses, intrinsics = novel_cameras(self.targets, len(frames), size, rng)
         white = torch.ones(len(frames), 3, device=self.device)
-        rendered, _, _ = self.model.render(instant, poses.to(self.device), intrinsics.to(self.device), size, size, white)
+        rendered, _, _ = self.model.render(
+            instant, poses.to(self.device), intrinsics.to(self.device), size, size, white
+        )
         return self.prior.loss(rendered, cameras, frames, self.step / self.config.steps, rng)
 
     def _motion_terms(self, instant: Instant, frames: list[int]) -> Tensor:
@@ -197,22 +214,22 @@ class Fit:
         total = torch.zeros((), device=self.device)
         picked = self._picked(len(carriers))
         points, moved, part = carriers[picked], motion.displacement[:, picked], motion.part[:, picked]
-        if self._neighbours is None or len(self._neighbours) != len(points):
-            self._neighbours = ball_neighbours(points, config.spatial_radius, config.spatial_neighbours)
+        if self._neighbors is None or len(self._neighbors) != len(points):
+            self._neighbors = ball_neighbors(points, config.spatial_radius, config.spatial_neighbors)
         if config.rigid and config.temporal:
             term = temporal_loss(points, moved, part)
             total = total + config.identification * config.temporal_weight * term
         if config.rigid and config.spatial:
-            total = total + config.identification * config.spatial_weight * spatial_loss(part, self._neighbours)
+            total = total + config.identification * config.spatial_weight * spatial_loss(part, self._neighbors)
         if self.control_reference is not None:
             drift = carriers + motion.displacement - self.control_reference[frames]
             total = total + config.control * drift.square().sum(-1).mean()
         if config.arap:
-            total = total + config.arap * arap_loss(points, points + moved, self._neighbours)
-        if self.regularise and self.targets.num_views == 1:
+            total = total + config.arap * arap_loss(points, points + moved, self._neighbors)
+        if self.regularize and self.targets.num_views == 1:
             axis = torch.from_numpy(self.targets.world_to_camera[self.targets.reference][2, :3]).float().to(self.device)
             total = total + config.thickness * thickness_loss(self.model.gaussians, axis)
-        if self.regularise:
+        if self.regularize:
             total = total + config.roundness * roundness_loss(self.model.gaussians, config.aspect)
         return total
 
@@ -262,15 +279,15 @@ class Fit:
 
     @torch.no_grad()
     def _limit(self) -> None:
-        """Keep sizes within what a picture can tell and colours within what it can show."""
+        """Keep sizes within what a picture can tell and colors within what it can show."""
         self.model.gaussians.log_scale.clamp_(math.log(1e-4), math.log(0.4))
-        self.model.gaussians.colour.clamp_(0.0, 1.0)
+        self.model.gaussians.color.clamp_(0.0, 1.0)
 
     def _densify(self, rng: torch.Generator) -> None:
         grow = self.step < self.config.grow_until * self.config.steps
         self.model.gaussians.grow_and_prune(self.optimizer, self.config, rng, grow)
-        self.model.refresh_neighbours()
-        self._neighbours = None
+        self.model.refresh_neighbors()
+        self._neighbors = None
 
     def _record(self, loss: float, squared: float) -> None:
         self.recent.setdefault("loss", []).append(loss)
@@ -287,18 +304,28 @@ class Fit:
     def _shown(self) -> dict:
         mean = {key: float(np.mean(values)) for key, values in self.recent.items()}
         psnr = -10 * math.log10(max(mean.get("squared", 1.0), 1e-10))
-        return {"loss": round(mean.get("loss", math.nan), 3), "psnr": round(psnr, 2), "gaussians": len(self.model.gaussians)}
+        return {
+            "loss": round(mean.get("loss", math.nan), 3),
+            "psnr": round(psnr, 2),
+            "gaussians": len(self.model.gaussians),
+        }
 
     # ---- checkpoints ---------------------------------------------------------------------------------------------
 
     def _save(self) -> None:
         gaussians = self.model.gaussians
         state = {
-            "step": self.step, "spent": self.spent, "gaussians": gaussians.state_dict(), "field": self.model.field.state_dict(),
+            "step": self.step,
+            "spent": self.spent,
+            "gaussians": gaussians.state_dict(),
+            "field": self.model.field.state_dict(),
             "control": None if self.model.control is None else self.model.control.state_dict(),
-            "control_reference": self.control_reference, "optimizer": self.optimizer.state_dict(), "recent": self.recent,
-            "nearest": self.model.nearest, "neighbours": self._neighbours,
-        }  # fmt: skip
+            "control_reference": self.control_reference,
+            "optimizer": self.optimizer.state_dict(),
+            "recent": self.recent,
+            "nearest": self.model.nearest,
+            "neighbors": self._neighbors,
+        }
         self.folder.save_state(state)
 
     def _restore(self, state: dict) -> None:
@@ -310,12 +337,12 @@ class Fit:
         self.model.to(self.device)
         self.optimizer = self._new_optimizer()
         if state["control"] is not None:
-            self.model.control = ControlPoints(state["control"]["position"], self.config.neighbours).to(self.device)
+            self.model.control = ControlPoints(state["control"]["position"], self.config.neighbors).to(self.device)
             self.model.control.load_state_dict(state["control"])
             for name, key in (("control", "position"), ("radius", "log_radius")):
                 self.optimizer.add_param_group({"params": [getattr(self.model.control, key)], "lr": 0.0, "name": name})
             self.control_reference = state["control_reference"].to(self.device)
         self.optimizer.load_state_dict(state["optimizer"])
-        self.model.nearest, self._neighbours = (
-            None if state[key] is None else state[key].to(self.device) for key in ("nearest", "neighbours")
+        self.model.nearest, self._neighbors = (
+            None if state[key] is None else state[key].to(self.device) for key in ("nearest", "neighbors")
         )

@@ -15,7 +15,7 @@ from dpcli.store.views import ViewsReader
 
 @dataclass
 class Targets:
-    """Pictures of V views by T frames, their cameras and times; colour is multiplied by alpha.
+    """Pictures of V views by T frames, their cameras and times; color is multiplied by alpha.
 
     pictures: f16 (V,T,S,S',4); intrinsics f64 (V,3,3) for that size; reference: the index of the input view among them.
     """
@@ -62,7 +62,7 @@ class Targets:
         return chosen, matrices, torch.from_numpy(self.world_to_camera[views]).float()
 
     def picture(self, view: int, frame: int) -> np.ndarray:
-        """f32 (H,W,4) with straight colour, 0..1."""
+        """f32 (H,W,4) with straight color, 0..1."""
         value = self.pictures[view, frame].float().numpy().copy()
         value[..., :3] /= np.maximum(value[..., 3:], 1e-3)
         return value.clip(0, 1)
@@ -85,16 +85,23 @@ def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
         factor = np.array([width / header.size[0], height / header.size[1], 1.0])[:, None]
         reference = chosen.index(header.reference)
         if not pictures[reference, :, :, :, 3].any():
-            raise DataError(f"{path}: the reference view shows nothing in any frame (alpha is zero); prepare the clip again")
+            raise DataError(
+                f"{path}: the reference view shows nothing in any frame (alpha is zero); prepare the clip again"
+            )
         return Targets(
-            header.name, pictures, np.asarray(header.intrinsics)[chosen] * factor,
-            np.asarray(header.world_to_camera)[chosen], np.asarray(header.time), reference, header.length_unit,
+            header.name,
+            pictures,
+            np.asarray(header.intrinsics)[chosen] * factor,
+            np.asarray(header.world_to_camera)[chosen],
+            np.asarray(header.time),
+            reference,
+            header.length_unit,
             list(reader.provenance),
-        )  # fmt: skip
+        )
 
 
 def _resize(rgba: np.ndarray, width: int, height: int) -> Tensor:  # [H, W, 4]
-    """Colour times alpha and alpha, area-averaged to the size."""
+    """Color times alpha and alpha, area-averaged to the size."""
     value = torch.from_numpy(rgba).float() / 255
     value[..., :3] *= value[..., 3:]
     if rgba.shape[:2] == (height, width):

@@ -1,4 +1,4 @@
-"""Geometry with more than one backend: sampling, neighbours, interpolation, small inverses.
+"""Geometry with more than one backend: sampling, neighbors, interpolation, small inverses.
 
 Every operation is one public function with a torch reference and a fast CPU kernel behind it (see `backend`).
 Names resolve on first use, so that `from dpcli.ops import fps_numpy` needs neither torch nor numba at import.

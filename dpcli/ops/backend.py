@@ -1,6 +1,6 @@
 """Which implementation runs, on how many threads, in pieces of what size; and the checks that all operations share.
 
-Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorised, chunked),
+Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorized, chunked),
 and `numba`, the fast kernels for CPU tensors. The environment variable DPC_BACKEND=torch|numba overrides the choice.
 """
 

@@ -1,4 +1,4 @@
-"""Space-time ball query: neighbours within a radius that depends on the distance in time (thesis 3.3, Kinet)."""
+"""Space-time ball query: neighbors within a radius that depends on the distance in time (thesis 3.3, Kinet)."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def space_time_ball_query(
     *,
     order: str = "first",
 ) -> tuple[torch.Tensor, torch.Tensor]:  # [B, M, k], [B, M]
-    """Up to k neighbours of each centroid in space and time: indices (B,M,k) i64 and hit counts (B,M) i64 in 0..k.
+    """Up to k neighbors of each centroid in space and time: indices (B,M,k) i64 and hit counts (B,M) i64 in 0..k.
 
-    Point j is a neighbour of centroid i when d = |t_i - t_j| < R and dist(i,j) < radii[d], both strict; distances are
+    Point j is a neighbor of centroid i when d = |t_i - t_j| < R and dist(i,j) < radii[d], both strict; distances are
     compared squared, in float32. times are whole frame indices (integers, or floats holding integers), in any order.
-    order "first": the k neighbours of lowest index, ascending; unused slots repeat the first. Frame-major points thus
-    favour the earlier frame, as the released Kinet does. order "nearest": the k nearest in space, ascending, ties to
+    order "first": the k neighbors of lowest index, ascending; unused slots repeat the first. Frame-major points thus
+    favor the earlier frame, as the released Kinet does. order "nearest": the k nearest in space, ascending, ties to
     the lowest index; unused slots repeat the nearest. order "balanced": `balanced_shares` of the slots for each frame
     within reach, from the earliest on, filled with the frame's first hits; its unused slots repeat the first; a frame
-    without hits gets the centroid's own frame's share, repeated. A centroid without any neighbour has count 0 and index
+    without hits gets the centroid's own frame's share, repeated. A centroid without any neighbor has count 0 and index
     0 in all slots.
     Indices carry no gradient: gather with them. Backends: numba on CPU (frames found by bisection when the times are
     sorted), torch elsewhere; same indices. Raises ValueError on wrong shapes, non-finite values, fractional times, or

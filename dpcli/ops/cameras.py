@@ -1,7 +1,7 @@
 """Pinhole cameras on an orbit: one convention for data readers, fitting, rendering and scoring.
 
-World: right-handed, y up. Azimuth 0 looks from +z, positive azimuth moves towards +x; positive elevation moves up (+y).
-Cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5. Angles in radians.
+World: right-handed, y up. Azimuth 0 looks from +z, positive azimuth moves toward +x; positive elevation moves up (+y).
+Cameras: OpenCV axes (x right, y down, z forward), pixel centers at +0.5. Angles in radians.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ def orbit_pose(azimuth: float, elevation: float, radius: float = DEFAULT_RADIUS)
 
 
 def orbit_of(world_to_camera: np.ndarray) -> tuple[float, float, float]:
-    """(azimuth, elevation, radius) of a camera's centre; the inverse of `orbit_pose` for cameras that look at the origin."""
+    """(azimuth, elevation, radius) of a camera's center; the inverse of `orbit_pose` for cameras that look at the origin."""
     x, y, z = -world_to_camera[:3, :3].T @ world_to_camera[:3, 3]
     radius = float(np.sqrt(x * x + y * y + z * z))
     return float(np.arctan2(x, z)), float(np.arcsin(y / radius)) if radius else 0.0, radius
 
 
 def pinhole(fovy: float, width: int, height: int) -> np.ndarray:
-    """intrinsics f64 (3,3) of a centred pinhole camera with square pixels; fovy: vertical field of view."""
+    """intrinsics f64 (3,3) of a centered pinhole camera with square pixels; fovy: vertical field of view."""
     focal = 0.5 * height / np.tan(0.5 * fovy)
     return np.array([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])

@@ -16,7 +16,7 @@ def fps(
 ) -> torch.Tensor:  # [B, num_samples]
     """Farthest point sampling: indices (B,S) i64 into each cloud, the first always `start`.
 
-    Each further index maximises the squared Euclidean distance (float32) to all chosen ones; ties go to the lowest
+    Each further index maximizes the squared Euclidean distance (float32) to all chosen ones; ties go to the lowest
     index, also among points already chosen, so once every distinct position is taken index 0 repeats.
     lengths: valid points per cloud; padding behind them is never chosen (but must be finite). Where num_samples exceeds
     a cloud's n points, the sequence repeats from its beginning: index s equals index s mod n.
@@ -39,7 +39,7 @@ def fps(
 def fps_reference(
     points: torch.Tensor, num_samples: int, *, start: int = 0, lengths: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """The torch twin of `fps`: same arguments, same indices, one vectorised pass over all points per sample."""
+    """The torch twin of `fps`: same arguments, same indices, one vectorized pass over all points per sample."""
     points, lengths = _checked(points, num_samples, start, lengths)
     return _fps_torch(points, num_samples, start, lengths)
 

@@ -15,7 +15,7 @@ def gather_points(features: Tensor, idx: Tensor) -> Tensor:
 
     Backward adds each row's gradient to its source: by a kernel per cloud on CPU (threads never share a cloud, so sums
     repeat exactly), by index_add_ elsewhere. Raises ValueError on wrong shapes and, on CPU, on indices out of range (on
-    a GPU that look would stall the stream, and an index past a cloud's end reads its neighbour in the batch).
+    a GPU that look would stall the stream, and an index past a cloud's end reads its neighbor in the batch).
     """
     _check(features, idx)
     batch, count, channels = features.shape
@@ -30,7 +30,7 @@ def gather_points(features: Tensor, idx: Tensor) -> Tensor:
 
 
 def gather_mean(features: Tensor, idx: Tensor) -> Tensor:
-    """Mean of each row's neighbours, features (B,N,C), idx (B,M,K) i64 -> (B,M,C): `gather_points(features, idx).mean(2)`.
+    """Mean of each row's neighbors, features (B,N,C), idx (B,M,K) i64 -> (B,M,C): `gather_points(features, idx).mean(2)`.
 
     On a CPU the (B,M,K,C) in between are never made. Differentiable in features; errors as `gather_points`.
     """

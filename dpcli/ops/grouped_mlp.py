@@ -1,4 +1,4 @@
-"""The core of a set-abstraction layer: gather neighbours, two shared linear layers with batch norm and ReLU, max pooling.
+"""The core of a set-abstraction layer: gather neighbors, two shared linear layers with batch norm and ReLU, max pooling.
 
 `grouped_mlp` has a plain torch form (the reference, and the path on a GPU) and a CPU form whose forward and backward keep
 only the first layer's activations: the second layer is pooled as it is made, and the gradient of a max-pooled batch norm
@@ -29,7 +29,7 @@ _LANES = 8  # channels in a vector of the kernels
 
 @dataclass
 class Norm:
-    """Affine batch normalisation of C channels: weight and bias (C), and either given or returned statistics (C)."""
+    """Affine batch normalization of C channels: weight and bias (C), and either given or returned statistics (C)."""
 
     weight: Tensor
     bias: Tensor
@@ -55,7 +55,12 @@ def grouped_mlp(
     C2 of 8 or more.
     """
     fast = chosen_backend(points.device) == "numba" and norm1.mean is None and points.dtype == torch.float32
-    fast = fast and len(norm1.weight) % _LANES == 0 and len(norm2.weight) >= _LANES and not torch.is_autocast_enabled(points.device.type)
+    fast = (
+        fast
+        and len(norm1.weight) % _LANES == 0
+        and len(norm2.weight) >= _LANES
+        and not torch.is_autocast_enabled(points.device.type)
+    )
     if fast:
         return _fast(points, centers, idx, features, linear1, norm1, linear2, norm2)
     if norm1.mean is not None and norm2.mean is not None and not torch.is_grad_enabled():
@@ -66,9 +71,15 @@ def grouped_mlp(
 
 
 def grouped_activations(
-    points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor], norm1: Norm,
-    linear2: tuple[Tensor, Tensor], norm2: Norm,
-) -> tuple[list[Tensor], list[Tensor]]:  # fmt: skip
+    points: Tensor,
+    centers: Tensor,
+    idx: Tensor,
+    features: Tensor | None,
+    linear1: tuple[Tensor, Tensor],
+    norm1: Norm,
+    linear2: tuple[Tensor, Tensor],
+    norm2: Norm,
+) -> tuple[list[Tensor], list[Tensor]]:
     """The two layers' activations before pooling, [(B,M,K,C1), (B,M,K,C2)], and the statistics. Arguments as `grouped_mlp`.
 
     The first linear layer acts on points before they are gathered: W [x_j - x_i, f_j] = (W [x_j, f_j]) - W_x x_i.
@@ -83,12 +94,22 @@ def grouped_activations(
 
 
 def frozen_activations(
-    points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor], norm1: Norm,
-    linear2: tuple[Tensor, Tensor], norm2: Norm,
-) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+    points: Tensor,
+    centers: Tensor,
+    idx: Tensor,
+    features: Tensor | None,
+    linear1: tuple[Tensor, Tensor],
+    norm1: Norm,
+    linear2: tuple[Tensor, Tensor],
+    norm2: Norm,
+) -> tuple[list[Tensor], Tensor]:
     """As `grouped_activations` with given statistics, but without gradients, and pooled: the two activations, (B,M,C2)."""
     with torch.no_grad():
-        plain = points.dtype != torch.float32 or chosen_backend(points.device) != "numba" or torch.is_autocast_enabled("cpu")
+        plain = (
+            points.dtype != torch.float32
+            or chosen_backend(points.device) != "numba"
+            or torch.is_autocast_enabled("cpu")
+        )
         if plain or len(norm2.weight) % _LANES:
             taps, _ = grouped_activations(points, centers, idx, features, linear1, norm1, linear2, norm2)
             return taps, taps[1].amax(2)
@@ -97,16 +118,23 @@ def frozen_activations(
 
 
 def _frozen_pieces(
-    points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None, linear1: tuple[Tensor, Tensor],
+    points: Tensor,
+    centers: Tensor,
+    idx: Tensor,
+    features: Tensor | None,
+    linear1: tuple[Tensor, Tensor],
     linear2: tuple[Tensor, Tensor],
-) -> tuple[list[Tensor], Tensor]:  # fmt: skip
+) -> tuple[list[Tensor], Tensor]:
     kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
     if features is None:  # cheaper from positions than gathered: the projected points are many
         make = kernels.hidden_xyz
         inputs = (points.numpy(), centers.numpy(), idx.numpy(), linear1[0].t().contiguous().numpy(), linear1[1].numpy())
     else:
         make = kernels.hidden_table
-        inputs = (*(tensor.contiguous().numpy() for tensor in _project(points, centers, features, linear1)), idx.numpy())
+        inputs = (
+            *(tensor.contiguous().numpy() for tensor in _project(points, centers, features, linear1)),
+            idx.numpy(),
+        )
     (clouds, count, neighbors), widths = idx.shape, (len(linear1[1]), len(linear2[1]))
     hidden, wide = (torch.empty(idx.numel(), width) for width in widths)
     best, weight, bias = torch.empty(clouds * count, widths[1]), linear2[0].t(), linear2[1].numpy()
@@ -161,7 +189,7 @@ def _fast(points, centers, idx, features, linear1, norm1, linear2, norm2):
 
 
 class _GroupedMLP(torch.autograd.Function):
-    """The training path on a CPU. With `table` and `offset` (the projected points and centres), the gradient of the first
+    """The training path on a CPU. With `table` and `offset` (the projected points and centers), the gradient of the first
     layer's weights reaches them through those two; without, weight1 and bias1 act on the relative positions alone."""
 
     @staticmethod
@@ -198,8 +226,23 @@ class _GroupedMLP(torch.autograd.Function):
         parts = scale2[:, None] * _back_pool(ctx.first, pooled, weight2 * scale2[:, None], mixed, constant)
         grad_w2 = parts - torch.outer(shift, total.float()) - v[:, None] * (weight2 @ gram.float())
         table, offset, weight1, bias1, grad_g1, grad_b1 = ctx.first.gradients()
-        return (None, None, None, table, offset, weight1, bias1, grad_g1, grad_b1, grad_g2, grad_b2,
-                grad_w2, torch.zeros_like(bias2), None, None)  # fmt: skip
+        return (
+            None,
+            None,
+            None,
+            table,
+            offset,
+            weight1,
+            bias1,
+            grad_g1,
+            grad_b1,
+            grad_g2,
+            grad_b2,
+            grad_w2,
+            torch.zeros_like(bias2),
+            None,
+            None,
+        )
 
 
 class _FromPositions:
@@ -255,7 +298,7 @@ class _FromPositions:
 
 
 class _FromTable:
-    """First layer as a difference of projected points and centres: table[j] - offset[i], offset = W_x centre."""
+    """First layer as a difference of projected points and centers: table[j] - offset[i], offset = W_x center."""
 
     def __init__(self, points, centers, idx, table: Tensor, offset: Tensor, weight: Tensor) -> None:
         self.kernels = parallel_kernels("dpcli.ops.cpu.grouped_mlp")
@@ -267,8 +310,9 @@ class _FromTable:
         """Mean and biased variance (C) over all rows."""
         self.sums = torch.empty(self.idx.shape[0] * self.idx.shape[1], self.channels)
         squares = torch.zeros(_BLOCKS, self.channels, dtype=torch.float64)
-        self.kernels.moments_table(self.table.numpy(), self.offset.numpy(), self.idx.numpy(), self.sums.numpy(),
-                                   squares.numpy())  # fmt: skip
+        self.kernels.moments_table(
+            self.table.numpy(), self.offset.numpy(), self.idx.numpy(), self.sums.numpy(), squares.numpy()
+        )
         mean = self.sums.sum(0, dtype=torch.float64) / self.rows
         self.mean = mean.float()
         return self.mean, (squares.sum(0) / self.rows - mean**2).clamp_min(0).float()

@@ -13,7 +13,7 @@ _LEAST = 1e-10  # squared distances are clamped to this, so that a coincident po
 def three_nn_interpolate(query: Tensor, points: Tensor, features: Tensor) -> Tensor:
     """Inverse-squared-distance mean of the three nearest points' features: (B,M,3), (B,N,3), (B,N,C) -> (B,M,C).
 
-    Weights are 1 / max(d^2, 1e-10), normalised; with fewer than three points, all of them count. Which points are
+    Weights are 1 / max(d^2, 1e-10), normalized; with fewer than three points, all of them count. Which points are
     nearest is decided in float32, ties to the lowest index; weights and result have the inputs' precision.
     Differentiable in features, and in both positions through the distances. Raises ValueError as `knn` does.
     """

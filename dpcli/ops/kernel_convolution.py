@@ -1,4 +1,4 @@
-"""The spatial half of an SE(3) convolution: neighbours summed into rotated kernel points, then mixed by weights."""
+"""The spatial half of an SE(3) convolution: neighbors summed into rotated kernel points, then mixed by weights."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from torch import Tensor
 from dpcli.ops.backend import chosen_backend, run_in_threads
 
 _FMA_NS = 0.08  # measured: per multiply-add of the kernels, one core
-_CENTRES = 64  # whose sums are held at a time: a few MiB, which stay in the cache between the steps
+_CENTERS = 64  # whose sums are held at a time: a few MiB, which stay in the cache between the steps
 
 
 def kernel_convolution(features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix: Tensor) -> Tensor:
     """out[b,p,g] = sum_k sum_j weight[b,p,j, slot[g,k]] * features[b, index[b,p,j], g] @ matrix[k]   (as EPN has it)
 
-    features (B,N,G,C); index (B,P,n) i64, the neighbours of every centre; weight (B,P,n,D), what each counts at D kernel
+    features (B,N,G,C); index (B,P,n) i64, the neighbors of every center; weight (B,P,n,D), what each counts at D kernel
     positions that the group permutes; slot (G,D) i64, the position that rotation g makes of kernel point k;
     matrix (D*C,C'), rows kernel point by kernel point. -> (B,P,G,C'). Differentiable in features and matrix only.
     Backends: numba on CPU (skips zero weights; sums are made again for the gradient, so nothing of size P*G*D*C or
@@ -39,18 +39,22 @@ def kernel_convolution_reference(
 
 def _check(features: Tensor, index: Tensor, weight: Tensor, slot: Tensor, matrix: Tensor) -> None:
     fits = (
-        features.ndim == 4 and index.ndim == 3 and weight.ndim == 4 and slot.ndim == 2
-        and index.shape[0] == features.shape[0] and weight.shape[:3] == index.shape
+        features.ndim == 4
+        and index.ndim == 3
+        and weight.ndim == 4
+        and slot.ndim == 2
+        and index.shape[0] == features.shape[0]
+        and weight.shape[:3] == index.shape
         and slot.shape == (features.shape[2], weight.shape[3])
         and len(matrix) == weight.shape[3] * features.shape[3]
-    )  # fmt: skip
+    )
     if not fits:
         shapes = ", ".join(str(tuple(t.shape)) for t in (features, index, weight, slot, matrix))
         raise ValueError(f"features (B,N,G,C), index (B,P,n), weight (B,P,n,D), slot (G,D), matrix (D*C,C'): {shapes}")
 
 
 class _Sums:
-    """The kernel sums of one batch, a few centres at a time, and their transpose."""
+    """The kernel sums of one batch, a few centers at a time, and their transpose."""
 
     def __init__(self, features: Tensor, index: Tensor, weight: Tensor, slot: Tensor) -> None:
         self.features, self.index, self.weight = features, index, weight
@@ -61,17 +65,17 @@ class _Sums:
         self.pick = (slot * self.rotations + g[:, None]).flatten()
         self.put = torch.argsort(self.pick)
         self.cost = index.shape[2] * self.orbit * self.rotations * self.channels * _FMA_NS / 4  # most weights are zero
-        self.flat = torch.empty(_CENTRES, self.orbit * self.rotations, self.channels)
-        self.turned = torch.empty(_CENTRES, self.orbit * self.rotations, self.channels)
+        self.flat = torch.empty(_CENTERS, self.orbit * self.rotations, self.channels)
+        self.turned = torch.empty(_CENTERS, self.orbit * self.rotations, self.channels)
 
     def pieces(self):
-        """Every (cloud, centres) piece."""
+        """Every (cloud, centers) piece."""
         for b in range(len(self.index)):
-            for start in range(0, self.index.shape[1], _CENTRES):
-                yield b, slice(start, min(start + _CENTRES, self.index.shape[1]))
+            for start in range(0, self.index.shape[1], _CENTERS):
+                yield b, slice(start, min(start + _CENTERS, self.index.shape[1]))
 
     def forward(self, b: int, piece: slice) -> Tensor:
-        """Sums (centres*G, D*C) of a piece, in a buffer that the next piece overwrites."""
+        """Sums (centers*G, D*C) of a piece, in a buffer that the next piece overwrites."""
         from dpcli.ops.cpu.kernel_convolution import group_forward
 
         size = piece.stop - piece.start
@@ -83,7 +87,7 @@ class _Sums:
         return turned.view(size * self.rotations, -1)
 
     def backward(self, b: int, piece: slice, grad: Tensor, out: Tensor) -> None:
-        """Add the gradient of a piece's sums (centres*G, D*C) into out (B,N,G*C)."""
+        """Add the gradient of a piece's sums (centers*G, D*C) into out (B,N,G*C)."""
         from dpcli.ops.cpu.kernel_convolution import group_backward
 
         size = piece.stop - piece.start
@@ -114,7 +118,7 @@ class _KernelConvolution(torch.autograd.Function):
         sums = _Sums(features, index, weight, slot)
         to_features = torch.zeros(features.flatten(2).shape) if ctx.needs_input_grad[0] else None
         to_matrix = torch.zeros_like(matrix) if ctx.needs_input_grad[4] else None
-        turned = torch.empty(_CENTRES * sums.rotations, matrix.shape[0])
+        turned = torch.empty(_CENTERS * sums.rotations, matrix.shape[0])
         for b, piece in sums.pieces():
             given = grad[b, piece].view(-1, matrix.shape[1])
             if to_matrix is not None:

@@ -1,4 +1,4 @@
-"""The k nearest neighbours of each query point."""
+"""The k nearest neighbors of each query point."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from dpcli.ops.backend import chosen_backend, run_in_threads
 
 _SUM_NS, _TURN_NS, _BLEND_NS = 6.0, 2e3, 4.0  # measured: per point and slot, per slot, per point and slot
 _EMPTY = 1e-12  # a slot with less weight in all has no motion to be fitted
-_TOWARDS_IDENTITY = 1e-6  # share of the covariance's norm; decides the turns that the points leave open
+_TOWARD_IDENTITY = 1e-6  # share of the covariance's norm; decides the turns that the points leave open
 
 
 def weighted_kabsch(
@@ -18,10 +18,10 @@ def weighted_kabsch(
     target: Tensor,  # [B, N, 3]
     weights: Tensor,  # [B, N, S]
 ) -> tuple[Tensor, Tensor]:  # [B, S, 3, 3], [B, S, 3]
-    """Rotation R (B,S,3,3), det +1, and translation t (B,S,3) that minimise sum_i w_is |R_s x_i + t_s - y_i|^2.
+    """Rotation R (B,S,3,3), det +1, and translation t (B,S,3) that minimize sum_i w_is |R_s x_i + t_s - y_i|^2.
 
     Kabsch 1976 with the sign of the determinant fixed (Umeyama 1991); the thesis's T-hat of section 4.4.4. Weights are
-    zero or more and need no norm. What the points leave open (all equal, on a line) is settled towards no turn.
+    zero or more and need no norm. What the points leave open (all equal, on a line) is settled toward no turn.
     A slot of weight below 1e-12 in all, or with NaN or infinite values, gets the identity and zero.
     Differentiable in all three, once; the gradient of the rotation is the polar factor's, finite also where singular
     values coincide (a gradient through the SVD itself is not), and zero along turns that the points leave open.
@@ -50,13 +50,13 @@ def _kabsch_torch(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tens
     total = weights.sum(1)  # [B, S]
     share = (weights / total.clamp(min=_EMPTY)[:, None]).mT  # [B, S, N]
     x_mean, y_mean = share @ source, share @ target
-    centred = source[:, None] - x_mean[:, :, None]  # [B, S, N, 3]
+    centered = source[:, None] - x_mean[:, :, None]  # [B, S, N, 3]
     spread = target[:, None] - y_mean[:, :, None]
-    covariance = spread.mT @ (centred * share[..., None])  # [B, S, 3, 3]
+    covariance = spread.mT @ (centered * share[..., None])  # [B, S, 3, 3]
     sound = (total >= _EMPTY) & covariance.isfinite().all(-1).all(-1)
     sound &= x_mean.isfinite().all(-1) & y_mean.isfinite().all(-1)
     eye = torch.eye(3, dtype=source.dtype, device=source.device)
-    noise = _rounding(x_mean, spread, share) + _rounding(y_mean, centred, share)
+    noise = _rounding(x_mean, spread, share) + _rounding(y_mean, centered, share)
     rotation = _Rotation.apply(torch.where(sound[..., None, None], covariance, eye), noise)
     moved = y_mean - (rotation @ x_mean[..., None]).squeeze(-1)
     return rotation, torch.where(sound[..., None], moved, 0.0)
@@ -144,7 +144,7 @@ class _Rotation(torch.autograd.Function):
         eye = torch.eye(3, dtype=matrix.dtype, device=matrix.device)
         scaled = torch.where(norm > 0, matrix / norm.clamp(min=torch.finfo(matrix.dtype).tiny), eye)
         least = noise[..., None, None] / norm.clamp(min=torch.finfo(matrix.dtype).tiny)
-        pull = torch.where(norm > 0, least.nan_to_num(0.0, 0.0).clamp(max=1e6), 0.0) + _TOWARDS_IDENTITY
+        pull = torch.where(norm > 0, least.nan_to_num(0.0, 0.0).clamp(max=1e6), 0.0) + _TOWARD_IDENTITY
         left, values, right = torch.linalg.svd(scaled + pull * eye)
         flip = torch.det(left @ right).sign()[..., None]
         left = torch.cat([left[..., :2], left[..., 2:] * flip[..., None]], -1)
@@ -159,6 +159,6 @@ class _Rotation(torch.autograd.Function):
         left, values, right, norm = ctx.saved_tensors
         inner = left.mT @ grad @ right.mT
         sums = values[..., :, None] + values[..., None, :]
-        open_turn = sums.abs() < 10 * _TOWARDS_IDENTITY
+        open_turn = sums.abs() < 10 * _TOWARD_IDENTITY
         inner = torch.where(open_turn, 0.0, (inner - inner.mT) / torch.where(open_turn, 1.0, sums))
         return left @ inner @ right / norm.clamp(min=_EMPTY), None

@@ -82,15 +82,19 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     parts = {name: name.split("/") for name in names}
     short = [name for name, own in parts.items() if len(own) < least]
     if short:
-        raise DataError(f"{root}: {short[0]!r} lies in no folder of its class; --label-from-folder expects {layout}, or"
-                        f" train/{layout} and test/{layout}, below what is given")  # fmt: skip
+        raise DataError(
+            f"{root}: {short[0]!r} lies in no folder of its class; --label-from-folder expects {layout}, or"
+            f" train/{layout} and test/{layout}, below what is given"
+        )
     deep = [name for name, own in parts.items() if own[0] in SPLIT_FOLDERS and len(own) > least]
     divided = len(deep) == len(parts)
     meant = len({parts[name][0] for name in deep}) > 1 or all(own[0] in SPLIT_FOLDERS for own in parts.values())
     if deep and meant and not divided:  # else `train` may be a class among others
         odd = [name for name in parts if name not in set(deep)]
-        raise DataError(f"{root}: {', '.join(map(repr, odd[:5]))}{' ...' if odd[5:] else ''}: not SPLIT/{layout}, as {deep[0]!r} and"
-                        f" {len(deep)} in all are; move away what makes a sample of it, such as a stray picture")  # fmt: skip
+        raise DataError(
+            f"{root}: {', '.join(map(repr, odd[:5]))}{' ...' if odd[5:] else ''}: not SPLIT/{layout}, as {deep[0]!r} and"
+            f" {len(deep)} in all are; move away what makes a sample of it, such as a stray picture"
+        )
     classes = {name: own[1 if divided else 0] for name, own in parts.items()}
     class_names = sorted(set(classes.values()))
     splits = {name: SPLIT_FOLDERS[own[0]] if divided else "" for name, own in parts.items()}

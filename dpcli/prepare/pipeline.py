@@ -75,7 +75,9 @@ def _looks(path: Path) -> str:
     try:
         if not path.is_dir():
             return str(path.stat().st_size)
-        names = sorted(name for name in os.listdir(path) if not name.startswith(".") and not name.endswith((".h5", ".hdf5")))
+        names = sorted(
+            name for name in os.listdir(path) if not name.startswith(".") and not name.endswith((".h5", ".hdf5"))
+        )
         last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
         return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"
     except OSError:  # an item that is made, or of a file beside others, or not there: reading it tells
@@ -126,10 +128,21 @@ def convert(
         return count_samples(report, output)
     work = partial(convert_item, reader, thinning, seed)
     try:
-        with stop_requested() as stop, CloudsWriter(
-            output, class_names=reader.class_names, length_unit=reader.length_unit, source=type(reader).__name__,
-            seed=seed, fields=reader.fields, compression=compression, provenance=provenance, force=force, resume=resume,
-        ) as writer:  # fmt: skip
+        with (
+            stop_requested() as stop,
+            CloudsWriter(
+                output,
+                class_names=reader.class_names,
+                length_unit=reader.length_unit,
+                source=type(reader).__name__,
+                seed=seed,
+                fields=reader.fields,
+                compression=compression,
+                provenance=provenance,
+                force=force,
+                resume=resume,
+            ) as writer,
+        ):
             run = _Run(writer, report, stop, on_error, items, shard)
             run.stream(work, jobs, executor, task)
             writer.skipped = report.skipped
@@ -151,9 +164,14 @@ class _Run:
     """One pass over the items that are not written yet, in order, into the writer."""
 
     def __init__(
-        self, writer: CloudsWriter, report: Report, stop: StopRequest, on_error: str, items: list[Item],
+        self,
+        writer: CloudsWriter,
+        report: Report,
+        stop: StopRequest,
+        on_error: str,
+        items: list[Item],
         shard: Shard | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.writer, self.report, self.stop, self.on_error = writer, report, stop, on_error
         self.items = [(place, items[place]) for place in (shard or WHOLE).places(len(items))]
         done = set(writer.written_names)

@@ -76,12 +76,7 @@ class Reader(Protocol):
 
 def describe(item: Item) -> dict[str, Any]:
     """The fields of a CloudSequence that the index already knows."""
-    return {
-        "split": item.split,
-        "label": item.label,
-        "subject": item.subject,
-        "camera": item.camera,
-    }
+    return {"split": item.split, "label": item.label, "subject": item.subject, "camera": item.camera}
 
 
 def natural_key(path: Path | str) -> list[tuple[int, int, str]]:

@@ -65,19 +65,54 @@ class Experiment:
 _GESTURES = ("--frames", "32", "--timing", "uniform", "--normalize", "image")  # facts of the peers' loaders
 _NTU = ("--frames", "24")
 EXPERIMENTS = {
-    "3.2": Experiment("3.2", "NvGesture", {"clouds": ("nvgesture",)}, (
-        Setting("kinet", "Kinet", "clouds", _GESTURES, "Point Cloud", {"static": 84.5, "dynamic": 82.4}),)),
-    "3.3": Experiment("3.3", "SHREC'17", {"bbox": ("shrec17", "--bbox"), "no-bbox": ("shrec17", "--no-bbox")}, (
-        Setting("bbox", "bounding box yes", "bbox", _GESTURES, "bounding box yes", {"dynamic": 93.1}),
-        Setting("no-bbox", "bounding box no", "no-bbox", _GESTURES, "bounding box no", {"static": 86.5, "dynamic": 92.6}))),
-    "3.4": Experiment("3.4", "MSRAction-3D", {"clouds": ("msraction3d", "--points", "2048")}, tuple(
-        Setting(f"{n}", f"{n} frames", "clouds", ("--frames", f"{n}"), f", {n} frames", {"static": 84.30} if n == 16 else {})
-        for n in (4, 8, 12, 16, 24)), short=True, first="16"),
-    "3.5": Experiment("3.5", "NTU RGB+D 60", {"xsub": ("ntu60", "--protocol", "xsub", "--points", "2048"),
-                                              "xview": ("ntu60", "--protocol", "xview", "--points", "2048")}, (
-        Setting("xsub", "cross-subject", "xsub", _NTU, "cross-subject"),
-        Setting("xview", "cross-view", "xview", _NTU, "cross-view"))),
-}  # fmt: skip
+    "3.2": Experiment(
+        "3.2",
+        "NvGesture",
+        {"clouds": ("nvgesture",)},
+        (Setting("kinet", "Kinet", "clouds", _GESTURES, "Point Cloud", {"static": 84.5, "dynamic": 82.4}),),
+    ),
+    "3.3": Experiment(
+        "3.3",
+        "SHREC'17",
+        {"bbox": ("shrec17", "--bbox"), "no-bbox": ("shrec17", "--no-bbox")},
+        (
+            Setting("bbox", "bounding box yes", "bbox", _GESTURES, "bounding box yes", {"dynamic": 93.1}),
+            Setting(
+                "no-bbox", "bounding box no", "no-bbox", _GESTURES, "bounding box no", {"static": 86.5, "dynamic": 92.6}
+            ),
+        ),
+    ),
+    "3.4": Experiment(
+        "3.4",
+        "MSRAction-3D",
+        {"clouds": ("msraction3d", "--points", "2048")},
+        tuple(
+            Setting(
+                f"{n}",
+                f"{n} frames",
+                "clouds",
+                ("--frames", f"{n}"),
+                f", {n} frames",
+                {"static": 84.30} if n == 16 else {},
+            )
+            for n in (4, 8, 12, 16, 24)
+        ),
+        short=True,
+        first="16",
+    ),
+    "3.5": Experiment(
+        "3.5",
+        "NTU RGB+D 60",
+        {
+            "xsub": ("ntu60", "--protocol", "xsub", "--points", "2048"),
+            "xview": ("ntu60", "--protocol", "xview", "--points", "2048"),
+        },
+        (
+            Setting("xsub", "cross-subject", "xsub", _NTU, "cross-subject"),
+            Setting("xview", "cross-view", "xview", _NTU, "cross-view"),
+        ),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -104,9 +139,14 @@ class Plan:
     def __str__(self) -> str:
         """What a reader has to type."""
         said = f"`dpc classify train {' '.join(['--preset', self.preset, '--validation none', *self.budget])}`"
-        return said if not self.first else (
-            f"{said} at {self.first} frames, from whose network of the same seed the other lengths go on "
-            f"(`--init`, `{' '.join(self.more)}`)")  # fmt: skip
+        return (
+            said
+            if not self.first
+            else (
+                f"{said} at {self.first} frames, from whose network of the same seed the other lengths go on "
+                f"(`--init`, `{' '.join(self.more)}`)"
+            )
+        )
 
 
 def too_short(clouds: Path, words: Sequence[str], split: str = "test") -> int:
@@ -178,9 +218,14 @@ def _rounds(
 
 
 def make(
-    experiment: Experiment, clouds: Mapping[str, Path], folder: Path, plan: Plan, seeds: Sequence[int], only: Sequence[str],
+    experiment: Experiment,
+    clouds: Mapping[str, Path],
+    folder: Path,
+    plan: Plan,
+    seeds: Sequence[int],
+    only: Sequence[str],
     run: Dpc = dpc,
-) -> dict[str, dict[int, dict]]:  # fmt: skip
+) -> dict[str, dict[int, dict]]:
     """Run what isn't done; table.md and results.json after every cell. clouds: by name, the prepared files."""
     about = (
         f"Ours: {plan} and each line's own {', '.join(word for word in experiment.settings[0].words if word.startswith('--'))}; "

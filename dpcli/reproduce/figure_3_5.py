@@ -4,7 +4,7 @@
                                                                    [--only 0,1]: these folds now, a job each or several
 
 N-fold cross-validation over the training videos; accuracy is the dynamic stream's alone, after its last epoch. A fold's
-static stream is trained once for all settings that leave it as it is (both radii change its neighbourhoods). Results:
+static stream is trained once for all settings that leave it as it is (both radii change its neighborhoods). Results:
 FOLDER/table.md and results.json after every network, figure.png at the end. Stopped, it goes on where it was. Jobs may
 share FOLDER once it is prepared, each with folds of its own; what a job writes shows all folds known to it.
 """
@@ -112,7 +112,11 @@ class Fold:
         """Folders of the static and of the dynamic stream, and the latter's words."""
         place = self.folder / f"fold{self.which}-of-{self.of}"
         static = place / f"static-{at.name(static=True)}"
-        return static, place / at.name(), [*at.words(), "--epochs", "0", "--static-from", str(static / "last.safetensors")]
+        return (
+            static,
+            place / at.name(),
+            [*at.words(), "--epochs", "0", "--static-from", str(static / "last.safetensors")],
+        )
 
     def known(self, at: Point) -> dict | None:
         """What `accuracy` found before, without doing anything."""
@@ -197,7 +201,9 @@ def make(
     about = f"Ours: `dpc classify train {' '.join(words)}`, {folds} folds of the training videos, one seed, the last epoch.{note}"
 
     def look() -> dict[str, dict[float, list[float]]]:
-        known = {key: {one: [fold.known(point(key, one)) for fold in everyone] for one in own} for key, own in values.items()}
+        known = {
+            key: {one: [fold.known(point(key, one)) for fold in everyone] for one in own} for key, own in values.items()
+        }
         return {
             key: {value: [100 * one["last"] for one in folds if one is not None] for value, folds in columns.items()}
             for key, columns in known.items()
@@ -261,7 +267,9 @@ def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
     values = swept(given.sweep)
     only = numbers(given.only) if given.only else range(given.folds)
     if not set(only) <= set(range(given.folds)):
-        parser.error(f"--only {given.only}: expected folds from 0 to {given.folds - 1} (--folds {given.folds}), such as 0,1")
+        parser.error(
+            f"--only {given.only}: expected folds from 0 to {given.folds - 1} (--folds {given.folds}), such as 0,1"
+        )
     clouds = (
         given.clouds or prepared(experiment, given.raw, given.folder, ["clouds"], given.prepare.split(), run)["clouds"]
     )

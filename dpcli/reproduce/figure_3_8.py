@@ -40,12 +40,16 @@ from dpcli.reproduce.runs import (
 BACKBONES = {"pointnet2": "PointNet++", "dgcnn": "DGCNN", "spidercnn": "SpiderCNN"}
 KINDS = {"static": "Static {}", "flow": "Flow-based two streams ({})", "kinet": "Kinet ({})"}
 THESIS = {  # table A.1: FLOPs (G), parameters (M), accuracy (%)
-    ("pointnet2", "static"): (4.82, 2.13, 84.30), ("pointnet2", "flow"): (163.93, 7.79, 90.23),
-    ("pointnet2", "kinet"): (10.35, 3.20, 91.92), ("dgcnn", "static"): (5.33, 5.25, 84.18),
-    ("dgcnn", "flow"): (164.95, 14.04, 89.56), ("dgcnn", "kinet"): (5.83, 5.85, 89.82),
-    ("spidercnn", "static"): (13.40, 8.03, 83.49), ("spidercnn", "flow"): (181.09, 19.60, 89.23),
+    ("pointnet2", "static"): (4.82, 2.13, 84.30),
+    ("pointnet2", "flow"): (163.93, 7.79, 90.23),
+    ("pointnet2", "kinet"): (10.35, 3.20, 91.92),
+    ("dgcnn", "static"): (5.33, 5.25, 84.18),
+    ("dgcnn", "flow"): (164.95, 14.04, 89.56),
+    ("dgcnn", "kinet"): (5.83, 5.85, 89.82),
+    ("spidercnn", "static"): (13.40, 8.03, 83.49),
+    ("spidercnn", "flow"): (181.09, 19.60, 89.23),
     ("spidercnn", "kinet"): (15.29, 8.62, 88.54),
-}  # fmt: skip
+}
 PEERS = {"MeteorNet": (1.70, 17.60, 88.21), "PSTNet": (54.09, 8.44, 89.90), "P4Transformer": (40.38, 42.07, 89.56)}
 _COLORS = {"pointnet2": "tab:blue", "dgcnn": "tab:green", "spidercnn": "tab:red"}
 _MARKS = {"static": "o", "flow": "s", "kinet": "*"}
@@ -151,8 +155,11 @@ def table(known: Mapping[str, Mapping[str, dict[str, Cost]]], found: Found, abou
         if backbone not in next(iter(known.values())):
             continue
         cost, own = known["thesis"][backbone][kind], found.get((backbone, kind), [])
-        line = [KINDS[kind].format(BACKBONES[backbone]), f"{flops:.2f} / {cost.paper_flops:.2f}",
-                f"{parameters:.2f} / {cost.paper_parameters:.2f}"]  # fmt: skip
+        line = [
+            KINDS[kind].format(BACKBONES[backbone]),
+            f"{flops:.2f} / {cost.paper_flops:.2f}",
+            f"{parameters:.2f} / {cost.paper_parameters:.2f}",
+        ]
         line += [
             f"{one[backbone][kind].true_flops:.3g}, {one[backbone][kind].true_parameters:.3f}" for one in known.values()
         ]
@@ -194,8 +201,12 @@ def picture(cost: Mapping[str, dict[str, Cost]], found: Found, path: Path) -> No
     for name, (flops, parameters, accuracy) in PEERS.items():
         axes.scatter(flops, accuracy, s=_area(parameters), facecolors="none", edgecolors="0.5", marker="D")
         axes.annotate(name, (flops, accuracy), textcoords="offset points", xytext=_BESIDE[name], color="0.4")
-    axes.set(xscale="log", xlabel="FLOPs of a clip (G), as the thesis counts", ylabel="accuracy (%)",
-             title="Hollow: the thesis. Filled: ours. Area: parameters")  # fmt: skip
+    axes.set(
+        xscale="log",
+        xlabel="FLOPs of a clip (G), as the thesis counts",
+        ylabel="accuracy (%)",
+        title="Hollow: the thesis. Filled: ours. Area: parameters",
+    )
     axes.grid(color="0.92")
     figure.legend(loc="outside right upper", frameon=False, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -210,7 +221,7 @@ def _about(plan: Plan, flow: str, reasons: Mapping[str, str]) -> list[str]:
         "statistics / 2^20, of Kinet's frozen static stream the weights alone. True: 2 x multiply-adds as computed / 1e9; "
         "trainable weights / 1e6. Peers are counted in plain millions.",
         f"Flow-based: flow by `{flow}` (the thesis: JustGo, 3.54 M and 154.29 G, which its rows hold and ours don't).",
-    ]  # fmt: skip
+    ]
     return notes + [f"{KINDS['flow'].format(BACKBONES[name])}: {DASH}, {why}." for name, why in reasons.items()]
 
 
@@ -224,15 +235,19 @@ def make(
     run: Dpc = dpc,
 ) -> dict[tuple[str, str], list[dict]]:
     """Run what isn't done; a table after each network, the picture at the end. clouds: None profiles only."""
-    known = {preset: {name: profile(run, folder, preset, name) for name in backbones}
-             for preset in dict.fromkeys(("thesis", plan.preset))}  # fmt: skip
+    known = {
+        preset: {name: profile(run, folder, preset, name) for name in backbones}
+        for preset in dict.fromkeys(("thesis", plan.preset))
+    }
     found: dict[tuple[str, str], list[dict]] = {}
     reasons: dict[str, str] = {}
 
     def tell() -> None:
         about = _about(plan, flow, reasons)
-        write_json(folder / "results.json", {"table": "A.1", "about": about,
-                                             "runs": {f"{name} {kind}": own for (name, kind), own in found.items()}})  # fmt: skip
+        write_json(
+            folder / "results.json",
+            {"table": "A.1", "about": about, "runs": {f"{name} {kind}": own for (name, kind), own in found.items()}},
+        )
         write_text(folder / "table.md", table(known, found, about))
 
     tell()

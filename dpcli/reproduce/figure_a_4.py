@@ -115,8 +115,15 @@ def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict
         if others != names:
             raise DataError(f"{flow[0]}: other classes than {files[0]}")
         about += f" Flow-based two streams: {some(len(flow), 'run')}, over their own static networks."
-    write_json(folder / "results.json", {"figure": "A.4", "classes": names, "static": base.tolist(),
-                                         "gain": {key: value.tolist() for key, value in found.items()}})  # fmt: skip
+    write_json(
+        folder / "results.json",
+        {
+            "figure": "A.4",
+            "classes": names,
+            "static": base.tolist(),
+            "gain": {key: value.tolist() for key, value in found.items()},
+        },
+    )
     write_text(folder / "table.md", table(names, base, found, about))
     picture(names, found, folder / "figure.png")
     return found

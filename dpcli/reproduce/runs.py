@@ -35,9 +35,12 @@ def dpc(*words: object, threads: int | None = None) -> str:
     limits = {} if threads is None else {"OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
     main = threading.current_thread() is threading.main_thread()
     process = subprocess.Popen(
-        [sys.executable, "-m", "dpcli", *map(str, words)], stdout=subprocess.PIPE, text=True,
-        env={**os.environ, **limits}, start_new_session=main,
-    )  # fmt: skip
+        [sys.executable, "-m", "dpcli", *map(str, words)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **limits},
+        start_new_session=main,
+    )
     before = {}
     if main:  # elsewhere Python allows no handlers
         before = {one: signal.signal(one, lambda number, _: process.send_signal(number)) for one in _FORWARDED}

@@ -1,4 +1,4 @@
-"""Table 3.1 of the thesis, ablations on NvGesture: what pretraining, surface normals and neighbours' weights are worth.
+"""Table 3.1 of the thesis, ablations on NvGesture: what pretraining, surface normals and neighbors' weights are worth.
 
     python -m dpcli.reproduce.table_3_1 nvgesture|msraction3d RAW FOLDER [--modelnet FOLDER] [-- words of `dpc classify train`]
 
@@ -32,8 +32,10 @@ from dpcli.reproduce.runs import (
     write_text,
 )
 
-DATA = {"nvgesture": (EXPERIMENTS["3.2"], EXPERIMENTS["3.2"].settings[0]),
-        "msraction3d": (EXPERIMENTS["3.4"], next(one for one in EXPERIMENTS["3.4"].settings if one.key == "16"))}  # fmt: skip
+DATA = {
+    "nvgesture": (EXPERIMENTS["3.2"], EXPERIMENTS["3.2"].settings[0]),
+    "msraction3d": (EXPERIMENTS["3.4"], next(one for one in EXPERIMENTS["3.4"].settings if one.key == "16")),
+}
 _SWITCH = {"normals": ("--no-normals",), "weights": ("--no-weights",)}
 
 
@@ -98,16 +100,24 @@ def table(rows: Sequence[Row], found: Mapping[str, Sequence[dict]], about: Seque
 
 
 def make(
-    setting: Setting, clouds: Path, folder: Path, plan: Plan, seeds: Sequence[int], start: Path | None, about: Sequence[str] = (),
+    setting: Setting,
+    clouds: Path,
+    folder: Path,
+    plan: Plan,
+    seeds: Sequence[int],
+    start: Path | None,
+    about: Sequence[str] = (),
     run: Dpc = dpc,
-) -> dict[str, list[dict]]:  # fmt: skip
+) -> dict[str, list[dict]]:
     """Run what isn't done, a table after every network. start: the pretrained static stream, None without."""
     rows = ROWS if start else tuple(row for row in ROWS if row.network == "scratch") + PLAIN
     notes = [*about, f"Ours: `dpc classify train --preset {plan.preset} --validation none {' '.join(plan.budget)}`."]
     if start is None:
         left = ", ".join(row.number.rstrip(".") for row in ROWS if row.network != "scratch")
-        notes.append(f"Rows {left} need ModelNet40 (MODELNET=folder of modelnet40_ply_hdf5_2048) and are left out; the "
-                     "lines without a number are the same switches on networks trained from scratch.")  # fmt: skip
+        notes.append(
+            f"Rows {left} need ModelNet40 (MODELNET=folder of modelnet40_ply_hdf5_2048) and are left out; the "
+            "lines without a number are the same switches on networks trained from scratch."
+        )
     found: dict[str, list[dict]] = {}
     for seed in seeds:
         for name in dict.fromkeys(row.network for row in rows):

@@ -33,13 +33,19 @@ class Row:
 
 
 ROWS = {
-    "plain": Row("no SE(3) features, past flow", ("--group", "trivial", *_PAST), (45.2, 44.2, 58.9, 53.8, 65.1, 60.9, 71.2)),
-    "global": Row("SE(3), pooled per cloud, past flow", ("--pooling", "global", *_PAST), (51.7, 50.0, 65.8, 64.7, 67.0, 61.6, 72.3)),
+    "plain": Row(
+        "no SE(3) features, past flow", ("--group", "trivial", *_PAST), (45.2, 44.2, 58.9, 53.8, 65.1, 60.9, 71.2)
+    ),
+    "global": Row(
+        "SE(3), pooled per cloud, past flow",
+        ("--pooling", "global", *_PAST),
+        (51.7, 50.0, 65.8, 64.7, 67.0, 61.6, 72.3),
+    ),
     "past": Row("SE(3), pooled per point, past flow", _PAST, (55.3, 52.8, 68.3, 65.9, 70.0, 62.3, 72.7)),
     "current": Row("the same, current flow", _CURRENT, (54.8, 52.0, 67.6, 66.0, 69.3, 63.5, 73.8)),
     "both": Row("the same, past and current flow", _BOTH, (57.0, 51.6, 67.3, 63.8, 71.1, 63.1, 73.2)),
     "full": Row("the same and consensus", (), (63.8, 61.3, 77.3, 84.2, 71.3, 63.7, 75.4)),
-}  # fmt: skip
+}
 _FIRST = "full"  # trained first: it estimates the first flows that the others take over
 
 

@@ -40,8 +40,23 @@ def film(meshes: Path, clip: str, out: Path, size: int) -> Path:
         sys.exit(f"{meshes}: no {model}.glb in it")
     path = out / f"{model}-{motion}.h5"
     if not path.exists():
-        dpc("prepare", "animation", found[0], "--clip", motion, "-o", path, "--size", size, "--yaw", 90,
-            "--train-azimuths", "15,-75,105,195", "--azimuths", "60,-30,150,240")  # fmt: skip
+        dpc(
+            "prepare",
+            "animation",
+            found[0],
+            "--clip",
+            motion,
+            "-o",
+            path,
+            "--size",
+            size,
+            "--yaw",
+            90,
+            "--train-azimuths",
+            "15,-75,105,195",
+            "--azimuths",
+            "60,-30,150,240",
+        )
     return path
 
 
@@ -51,8 +66,26 @@ def score(views: Path, row: str, out: Path, steps: tuple[int, int], seed: int) -
     result = scene.with_suffix(".json")
     if not result.exists():
         if not scene.exists():
-            dpc("generate4d", "fit", views, "-o", scene, "--preset", "quick", "--prior", "views", "--seed", seed,
-                "--dense-steps", steps[0], "--sparse-steps", steps[1], "--most-gaussians", 6000, *ROWS[row])  # fmt: skip
+            dpc(
+                "generate4d",
+                "fit",
+                views,
+                "-o",
+                scene,
+                "--preset",
+                "quick",
+                "--prior",
+                "views",
+                "--seed",
+                seed,
+                "--dense-steps",
+                steps[0],
+                "--sparse-steps",
+                steps[1],
+                "--most-gaussians",
+                6000,
+                *ROWS[row],
+            )
         text = dpc("evaluate", "video", scene, "--truth", views, "--metrics", "psnr,ssim,parts,tracks", "--json")
         result.write_text(text)
     return json.loads(result.read_text())["metrics"]

@@ -50,8 +50,12 @@ class Processes:
 def from_environment() -> Processes:
     """What torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. UsageError when they are no numbers."""
     try:
-        return Processes(*(int(os.environ.get(name, default)) for name, default in
-                           (("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_RANK", "0"))))  # fmt: skip
+        return Processes(
+            *(
+                int(os.environ.get(name, default))
+                for name, default in (("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_RANK", "0"))
+            )
+        )
     except ValueError:
         raise UsageError("RANK, WORLD_SIZE or LOCAL_RANK is no number; start with torchrun, or unset them") from None
 

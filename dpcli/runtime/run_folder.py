@@ -20,8 +20,18 @@ from dpcli.runtime.whole_file import DiskFull, disk_full, whole_file
 _TOLD = 3  # differences named when a run can't be continued
 _LOCK = ".lock"
 # What --force removes; the flows are those of `segment train`, the preview that of `generate4d fit`.
-_FILES = ("state.pt", "last.safetensors", "best.safetensors", "log.csv", "log.json", "curves.png", "flows_first.npy",
-          "flows.npy", "flows_known.npy", "preview.png")  # fmt: skip
+_FILES = (
+    "state.pt",
+    "last.safetensors",
+    "best.safetensors",
+    "log.csv",
+    "log.json",
+    "curves.png",
+    "flows_first.npy",
+    "flows.npy",
+    "flows_known.npy",
+    "preview.png",
+)
 
 
 class RunFolder:
@@ -35,9 +45,14 @@ class RunFolder:
     """
 
     def __init__(
-        self, path: str | Path, config: dict, force: bool = False, *, columns: Sequence[str],
+        self,
+        path: str | Path,
+        config: dict,
+        force: bool = False,
+        *,
+        columns: Sequence[str],
         curves: Callable[[list[dict], Path], None] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.columns, self.curves = tuple(columns), curves
         self.path, self.config, self.force = Path(path), config, force
         self.rows: list[dict] = []
@@ -106,7 +121,9 @@ class RunFolder:
     def refuse_inside(self, option: str, file: Path) -> None:
         """UsageError when `file`, named by an option to start from, is among those that the run replaces."""
         if self.path.resolve() in (file.parent.resolve(), file.resolve().parent):
-            raise UsageError(f"{option} {file}: lies in the folder of -o, whose files this run replaces; use another -o")
+            raise UsageError(
+                f"{option} {file}: lies in the folder of -o, whose files this run replaces; use another -o"
+            )
 
     def file(self, name: str) -> Path:
         return self.path / name
@@ -127,7 +144,9 @@ class RunFolder:
 
     def tell_continuing(self, where: str | None) -> None:
         """Say where an earlier run goes on; None: at its end."""
-        log.info(f"continuing {self.path} at {where}" if where else f"{self.path}: is finished already; --force starts over")
+        log.info(
+            f"continuing {self.path} at {where}" if where else f"{self.path}: is finished already; --force starts over"
+        )
 
     def save_state(self, state: dict) -> None:
         with whole_file(self.path / "state.pt") as part, open(part, "wb") as file:  # given a name, torch says no reason

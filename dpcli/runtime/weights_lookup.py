@@ -45,10 +45,16 @@ def weights_summary(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a complete safetensors file ({error})") from None
     card = path.with_suffix(".md")
     return {
-        "kind": "model", "format": header.pop("format", None), "version": header.pop("version", None),
-        "bytes": path.stat().st_size, "weights": sum(sizes), "tensors": len(sizes), "types": types,
-        "card": str(card) if card.is_file() else None, "header": {key: _plain(text) for key, text in sorted(header.items())},
-    }  # fmt: skip
+        "kind": "model",
+        "format": header.pop("format", None),
+        "version": header.pop("version", None),
+        "bytes": path.stat().st_size,
+        "weights": sum(sizes),
+        "tensors": len(sizes),
+        "types": types,
+        "card": str(card) if card.is_file() else None,
+        "header": {key: _plain(text) for key, text in sorted(header.items())},
+    }
 
 
 def _plain(text: str) -> Any:

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Sequence
 from multiprocessing import forkserver, resource_tracker
 
-# One process per core is the parallelism: libraries inside a worker must not start threads of their own.
+# One process per core is the parallelizm: libraries inside a worker must not start threads of their own.
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]

@@ -34,16 +34,16 @@ def paper_parameters(module: nn.Module) -> int:
 
 
 def convolution_macs(config: PartConfig, points: int) -> dict[str, int]:
-    """Multiply-adds of one frame's convolutions, by kind, every neighbour counted whether its weight is zero or not."""
+    """Multiply-adds of one frame's convolutions, by kind, every neighbor counted whether its weight is zero or not."""
     group, kernel = GROUPS[config.group](), kernel_points(config.kernel, config.group)
     rotations, positions, nearby = len(group), len(kernel.points), len(group.nearby)
-    total = {"neighbour_sums": 0, "spatial": 0, "group": 0, "shortcut": 0}
+    total = {"neighbor_sums": 0, "spatial": 0, "group": 0, "shortcut": 0}
     channels, here = 1, points
     for layer in (layer for block in config.layers for layer in block):
         here = -(-here // layer.stride)
-        count = min(layer.neighbours, points)
+        count = min(layer.neighbors, points)
         sums = len(kernel.orbit) * count if channels == 1 else positions * count * rotations * channels
-        total["neighbour_sums"] += here * sums
+        total["neighbor_sums"] += here * sums
         total["spatial"] += here * rotations * positions * channels * layer.channels
         total["group"] += here * rotations * nearby * layer.channels**2
         total["shortcut"] += 0 if channels == 1 else here * rotations * channels * layer.channels
@@ -96,15 +96,18 @@ def measure(config: PartConfig, device: torch.device) -> dict[str, Any]:
     parts = {name: count_parameters(module) for name, module in model.named_children()}
     linear = sum(count_parameters(m) for m in model.modules() if isinstance(m, nn.MultiheadAttention))
     return {
-        "group": config.group, "points": config.points, "slots": config.slots,
+        "group": config.group,
+        "points": config.points,
+        "slots": config.slots,
         "parameters": {"total": count_parameters(model), **parts, "attention": linear},
         "paper_style_parameters": {"total": paper_parameters(model), "rule": "1x1 layers and layer norms only"},
         "macs_per_frame": counts,
-        "uncounted": "neighbour search, norms, activations, softmax, interpolation between levels",
+        "uncounted": "neighbor search, norms, activations, softmax, interpolation between levels",
         "latency_ms": {"four_frames": latency(model, frames)},
         "peak_memory_mb": round(peak_memory() / 2**20, 1),
-        "device": str(device), "threads": torch.get_num_threads(),
-    }  # fmt: skip
+        "device": str(device),
+        "threads": torch.get_num_threads(),
+    }
 
 
 def render(result: dict[str, Any]) -> str:
@@ -113,15 +116,18 @@ def render(result: dict[str, Any]) -> str:
     parts = ", ".join(f"{key} {value:,}" for key, value in parameters.items() if key != "total")
     paper = result["paper_style_parameters"]
     shares = ", ".join(f"{key.replace('_', ' ')} {value / 1e6:.0f}" for key, value in counts.items() if key != "total")
-    return "\n".join([
-        f"part network, {result['group']} group, {result['points']} points a frame, {result['slots']} slots",
-        f"parameters    {parameters['total']:,} ({parts})",
-        f"  paper style {paper['total']:,}: {paper['rule']}",
-        f"multiply-adds {counts['total'] / 1e9:.3f} G per frame (M: {shares})",
-        f"  not counted: {result['uncounted']}",
-        f"latency       {result['latency_ms']['four_frames']} ms for four frames on {result['device']} with {result['threads']} threads",
-        f"peak memory   {result['peak_memory_mb']} MB of the process",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"part network, {result['group']} group, {result['points']} points a frame, {result['slots']} slots",
+            f"parameters    {parameters['total']:,} ({parts})",
+            f"  paper style {paper['total']:,}: {paper['rule']}",
+            f"multiply-adds {counts['total'] / 1e9:.3f} G per frame (M: {shares})",
+            f"  not counted: {result['uncounted']}",
+            f"latency       {result['latency_ms']['four_frames']} ms for four frames on {result['device']}"
+            f" with {result['threads']} threads",
+            f"peak memory   {result['peak_memory_mb']} MB of the process",
+        ]
+    )
 
 
 def run_profile(config: str, group: str | None, points: int | None, as_object: bool, device: str) -> None:

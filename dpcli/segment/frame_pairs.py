@@ -1,4 +1,4 @@
-"""Training pairs: two neighbouring frames of a sequence, thinned to the network's number of points and to size 1."""
+"""Training pairs: two neighboring frames of a sequence, thinned to the network's number of points and to size 1."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Pair:
 
 @dataclass
 class LoadedPair:
-    """points f32 (2,N,3) in units of the sequence's diameter, centred; part i64 (2,N) (-1 unknown); flow f32 (2,N,3), the
+    """points f32 (2,N,3) in units of the sequence's diameter, centered; part i64 (2,N) (-1 unknown); flow f32 (2,N,3), the
     true one each way, None without poses and scene_flow."""
 
     points: np.ndarray
@@ -57,9 +57,13 @@ class PairSource:
         both = [(s, f) for s, f in spots if sizes[s][f : f + 2].all()]
         if not both:
             without = ", all with a frame without points" if spots else ""
-            raise DataError(f"{reader.path}: no two frames that follow each other in {len(sequences)} sequences to train on{without}")
+            raise DataError(
+                f"{reader.path}: no two frames that follow each other in {len(sequences)} sequences to train on{without}"
+            )
         if len(both) < len(spots):
-            log.warn(f"{reader.path}: {len(spots) - len(both)} of {len(spots)} pairs of frames left out: one has no points")
+            log.warn(
+                f"{reader.path}: {len(spots) - len(both)} of {len(spots)} pairs of frames left out: one has no points"
+            )
         self.pairs = [Pair(n, s, f) for n, (s, f) in enumerate(both)]
         truth = next((name for name in MOTION_FIELDS if name in reader.fields), None)
         self.fields = [name for name in ("part", truth) if name in reader.fields]
@@ -77,9 +81,9 @@ class PairSource:
         points = np.stack([cloud[pick] for cloud, pick in zip(clouds, picks)])
         flow = self._flow(pair, sample, points, parts, picks)
         scale = sequence_scale(clouds)
-        centre = np.float32(points.mean((0, 1)))
+        center = np.float32(points.mean((0, 1)))
         return LoadedPair(
-            np.float32((points - centre) * scale), parts, None if flow is None else np.float32(flow * scale)
+            np.float32((points - center) * scale), parts, None if flow is None else np.float32(flow * scale)
         )
 
     def _flow(

@@ -1,4 +1,4 @@
-"""Parts in colour: a contact sheet of sequences, predictions above the truth, and an object on a turntable."""
+"""Parts in color: a contact sheet of sequences, predictions above the truth, and an object on a turntable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.draw.palette import part_colours
+from dpcli.draw.palette import part_colors
 from dpcli.draw.shaded_points import draw_balls, view_matrix
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence
@@ -46,7 +46,7 @@ class Look:
 
 
 def matched_ids(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """`found` i64 (N) renamed after the true parts it covers, so that colours agree.
+    """`found` i64 (N) renamed after the true parts it covers, so that colors agree.
 
     Parts are paired such that the sum of IoU is largest; those left over take ids beyond the true ones; -1 stays.
     """
@@ -75,9 +75,9 @@ def parts_picture(
     frames: int = 4,
     look: Look | None = None,
 ) -> None:
-    """Write a contact sheet: a row per sequence, its frames as columns, points coloured by `part`.
+    """Write a contact sheet: a row per sequence, its frames as columns, points colored by `part`.
 
-    truth: for each sequence the same points with their true parts, or None; drawn in a row below, in the same colours.
+    truth: for each sequence the same points with their true parts, or None; drawn in a row below, in the same colors.
     At most `frames` frames are shown, spread over the sequence. DataError on sequences without parts, truth of other
     size, or when the picture can't be written.
     """
@@ -117,10 +117,10 @@ def _draw_row(sequence: CloudSequence, part: np.ndarray, shown: list[int], look:
     seen = sequence.points @ matrix.T
     low, high = np.percentile(seen, [0.1, 99.9], axis=0)
     scale = look.cell / (_MARGIN * max(float((high - low)[:2].max()), 1e-9))
-    offsets, colours = sequence.frame_offsets, part_colours(part)
+    offsets, colors = sequence.frame_offsets, part_colors(part)
     spans = [slice(offsets[t], offsets[t + 1]) for t in shown]
-    size, centre, depth = (look.cell, look.cell), (low + high)[:2] / 2, (float(low[2]), float(high[2]))
-    return [draw_balls(seen[span], colours[span], size, centre, scale, look.background, depth) for span in spans]
+    size, center, depth = (look.cell, look.cell), (low + high)[:2] / 2, (float(low[2]), float(high[2]))
+    return [draw_balls(seen[span], colors[span], size, center, scale, look.background, depth) for span in spans]
 
 
 def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) -> Any:
@@ -150,8 +150,8 @@ def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> in
             draw.text((left - 14, top + 4), "…", fill=look.ink, font=font)
             return left - 14
         left -= width
-        colour = tuple(part_colours(np.array([own]))[0].tolist())
-        draw.ellipse((left, top + 6, left + 9, top + 15), fill=colour)
+        color = tuple(part_colors(np.array([own]))[0].tolist())
+        draw.ellipse((left, top + 6, left + 9, top + 15), fill=color)
         draw.text((left + 13, top + 4), text, fill=look.ink, font=font)
     return left
 
@@ -173,23 +173,23 @@ def _font(size: int) -> Any:
 def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look: Look | None = None) -> None:
     """Write an animation (.gif): one turn about the upright axis, while the frames pass to the last one and back.
 
-    Points are coloured by `part`. DataError on a sequence without parts or when the file can't be written.
+    Points are colored by `part`. DataError on a sequence without parts or when the file can't be written.
     """
     if path.suffix.lower() != ".gif":
         raise UsageError(f"{path}: unknown kind of animation {path.suffix!r}; expected .gif")
     look = look or Look(cell=320)
-    colours, offsets = part_colours(_parts_of(sequence)), sequence.frame_offsets
+    colors, offsets = part_colors(_parts_of(sequence)), sequence.frame_offsets
     low, high = np.percentile(sequence.points, [0.1, 99.9], axis=0)
-    centred = sequence.points - (low + high) / 2
-    radius = max(float(np.percentile(np.linalg.norm(centred, axis=1), 99.9)), 1e-9)
+    centered = sequence.points - (low + high) / 2
+    radius = max(float(np.percentile(np.linalg.norm(centered, axis=1), 99.9)), 1e-9)
     scale, count = look.cell / (2 * radius * _MARGIN), max(int(seconds * _RATE), 1)
     images = []
     for image, t in enumerate(there_and_back(sequence.num_frames, count)):
         matrix = view_matrix(look.azimuth + 2 * np.pi * image / count, look.elevation, look.up)
         span = slice(offsets[t], offsets[t + 1])
         size, depth = (look.cell, look.cell), (-radius, radius)
-        seen = centred[span] @ matrix.T
-        images.append(draw_balls(seen, colours[span], size, np.zeros(2), scale, look.background, depth))
+        seen = centered[span] @ matrix.T
+        images.append(draw_balls(seen, colors[span], size, np.zeros(2), scale, look.background, depth))
     _save_animation(images, path)
 
 
@@ -201,7 +201,7 @@ def there_and_back(frames: int, count: int) -> list[int]:
 
 
 def _save_animation(images: list[np.ndarray], path: Path) -> None:
-    """All images with one table of colours, so that nothing flickers."""
+    """All images with one table of colors, so that nothing flickers."""
     from PIL import Image
 
     some = np.concatenate(images[:: max(1, len(images) // 4)], axis=1)

@@ -35,7 +35,7 @@ Segmenter = Callable[[list[Tensor], Flows], list[Tensor]]  # frames, flows -> ma
 @dataclass(frozen=True)
 class Refinement:
     """points: most points of a frame that the segmenter sees. pairs: adjacent or all. icp: steps of object-aware ICP.
-    vote: blend each frame's mask with its neighbours' carried along the flow. smallest: parts below this share of a
+    vote: blend each frame's mask with its neighbors' carried along the flow. smallest: parts below this share of a
     sequence's points are given to each point's next best part."""
 
     points: int = 512
@@ -79,15 +79,15 @@ def predict_parts(
 ) -> tuple[np.ndarray, PartsSample]:
     """Hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
 
-    Frames are thinned to `points`, centred and scaled together to diameter 1 (so no unit or place matters); masks are
+    Frames are thinned to `points`, centered and scaled together to diameter 1 (so no unit or place matters); masks are
     carried back to all points from the three nearest. One frame gives parts and no motion. Frames without points are
-    left out of everything: their neighbours are each other's, and what leads from or to them stands still.
+    left out of everything: their neighbors are each other's, and what leads from or to them stands still.
     """
     clouds = [np.float32(sequence.frame(t)) for t in range(sequence.num_frames)]
     seen = [t for t, cloud in enumerate(clouds) if len(cloud)] or [0]
-    centre = np.float32(np.concatenate([c for c in clouds if len(c)] or [np.zeros((1, 3))]).mean(0))
+    center = np.float32(np.concatenate([c for c in clouds if len(c)] or [np.zeros((1, 3))]).mean(0))
     scale = np.float32(sequence_scale([c for c in clouds if len(c)])) if options.normalize else np.float32(1)
-    whole = [torch.from_numpy((clouds[t] - centre) * scale) for t in seen]
+    whole = [torch.from_numpy((clouds[t] - center) * scale) for t in seen]
     thin = [_thinned(cloud, options.points, generator(seed, index, t)) for t, cloud in zip(seen, whole)]
     wanted, place = needs_flows(len(clouds), options.pairs), {t: number for number, t in enumerate(seen)}
     pairs = [(place[i], place[j]) for i, j in wanted if i in place and j in place]
@@ -104,15 +104,19 @@ def predict_parts(
     full = [_carried_back(cloud, few, mask) for cloud, few, mask in zip(whole, thin, masks)]
     labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
     probability = torch.cat(full).numpy().astype(np.float32)
-    motion, flow = _motions(thin, whole, masks, full, flows, pairs, options, float(scale), centre)
+    motion, flow = _motions(thin, whole, masks, full, flows, pairs, options, float(scale), center)
     if len(pairs) < len(wanted):
         motion, flow = _with_empty_frames(wanted, [(seen[i], seen[j]) for i, j in pairs], clouds, motion, flow)
     return labels, PartsSample(probability, np.array(wanted, np.int32).reshape(-1, 2), motion, flow)
 
 
 def _with_empty_frames(
-    wanted: list[tuple[int, int]], known: list[tuple[int, int]], clouds: list[np.ndarray], motion: np.ndarray, flow: list[np.ndarray]
-) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+    wanted: list[tuple[int, int]],
+    known: list[tuple[int, int]],
+    clouds: list[np.ndarray],
+    motion: np.ndarray,
+    flow: list[np.ndarray],
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Motions (Q,S,4,4) and flows of all wanted pairs: what is not known stands still."""
     every = np.tile(np.eye(4, dtype=np.float32), (len(wanted), motion.shape[1], 1, 1))
     flows = [np.zeros_like(clouds[i]) for i, _ in wanted]
@@ -149,7 +153,7 @@ def _flows_and_masks(
 
 
 def _consistent(frames: list[Tensor], flows: Flows, masks: list[Tensor], vote: bool) -> list[Tensor]:
-    """Slots in frame 0's order in every frame, and each mask averaged with its neighbours' as the flow brings them."""
+    """Slots in frame 0's order in every frame, and each mask averaged with its neighbors' as the flow brings them."""
     if len(frames) == 1:
         return masks
     chain = [flows[t, t + 1] for t in range(len(frames) - 1)]
@@ -188,13 +192,20 @@ def _carried_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
 
 
 def _motions(
-    thin: list[Tensor], whole: list[Tensor], masks: list[Tensor], full: list[Tensor],
-    flows: Flows, pairs: list[tuple[int, int]], options: Refinement, scale: float, centre: np.ndarray,
-) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+    thin: list[Tensor],
+    whole: list[Tensor],
+    masks: list[Tensor],
+    full: list[Tensor],
+    flows: Flows,
+    pairs: list[tuple[int, int]],
+    options: Refinement,
+    scale: float,
+    center: np.ndarray,
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """Motion f32 (Q,S,4,4) in the input's own coordinates and flow of all points, pair by pair."""
     slots = masks[0].shape[1]
     motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
-    middle = torch.from_numpy(centre)
+    middle = torch.from_numpy(center)
     with _threads_for(thin):
         fitted = _fitted(thin, masks, flows, pairs, options.icp)
     for q, ((i, _), (rotation, shift)) in enumerate(zip(pairs, fitted)):
@@ -218,7 +229,7 @@ def _threads_for(frames: list[Tensor]) -> Iterator[None]:
 
 def _fitted(
     thin: list[Tensor], masks: list[Tensor], flows: Flows, pairs: list[tuple[int, int]], steps: int
-) -> list[tuple[Tensor, Tensor]]:  # fmt: skip
+) -> list[tuple[Tensor, Tensor]]:
     """Motions (S,3,3), (S,3) of every pair of frames; pairs of equally many points together, `_TOGETHER` at a time."""
     found: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
     alike: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -245,10 +256,7 @@ def _fit(
     _, rotation, shift = object_icp(first, second, mask1, mask2, flow, steps, 0.01, same)
     gaps = [_gap(first, second, mask1, *found) for found in (start, (rotation, shift))]  # [B, S] each
     better = gaps[1] <= gaps[0]
-    return (
-        torch.where(better[..., None, None], rotation, start[0]),
-        torch.where(better[..., None], shift, start[1]),
-    )
+    return (torch.where(better[..., None, None], rotation, start[0]), torch.where(better[..., None], shift, start[1]))
 
 
 def _gap(first: Tensor, second: Tensor, mask1: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:

@@ -153,9 +153,15 @@ class CloudsReader:
                 f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
             )
         return CloudSequence(
-            self.names[index], values.pop("points"), np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
-            self.splits[index], int(self.labels[index]), int(self.subjects[index]), int(self.cameras[index]), **values,
-        )  # fmt: skip
+            self.names[index],
+            values.pop("points"),
+            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            self.splits[index],
+            int(self.labels[index]),
+            int(self.subjects[index]),
+            int(self.cameras[index]),
+            **values,
+        )
 
     def close(self) -> None:
         if self._file is not None and self._process == os.getpid():

@@ -52,9 +52,15 @@ class CloudsWriter(ResumableWriter):
         resume: bool = False,
     ) -> None:
         super().__init__(
-            path, class_names=class_names, length_unit=length_unit, source=source, seed=seed,
-            provenance=provenance, force=force, resume=resume,
-        )  # fmt: skip
+            path,
+            class_names=class_names,
+            length_unit=length_unit,
+            source=source,
+            seed=seed,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        )
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
         unknown = set(fields) - set(_FIELDS)
@@ -124,8 +130,9 @@ class CloudsWriter(ResumableWriter):
         if "pose" in self.fields and "pose" in self._file:
             own, others = sequence.pose.shape[1], self._file["pose"].shape[1]
             if own != others:
-                raise DataError(f"sample {sequence.name!r}: pose has {own} parts, earlier samples have {others}; "
-                                "pad to the largest")  # fmt: skip
+                raise DataError(
+                    f"sample {sequence.name!r}: pose has {own} parts, earlier samples have {others}; pad to the largest"
+                )
 
     def _append_sequence(self, sequence: CloudSequence) -> None:
         self._append("points", sequence.points)

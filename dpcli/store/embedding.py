@@ -16,7 +16,7 @@ _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 @dataclass
 class StreamEmbedding:
-    """features f32 (S,D); coordinates f32 (S,2), without unit; values: figures by name, such as neighbour_accuracy."""
+    """features f32 (S,D); coordinates f32 (S,2), without unit; values: figures by name, such as neighbor_accuracy."""
 
     features: np.ndarray
     coordinates: np.ndarray
@@ -24,9 +24,18 @@ class StreamEmbedding:
 
 
 def write_embedding(
-    path: str | Path, names: Sequence[str], labels: np.ndarray, splits: Sequence[str], streams: dict[str, StreamEmbedding], *,
-    class_names: Sequence[str], source: str = "", seed: int = 0, provenance: Sequence[dict] = (), force: bool = False,
-) -> None:  # fmt: skip
+    path: str | Path,
+    names: Sequence[str],
+    labels: np.ndarray,
+    splits: Sequence[str],
+    streams: dict[str, StreamEmbedding],
+    *,
+    class_names: Sequence[str],
+    source: str = "",
+    seed: int = 0,
+    provenance: Sequence[dict] = (),
+    force: bool = False,
+) -> None:
     """Write the file whole or not at all. UsageError when it exists and `force` is off, DataError on malformed arrays."""
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
@@ -35,13 +44,7 @@ def write_embedding(
     try:
         file = atomic.file
         write_root(
-            file,
-            "embedding",
-            length_unit="",
-            source=source,
-            seed=seed,
-            class_names=class_names,
-            provenance=provenance,
+            file, "embedding", length_unit="", source=source, seed=seed, class_names=class_names, provenance=provenance
         )
         file.create_dataset("name", data=np.array(list(names), dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(list(splits), dtype=object), dtype=STRING)

@@ -25,12 +25,36 @@ _MAGIC = b"\x89HDF\r\n\x1a\n"
 STRING = h5py.string_dtype("utf-8")
 _SORTS = {
     "strings": ("class_names", "provenance", "name", "split", "role", "skipped"),
-    "whole numbers": ("label", "subject", "camera", "frame_offsets", "sequence_offsets", "color", "part", "pair",
-                      "pair_offsets", "flow_offsets", "position", "skipped_position"),
-    "numbers": ("scores", "points", "time", "track", "scene_flow", "pose", "flow", "part_motion", "part_probability", "rgba", "intrinsics",
-                "world_to_camera"),
+    "whole numbers": (
+        "label",
+        "subject",
+        "camera",
+        "frame_offsets",
+        "sequence_offsets",
+        "color",
+        "part",
+        "pair",
+        "pair_offsets",
+        "flow_offsets",
+        "position",
+        "skipped_position",
+    ),
+    "numbers": (
+        "scores",
+        "points",
+        "time",
+        "track",
+        "scene_flow",
+        "pose",
+        "flow",
+        "part_motion",
+        "part_probability",
+        "rgba",
+        "intrinsics",
+        "world_to_camera",
+    ),
     "group": ("streams", "features", "coordinates", "activation"),
-}  # fmt: skip
+}
 
 
 def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
@@ -119,7 +143,9 @@ def _check_types(file: h5py.File, path: Path) -> None:
             good = isinstance(item, h5py.Dataset) and item.ndim > 0 and h5py.check_string_dtype(item.dtype) is not None
         if not good:
             expected = "data sets of numbers below it" if sort == "group" else f"a data set of {sort}"
-            raise DataError(f"{path}: {name!r} holds something else, expected {expected}; another program changed it, make it again")
+            raise DataError(
+                f"{path}: {name!r} holds something else, expected {expected}; another program changed it, make it again"
+            )
 
 
 def _is_numbers(item: h5py.Group | h5py.Dataset, kinds: str) -> bool:
@@ -147,8 +173,10 @@ def read_provenance(file: h5py.File) -> list[dict]:
         raise DataError(f"{file.filename}: provenance is not JSON; the file was changed by another program") from None
     for entry in found:
         if not isinstance(entry, dict):
-            raise DataError(f"{file.filename}: provenance holds {entry!r:.80}, expected a command's JSON object;"
-                            " the file was changed by another program")  # fmt: skip
+            raise DataError(
+                f"{file.filename}: provenance holds {entry!r:.80}, expected a command's JSON object;"
+                " the file was changed by another program"
+            )
     return found
 
 
@@ -283,9 +311,12 @@ class AtomicFile:
             pass
 
     def failed(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None,
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
         keep: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Discard after an exception, or `keep` the part unfinished; re-raise a failed write in words."""
         worded = self.problem(error) if error is not None else None
         if worded is not None:
@@ -310,14 +341,29 @@ class AtomicFile:
             pass
 
 
-def write_root(file: h5py.File, kind: str, *, length_unit: str, source: str, seed: int, class_names: Sequence[str],
-               provenance: Sequence[dict]) -> None:  # fmt: skip
+def write_root(
+    file: h5py.File,
+    kind: str,
+    *,
+    length_unit: str,
+    source: str,
+    seed: int,
+    class_names: Sequence[str],
+    provenance: Sequence[dict],
+) -> None:
     """Root attributes, class names and provenance, as design.md section 3 lists them. No clock time, so bytes repeat."""
     last = provenance[-1] if provenance else {}
-    file.attrs.update({
-        "dpc_kind": kind, "dpc_schema": SCHEMA, "dpc_version": __version__, "seed": int(seed),
-        "command": as_utf8(str(last.get("command", ""))), "source": as_utf8(source), "length_unit": length_unit,
-    })  # fmt: skip
+    file.attrs.update(
+        {
+            "dpc_kind": kind,
+            "dpc_schema": SCHEMA,
+            "dpc_version": __version__,
+            "seed": int(seed),
+            "command": as_utf8(str(last.get("command", ""))),
+            "source": as_utf8(source),
+            "length_unit": length_unit,
+        }
+    )
     file.create_dataset("class_names", data=np.array(list(class_names), dtype=object), dtype=STRING)
     entries = [json.dumps(entry, sort_keys=True) for entry in provenance]
     file.create_dataset("provenance", data=np.array(entries, dtype=object), dtype=STRING)

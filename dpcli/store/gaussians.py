@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import AtomicFile, open_store, read_provenance, root_attributes, write_root
 
-SH_C0 = 0.28209479177387814  # the constant spherical harmonic: colour = 0.5 + SH_C0 sh[:, 0]
+SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _TOLERANCE = 1e-3  # of float32 unit quaternions, probabilities and rotations
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _LETTERS = {"N": "Gaussians", "T": "frames", "S": "parts", "K": "control points", "V": "cameras", "B": "SH terms"}
@@ -104,7 +104,7 @@ class GaussianScene:
 
     @property
     def color(self) -> np.ndarray:
-        """The colour that doesn't depend on the direction, u8 (N,3)."""
+        """The color that doesn't depend on the direction, u8 (N,3)."""
         return color_of(self.sh)
 
     def between(self, time: float) -> tuple[int, int, float]:
@@ -121,7 +121,7 @@ class GaussianScene:
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Means f32 (N,3) and unit quaternions f32 (N,4) at `time` in seconds, clamped at the ends of the clip.
 
-        Between frames means go straight and quaternions along the normalised shorter chord; at a frame's time the
+        Between frames means go straight and quaternions along the normalized shorter chord; at a frame's time the
         result is that frame, exactly.
         """
         a, b, weight = self.between(time)
@@ -137,8 +137,14 @@ class GaussianScene:
 
     def validate(self, where: str = "scene") -> None:
         """Raise DataError, starting with `where`, unless types, shapes and values are as the class says."""
-        counts = {"N": len(self.mean), "T": len(self.time), "S": _axis(self.part_probability, 1),
-                  "K": len(self.control_point), "V": len(self.camera_intrinsics), "B": _axis(self.sh, 1)}  # fmt: skip
+        counts = {
+            "N": len(self.mean),
+            "T": len(self.time),
+            "S": _axis(self.part_probability, 1),
+            "K": len(self.control_point),
+            "V": len(self.camera_intrinsics),
+            "B": _axis(self.sh, 1),
+        }
         for key, (dtype, shape) in LAYOUT.items():
             _check_array(where, key, getattr(self, key), dtype, shape, counts)
         for letter in "NTV":
@@ -156,7 +162,7 @@ class GaussianScene:
         for key in _QUATERNIONS:
             off = np.abs(np.linalg.norm(getattr(self, key), axis=-1) - 1) > _TOLERANCE
             if off.any():
-                yield f"{int(off.sum())} rows of {key} are not of length 1; normalise them before writing"
+                yield f"{int(off.sum())} rows of {key} are not of length 1; normalize them before writing"
         for key in ("part_probability", "rigid_weight"):
             value = getattr(self, key)
             if value.size and (value.min() < -_TOLERANCE or value.max() > 1 + _TOLERANCE):
@@ -188,7 +194,7 @@ def opacity_of(logit: np.ndarray) -> np.ndarray:
 
 
 def color_of(sh: np.ndarray) -> np.ndarray:
-    """The colour u8 (N,3) of spherical harmonics (N,terms,3) that doesn't depend on the direction."""
+    """The color u8 (N,3) of spherical harmonics (N,terms,3) that doesn't depend on the direction."""
     return (np.clip(0.5 + SH_C0 * sh[:, 0], 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
@@ -215,9 +221,15 @@ def _rigid(motion: np.ndarray) -> np.ndarray:
 
 
 def write_scene(
-    path: str | Path, scene: GaussianScene, *, provenance: dict | Sequence[dict] | None = None, seed: int = 0,
-    source: str = "", length_unit: str = "", force: bool = False,
-) -> None:  # fmt: skip
+    path: str | Path,
+    scene: GaussianScene,
+    *,
+    provenance: dict | Sequence[dict] | None = None,
+    seed: int = 0,
+    source: str = "",
+    length_unit: str = "",
+    force: bool = False,
+) -> None:
     """Write one scene whole or not at all. UsageError when `path` exists and `force` is off; DataError as `validate`."""
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
@@ -225,8 +237,15 @@ def write_scene(
     history = [provenance] if isinstance(provenance, dict) else list(provenance or [])
     atomic = AtomicFile(path)
     try:
-        write_root(atomic.file, "gaussians", length_unit=length_unit, source=source, seed=seed, class_names=[],
-                   provenance=history)  # fmt: skip
+        write_root(
+            atomic.file,
+            "gaussians",
+            length_unit=length_unit,
+            source=source,
+            seed=seed,
+            class_names=[],
+            provenance=history,
+        )
         _write_arrays(atomic.file, scene)
     except BaseException as error:
         atomic.failed(type(error), error, None)

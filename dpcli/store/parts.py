@@ -62,22 +62,28 @@ class PartsSample:
         sizes = np.diff(sequence.frame_offsets)
         for (source, target), flow in zip(self.pairs.tolist(), self.flow, strict=True):
             if flow.shape != (sizes[source], 3):
-                raise DataError(f"{where}: flow {source} -> {target} has shape {flow.shape}, expected one row for each "
-                                f"of the {sizes[source]} points of frame {source}")  # fmt: skip
+                raise DataError(
+                    f"{where}: flow {source} -> {target} has shape {flow.shape}, expected one row for each "
+                    f"of the {sizes[source]} points of frame {source}"
+                )
         bad = [np.flatnonzero(~np.isfinite(flow).all(axis=1)) for flow in self.flow]
         count, total = sum(map(len, bad)), sum(map(len, self.flow))
         if count:
             row = next(row for row, own in enumerate(bad) if len(own))
             source, target = self.pairs[row].tolist()
-            raise DataError(f"{where}: {count} of {total} points with NaN or infinite flow, the first is point "
-                            f"{bad[row][0]} of flow {source} -> {target}")  # fmt: skip
+            raise DataError(
+                f"{where}: {count} of {total} points with NaN or infinite flow, the first is point "
+                f"{bad[row][0]} of flow {source} -> {target}"
+            )
 
 
 def _check_probability(probability: np.ndarray, where: str) -> None:
     bad = np.flatnonzero(~np.isfinite(probability).all(axis=1))
     if len(bad):
-        raise DataError(f"{where}: {len(bad)} of {len(probability)} points with NaN or infinite probability, "
-                        f"the first is point {bad[0]}")  # fmt: skip
+        raise DataError(
+            f"{where}: {len(bad)} of {len(probability)} points with NaN or infinite probability, "
+            f"the first is point {bad[0]}"
+        )
     wrong = (probability < -_TOLERANCE) | (probability > 1 + _TOLERANCE)
     if wrong.any():
         raise DataError(f"{where}: probability holds {probability[wrong][0]}, expected 0..1")
@@ -92,8 +98,10 @@ def _check_motion(motion: np.ndarray, where: str) -> None:
         rigid[rigid] = np.linalg.det(rotation[rigid]) > 0
     if not rigid.all():
         pair, part = np.argwhere(~rigid)[0]
-        raise DataError(f"{where}: motion of part {part} in pair {pair} is not a rigid one "
-                        "(a rotation and a translation, last row 0 0 0 1)")  # fmt: skip
+        raise DataError(
+            f"{where}: motion of part {part} in pair {pair} is not a rigid one "
+            "(a rotation and a translation, last row 0 0 0 1)"
+        )
 
 
 class PartsWriter(CloudsWriter):
@@ -181,8 +189,10 @@ class PartsReader(CloudsReader):
     def _rising(self, file: h5py.File, name: str, spans: int, end: int) -> np.ndarray:
         offsets = self._offsets(file, name, None)
         if len(offsets) != spans + 1 or offsets[-1] != end:
-            raise DataError(f"{self.path}: {name} has {len(offsets)} rows ending at {offsets[-1]}, "
-                            f"expected {spans + 1} ending at {end}")  # fmt: skip
+            raise DataError(
+                f"{self.path}: {name} has {len(offsets)} rows ending at {offsets[-1]}, "
+                f"expected {spans + 1} ending at {end}"
+            )
         return offsets
 
     @property
@@ -203,8 +213,12 @@ class PartsReader(CloudsReader):
             self._set("part_motion")[pairs],
             np.split(flow, offsets[1:-1] - offsets[0]) if pairs.stop > pairs.start else [],
         )
-        sequence = CloudSequence(self.names[index], np.empty((points.stop - points.start, 3), np.float32),
-                                 frames - frames[0], part=self._set("part")[points])  # fmt: skip
+        sequence = CloudSequence(
+            self.names[index],
+            np.empty((points.stop - points.start, 3), np.float32),
+            frames - frames[0],
+            part=self._set("part")[points],
+        )
         try:
             said.validate(sequence, self.num_parts)
         except DataError as error:

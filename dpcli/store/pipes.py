@@ -62,7 +62,9 @@ def standard_input() -> BinaryIO:
 def refuse_pipe(path: Path) -> None:
     """UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
     if path.exists() and not path.is_file() and not path.is_dir():
-        raise UsageError(f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -")
+        raise UsageError(
+            f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -"
+        )
 
 
 def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
@@ -107,7 +109,9 @@ def refuse_repeats(names: Iterable[str | Path]) -> None:
     seen: list[Path] = []
     for name in names:
         path = Path(name).resolve()
-        if str(name) != "-" and any(path == one or (path.exists() and one.exists() and path.samefile(one)) for one in seen):
+        if str(name) != "-" and any(
+            path == one or (path.exists() and one.exists() and path.samefile(one)) for one in seen
+        ):
             raise UsageError(f"{path}: is named twice; every file once, and the output is another one")
         seen.append(path)
 
@@ -125,9 +129,13 @@ def _is_result(path: Path) -> bool:
 def check_replaced(folder: Path, own: Sequence[str]) -> None:
     """Before --force replaces a folder whole: UsageError where it holds what no name pattern of the command's own covers."""
     if folder.is_dir():
-        others = [one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)]
+        others = [
+            one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)
+        ]
         if others:
-            raise UsageError(f"{folder}: holds other things, too, such as {min(others)}; name another folder, or empty it yourself")
+            raise UsageError(
+                f"{folder}: holds other things, too, such as {min(others)}; name another folder, or empty it yourself"
+            )
 
 
 def _regular_file(stream: BinaryIO) -> Path | None:

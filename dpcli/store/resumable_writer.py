@@ -35,9 +35,17 @@ class ResumableWriter(ABC):
     kind = ""
 
     def __init__(
-        self, path: str | Path, *, class_names: Sequence[str], length_unit: str, source: str, seed: int,
-        provenance: dict | Sequence[dict] | None, force: bool, resume: bool,
-    ) -> None:  # fmt: skip
+        self,
+        path: str | Path,
+        *,
+        class_names: Sequence[str],
+        length_unit: str,
+        source: str,
+        seed: int,
+        provenance: dict | Sequence[dict] | None,
+        force: bool,
+        resume: bool,
+    ) -> None:
         if Path(path).exists() and not force:
             raise UsageError(f"{path}: exists already; --force replaces it")
         self.path, self.resume, self.keep = Path(path), resume, False
@@ -47,7 +55,7 @@ class ResumableWriter(ABC):
         self._journal: Journal | None = None
 
     def _about(self) -> dict[str, Any]:
-        """What decides whether a journal is of this very work: not the words of the command, which may be spelt otherwise."""
+        """What decides whether a journal is of this very work: not the words of the command, which may be spelled otherwise."""
         work = [{key: value for key, value in entry.items() if key != "command"} for entry in self.provenance]
         return {"kind": self.kind, "provenance": work}
 
@@ -68,7 +76,9 @@ class ResumableWriter(ABC):
 
     def _open(self, force: bool) -> None:
         before = None
-        if self.resume and self.path.parent.is_dir() and not self.path.is_dir():  # AtomicFile explains what is wrong otherwise
+        if (
+            self.resume and self.path.parent.is_dir() and not self.path.is_dir()
+        ):  # AtomicFile explains what is wrong otherwise
             before = Journal(journal_path(self.path), self._about())
         try:
             if before and before.other and not force:

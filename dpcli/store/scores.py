@@ -25,13 +25,27 @@ class ScoresWriter(ResumableWriter):
     kind = "scores"
 
     def __init__(
-        self, path: str | Path, *, class_names: Sequence[str], seed: int = 0, source: str = "",
-        provenance: dict | Sequence[dict] | None = None, streams: Sequence[str] = (), force: bool = False, resume: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        path: str | Path,
+        *,
+        class_names: Sequence[str],
+        seed: int = 0,
+        source: str = "",
+        provenance: dict | Sequence[dict] | None = None,
+        streams: Sequence[str] = (),
+        force: bool = False,
+        resume: bool = False,
+    ) -> None:
         super().__init__(
-            path, class_names=class_names, length_unit="", source=source, seed=seed,
-            provenance=provenance, force=force, resume=resume,
-        )  # fmt: skip
+            path,
+            class_names=class_names,
+            length_unit="",
+            source=source,
+            seed=seed,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        )
         self.streams = tuple(streams)
         self._rows: list[tuple] = []
         self._open(force)
@@ -111,13 +125,17 @@ class ScoresReader:
                 raise DataError(f"{self.path}: {key} has shape {value.shape}, expected (samples, classes) = {shape}")
             bad = np.flatnonzero(~np.isfinite(value).all(1))
             if len(bad):
-                raise DataError(f"{self.path}: {len(bad)} of {len(value)} samples with NaN or infinite {key}, the first "
-                                f"{self.names[bad[0]]!r}; predict again")  # fmt: skip
+                raise DataError(
+                    f"{self.path}: {len(bad)} of {len(value)} samples with NaN or infinite {key}, the first "
+                    f"{self.names[bad[0]]!r}; predict again"
+                )
         if self.labels.shape != shape[:1] or len(self.splits) != shape[0]:
             raise DataError(f"{self.path}: {len(self.labels)} labels for {shape[0]} names")
         twice = sorted({name for name in self.class_names if name and self.class_names.count(name) > 1})
         if twice:
-            raise DataError(f"{self.path}: {len(twice)} class names repeat, such as {twice[0]!r}; each class needs a name of its own")
+            raise DataError(
+                f"{self.path}: {len(twice)} class names repeat, such as {twice[0]!r}; each class needs a name of its own"
+            )
         if len(set(self.names)) != len(self.names):
             raise DataError(f"{self.path}: sample names repeat; names identify samples")
         if len(self.labels) and (self.labels.min() < -1 or self.labels.max() >= shape[1]):

@@ -35,8 +35,14 @@ def summary(path: str | Path) -> dict[str, Any]:
             "provenance": read_provenance(file),
             "datasets": _datasets(file),
         }
-    own = {"clouds": _clouds, "parts": _parts, "scores": _scores, "views": _views, "gaussians": _gaussians,
-           "embedding": _embedding}[kind]  # fmt: skip
+    own = {
+        "clouds": _clouds,
+        "parts": _parts,
+        "scores": _scores,
+        "views": _views,
+        "gaussians": _gaussians,
+        "embedding": _embedding,
+    }[kind]
     return {**common, **own(path)}
 
 
@@ -57,8 +63,11 @@ def _clouds(path: Path) -> dict[str, Any]:
         ranges, not_finite = point_ranges(reader)
         return {
             "counts": {
-                "sequences": len(reader), "frames": int(reader.frame_counts.sum()), "points": reader.num_points,
-                "empty_frames": int((reader.frame_sizes == 0).sum()), "not_finite_points": not_finite,
+                "sequences": len(reader),
+                "frames": int(reader.frame_counts.sum()),
+                "points": reader.num_points,
+                "empty_frames": int((reader.frame_sizes == 0).sum()),
+                "not_finite_points": not_finite,
             },
             "frames_per_sequence": _spread(reader.frame_counts),
             "points_per_frame": _spread(reader.frame_sizes),
@@ -70,7 +79,7 @@ def _clouds(path: Path) -> dict[str, Any]:
             "subjects": _count(_known(reader.subjects)),
             "cameras": _count(_known(reader.cameras)),
             "skipped": [{"name": name, "reason": reason} for name, reason in reader.skipped],
-        }  # fmt: skip
+        }
 
 
 def _parts(path: Path) -> dict[str, Any]:
@@ -108,7 +117,9 @@ def _embedding(path: Path) -> dict[str, Any]:
     return {
         "counts": {"samples": len(reader.names), "classes": len(reader.class_names)},
         "streams": sorted(reader.streams),
-        "metrics": {f"{stream}_{key}": value for stream, said in reader.streams.items() for key, value in said.values.items()},
+        "metrics": {
+            f"{stream}_{key}": value for stream, said in reader.streams.items() for key, value in said.values.items()
+        },
         **_who(reader.class_names, reader.labels, reader.splits),
     }
 
@@ -117,36 +128,52 @@ def _views(path: Path) -> dict[str, Any]:
     with ViewsReader(path) as reader:
         header = reader.header
         track, part = reader.track, reader.part
-        centres = header.camera_centres()
+        centers = header.camera_centers()
     angles = np.rad2deg(
-        [np.arctan2(centres[:, 0], centres[:, 2]), np.arctan2(centres[:, 1], np.hypot(*centres[:, ::2].T))]
+        [np.arctan2(centers[:, 0], centers[:, 2]), np.arctan2(centers[:, 1], np.hypot(*centers[:, ::2].T))]
     )
     fovy = np.rad2deg(2 * np.arctan(0.5 * header.size[1] / header.intrinsics[:, 1, 1]))
     cameras = [
-        {"view": view, "role": role, "azimuth": float(azimuth), "elevation": float(elevation), "radius": float(radius),
-         "fovy": float(view_angle)}
+        {
+            "view": view,
+            "role": role,
+            "azimuth": float(azimuth),
+            "elevation": float(elevation),
+            "radius": float(radius),
+            "fovy": float(view_angle),
+        }
         for view, (role, azimuth, elevation, radius, view_angle) in enumerate(
-            zip(header.role, *angles, np.linalg.norm(centres, axis=1), fovy, strict=True))
-    ]  # fmt: skip
+            zip(header.role, *angles, np.linalg.norm(centers, axis=1), fovy, strict=True)
+        )
+    ]
     return {
         "name": header.name,
-        "counts": {"views": header.num_views, "frames": header.num_frames, "tracks": 0 if track is None else track.shape[1],
-                   "parts": 0 if part is None else len(np.unique(part[part >= 0]))},
+        "counts": {
+            "views": header.num_views,
+            "frames": header.num_frames,
+            "tracks": 0 if track is None else track.shape[1],
+            "parts": 0 if part is None else len(np.unique(part[part >= 0])),
+        },
         "size": list(header.size),
         "reference": header.reference,
         "duration": float(header.time[-1] - header.time[0]),
         "frame_interval": _spread(np.diff(header.time), float),
         "fields": list(reader.fields),
         "orbit": cameras,
-    }  # fmt: skip
+    }
 
 
 def _gaussians(path: Path) -> dict[str, Any]:
     scene = read_scene(path)
     low, high = scene.frame_mean.min((0, 1)).tolist(), scene.frame_mean.max((0, 1)).tolist()
     return {
-        "counts": {"gaussians": scene.num_gaussians, "frames": scene.num_frames, "parts": scene.num_parts,
-                   "control_points": len(scene.control_point), "cameras": len(scene.camera_intrinsics)},
+        "counts": {
+            "gaussians": scene.num_gaussians,
+            "frames": scene.num_frames,
+            "parts": scene.num_parts,
+            "control_points": len(scene.control_point),
+            "cameras": len(scene.camera_intrinsics),
+        },
         "size": list(scene.size),
         "reference": scene.reference,
         "sh_degree": scene.sh_degree,
@@ -155,7 +182,7 @@ def _gaussians(path: Path) -> dict[str, Any]:
         "range": {axis: [a, b] for axis, a, b in zip("xyz", low, high, strict=True)},
         "gaussians_per_part": _count(scene.part),
         "metrics": scene.metrics,
-    }  # fmt: skip
+    }
 
 
 def point_ranges(reader: CloudsReader) -> tuple[dict[str, list[float] | None], int]:

@@ -22,7 +22,7 @@ _RIGID = 1e-5  # how far R R^T may be from the identity: room for matrices that 
 class ViewsHeader:
     """All of a views file but its pictures and ground truth; V views, T frames.
 
-    name: str. intrinsics: f64 (V,3,3) pixels, pixel centres at +0.5. world_to_camera: f64 (V,4,4) rigid, OpenCV axes.
+    name: str. intrinsics: f64 (V,3,3) pixels, pixel centers at +0.5. world_to_camera: f64 (V,4,4) rigid, OpenCV axes.
     time: f64 (T) seconds, rising. role: V of reference | train | test, with one reference. reference: its index.
     size: (width, height) pixels. length_unit: of the world; "" = nobody knows.
     """
@@ -44,7 +44,7 @@ class ViewsHeader:
     def num_frames(self) -> int:
         return len(self.time)
 
-    def camera_centres(self) -> np.ndarray:
+    def camera_centers(self) -> np.ndarray:
         """Where the cameras stand in the world, f64 (V,3)."""
         return -np.einsum("vji,vj->vi", self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3])
 
@@ -110,10 +110,17 @@ class ViewsWriter:
     """
 
     def __init__(
-        self, path: str | Path, header: ViewsHeader, *, seed: int = 0, source: str = "",
-        provenance: dict | Sequence[dict] | None = None, track: np.ndarray | None = None,
-        part: np.ndarray | None = None, force: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        path: str | Path,
+        header: ViewsHeader,
+        *,
+        seed: int = 0,
+        source: str = "",
+        provenance: dict | Sequence[dict] | None = None,
+        track: np.ndarray | None = None,
+        part: np.ndarray | None = None,
+        force: bool = False,
+    ) -> None:
         if Path(path).exists() and not force:
             raise UsageError(f"{path}: exists already; --force replaces it")
         header.validate()
@@ -133,9 +140,14 @@ class ViewsWriter:
     def _create(self, seed: int, source: str, track: np.ndarray | None, part: np.ndarray | None) -> None:
         file, header = self._atomic.file, self.header
         write_root(
-            file, "views", length_unit=header.length_unit, source=source, seed=seed, class_names=(),
+            file,
+            "views",
+            length_unit=header.length_unit,
+            source=source,
+            seed=seed,
+            class_names=(),
             provenance=self.provenance,
-        )  # fmt: skip
+        )
         file.attrs.update({"name": header.name, "reference": int(header.reference)})
         width, height = header.size
         picture = (height, width, 4)
@@ -216,9 +228,15 @@ class ViewsReader:
                 f"(views = {found[0]}, frames = {found[1]}, height, width, 4)"
             )
         header = ViewsHeader(
-            str(self.attributes["name"]), file["intrinsics"][:], file["world_to_camera"][:], file["time"][:], role,
-            int(self.attributes["reference"]), (rgba.shape[3], rgba.shape[2]), str(self.attributes.get("length_unit", "")),
-        )  # fmt: skip
+            str(self.attributes["name"]),
+            file["intrinsics"][:],
+            file["world_to_camera"][:],
+            file["time"][:],
+            role,
+            int(self.attributes["reference"]),
+            (rgba.shape[3], rgba.shape[2]),
+            str(self.attributes.get("length_unit", "")),
+        )
         try:
             header.validate()
         except DataError as error:

@@ -57,7 +57,7 @@ def open3d_fps(points: torch.Tensor, samples: int) -> Callable[[], object] | Non
 def scipy_ball(
     points: torch.Tensor, times: torch.Tensor, centers: torch.Tensor, center_times: torch.Tensor, radius: float
 ):
-    """A tree per frame, asked for all neighbours: what fills the slots is left to the user."""
+    """A tree per frame, asked for all neighbors: what fills the slots is left to the user."""
     from scipy.spatial import cKDTree
 
     frames = [points[0][times[0] == t].numpy() for t in range(int(times.max()) + 1)]

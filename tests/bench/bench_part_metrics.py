@@ -94,15 +94,19 @@ def main() -> int:
     frames = options.sequences * options.frames
     own_s, (found, metrics) = timed(lambda: ours(objects), options.repeat)
     other_s, two = timed(lambda: libraries(objects), 1)
-    print(f"{frames} frames x {options.points} points: ours (7 scores) {own_s:.2f} s, "
-          f"scikit-learn (2 scores) {other_s:.2f} s")  # fmt: skip
+    print(
+        f"{frames} frames x {options.points} points: ours (7 scores) {own_s:.2f} s, "
+        f"scikit-learn (2 scores) {other_s:.2f} s"
+    )
     metric, count = segmentation_weighted(found), len(found)
     boot_s, draws = timed(
         lambda: replicates(metric, count, np.random.default_rng(0), options.resamples), options.repeat
     )
     again_s, plain = timed(lambda: merged(found, _AGAIN), 1)
-    print(f"{options.resamples} resamples of {count} sequences, {metrics.predictions} predictions: ours "
-          f"{boot_s:.2f} s, merging again {again_s / _AGAIN * options.resamples:.1f} s (from {_AGAIN})")  # fmt: skip
+    print(
+        f"{options.resamples} resamples of {count} sequences, {metrics.predictions} predictions: ours "
+        f"{boot_s:.2f} s, merging again {again_s / _AGAIN * options.resamples:.1f} s (from {_AGAIN})"
+    )
     same = np.allclose(two, (metrics.miou, metrics.ri), atol=1e-9) and np.allclose(
         draws["ap"][:_AGAIN], plain, atol=1e-9
     )

@@ -1,4 +1,4 @@
-"""Speed of the rasteriser, forward and backward: ours against plain torch, tile by tile, and how both grow.
+"""Speed of the rasterizer, forward and backward: ours against plain torch, tile by tile, and how both grow.
 
     OMP_WAIT_POLICY=passive python -m tests.bench.bench_splatting [--repeat 10] [--without-torch]
 
@@ -20,8 +20,17 @@ import torch
 from dpcli.ops.splatting.rasterization import rasterization, rasterization_reference
 from tests.support.splatting_helpers import cameras, scene
 
-ROWS = ((1_250, 256), (2_500, 256), (5_000, 256), (10_000, 256), (20_000, 256), (40_000, 256), (10_000, 64),
-        (10_000, 128), (10_000, 512))  # fmt: skip
+ROWS = (
+    (1_250, 256),
+    (2_500, 256),
+    (5_000, 256),
+    (10_000, 256),
+    (20_000, 256),
+    (40_000, 256),
+    (10_000, 64),
+    (10_000, 128),
+    (10_000, 512),
+)
 REFERENCE = ((2_500, 256), (10_000, 256))  # rows in which plain torch runs too
 
 
@@ -47,8 +56,8 @@ def least(function: Callable, *arguments: object, repeat: int) -> tuple:
 
 def covered(notes: dict) -> float:
     """Millions of pixels inside the boxes of the Gaussians."""
-    centre, radii = notes["means2d"].detach(), notes["radii"]
-    low, high = centre - radii, centre + radii
+    center, radii = notes["means2d"].detach(), notes["radii"]
+    low, high = center - radii, center + radii
     size = torch.tensor([notes["width"], notes["height"]])
     return float((torch.minimum(high, size) - low.clamp(min=0)).clamp(min=0).prod(-1).sum()) / 1e6
 

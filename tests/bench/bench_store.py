@@ -28,7 +28,7 @@ FRAMES, HEIGHT, WIDTH = 40, 240, 320
 
 
 def make_depth(seed: int) -> np.ndarray:
-    """u16 (T,H,W), millimetres: a smooth moving shape with sensor noise on an empty background."""
+    """u16 (T,H,W), millimeters: a smooth moving shape with sensor noise on an empty background."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     video = np.zeros((FRAMES, HEIGHT, WIDTH), np.uint16)
@@ -110,9 +110,11 @@ def bench_conversion(folder: Path, videos: int, jobs: int) -> None:
             started = min(conversion(source, folder / "few.h5", jobs, "--limit", str(jobs), *words) for _ in range(2))
             whole = min(conversion(source, folder / "all.h5", jobs, *words) for _ in range(2))
             steady = (whole - started) * videos / max(videos - jobs, 1)
-            print(f"  {name}, {kept}: conversion {whole:5.2f} s of which {started:4.2f} s to start and end; without those "
-                  f"{steady / plain:4.2f}x OpenCV's decoding (target 1.1-1.3), {steady / alone:4.2f}x the reader's; "
-                  f"with them {whole / plain:4.2f}x and {whole / alone:4.2f}x")  # fmt: skip
+            print(
+                f"  {name}, {kept}: conversion {whole:5.2f} s of which {started:4.2f} s to start and end; without those "
+                f"{steady / plain:4.2f}x OpenCV's decoding (target 1.1-1.3), {steady / alone:4.2f}x the reader's; "
+                f"with them {whole / plain:4.2f}x and {whole / alone:4.2f}x"
+            )
 
 
 def _clips(path: Path, seed: int, seconds: float) -> tuple[int, float]:
@@ -137,8 +139,10 @@ def bench_clips(folder: Path, processes: int = 2) -> None:
         with ProcessPoolExecutor(processes, get_context("forkserver")) as pool:
             results = list(pool.map(_clips, [path] * processes, range(processes), [3.0] * processes))
         rate = sum(count / seconds for count, seconds in results)
-        print(f"  --compression {compression}: {rate:6.0f} random clips of 24 frames x 2,048 points per second, "
-              f"{processes} processes (target >= 300)")  # fmt: skip
+        print(
+            f"  --compression {compression}: {rate:6.0f} random clips of 24 frames x 2,048 points per second, "
+            f"{processes} processes (target >= 300)"
+        )
 
 
 def depth_sequences(raw: Path | None, count: int) -> list[CloudSequence]:
@@ -166,8 +170,10 @@ def depth_sequences(raw: Path | None, count: int) -> list[CloudSequence]:
 def bench_compression(folder: Path, raw: Path | None, count: int) -> None:
     sequences = depth_sequences(raw, count)
     size = sum(sequence.points.nbytes for sequence in sequences)
-    print(f"compression of depth clouds in raster order, {len(sequences)} videos of "
-          f"{'MSR-Action3D' if raw else 'made depth'}, {size / 1e6:.0f} MB of points")  # fmt: skip
+    print(
+        f"compression of depth clouds in raster order, {len(sequences)} videos of "
+        f"{'MSR-Action3D' if raw else 'made depth'}, {size / 1e6:.0f} MB of points"
+    )
     for compression in ("none", "lzf", "gzip"):
         path = folder / f"{compression}.h5"
         start = time.perf_counter()
@@ -180,8 +186,10 @@ def bench_compression(folder: Path, raw: Path | None, count: int) -> None:
             for index in range(len(reader)):
                 reader.read(index)
         read = time.perf_counter() - start
-        print(f"  {compression:5}: ratio {size / path.stat().st_size:4.2f}, write {size / written / 1e6:6.0f} MB/s, "
-              f"read {size / read / 1e6:6.0f} MB/s")  # fmt: skip
+        print(
+            f"  {compression:5}: ratio {size / path.stat().st_size:4.2f}, write {size / written / 1e6:6.0f} MB/s, "
+            f"read {size / read / 1e6:6.0f} MB/s"
+        )
 
 
 def bench_small_samples(folder: Path, samples: int = 1000) -> None:

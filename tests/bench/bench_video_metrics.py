@@ -44,8 +44,10 @@ def pictures(side: int) -> tuple[np.ndarray, np.ndarray]:
 
 def ours(pair: tuple[np.ndarray, np.ndarray], frames: int, border: str) -> tuple[float, float]:
     protocol = VideoProtocol("bench", border=border)
-    jobs = ((lambda f=f: score_frame(f, Picture(rgba=pair[0]), Picture(rgba=pair[1]), protocol, ("psnr", "ssim")))
-            for f in range(frames))  # fmt: skip
+    jobs = (
+        (lambda f=f: score_frame(f, Picture(rgba=pair[0]), Picture(rgba=pair[1]), protocol, ("psnr", "ssim")))
+        for f in range(frames)
+    )
     found = picture_compute(picture_merge(_in_threads(jobs, Progress("bench", None))))
     return found.psnr, found.ssim
 
@@ -98,8 +100,10 @@ def main() -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     whole, _ = timed(lambda: ours(pair, asked.frames, "valid"))
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    print(f"{asked.frames} frames of {asked.side}x{asked.side} RGB: {whole:.2f} s = {asked.frames / whole:.0f} frames/s; "
-          f"memory grew by {grown:.0f} MiB; {torch.get_num_threads()} torch threads")  # fmt: skip
+    print(
+        f"{asked.frames} frames of {asked.side}x{asked.side} RGB: {whole:.2f} s = {asked.frames / whole:.0f} frames/s; "
+        f"memory grew by {grown:.0f} MiB; {torch.get_num_threads()} torch threads"
+    )
     print(f"{'':16} {'frames/s':>9} {'ours':>7} {'ratio':>6}  SSIM agrees to")
     for name, (border, function) in others(pair).items():
         function()

@@ -66,7 +66,7 @@ def test_groups_list_all_they_have(words, whole):
 
 
 @pytest.mark.parametrize("words", [("prepare", "nvgestur"), ("prepare", "synthetic", "gesture"), ("prepar",)])
-def test_a_misspelt_command_is_told_the_right_one(words, whole):
+def test_a_misspelled_command_is_told_the_right_one(words, whole):
     code, text = said(cli.application(words), *words)
     assert (code, text) == said(whole, *words)
     assert code == 2 and "Did you mean" in text
@@ -79,7 +79,9 @@ def started(monkeypatch) -> list[list[str]]:
     return calls
 
 
-@pytest.mark.parametrize("words", ["--jobs 2 --sampling=fps", "-q --sampling fps --jobs=2", "--force --sampling fps --jobs 3"])
+@pytest.mark.parametrize(
+    "words", ["--jobs 2 --sampling=fps", "-q --sampling fps --jobs=2", "--force --sampling fps --jobs 3"]
+)
 def test_the_workers_server_is_started_before_the_words_are_parsed(words, started):
     head_start.head_start(["-v", "prepare", "nvgesture", "raw", "-o", "out.h5", *words.split()])
     (modules,) = started
@@ -89,12 +91,21 @@ def test_the_workers_server_is_started_before_the_words_are_parsed(words, starte
 @pytest.mark.parametrize(
     "words",
     [
-        "prepare nvgesture raw", "prepare nvgesture raw -o out.h5 --help", "prepare nvgesture raw -o out.h5 --check", "",
-        "--help", "prepare", "prepare --help", "prepare nvgesture raw -o out.h5 --dask local", "info nvgesture -o x",
-        "prepare nvgesture raw -o out.h5 --jobs=1", "prepare merge a.h5 -o out.h5", "prepare unknown raw -o out.h5",
+        "prepare nvgesture raw",
+        "prepare nvgesture raw -o out.h5 --help",
+        "prepare nvgesture raw -o out.h5 --check",
+        "",
+        "--help",
+        "prepare",
+        "prepare --help",
+        "prepare nvgesture raw -o out.h5 --dask local",
+        "info nvgesture -o x",
+        "prepare nvgesture raw -o out.h5 --jobs=1",
+        "prepare merge a.h5 -o out.h5",
+        "prepare unknown raw -o out.h5",
         "prepare nvgesture raw -o out.h5 --jobs 1",
     ],
-)  # fmt: skip
+)
 def test_no_server_for_what_needs_none(words, started):
     head_start.head_start(words.split())
     assert not started
@@ -128,13 +139,23 @@ def test_what_every_worker_imports_is_little(reader):
 @pytest.mark.parametrize(
     "error, expected",
     [
-        (MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)"), "this machine (7.28 TiB more"),
-        (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 44"), "the GPU (2.00 GiB more"),
-        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes."),
-         "this machine (8.0 GB more"),
+        (
+            MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)"),
+            "this machine (7.28 TiB more",
+        ),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has 44"),
+            "the GPU (2.00 GiB more",
+        ),
+        (
+            RuntimeError(
+                "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8000000000 bytes."
+            ),
+            "this machine (8.0 GB more",
+        ),
         (MemoryError(), "this machine; take less"),
     ],
-)  # fmt: skip
+)
 def test_too_little_memory_is_no_bug(error, expected, capsys):
     assert cli._explain(error) == 1
     assert f"not enough memory on {expected}" in capsys.readouterr().err
@@ -168,24 +189,43 @@ def test_no_option_takes_what_is_no_number():
 
 
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
-    for room, number, below in (("classify", "nan", ""), ("classify", "1e+300", " below 1e+30"), ("segment", "1e+300", " below 1e+30")):
+    for room, number, below in (
+        ("classify", "nan", ""),
+        ("classify", "1e+300", " below 1e+30"),
+        ("segment", "1e+300", " below 1e+30"),
+    ):
         done = dpc_here(room, "train", "clouds.h5", "-o", "runs", "--lr", number)
-        assert done.returncode == 2 and done.stderr.decode() == f"dpc: error: --lr {number}: expected a finite number{below}\n"
+        assert (
+            done.returncode == 2
+            and done.stderr.decode() == f"dpc: error: --lr {number}: expected a finite number{below}\n"
+        )
 
 
-@pytest.mark.parametrize("number, said", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "disk quota"), (errno.EFBIG, "too large")])
+@pytest.mark.parametrize(
+    "number, said", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "disk quota"), (errno.EFBIG, "too large")]
+)
 def test_a_full_disk_is_no_bug(number, said, capsys):
     assert cli._explain(OSError(number, "of the system")) == 1 and said in capsys.readouterr().err
 
 
 REPLACING = [
-    "classify predict good.h5 --model run -o", "classify explain pac good.h5 --model run -o",
-    "classify explain tsne good.h5 --model run -o", "classify fuse good.h5 other.h5 -o",
-    "classify fuse other.h5 third.h5 --weights-from fourth.h5,good.h5 -o", "prepare split good.h5 -o",
-    "prepare split other.h5 --list good.h5 -o", "prepare merge good.h5 other.h5 -o", "prepare video good.h5 -o",
-    "segment predict good.h5 -o", "segment estimate-flow good.h5 -o", "generate4d fit good.h5 -o", "generate4d render good.h5 -o",
-    "generate4d export good.h5 --as clouds -o", "evaluate report good.h5 -o", "info other.h5 --picture",
-]  # fmt: skip
+    "classify predict good.h5 --model run -o",
+    "classify explain pac good.h5 --model run -o",
+    "classify explain tsne good.h5 --model run -o",
+    "classify fuse good.h5 other.h5 -o",
+    "classify fuse other.h5 third.h5 --weights-from fourth.h5,good.h5 -o",
+    "prepare split good.h5 -o",
+    "prepare split other.h5 --list good.h5 -o",
+    "prepare merge good.h5 other.h5 -o",
+    "prepare video good.h5 -o",
+    "segment predict good.h5 -o",
+    "segment estimate-flow good.h5 -o",
+    "generate4d fit good.h5 -o",
+    "generate4d render good.h5 -o",
+    "generate4d export good.h5 --as clouds -o",
+    "evaluate report good.h5 -o",
+    "info other.h5 --picture",
+]
 
 
 @pytest.fixture
@@ -207,7 +247,9 @@ def files(tmp_path, monkeypatch):
 def test_force_replaces_no_input(words, output, files, dpc_here):
     done = dpc_here(*words.split(), output, "--force")
     assert done.returncode == 2 and f"{Path(output)}: is an input, too" in done.stderr.decode()
-    assert (files / output).read_text() == "good.h5" and sorted(os.listdir()) == sorted(path.name for path in files.iterdir())
+    assert (files / output).read_text() == "good.h5" and sorted(os.listdir()) == sorted(
+        path.name for path in files.iterdir()
+    )
 
 
 def test_force_replaces_no_file_of_an_input_folder(files, dpc_here):
@@ -225,7 +267,10 @@ def test_force_replaces_no_file_of_an_input_folder(files, dpc_here):
 @pytest.mark.parametrize("force", [[], ["--force"]])
 def test_what_is_no_regular_file_is_not_replaced(words, output, force, files, dpc_here):
     done = dpc_here(*words.split(), output, *([] if "info" in words else force))
-    assert done.returncode == 2 and f"{output}: is not a regular file; to write into a pipe use `-o -" in done.stderr.decode()
+    assert (
+        done.returncode == 2
+        and f"{output}: is not a regular file; to write into a pipe use `-o -" in done.stderr.decode()
+    )
     assert (files / "pipe").is_fifo() and Path("/dev/null").is_char_device()
 
 

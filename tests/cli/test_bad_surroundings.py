@@ -38,9 +38,13 @@ def leftovers(folder: Path) -> list[str]:
 def namespace(script: str, **env: str) -> subprocess.CompletedProcess:
     """A shell script as root of a user and mount namespace of its own."""
     return subprocess.run(
-        ["unshare", "-rm", "sh", "-ec", script], cwd=ROOT, capture_output=True, text=True, timeout=300,
+        ["unshare", "-rm", "sh", "-ec", script],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
         env={**os.environ, **env},
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture
@@ -152,9 +156,13 @@ def test_wherever_a_write_fails_it_is_told_once_and_leaves_nothing(tmp_path):
     """HDF5 buffers a data set's last bytes until nobody holds it, where h5py prints a trace instead of raising, then crashes."""
     (tmp_path / "work").mkdir()
     done = subprocess.run(
-        [sys.executable, "-c", WRITES, tmp_path / "work"], cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True,
-        text=True, timeout=300,
-    )  # fmt: skip
+        [sys.executable, "-c", WRITES, tmp_path / "work"],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert (done.returncode, done.stdout, done.stderr) == (0, "done\n", "")
 
 
@@ -167,8 +175,12 @@ def test_a_file_size_limit_is_told_like_a_full_disk(raw, tmp_path):
 
     done = subprocess.run(
         [*DPC, "prepare", "msraction3d", raw, "-o", tmp_path / "out.h5", "--jobs", "1"],
-        cwd=ROOT, capture_output=True, text=True, timeout=300, preexec_fn=limited,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        preexec_fn=limited,
+    )
     assert done.returncode == 1 and "the file size limit is reached" in done.stderr
     assert leftovers(tmp_path) == []
 
@@ -176,9 +188,27 @@ def test_a_file_size_limit_is_told_like_a_full_disk(raw, tmp_path):
 def start(raw: Path, output: Path, count: int) -> subprocess.Popen:
     """A conversion in two worker processes, returned once `count` samples are in the unfinished file."""
     process = subprocess.Popen(
-        [*DPC, "-v", "prepare", "msraction3d", raw, "-o", output, "--jobs", "2", "--points", "4000", "--sampling", "fps"],
-        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+        [
+            *DPC,
+            "-v",
+            "prepare",
+            "msraction3d",
+            raw,
+            "-o",
+            output,
+            "--jobs",
+            "2",
+            "--points",
+            "4000",
+            "--sampling",
+            "fps",
+        ],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
     part, limit = output.with_name(f".{output.name}.new"), time.monotonic() + 120
     while time.monotonic() < limit and process.poll() is None:
         if part.exists() and part.stat().st_size > count * 300_000:
@@ -293,7 +323,7 @@ def test_many_and_odd_reasons_survive(tmp_path):
 
 @pytest.fixture(scope="module")
 def named(tmp_path_factory) -> Path:
-    """Scores whose classes have names that ASCII can't spell, and that would colour a terminal and clear it."""
+    """Scores whose classes have names that ASCII can't spell, and that would color a terminal and clear it."""
     path = tmp_path_factory.mktemp("named") / "scores.h5"
     with ScoresWriter(path, class_names=["p\u00fcnch", "\x1b[31mred\x9b2J"]) as writer:
         for k in range(4):
@@ -304,9 +334,12 @@ def named(tmp_path_factory) -> Path:
 def shell(line: str, path: Path, **env: str) -> subprocess.CompletedProcess:
     """A line of bash in which DPC is the command and F the file."""
     return subprocess.run(
-        ["bash", "-c", line.replace("DPC", f'"{sys.executable}" -m dpcli').replace("F", f"'{path}'")], capture_output=True,
-        text=True, timeout=120, env={**os.environ, "PYTHONPATH": str(ROOT), **env},
-    )  # fmt: skip
+        ["bash", "-c", line.replace("DPC", f'"{sys.executable}" -m dpcli').replace("F", f"'{path}'")],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **env},
+    )
 
 
 @pytest.mark.parametrize(
@@ -335,6 +368,12 @@ def test_what_a_terminal_can_not_show_is_spelled(named):
     ascii_only = {"PYTHONUTF8": "0", "LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0"}
     for line in ("DPC info F", "DPC evaluate classification F", "DPC evaluate classification F --markdown"):
         done = shell(line, named, **ascii_only)
-        assert done.returncode == 0 and ("p\\xfcnch" in done.stdout or "--markdown" in line), done.stderr  # markdown is UTF-8
+        assert done.returncode == 0 and ("p\\xfcnch" in done.stdout or "--markdown" in line), (
+            done.stderr
+        )  # markdown is UTF-8
         done = shell(line, named, PYTHONUTF8="1")
-        assert "p\u00fcnch" in done.stdout and "\\x1b[31mred\\x9b2J" in done.stdout and not {"\x1b", "\x9b"} & set(done.stdout)
+        assert (
+            "p\u00fcnch" in done.stdout
+            and "\\x1b[31mred\\x9b2J" in done.stdout
+            and not {"\x1b", "\x9b"} & set(done.stdout)
+        )

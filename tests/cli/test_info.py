@@ -152,7 +152,10 @@ def test_what_the_system_refuses_is_said_in_words(capsys) -> None:
     """Not as a bug: a folder that may not be read, a file where a folder should be. An error without a file is one."""
     from dpcli.cli.app import _explain
 
-    for error in (PermissionError(13, "Permission denied", "there"), NotADirectoryError(20, "Not a directory", "there")):
+    for error in (
+        PermissionError(13, "Permission denied", "there"),
+        NotADirectoryError(20, "Not a directory", "there"),
+    ):
         assert _explain(error) == 1
         said = capsys.readouterr().err
         assert said.startswith("dpc: error: there: ") and "Errno" not in said and "bug" not in said
@@ -164,8 +167,15 @@ def test_a_shipped_model_tells_its_classes_and_training(dpc_here):
     done = dpc_here("info", "msraction3d-24")
     assert done.returncode == 0, done.stderr.decode()
     text = " ".join(done.stdout.decode().split())
-    for said in ("model, dpc-kinet-1", "class names 20: high arm wave", "config num frames 24", "notes trained on 266 videos",
-                 "timing clips", "msraction3d-24.md", "notes command dpc classify train"):  # fmt: skip
+    for said in (
+        "model, dpc-kinet-1",
+        "class names 20: high arm wave",
+        "config num frames 24",
+        "notes trained on 266 videos",
+        "timing clips",
+        "msraction3d-24.md",
+        "notes command dpc classify train",
+    ):
         assert said in text, said
     told = json.loads(dpc_here("info", "articulated-compact", "--json").stdout)
     assert told["kind"] == "model" and told["format"] == "dpc-parts-1" and told["header"]["config"]["slots"] == 8
@@ -177,8 +187,11 @@ def test_a_training_folder_is_its_best_weights(dpc_here, tmp_path):
 
     (tmp_path / "run").mkdir()
     weights = tmp_path / "run" / "best.safetensors"
-    save_file({"a": np.zeros((3, 4), np.float16), "b": np.zeros(5, np.float32)}, weights,
-              {"note": "[not json", "weights": "x", "kind": "7", "class_names": "5", "loss": "NaN"})  # fmt: skip
+    save_file(
+        {"a": np.zeros((3, 4), np.float16), "b": np.zeros(5, np.float32)},
+        weights,
+        {"note": "[not json", "weights": "x", "kind": "7", "class_names": "5", "loss": "NaN"},
+    )
     for name in (weights, weights.parent):
         told = json.loads(dpc_here("info", name, "--json").stdout)
         assert (told["kind"], told["weights"], told["tensors"], told["types"]) == ("model", 17, 2, ["F16", "F32"])

@@ -17,18 +17,18 @@ from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 RED, GREEN = (255, 0, 0), (0, 255, 0)
 
 
-def loop_z_buffer(points: np.ndarray, colours: np.ndarray, raster: Raster, size: int) -> np.ndarray:
+def loop_z_buffer(points: np.ndarray, colors: np.ndarray, raster: Raster, size: int) -> np.ndarray:
     """Every pixel of every square, one after the other; the nearest wins, of equally near ones the later point."""
     image = np.full((raster.height, raster.width, 3), sheet_module._BACKGROUND, np.uint8)
     depth = np.full((raster.height, raster.width), np.inf)
-    for (x, y, z), colour in zip(points, colours, strict=True):
-        column = int(np.floor((x - raster.centre[0]) * raster.scale + raster.width / 2))
-        row = int(np.floor((y - raster.centre[1]) * raster.scale + raster.height / 2))
+    for (x, y, z), color in zip(points, colors, strict=True):
+        column = int(np.floor((x - raster.center[0]) * raster.scale + raster.width / 2))
+        row = int(np.floor((y - raster.center[1]) * raster.scale + raster.height / 2))
         for dy in range(size):
             for dx in range(size):
                 r, c = row + dy - size // 2, column + dx - size // 2
                 if 0 <= r < raster.height and 0 <= c < raster.width and z <= depth[r, c]:
-                    depth[r, c], image[r, c] = z, colour
+                    depth[r, c], image[r, c] = z, color
     return image
 
 
@@ -40,14 +40,14 @@ def random_cloud(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, Raster]
 
 
 def assert_draws_the_nearest(draw, seed: int, count: int, size: int) -> None:
-    points, colours, raster = random_cloud(seed, count)
-    expected = loop_z_buffer(points, colours, raster, size)
-    np.testing.assert_array_equal(draw(points, colours, raster), expected)
+    points, colors, raster = random_cloud(seed, count)
+    expected = loop_z_buffer(points, colors, raster, size)
+    np.testing.assert_array_equal(draw(points, colors, raster), expected)
 
 
 @pytest.fixture
 def flat(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without shading and closing gaps, so that colours can be compared."""
+    """Without shading and closing gaps, so that colors can be compared."""
     monkeypatch.setattr(sheet_module, "_fill_gaps", lambda image, depth: (image, depth))
     monkeypatch.setattr(sheet_module, "_relief", lambda image, depth: image)
 
@@ -72,7 +72,7 @@ def test_the_loop_rejects_a_drawing_in_which_the_far_hides_the_near(
 def test_y_points_down_and_x_right() -> None:
     points = np.array([[0.5, 0, 1], [0, 0.5, 1]], np.float32)
     image = draw_frame(points, np.array([RED, GREEN], np.uint8), Raster(20, 20, np.zeros(2), 10.0))
-    red, green = ((image == colour).all(-1) for colour in (RED, GREEN))
+    red, green = ((image == color).all(-1) for color in (RED, GREEN))
     assert np.argwhere(red).mean(0)[1] > 12 and np.argwhere(green).mean(0)[0] > 12
 
 
@@ -85,7 +85,7 @@ def test_only_gaps_of_one_pixel_are_closed() -> None:
     np.testing.assert_array_equal(np.isfinite(deep), expected)
 
 
-def test_relief_darkens_only_what_lies_behind_its_neighbour() -> None:
+def test_relief_darkens_only_what_lies_behind_its_neighbor() -> None:
     image = np.full((5, 6, 3), 200, np.uint8)
     depth = np.full((5, 6), 10, np.float32)
     depth[:, 3:] = 14
@@ -95,9 +95,13 @@ def test_relief_darkens_only_what_lies_behind_its_neighbour() -> None:
 
 @pytest.mark.parametrize(
     ("text", "right", "down", "away"),
-    [("xyz", (1, 0, 0), (0, 1, 0), (0, 0, 1)), ("x-zy", (1, 0, 0), (0, 0, -1), (0, 1, 0)),
-     ("yx-z", (0, 1, 0), (1, 0, 0), (0, 0, -1)), ("-yzx", (0, -1, 0), (0, 0, 1), (1, 0, 0))],
-)  # fmt: skip
+    [
+        ("xyz", (1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ("x-zy", (1, 0, 0), (0, 0, -1), (0, 1, 0)),
+        ("yx-z", (0, 1, 0), (1, 0, 0), (0, 0, -1)),
+        ("-yzx", (0, -1, 0), (0, 0, 1), (1, 0, 0)),
+    ],
+)
 def test_view(text: str, right: tuple, down: tuple, away: tuple) -> None:
     assert parse_view(text).tolist() == [list(right), list(down), list(away)]
 
@@ -109,7 +113,7 @@ def test_a_view_that_is_none(text: str) -> None:
 
 
 def test_image_coordinates_are_turned_upright() -> None:
-    assert default_view("pixel (row, column), grey level") == "yx-z" and default_view("m") == "xyz"
+    assert default_view("pixel (row, column), gray level") == "yx-z" and default_view("m") == "xyz"
 
 
 @settings(max_examples=60, deadline=None)
@@ -127,7 +131,7 @@ def test_samples_are_spread_over_the_classes(labels: list[int], count: int) -> N
 
 
 @pytest.mark.parametrize("field", ["none", "color", "part"])
-def test_the_sheet_shows_the_colours_of_the_file(tmp_path: Path, field: str) -> None:
+def test_the_sheet_shows_the_colors_of_the_file(tmp_path: Path, field: str) -> None:
     from PIL import Image
 
     rng = np.random.default_rng(0)
@@ -146,9 +150,9 @@ def test_the_sheet_shows_the_colours_of_the_file(tmp_path: Path, field: str) -> 
     with Image.open(picture) as image:
         pixels = np.asarray(image).reshape(-1, 3).astype(int)
     red = ((pixels[:, 0] > 120) & (pixels[:, 1] < 40) & (pixels[:, 2] < 40)).sum()
-    coloured = (pixels.max(1) - pixels.min(1) > 60).sum()
-    assert coloured > 500
-    assert (red > 0.9 * coloured) == (field == "color")
+    colored = (pixels.max(1) - pixels.min(1) > 60).sum()
+    assert colored > 500
+    assert (red > 0.9 * colored) == (field == "color")
 
 
 def test_a_picture_into_nowhere(tmp_path: Path) -> None:

@@ -42,10 +42,11 @@ def mean_of(values: np.ndarray):
 
 
 @pytest.mark.parametrize("method", ["bca", "percentile"])
-@pytest.mark.parametrize("draw", [
-    lambda rng: rng.normal(3, 2, 120),
-    lambda rng: (rng.random(120) < 0.7).astype(float),
-], ids=["normal", "bernoulli"])  # fmt: skip
+@pytest.mark.parametrize(
+    "draw",
+    [lambda rng: rng.normal(3, 2, 120), lambda rng: (rng.random(120) < 0.7).astype(float)],
+    ids=["normal", "bernoulli"],
+)
 def test_coverage(method, draw):
     """A 95 % interval holds the true mean in 95 % of 400 samples, give or take two standard errors (1.1 % each)."""
     truth = {"normal": 3, "bernoulli": 0.7}["bernoulli" if draw(np.random.default_rng(0)).max() <= 1 else "normal"]
@@ -77,8 +78,15 @@ def test_equals_scipy_on_the_same_resamples(method, scipys, confidence):
     from scipy.stats import bootstrap as reference
 
     values = np.random.default_rng(5).exponential(size=40)
-    expected = reference((values,), np.mean, n_resamples=999, batch=999, confidence_level=confidence, method=scipys,
-                         rng=np.random.default_rng(3)).confidence_interval  # fmt: skip
+    expected = reference(
+        (values,),
+        np.mean,
+        n_resamples=999,
+        batch=999,
+        confidence_level=confidence,
+        method=scipys,
+        rng=np.random.default_rng(3),
+    ).confidence_interval
     found = bootstrap(
         mean_of(values), 40, np.random.default_rng(3), resamples=999, confidence=confidence, method=method
     )
@@ -180,8 +188,20 @@ def random_objects(count: int, seed: int = 0, ties: bool = True) -> list[Segment
         confidence = rng.integers(0, 5, said) / 4 if ties else rng.random(said)
         matched = rng.random(said) < 0.6
         mean = np.array([np.nan if number == 1 else rng.random()])
-        made.append(SegmentationStatistics(rng.random(said), matched, confidence, mean, mean.copy(),
-                                           int(matched.sum() + rng.integers(0, 3)), 2, 0, 0, 0))  # fmt: skip
+        made.append(
+            SegmentationStatistics(
+                rng.random(said),
+                matched,
+                confidence,
+                mean,
+                mean.copy(),
+                int(matched.sum() + rng.integers(0, 3)),
+                2,
+                0,
+                0,
+                0,
+            )
+        )
     return made
 
 
@@ -208,8 +228,16 @@ def random_motions(count: int, seed: int = 0) -> list[MotionStatistics]:
         pairs, parts = int(rng.integers(1, 5)), int(rng.integers(0, 4))
         points = rng.integers(5, 30, pairs)
         hits = rng.integers(0, 5, (pairs, len(TAUS), 3))
-        made.append(MotionStatistics(points, rng.random(pairs) * points, rng.random(pairs) * points, hits,
-                                     rng.random(parts), rng.random(parts)))  # fmt: skip
+        made.append(
+            MotionStatistics(
+                points,
+                rng.random(pairs) * points,
+                rng.random(pairs) * points,
+                hits,
+                rng.random(parts),
+                rng.random(parts),
+            )
+        )
     return made
 
 
@@ -219,8 +247,12 @@ def test_motion_of_resamples(batch):
     found = motion_weighted(objects, 0.05, batch)(counts)
     for number, row in enumerate(counts):
         expected = motion_compute(motion_merge([objects[i] for i in repeated(row)]), batch)
-        own = {"epe3d": expected.epe3d, "epe3d_no_motion": expected.still, "part_displacement": expected.displacement,
-               "part_rotation": np.degrees(expected.rotation)}  # fmt: skip
+        own = {
+            "epe3d": expected.epe3d,
+            "epe3d_no_motion": expected.still,
+            "part_displacement": expected.displacement,
+            "part_rotation": np.degrees(expected.rotation),
+        }
         for tau, suffix in ((0.05, ""), (0.01, "_0.01")):
             own |= {f"{key}{suffix}": getattr(expected.shares[tau], key) for key in ("accs", "accr", "outlier")}
         assert set(own) == set(found)
@@ -240,8 +272,9 @@ def test_replicates_of_a_metric_that_is_no_ratio_spread_like_a_brute_resampling(
     objects = random_objects(30, seed=3)
     fast = replicates(segmentation_weighted(objects), 30, np.random.default_rng(0), 400)["ap"]
     rng = np.random.default_rng(0)
-    slow = [segmentation_compute(segmentation_merge([objects[i] for i in rng.integers(0, 30, 30)])).ap
-            for _ in range(400)]  # fmt: skip
+    slow = [
+        segmentation_compute(segmentation_merge([objects[i] for i in rng.integers(0, 30, 30)])).ap for _ in range(400)
+    ]
     assert fast == pytest.approx(slow, abs=1e-12)  # the same stream of draws
 
 
@@ -263,8 +296,12 @@ def files(tmp_path_factory):
     with ScoresWriter(folder / "scores.h5", class_names=("a", "b", "c")) as writer:
         for i in range(40):
             writer.write(f"v{i}", np.eye(3)[i % 3 if i % 4 else 0], label=i % 3)
-    return {"parts": write_parts(folder / "p.h5", samples), "truth": write_truth(folder / "t.h5", truths),
-            "single": write_parts(folder / "one.h5", samples[3:4]), "scores": folder / "scores.h5"}  # fmt: skip
+    return {
+        "parts": write_parts(folder / "p.h5", samples),
+        "truth": write_truth(folder / "t.h5", truths),
+        "single": write_parts(folder / "one.h5", samples[3:4]),
+        "scores": folder / "scores.h5",
+    }
 
 
 def run(*arguments: object):

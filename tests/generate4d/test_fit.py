@@ -31,7 +31,7 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
     poses = np.stack([orbit_pose(a, 0.0) for a in azimuths])
     intrinsics = np.stack([pinhole(DEFAULT_FOVY, SIZE, SIZE)] * len(poses))
     header = ViewsHeader("toy", intrinsics, poses, np.arange(FRAMES) / 8, roles, 0, (SIZE, SIZE))
-    colour = torch.tensor([[0.9, 0.2, 0.1]] * 60 + [[0.1, 0.3, 0.9]] * 60)
+    color = torch.tensor([[0.9, 0.2, 0.1]] * 60 + [[0.1, 0.3, 0.9]] * 60)
     with ViewsWriter(path, header) as writer:
         for frame in range(FRAMES):
             turn = np.pi / 2 * frame / FRAMES
@@ -40,9 +40,16 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
             points = torch.from_numpy(np.concatenate([cloud[0], blue])).float()
             with torch.no_grad():
                 rgb, alpha, _ = rasterization(
-                    points, torch.tensor([[1.0, 0, 0, 0]]).repeat(120, 1), torch.full((120, 3), 0.05), torch.full((120,), 0.9),
-                    colour, torch.from_numpy(poses).float(), torch.from_numpy(intrinsics).float(), SIZE, SIZE,
-                )  # fmt: skip
+                    points,
+                    torch.tensor([[1.0, 0, 0, 0]]).repeat(120, 1),
+                    torch.full((120, 3), 0.05),
+                    torch.full((120,), 0.9),
+                    color,
+                    torch.from_numpy(poses).float(),
+                    torch.from_numpy(intrinsics).float(),
+                    SIZE,
+                    SIZE,
+                )
             rgba = torch.cat([rgb / alpha.clamp(min=1e-3), alpha], -1).clamp(0, 1) * (0 if empty else 255)
             for view in range(len(poses)):
                 writer.add(view, frame, rgba[view].round().byte().numpy())
@@ -51,8 +58,21 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
 
 def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
-    done = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--dense-steps", 60, "--sparse-steps", 60,
-               "--picture", tmp_path / "sheet.png")  # fmt: skip
+    done = dpc(
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--dense-steps",
+        60,
+        "--sparse-steps",
+        60,
+        "--picture",
+        tmp_path / "sheet.png",
+    )
     assert done.returncode == 0, done.stderr
     result = read_scene(scene)
     assert result.num_frames == FRAMES and result.num_parts == 3 and len(result.control_point) == 24
@@ -108,9 +128,7 @@ def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc_here):
     views = toy_views(tmp_path / "views.h5")
     steps = ("--preset", "tiny", "--dense-steps", 8, "--sparse-steps", 8)
     scenes = {}
-    for name, switches in {
-        "a": ("--no-rigid", "--no-sparse"), "c": ("--no-fusion", "--no-sparse"), "e": (),
-    }.items():  # fmt: skip
+    for name, switches in {"a": ("--no-rigid", "--no-sparse"), "c": ("--no-fusion", "--no-sparse"), "e": ()}.items():
         done = dpc_here("generate4d", "fit", views, "-o", tmp_path / f"{name}.h5", *steps, *switches)
         assert done.returncode == 0, done.stderr
         scenes[name] = read_scene(tmp_path / f"{name}.h5")
@@ -142,10 +160,14 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
         pass
     with pytest.raises(UsageError, match="another configuration"):
         RunFolder(tmp_path / "scene.fit", {"config": 2}, columns=COLUMNS)
-    with pytest.raises(UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*d absent, now 2, and 1 more\)"):
+    with pytest.raises(
+        UsageError, match=r"\(config 1, now absent; config.a absent, now 1; .*d absent, now 2, and 1 more\)"
+    ):
         RunFolder(tmp_path / "scene.fit", {"config": {"a": 1, "b": {"c": None, "d": 2, "e": 3}}}, columns=COLUMNS)
     RunFolder(tmp_path / "scene.fit", {"config": 1, "newer": None}, columns=COLUMNS)  # a setting that nobody sets
-    done = dpc_here("generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny")
+    done = dpc_here(
+        "generate4d", "fit", toy_views(tmp_path / "views.h5"), "-o", tmp_path / "scene.h5", "--preset", "tiny"
+    )
     assert done.returncode == 2 and b"another configuration" in done.stderr
 
 
@@ -153,8 +175,21 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
     import imageio.v3 as imageio
 
     views, scene = toy_views(tmp_path / "views.h5", train=1), tmp_path / "scene.h5"
-    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", "views", "--dense-steps", 20,
-             "--sparse-steps", 20)  # fmt: skip
+    words = (
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--prior",
+        "views",
+        "--dense-steps",
+        20,
+        "--sparse-steps",
+        20,
+    )
     assert dpc_here(*words, "--picture", tmp_path / "first.png").returncode == 0
     before = scene.read_bytes()
     done = dpc_here(*words, "--picture", tmp_path / "later.png")
@@ -165,7 +200,21 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
 
 def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monkeypatch):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
-    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--size", 16, "--dense-steps", 1, "--sparse-steps", 1)
+    words = (
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--size",
+        16,
+        "--dense-steps",
+        1,
+        "--sparse-steps",
+        1,
+    )
     for name, said in (("no/x.png", b"the folder"), ("x.foo", b"unknown kind '.foo'"), ("", b"unknown kind ''")):
         done = dpc_here(*words, "--picture", tmp_path / name if name else "")
         assert done.returncode in (2, 3) and said in done.stderr and not (tmp_path / "scene.fit").exists()

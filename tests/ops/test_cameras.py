@@ -17,20 +17,20 @@ def _project(point, pose, intrinsics):
 
 
 @pytest.mark.parametrize(
-    ("azimuth", "elevation", "centre"),
+    ("azimuth", "elevation", "center"),
     [(0, 0, (0, 0, 2)), (90, 0, (2, 0, 0)), (180, 0, (0, 0, -2)), (0, 90, (0, 2, 0)), (-90, 0, (-2, 0, 0))],
 )
-def test_the_camera_stands_where_the_convention_says(azimuth, elevation, centre):
+def test_the_camera_stands_where_the_convention_says(azimuth, elevation, center):
     pose = orbit_pose(np.deg2rad(azimuth), np.deg2rad(elevation), 2.0)
-    np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], centre, atol=1e-12)
+    np.testing.assert_allclose(-pose[:3, :3].T @ pose[:3, 3], center, atol=1e-12)
 
 
 def test_up_is_up_and_right_is_right_in_the_picture():
     pose, intrinsics = orbit_pose(0.0, 0.0), pinhole(np.deg2rad(49.1), 100, 80)
-    (centre, depth), (up, _), (right, _) = (
+    (center, depth), (up, _), (right, _) = (
         _project(np.array(p, float), pose, intrinsics) for p in ((0, 0, 0), (0, 0.2, 0), (0.2, 0, 0))
     )
-    np.testing.assert_allclose(centre, (50, 40))
+    np.testing.assert_allclose(center, (50, 40))
     assert depth == pytest.approx(2.0) and up[1] < 40 and up[0] == pytest.approx(50) and right[0] > 50
 
 

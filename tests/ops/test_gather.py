@@ -1,4 +1,4 @@
-"""Gathering neighbours, and their mean without gathering them."""
+"""Gathering neighbors, and their mean without gathering them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dpcli.ops.backend import chosen_backend, reference_only
 
 
 @pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-6), (torch.float64, 1e-14)])
-def test_the_mean_of_neighbours_is_that_of_the_gathered_ones(dtype, tolerance):
-    """In value and gradient, with neighbours that repeat and points that nobody has for a neighbour."""
+def test_the_mean_of_neighbors_is_that_of_the_gathered_ones(dtype, tolerance):
+    """In value and gradient, with neighbors that repeat and points that nobody has for a neighbor."""
     g = torch.Generator().manual_seed(0)
     features = torch.randn(3, 40, 11, generator=g, dtype=dtype).requires_grad_()
     idx = torch.randint(0, 30, (3, 17, 9), generator=g)
@@ -40,7 +40,7 @@ def test_indices_that_name_no_point_are_refused(function):
         function(features, torch.zeros(3, 4, 5, dtype=torch.long))
 
 
-def test_no_neighbours_and_other_shapes_take_the_plain_way():
+def test_no_neighbors_and_other_shapes_take_the_plain_way():
     features = torch.randn(2, 6, 3)
     assert gather_mean(features, torch.zeros(2, 0, 5, dtype=torch.long)).shape == (2, 0, 3)
     many = torch.randint(0, 6, (2, 4, 5, 2))

@@ -101,8 +101,24 @@ def test_a_constant_left_on_the_cpu_is_found(card, monkeypatch):
 
 def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, tmp_path):
     data, model = gestures(tmp_path / "clouds.h5", videos=6), tmp_path / "model"
-    done = dpc_here("classify", "train", data, "-o", model, *TRAIN, "--epochs", 1, "--epochs-dynamic", 2, "--workers", 0,
-                    "--draws", 1, "--static-temporal-radius", 0)  # fmt: skip
+    done = dpc_here(
+        "classify",
+        "train",
+        data,
+        "-o",
+        model,
+        *TRAIN,
+        "--epochs",
+        1,
+        "--epochs-dynamic",
+        2,
+        "--workers",
+        0,
+        "--draws",
+        1,
+        "--static-temporal-radius",
+        0,
+    )
     assert done.returncode == 0 and b"training on pretend card" in done.stderr, done.stderr
     scores = []
     for device in ("cuda", "cpu"):
@@ -123,8 +139,22 @@ def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, t
     masks = []
     for device in ("cuda", "cpu"):
         found = tmp_path / f"{device}.h5"
-        done = dpc_here("segment", "predict", data, "-o", found, "--model", model, "--flow", "nearest", "--device", device,
-                        "--split", "all", "--no-amp")  # fmt: skip
+        done = dpc_here(
+            "segment",
+            "predict",
+            data,
+            "-o",
+            found,
+            "--model",
+            model,
+            "--flow",
+            "nearest",
+            "--device",
+            device,
+            "--split",
+            "all",
+            "--no-amp",
+        )
         assert done.returncode == 0, done.stderr
         with PartsReader(found) as reader:
             masks.append(np.concatenate([reader.read_parts(i).probability for i in range(len(reader))]))
@@ -133,8 +163,25 @@ def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, t
 
 def test_a_scene_fitted_on_the_card_stops_and_goes_on(card, dpc_here, tmp_path, monkeypatch):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
-    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--size", 16, "--gaussians", 40,
-             "--control-points", 8, "--dense-steps", 2, "--sparse-steps", 2)  # fmt: skip
+    words = (
+        "generate4d",
+        "fit",
+        views,
+        "-o",
+        scene,
+        "--preset",
+        "tiny",
+        "--size",
+        16,
+        "--gaussians",
+        40,
+        "--control-points",
+        8,
+        "--dense-steps",
+        2,
+        "--sparse-steps",
+        2,
+    )
     step = Fit._one_step
 
     def stop_after_three(fit: Fit) -> None:

@@ -23,18 +23,35 @@ def layer(features: int, dtype=torch.float32, seed: int = 0, repeat: bool = Fals
     rand = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)  # noqa: E731
     points, idx = rand(2, 50, 3), torch.randint(0, 50, (2, 20, 9), generator=g)
     if repeat:
-        idx[:] = idx[..., :1]  # a centroid with one neighbour, nine times: every maximum is a tie
+        idx[:] = idx[..., :1]  # a centroid with one neighbor, nine times: every maximum is a tie
     c1, c2 = widths
-    inputs = {"features": rand(2, 50, features) if features else None, "w1": rand(c1, 3 + features) * 0.3, "b1": rand(c1),
-              "g1": rand(c1), "s1": rand(c1), "w2": rand(c2, c1) * 0.3, "b2": rand(c2), "g2": rand(c2), "s2": rand(c2)}  # fmt: skip
+    inputs = {
+        "features": rand(2, 50, features) if features else None,
+        "w1": rand(c1, 3 + features) * 0.3,
+        "b1": rand(c1),
+        "g1": rand(c1),
+        "s1": rand(c1),
+        "w2": rand(c2, c1) * 0.3,
+        "b2": rand(c2),
+        "g2": rand(c2),
+        "s2": rand(c2),
+    }
     learned = {key: value.requires_grad_() for key, value in inputs.items() if value is not None}
     return points, points[:, :20].clone(), idx, inputs, learned
 
 
 def run(case, fast: bool, grad):
     points, centers, idx, v, learned = case
-    arguments = (points, centers, idx, v["features"], (v["w1"], v["b1"]), Norm(v["g1"], v["s1"], None, None),
-                 (v["w2"], v["b2"]), Norm(v["g2"], v["s2"], None, None))  # fmt: skip
+    arguments = (
+        points,
+        centers,
+        idx,
+        v["features"],
+        (v["w1"], v["b1"]),
+        Norm(v["g1"], v["s1"], None, None),
+        (v["w2"], v["b2"]),
+        Norm(v["g2"], v["s2"], None, None),
+    )
     if fast:
         pooled, statistics = grouped_mlp(*arguments)
     else:
@@ -91,8 +108,10 @@ def test_kernels_give_the_same_on_any_number_of_threads(features, one_thread, mo
 
 def test_numba_s_threads_leave_torch_the_number_it_was_given():
     """numba starts its threads once a process, as many as there are CPUs; a job that asked for one keeps to one."""
-    code = ("import numba, torch; from dpcli.ops.cpu.parallel import parallel_kernels; parallel_kernels('dpcli.ops.cpu.grouped_mlp');"
-            "print(torch.get_num_threads(), numba.get_num_threads())")  # fmt: skip
+    code = (
+        "import numba, torch; from dpcli.ops.cpu.parallel import parallel_kernels; parallel_kernels('dpcli.ops.cpu.grouped_mlp');"
+        "print(torch.get_num_threads(), numba.get_num_threads())"
+    )
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_NUM_THREADS"}
     asked = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={**environment, **asked})
@@ -190,7 +209,9 @@ def frozen(features, dtype, widths=(8, 16)):
     points, centers, idx, v, _ = layer(features, dtype, widths=widths)
     g = torch.Generator().manual_seed(5)
     mean, var = (torch.rand(sum(widths), generator=g).to(dtype).split(widths) for _ in range(2))
-    norms = [Norm(v[w].detach(), v[b].detach(), m, s + 0.5) for w, b, m, s in zip(("g1", "g2"), ("s1", "s2"), mean, var)]
+    norms = [
+        Norm(v[w].detach(), v[b].detach(), m, s + 0.5) for w, b, m, s in zip(("g1", "g2"), ("s1", "s2"), mean, var)
+    ]
     given = None if v["features"] is None else v["features"].detach()
     linear = [(v[w].detach(), v[b].detach()) for w, b in (("w1", "b1"), ("w2", "b2"))]
     return points, centers, idx, given, linear[0], norms[0], linear[1], norms[1]

@@ -1,4 +1,4 @@
-"""Gathering and three-nearest-neighbour interpolation: values, gradients, every backend."""
+"""Gathering and three-nearest-neighbor interpolation: values, gradients, every backend."""
 
 from __future__ import annotations
 

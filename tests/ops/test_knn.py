@@ -1,4 +1,4 @@
-"""Nearest neighbours: the definition with its ties, scipy's tree, ragged batches, and every backend alike."""
+"""Nearest neighbors: the definition with its ties, scipy's tree, ragged batches, and every backend alike."""
 
 from __future__ import annotations
 

@@ -141,7 +141,7 @@ def test_cholesky_refuses_an_indefinite_matrix() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("guard", ["signed", "release"])
 def test_cholesky_lifts_singular_matrices_alone(guard: str, dtype: torch.dtype) -> None:
-    """Dead features and doubled neighbours: a regular matrix beside them keeps its inverse to the bit, theirs is that of
+    """Dead features and doubled neighbors: a regular matrix beside them keeps its inverse to the bit, theirs is that of
     the lifted matrix, and all gradients are finite."""
     regular = spd(0, n=20)
     dead = regular.clone()

@@ -213,8 +213,9 @@ def test_a_journal_of_other_work_stays_and_force_starts_over(killed, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def test_a_command_spelt_otherwise_goes_on_and_another_one_is_refused(tmp_path, monkeypatch):
+def test_a_command_spelled_otherwise_goes_on_and_another_one_is_refused(tmp_path, monkeypatch):
     """As `dpc` is called with another --on-error, or RAW/ instead of RAW."""
+
     def run(words: list[str], **more):
         monkeypatch.setattr("sys.argv", ["dpc", "prepare", *words])
         return convert(ToyReader(), tmp_path / "a.h5", **more)
@@ -278,8 +279,11 @@ def test_kill_minus_nine_at_random_moments(tmp_path):
     for _ in range(4):
         process = subprocess.Popen(
             [*DPC, *SYNTHETIC, "-o", str(out), "--jobs", "2"],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT, start_new_session=True,
-        )  # fmt: skip
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd=ROOT,
+            start_new_session=True,
+        )
         deadline = time.monotonic() + 60
         while process.poll() is None and time.monotonic() < deadline:
             if journal.exists() and journal.stat().st_size > kept:

@@ -118,7 +118,7 @@ def test_bad_samples_are_skipped_and_named(tmp_path):
     assert report.lines()[0] == "2 skipped:" and "toy003: toy003 is broken" in report.lines()[2]
     with CloudsReader(tmp_path / "a.h5") as skipping:
         convert(ToyReader(), tmp_path / "b.h5", points=20)
-        with CloudsReader(tmp_path / "b.h5") as whole:  # its neighbours' randomness is untouched
+        with CloudsReader(tmp_path / "b.h5") as whole:  # its neighbors' randomness is untouched
             np.testing.assert_array_equal(skipping.read(1).points, whole.read(2).points)
 
 
@@ -278,7 +278,11 @@ def test_other_data_labels_or_classes_under_the_same_names_are_not_already_compl
 
     table, other = tmp_path / "one.csv", tmp_path / "other.csv"
     table.write_text("name,label,subject,split\na,wave,1,train\nb,zoom,2,test\n")
-    first, copied, longer = write(tmp_path / "x/clouds", 2), write(tmp_path / "y/clouds", 2), write(tmp_path / "z/clouds", 3)
+    first, copied, longer = (
+        write(tmp_path / "x/clouds", 2),
+        write(tmp_path / "y/clouds", 2),
+        write(tmp_path / "z/clouds", 3),
+    )
     output = first / "out.h5"  # beside the data, as some have it
     convert(CloudFolders(first, labels=table), output)
     for same in (first, copied):

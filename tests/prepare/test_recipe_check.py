@@ -48,8 +48,16 @@ def toy(tmp_path, monkeypatch) -> Path:
     (tmp_path / "recipes" / "toy.toml").write_text(RECIPE)
     monkeypatch.setattr(recipe_check, "RECIPES", tmp_path / "recipes")
     raw = tmp_path / "raw ü"
-    for name in ("seq/00/a.bin", "seq/00/b.bin", "seq/01/a.bin", "seq/02/a.bin", "lists.csv",
-                 "x/clip.avi", "x/y z/clip.avi", "clip.avi"):  # fmt: skip
+    for name in (
+        "seq/00/a.bin",
+        "seq/00/b.bin",
+        "seq/01/a.bin",
+        "seq/02/a.bin",
+        "lists.csv",
+        "x/clip.avi",
+        "x/y z/clip.avi",
+        "clip.avi",
+    ):
         (raw / name).parent.mkdir(parents=True, exist_ok=True)
         (raw / name).write_bytes(b"12345")
     return raw
@@ -128,9 +136,12 @@ def test_braces():
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("[[raw]]\nfile = 'x'", "has \\['file'\\]"), ("[[raw]]\nwhat = 'x'", "no path"),
-     ("[[raw]]\npath = '{0..2}'\neach = [1, 2]", "each has 2 numbers, but .* names 3 paths")],
-)  # fmt: skip
+    [
+        ("[[raw]]\nfile = 'x'", "has \\['file'\\]"),
+        ("[[raw]]\nwhat = 'x'", "no path"),
+        ("[[raw]]\npath = '{0..2}'\neach = [1, 2]", "each has 2 numbers, but .* names 3 paths"),
+    ],
+)
 def test_recipes_that_say_something_else_are_refused(toy, text, message):
     (recipe_check.RECIPES / "toy.toml").write_text(text)
     with pytest.raises(DataError, match=message):
@@ -201,15 +212,21 @@ def test_a_whole_animal_passes(panda):
     [
         (lambda raw: (raw / "CamPose.inf").unlink(), "CamPose.inf: missing"),
         (lambda raw: (raw / "Intrinsic.inf").write_text("0\n9 0 4\n0 9 4\n0 0 1\n"), "2 cameras, Intrinsic.inf 1"),
-        (lambda raw: (raw / "img/walk/1/img_0001.jpg").unlink(), "1 files are missing, the first: img/walk/1/img_0001.jpg"),
+        (
+            lambda raw: (raw / "img/walk/1/img_0001.jpg").unlink(),
+            "1 files are missing, the first: img/walk/1/img_0001.jpg",
+        ),
         (lambda raw: (raw / "img/walk/2/img_0000_alpha.png").unlink(), "the first: img/walk/2/img_0000_alpha.png"),
         (lambda raw: (raw / "img/walk/0/img_0000.jpg").write_bytes(b""), "0 bytes, expected at least 1"),
         (lambda raw: (raw / "bones/walk/Bones_0001.inf").unlink(), "the first: bones/walk/Bones_0001.inf"),
         (lambda raw: (raw / "sequences").write_text("walk 5\n"), "walk: 3 of the 5 frames are there"),
-        (lambda raw: (raw / "sequences").write_text("walk 3\nrun 9\n"), "img/run: missing; sequences tells of its 9 frames"),
+        (
+            lambda raw: (raw / "sequences").write_text("walk 3\nrun 9\n"),
+            "img/run: missing; sequences tells of its 9 frames",
+        ),
         (lambda raw: shutil.rmtree(raw / "img"), "img/*/*/img_????_alpha.png: missing"),
     ],
-)  # fmt: skip
+)
 def test_what_an_animal_lacks_is_told(panda, change, message):
     change(panda)
     done = check("artemis", panda)
@@ -244,12 +261,17 @@ def test_a_whole_clip_passes(clip):
     [
         (lambda raw: (raw / "2.png").write_bytes(b""), "2.png: 0 bytes"),
         (lambda raw: (raw / "2.png").write_bytes(b"no picture"), "2.png: not a readable image"),
-        (lambda raw: Image.new("L", (9, 6)).save(raw / "3.png"), "3.png: 9x6, 0.png is 8x6; export all frames at one size"),
+        (
+            lambda raw: Image.new("L", (9, 6)).save(raw / "3.png"),
+            "3.png: 9x6, 0.png is 8x6; export all frames at one size",
+        ),
         (lambda raw: [path.unlink() for path in raw.iterdir()], "MISSING"),
-        (lambda raw: (raw / "rgba").mkdir() or [p.rename(raw / "rgba" / p.name) for p in raw.glob("*.png")],
-         "it has folders (rgba): name one of them"),
+        (
+            lambda raw: (raw / "rgba").mkdir() or [p.rename(raw / "rgba" / p.name) for p in raw.glob("*.png")],
+            "it has folders (rgba): name one of them",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_a_clip_lacks_is_told(clip, change, message):
     change(clip)
     done = check("video", clip)

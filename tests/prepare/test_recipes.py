@@ -16,7 +16,7 @@ else:
     tomllib = pytest.importorskip("tomli")
 
 RECIPES = {path.stem: path for path in (ROOT / "data_recipes").glob("*.toml")}
-SECTIONS = {"get": {"ask", "licence"}, "layout": {"tree"}, "checks": set(), "prepare": {"command"}, "split": {"rule"}}
+SECTIONS = {"get": {"ask", "license"}, "layout": {"tree"}, "checks": set(), "prepare": {"command"}, "split": {"rule"}}
 
 
 @pytest.mark.parametrize("name", ["msraction3d", "nvgesture"])

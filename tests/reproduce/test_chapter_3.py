@@ -196,13 +196,17 @@ def test_other_lengths_go_on_from_the_first_one_or_stand_alone(clouds, tmp_path)
     for (name, before), after in zip(first.named_parameters(), second.parameters()):
         torch.testing.assert_close(before, after, atol=1e-6, rtol=0, msg=name)  # a rate this small changes nothing
     alone = Pretended()
-    accuracy_tables.main(["3.4", "-", str(tmp_path), "--clouds", str(clouds), "--seeds", "0", "--only", "4", "--from", "none"], alone)
+    accuracy_tables.main(
+        ["3.4", "-", str(tmp_path), "--clouds", str(clouds), "--seeds", "0", "--only", "4", "--from", "none"], alone
+    )
     assert len(alone.trained) == 1 and "--init" not in alone.trained[0] and (tmp_path / "quick-4-seed0").is_dir()
 
 
 def test_a_length_that_is_not_there_ends_with_a_sentence(clouds, tmp_path, capsys):
-    for words, said in ((["3.4", "--from", "20"], "--from: no setting '20'; there are 4, 8, 12, 16, 24"),
-                        (["3.2", "--from", "kinet"], "--from: the settings of table 3.2 don't go on")):  # fmt: skip
+    for words, said in (
+        (["3.4", "--from", "20"], "--from: no setting '20'; there are 4, 8, 12, 16, 24"),
+        (["3.2", "--from", "kinet"], "--from: the settings of table 3.2 don't go on"),
+    ):
         with pytest.raises(SystemExit) as ended:
             accuracy_tables.main([words[0], "-", str(tmp_path), *words[1:], "--clouds", str(clouds)], Pretended())
         assert ended.value.code == 2 and said in capsys.readouterr().err
@@ -296,7 +300,9 @@ def test_a_job_trains_its_own_folds_and_shows_everyones(clouds, tmp_path):
 
 def test_a_fold_that_is_not_there_is_told(tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
-        figure_3_5.main(["msraction3d", "-", str(tmp_path), "--clouds", "-", "--folds", "3", "--only", "3"], Pretended())
+        figure_3_5.main(
+            ["msraction3d", "-", str(tmp_path), "--clouds", "-", "--folds", "3", "--only", "3"], Pretended()
+        )
     assert "--only 3: expected folds from 0 to 2 (--folds 3)" in capsys.readouterr().err
 
 
@@ -366,11 +372,20 @@ def test_gains_of_classes(tmp_path, real):
         )
 
 
-@pytest.mark.parametrize("target, variable", [
-    ("table-3.1", "NVGESTURE=folder or MSRACTION=folder"), ("table-3.2", "NVGESTURE=folder"), ("table-3.3", "SHREC17=folder"),
-    ("table-3.4", "MSRACTION=folder"), ("table-3.5", "NTU60=folder"), ("figure-3.5", "NVGESTURE=folder or MSRACTION=folder"),
-    ("figure-3.8", "MSRACTION=folder"), ("table-A.1", "MSRACTION=folder"), ("figure-A.4", "MSRACTION=folder"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "target, variable",
+    [
+        ("table-3.1", "NVGESTURE=folder or MSRACTION=folder"),
+        ("table-3.2", "NVGESTURE=folder"),
+        ("table-3.3", "SHREC17=folder"),
+        ("table-3.4", "MSRACTION=folder"),
+        ("table-3.5", "NTU60=folder"),
+        ("figure-3.5", "NVGESTURE=folder or MSRACTION=folder"),
+        ("figure-3.8", "MSRACTION=folder"),
+        ("table-A.1", "MSRACTION=folder"),
+        ("figure-A.4", "MSRACTION=folder"),
+    ],
+)
 def test_a_target_without_its_folder_says_which_variable_to_give(target, variable):
     if not (ROOT / "Makefile").exists() or shutil.which("make") is None:
         pytest.skip("no make here")

@@ -27,8 +27,25 @@ def test_table_says_what_is_missing() -> None:
 @pytest.fixture(scope="module")
 def objects(dpc, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("table") / "objects.h5"
-    made = dpc("prepare", "synthetic", "articulated", "-o", path, "--kinds", "laptop,scissors", "--objects", 4, "--frames", 2,
-               "--points", 64, "--sequences-per-object", 2, "--fractions", "0.5,0,0.5")  # fmt: skip
+    made = dpc(
+        "prepare",
+        "synthetic",
+        "articulated",
+        "-o",
+        path,
+        "--kinds",
+        "laptop,scissors",
+        "--objects",
+        4,
+        "--frames",
+        2,
+        "--points",
+        64,
+        "--sequences-per-object",
+        2,
+        "--fractions",
+        "0.5,0,0.5",
+    )
     assert made.returncode == 0, made.stderr.decode()
     with CloudsReader(path) as reader:
         assert {"train", "test"} <= set(reader.splits)
@@ -36,8 +53,25 @@ def objects(dpc, tmp_path_factory) -> Path:
 
 
 def test_a_toy_table_is_made_and_running_again_trains_nothing(objects, tmp_path) -> None:
-    words = [sys.executable, "-m", "dpcli.reproduce.table_4_1", objects, objects, tmp_path / "t", "--rows", "past", "--",
-             "--epochs", "1", "--pairs-per-epoch", "4", "--batch", "2", "--points", "64"]  # fmt: skip
+    words = [
+        sys.executable,
+        "-m",
+        "dpcli.reproduce.table_4_1",
+        objects,
+        objects,
+        tmp_path / "t",
+        "--rows",
+        "past",
+        "--",
+        "--epochs",
+        "1",
+        "--pairs-per-epoch",
+        "4",
+        "--batch",
+        "2",
+        "--points",
+        "64",
+    ]
     first = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert first.returncode == 0, first.stderr
     logs = {path.parent.name: path.read_bytes() for path in (tmp_path / "t").glob("*/log.json")}

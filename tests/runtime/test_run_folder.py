@@ -51,8 +51,15 @@ def start(*words: object, limit: int | None = None) -> subprocess.Popen:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-    return subprocess.Popen([sys.executable, "-m", "dpcli", *map(str, words)], cwd=ROOT, text=True, env=environment,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=limited)  # fmt: skip
+    return subprocess.Popen(
+        [sys.executable, "-m", "dpcli", *map(str, words)],
+        cwd=ROOT,
+        text=True,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=limited,
+    )
 
 
 def wait_for(come: Callable[[], bool], process: subprocess.Popen) -> None:
@@ -106,7 +113,9 @@ def test_a_second_training_into_a_folder_is_refused(data, tmp_path, dpc_here, mo
     try:
         wait_for((folder / "state.pt").exists, first)
         second = dpc_here(*words, *more)
-        assert second.returncode == 1 and f"{folder}: cannot write (another dpc is writing it)".encode() in second.stderr
+        assert (
+            second.returncode == 1 and f"{folder}: cannot write (another dpc is writing it)".encode() in second.stderr
+        )
         assert first.poll() is None and (folder / "state.pt").exists() and (folder / "config.json").exists()
     finally:
         first.kill()
@@ -154,7 +163,9 @@ def test_a_model_of_a_run_without_weights_yet(data, finished, tmp_path, dpc_here
     words = ("classify", "predict", data, "--model", finished, "-o", tmp_path / "s.h5")
     (finished / "best.safetensors").unlink()
     early = dpc_here(*words).stderr.decode()
-    assert "no best.safetensors yet" in early and f"{finished}/last.safetensors" in early and "no such file" not in early
+    assert (
+        "no best.safetensors yet" in early and f"{finished}/last.safetensors" in early and "no such file" not in early
+    )
     (finished / "last.safetensors").unlink()
     none = dpc_here(*words)
     assert none.returncode == 2 and b"no best.safetensors yet" in none.stderr and b"to continue it" in none.stderr

@@ -35,9 +35,14 @@ def test_a_signal_to_all_while_it_imports_reaches_the_command_only(tmp_path: Pat
     (tmp_path / "program.py").write_text(PROGRAM)
     paths = os.pathsep.join([str(tmp_path), str(Path(__file__).resolve().parents[2])])
     process = subprocess.Popen(
-        [sys.executable, "program.py"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": paths}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
-    )  # fmt: skip
+        [sys.executable, "program.py"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": paths},
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
     waited = time.monotonic() + 60
     while not (tmp_path / "importing").exists() and time.monotonic() < waited:
         time.sleep(0.01)

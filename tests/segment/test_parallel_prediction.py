@@ -32,7 +32,7 @@ def halves(points: torch.Tensor) -> FrameParts:
     return FrameParts(torch.stack([0.9 - 0.8 * side, 0.1 + 0.8 * side], -1), None)
 
 
-def to_centre(first: torch.Tensor, second: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def to_center(first: torch.Tensor, second: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     shift = second.mean(0) - first.mean(0)
     return shift.expand_as(first).clone(), (-shift).expand_as(second).clone()
 
@@ -57,7 +57,7 @@ def test_flows_and_network_meet(two_threads) -> None:
 
     def estimate(first, second):
         meet("flow", "network")
-        return to_centre(first, second)
+        return to_center(first, second)
 
     predict(network_segmenter(network, torch.device("cpu")), estimate)
     assert set(threads) == {1} and torch.get_num_threads() == 2
@@ -65,14 +65,14 @@ def test_flows_and_network_meet(two_threads) -> None:
 
 def test_the_result_is_that_of_one_after_the_other(two_threads) -> None:
     network = network_segmenter(halves, torch.device("cpu"))
-    labels, sample = predict(network, to_centre)
+    labels, sample = predict(network, to_center)
     seen = []
 
     def afterwards(frames, flows):
         seen.extend(flows)
         return network(frames, flows)
 
-    same, again = predict(afterwards, to_centre)
+    same, again = predict(afterwards, to_center)
     assert sorted(seen) == [(0, 1), (1, 0), (1, 2), (2, 1)]
     assert np.array_equal(labels, same) and np.array_equal(sample.motion, again.motion)
     assert np.array_equal(sample.probability, again.probability) and len(np.unique(labels)) == 2
@@ -84,6 +84,8 @@ def test_an_error_in_either_comes_out(two_threads, broken: str) -> None:
         raise ValueError(broken)
 
     with pytest.raises(ValueError, match=broken):
-        predict(network_segmenter(fail if broken == "network" else halves, torch.device("cpu")),
-                fail if broken == "flow" else to_centre)  # fmt: skip
+        predict(
+            network_segmenter(fail if broken == "network" else halves, torch.device("cpu")),
+            fail if broken == "flow" else to_center,
+        )
     assert torch.get_num_threads() == 2

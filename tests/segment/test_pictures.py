@@ -1,4 +1,4 @@
-"""Pictures and PLY files of parts: who hides whom, which colour means what, and files that other programs read."""
+"""Pictures and PLY files of parts: who hides whom, which color means what, and files that other programs read."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dpcli.draw.palette import PALETTE, UNKNOWN, part_colours
+from dpcli.draw.palette import PALETTE, UNKNOWN, part_colors
 from dpcli.draw.ply import write_ply, write_ply_frames
 from dpcli.draw.shaded_points import FINE, _ball, draw_balls, view_matrix
 from dpcli.errors import DataError, UsageError
@@ -35,17 +35,17 @@ def test_view_is_a_rotation_with_up_upwards() -> None:
             np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(view) == pytest.approx(1)
             right, down, away = view @ np.array(axis)
-            assert abs(right) < 1e-12 and down < 0 and away < 0  # seen from above, upright tips towards the viewer
+            assert abs(right) < 1e-12 and down < 0 and away < 0  # seen from above, upright tips toward the viewer
     np.testing.assert_allclose(view_matrix(np.pi / 2, 0, "z"), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
 
 
 def test_the_nearest_ball_wins_whatever_the_order() -> None:
-    """Against a loop over pixels: the colour of the nearest ball that covers it, as told by its strongest channel."""
+    """Against a loop over pixels: the color of the nearest ball that covers it, as told by its strongest channel."""
     rng = np.random.default_rng(1)
     points = np.concatenate([rng.uniform(-1, 1, (40, 2)), rng.permutation(40)[:, None]], 1)
-    colours = np.eye(3)[rng.integers(0, 3, 40)] * 255
+    colors = np.eye(3)[rng.integers(0, 3, 40)] * 255
     picture = [
-        draw_balls(points[o], colours[o], (60, 50), np.zeros(2), 22, WHITE) for o in (slice(None), slice(39, None, -1))
+        draw_balls(points[o], colors[o], (60, 50), np.zeros(2), 22, WHITE) for o in (slice(None), slice(39, None, -1))
     ]
     np.testing.assert_array_equal(*picture)
     drawn = picture[0].astype(int)
@@ -63,23 +63,23 @@ def test_the_nearest_ball_wins_whatever_the_order() -> None:
             if len(winners) == 1:  # no edge inside the pixel
                 checked += 1
                 (winner,) = winners
-                expected = (255,) * 3 if winner < 0 else colours[winner]
+                expected = (255,) * 3 if winner < 0 else colors[winner]
                 assert drawn[row, column].argmax() == np.argmax(expected)
                 assert (drawn[row, column] == 255).all() == (winner < 0)
     assert checked > 1500
 
 
 def test_the_far_fades_and_the_light_comes_from_above() -> None:
-    points, colours = np.array([[-1, 0, 0], [1, 0, 5.0]]), np.zeros((2, 3))
-    image = draw_balls(points, colours, (80, 40), np.zeros(2), 15, WHITE)
+    points, colors = np.array([[-1, 0, 0], [1, 0, 5.0]]), np.zeros((2, 3))
+    image = draw_balls(points, colors, (80, 40), np.zeros(2), 15, WHITE)
     assert image[:, :40].min() == 0 and image[:, 40:].min() > 50
     offsets, light = _ball(9.0)
     assert len(light) == pytest.approx(np.pi * 81, rel=0.05) and 0.5 <= light.min() < 0.6 < 0.95 < light.max() <= 1
     assert light[offsets[:, 1] < 0].mean() > light[offsets[:, 1] > 0].mean() + 0.1
-    assert (draw_balls(points[:0], colours[:0], (8, 6), np.zeros(2), 1, WHITE) == 255).all()
+    assert (draw_balls(points[:0], colors[:0], (8, 6), np.zeros(2), 1, WHITE) == 255).all()
 
 
-def test_colours_are_apart_also_for_the_colour_blind() -> None:
+def test_colors_are_apart_also_for_the_color_blind() -> None:
     """The first eight in the LMS space of Vienot et al. 1999: no two the same without red or without green cones."""
     to_lms = np.array([[17.8824, 43.5161, 4.11935], [3.45565, 27.1554, 3.86714], [0.0299566, 0.184309, 1.46709]])
     protan, deutan = np.eye(3), np.eye(3)
@@ -92,9 +92,9 @@ def test_colours_are_apart_also_for_the_colour_blind() -> None:
     assert len(np.unique(PALETTE, axis=0)) == len(PALETTE)
 
 
-def test_part_colours() -> None:
-    colours = part_colours(np.array([0, 3, -1, len(PALETTE)], np.int16))
-    np.testing.assert_array_equal(colours, [PALETTE[0], PALETTE[3], UNKNOWN, PALETTE[0]])
+def test_part_colors() -> None:
+    colors = part_colors(np.array([0, 3, -1, len(PALETTE)], np.int16))
+    np.testing.assert_array_equal(colors, [PALETTE[0], PALETTE[3], UNKNOWN, PALETTE[0]])
     assert tuple(PALETTE[0]) == (0, 114, 178)
 
 
@@ -107,14 +107,14 @@ def test_matched_ids_follow_the_truth() -> None:
     np.testing.assert_array_equal(matched_ids(np.array([4, 4, 1]), np.array([-1, -1, -1])) >= 0, True)
 
 
-def test_sheet_shows_parts_and_truth_in_the_same_colours(sequence: CloudSequence, tmp_path: Path) -> None:
+def test_sheet_shows_parts_and_truth_in_the_same_colors(sequence: CloudSequence, tmp_path: Path) -> None:
     swapped = replace(sequence, part=1 - sequence.part)
     look = Look(cell=100)
     parts_picture(tmp_path / "a.png", [swapped, sequence], truth=[sequence, None], frames=3, look=look)
     image = np.asarray(Image.open(tmp_path / "a.png"))
     rows = [image[8 + 122 * row + 22 : 8 + 122 * (row + 1), 8:-8] for row in range(3)]
     assert image.shape == (3 * 122 + 16, 3 * 100 + 16, 3)
-    np.testing.assert_array_equal(rows[0], rows[1])  # the prediction has other ids, but the truth's colours
+    np.testing.assert_array_equal(rows[0], rows[1])  # the prediction has other ids, but the truth's colors
     np.testing.assert_array_equal(rows[0], rows[2])
     parts_picture(tmp_path / "b.png", [swapped], frames=3, look=look)
     assert not np.array_equal(np.asarray(Image.open(tmp_path / "b.png"))[30:130, 8:-8], rows[0])
@@ -122,7 +122,7 @@ def test_sheet_shows_parts_and_truth_in_the_same_colours(sequence: CloudSequence
         assert (rows[0][:, 100 * column : 100 * (column + 1)] < 250).any()
 
 
-def test_one_part_has_its_colour(sequence: CloudSequence, tmp_path: Path) -> None:
+def test_one_part_has_its_color(sequence: CloudSequence, tmp_path: Path) -> None:
     for part in (0, 1, 5):
         one = replace(sequence, part=np.full_like(sequence.part, part))
         parts_picture(tmp_path / "a.png", [one], look=Look(elevation=0.0))
@@ -133,7 +133,7 @@ def test_one_part_has_its_colour(sequence: CloudSequence, tmp_path: Path) -> Non
 
 
 def color_left(mean: np.ndarray, color: np.ndarray) -> float:
-    """What of a mean colour is no mixture of the colour (in any light) and white."""
+    """What of a mean color is no mixture of the color (in any light) and white."""
     return float(np.linalg.lstsq(np.stack([color / 255, np.ones(3)], 1), mean, rcond=None)[1][0])
 
 
@@ -196,11 +196,11 @@ def test_ply_is_what_open3d_reads(sequence: CloudSequence, tmp_path: Path) -> No
         cloud = open3d.t.io.read_point_cloud(str(path)).point
         span = slice(*sequence.frame_offsets[t : t + 2])
         np.testing.assert_array_equal(cloud.positions.numpy(), sequence.points[span])
-        np.testing.assert_array_equal(cloud.colors.numpy(), part_colours(sequence.part[span]))
+        np.testing.assert_array_equal(cloud.colors.numpy(), part_colors(sequence.part[span]))
         np.testing.assert_array_equal(cloud["part"].numpy()[:, 0], sequence.part[span])
 
 
-def test_ply_keeps_given_colours_and_unknown_parts(tmp_path: Path) -> None:
+def test_ply_keeps_given_colors_and_unknown_parts(tmp_path: Path) -> None:
     points, colors = np.eye(3, dtype=np.float32), np.arange(9, dtype=np.uint8).reshape(3, 3)
     write_ply(tmp_path / "a.ply", points, colors, np.array([-1, 0, 300]))
     raw = (tmp_path / "a.ply").read_bytes()

@@ -38,8 +38,12 @@ def test_equal_scenes_give_equal_bytes_and_no_part_file_stays(tmp_path):
 
 def test_no_control_points_and_no_parts_are_allowed(tmp_path):
     scene = toy_scene(controls=0)
-    bare = replace(scene, part=np.full_like(scene.part, -1), part_probability=scene.part_probability[:, :0],
-                   part_motion=scene.part_motion[:, :0])  # fmt: skip
+    bare = replace(
+        scene,
+        part=np.full_like(scene.part, -1),
+        part_probability=scene.part_probability[:, :0],
+        part_motion=scene.part_motion[:, :0],
+    )
     write_scene(tmp_path / "bare.h5", bare)
     assert (read_scene(tmp_path / "bare.h5").num_parts, len(read_scene(tmp_path / "bare.h5").control_point)) == (0, 0)
 

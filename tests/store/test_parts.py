@@ -71,12 +71,15 @@ def test_any_ragged_file(tmp_path, sizes, num_parts, data):
         clouds = [rng.normal(size=(n, 3)) for n in frames]
         part = [rng.integers(-1, num_parts, n) for n in frames]
         motion = np.array([rigid(rng) for _ in range(len(pairs) * num_parts)], np.float32)
-        samples.append((
-            CloudSequence.from_frames(f"n{number}", clouds, part=part),
-            rng.dirichlet(np.ones(num_parts), sum(frames)).astype(np.float32), pairs,
-            motion.reshape(len(pairs), num_parts, 4, 4),
-            [rng.normal(size=(frames[i], 3)).astype(np.float32) for i, _ in pairs],
-        ))  # fmt: skip
+        samples.append(
+            (
+                CloudSequence.from_frames(f"n{number}", clouds, part=part),
+                rng.dirichlet(np.ones(num_parts), sum(frames)).astype(np.float32),
+                pairs,
+                motion.reshape(len(pairs), num_parts, 4, 4),
+                [rng.normal(size=(frames[i], 3)).astype(np.float32) for i, _ in pairs],
+            )
+        )
     assert_holds(write_parts(tmp_path / "ragged.h5", samples, num_parts, force=True), samples)
 
 

@@ -82,7 +82,9 @@ def test_bad_files_are_refused(tmp_path, name, value, message):
         ScoresReader(path)
 
 
-@pytest.mark.parametrize(("key", "value"), [("dpc_schema", "a"), ("dpc_schema", [1, 1]), ("dpc_kind", [1, 2]), ("dpc_kind", 3)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("dpc_schema", "a"), ("dpc_schema", [1, 1]), ("dpc_kind", [1, 2]), ("dpc_kind", 3)]
+)
 def test_bad_root_attributes_are_refused(tmp_path, key, value):
     path = write(tmp_path / "s.h5")
     with h5py.File(path, "r+") as file:

@@ -111,7 +111,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
     assert peaks[1] < 40e6 and peaks[1] < 1.2 * peaks[0]
 
 
-def test_a_scene_is_summarised_and_a_broken_one_is_named(tmp_path: Path) -> None:
+def test_a_scene_is_summarized_and_a_broken_one_is_named(tmp_path: Path) -> None:
     scene = toy_scene()
     write_scene(tmp_path / "scene.h5", scene)
     found = summary(tmp_path / "scene.h5")

@@ -19,10 +19,15 @@ from dpcli.store.summary import summary
 
 def make_header(views: int = 3, frames: int = 4, size: tuple[int, int] = (6, 5)) -> ViewsHeader:
     return ViewsHeader(
-        "toy", np.stack([pinhole(DEFAULT_FOVY, *size)] * views),
-        np.stack([orbit_pose(0.5 * view, 0.1 * view) for view in range(views)]), np.arange(frames) / 16.0,
-        ["train"] * (views - 2) + ["reference", "test"][: min(views, 2)], max(views - 2, 0), size, "m",
-    )  # fmt: skip
+        "toy",
+        np.stack([pinhole(DEFAULT_FOVY, *size)] * views),
+        np.stack([orbit_pose(0.5 * view, 0.1 * view) for view in range(views)]),
+        np.arange(frames) / 16.0,
+        ["train"] * (views - 2) + ["reference", "test"][: min(views, 2)],
+        max(views - 2, 0),
+        size,
+        "m",
+    )
 
 
 def picture(view: int, frame: int, size: tuple[int, int] = (6, 5)) -> np.ndarray:
@@ -45,9 +50,14 @@ def test_everything_comes_back(tmp_path_factory, views, frames, size, points):
     track = rng.normal(size=(frames, points, 3)).astype(np.float32) if points else None
     part = np.arange(-1, points - 1).astype(np.int16) if points else None
     path = write(
-        tmp_path_factory.mktemp("views") / "a.h5", header, track=track, part=part, seed=3, source="toy",
+        tmp_path_factory.mktemp("views") / "a.h5",
+        header,
+        track=track,
+        part=part,
+        seed=3,
+        source="toy",
         provenance={"command": "dpc x"},
-    )  # fmt: skip
+    )
     with ViewsReader(path) as reader:
         assert (reader.num_views, reader.num_frames) == (views, frames)
         for key in ("name", "role", "reference", "size", "length_unit"):
@@ -229,6 +239,6 @@ def test_info_tells_cameras_and_draws_every_view(tmp_path, dpc):
         assert (camera["radius"], camera["fovy"]) == (pytest.approx(2), pytest.approx(49.1))
     result = dpc("info", path, "--picture", tmp_path / "sheet.png")
     assert result.returncode == 0 and b"view 2" in result.stdout and b"40x30" in result.stdout
-    colours = {tuple(c) for c in np.array(Image.open(tmp_path / "sheet.png").convert("RGB")).reshape(-1, 3).tolist()}
-    assert {(255, 0, 0), (127, 127, 255), (255, 255, 255)} <= colours  # half-transparent blue lies on white
+    colors = {tuple(c) for c in np.array(Image.open(tmp_path / "sheet.png").convert("RGB")).reshape(-1, 3).tolist()}
+    assert {(255, 0, 0), (127, 127, 255), (255, 255, 255)} <= colors  # half-transparent blue lies on white
     assert dpc("info", path, "--picture", tmp_path / "s.png", "--view", "xyz").returncode == 2

@@ -38,7 +38,9 @@ def test_rows_are_where_it_says(tmp_path: Path, monkeypatch, disturbed: str, val
             given.append(part)
             places.append(chunks.append(part))
             if disturbed:
-                size = int(rng.integers(1, 4000)) if disturbed == "by any" else rows * 3 // 2  # float64: as long as a chunk
+                size = (
+                    int(rng.integers(1, 4000)) if disturbed == "by any" else rows * 3 // 2
+                )  # float64: as long as a chunk
                 file.create_dataset(f"other{number}", data=rng.normal(size=size))
                 file.flush()
         chunks.finish()

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-CUBE_OBJ = """mtllib nowhere.mtl
+CUBE_OBJ = (
+    """mtllib nowhere.mtl
 usemtl none
-""" + "".join(f"v {x} {y} {z}\n" for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)) + (
-    "f 1 2 4\nf 1 4 3\nf 5 7 8\nf 5 8 6\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n"
-)  # fmt: skip
+"""
+    + "".join(f"v {x} {y} {z}\n" for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5))
+    + ("f 1 2 4\nf 1 4 3\nf 5 7 8\nf 5 8 6\nf 1 5 6\nf 1 6 2\nf 3 4 8\nf 3 8 7\nf 1 3 7\nf 1 7 5\nf 2 6 8\nf 2 8 4\n")
+)
 
 
 def link(name: str, geometry: str = "", xyz: str = "0 0 0", kind: str = "visual") -> str:
@@ -20,9 +22,16 @@ def link(name: str, geometry: str = "", xyz: str = "0 0 0", kind: str = "visual"
 
 
 def joint(
-    name: str, parent: str, child: str, kind: str = "revolute", axis: str = "0 0 1", limits: str = "0 1.5",
-    xyz: str = "0 0 0", rpy: str = "0 0 0", more: str = "",
-) -> str:  # fmt: skip
+    name: str,
+    parent: str,
+    child: str,
+    kind: str = "revolute",
+    axis: str = "0 0 1",
+    limits: str = "0 1.5",
+    xyz: str = "0 0 0",
+    rpy: str = "0 0 0",
+    more: str = "",
+) -> str:
     """A joint; limits "" for none."""
     low, high = limits.split() if limits else ("", "")
     limit = f'<limit lower="{low}" upper="{high}"/>' if limits else ""

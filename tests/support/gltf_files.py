@@ -30,10 +30,15 @@ class GlbFile:
     def add(self, array: Any, dtype: str = "f4", **more: object) -> int:
         array = np.asarray(array, dtype)
         columns = int(np.prod(array.shape[1:]))
-        self.tree["accessors"].append({
-            "bufferView": self.view(array.tobytes()), "componentType": _COMPONENTS[dtype], "count": len(array),
-            "type": _TYPES[columns], **more,
-        })  # fmt: skip
+        self.tree["accessors"].append(
+            {
+                "bufferView": self.view(array.tobytes()),
+                "componentType": _COMPONENTS[dtype],
+                "count": len(array),
+                "type": _TYPES[columns],
+                **more,
+            }
+        )
         return len(self.tree["accessors"]) - 1
 
     def picture(self, pixels: np.ndarray, **material: object) -> None:
@@ -82,9 +87,11 @@ def arm(turn: float = np.pi / 2, smooth: bool = False) -> GlbFile:
     bind = np.tile(np.eye(4), (2, 1, 1))
     bind[1, :3, 3] = [-1, 0, 0]
     attributes = {
-        "POSITION": file.add(positions), "NORMAL": file.add(np.tile([0.0, 0, 1], (10, 1))),
-        "JOINTS_0": file.add(joints, "u1"), "WEIGHTS_0": file.add(weights),
-    }  # fmt: skip
+        "POSITION": file.add(positions),
+        "NORMAL": file.add(np.tile([0.0, 0, 1], (10, 1))),
+        "JOINTS_0": file.add(joints, "u1"),
+        "WEIGHTS_0": file.add(weights),
+    }
     file.tree |= {
         "nodes": [
             {"name": "rig", "children": [1, 3], "translation": [0, 5, 0]},
@@ -96,13 +103,13 @@ def arm(turn: float = np.pi / 2, smooth: bool = False) -> GlbFile:
         "skins": [{"joints": [1, 2], "inverseBindMatrices": file.add(bind.transpose(0, 2, 1).reshape(2, 16))}],
         "scenes": [{"nodes": [0]}],
         "scene": 0,
-    }  # fmt: skip
+    }
     file.animate(2, "rotation", [0, 1], [[0, 0, 0, 1], [0, 0, np.sin(turn / 2), np.cos(turn / 2)]])
     return file
 
 
 def quad(shift: float = 0.0) -> GlbFile:
-    """A square from -1 to 1 that faces +z, coloured by material or vertices as the test adds; it slides by `shift` in x."""
+    """A square from -1 to 1 that faces +z, colored by material or vertices as the test adds; it slides by `shift` in x."""
     file = GlbFile()
     attributes = {
         "POSITION": file.add([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),
@@ -110,9 +117,10 @@ def quad(shift: float = 0.0) -> GlbFile:
     }
     indices = file.add([0, 1, 2, 0, 2, 3], "u4")
     file.tree |= {
-        "nodes": [{"name": "square", "mesh": 0}], "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "square", "mesh": 0}],
+        "scenes": [{"nodes": [0]}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [{"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}],
-    }  # fmt: skip
+    }
     file.animate(0, "translation", [0, 1], [[0, 0, 0], [shift, 0, 0]])
     return file

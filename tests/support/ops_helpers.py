@@ -58,7 +58,7 @@ def brute_fps(points: np.ndarray, num_samples: int, start: int = 0) -> list[int]
 def brute_ball_query(
     points: np.ndarray, times: np.ndarray, centroid: np.ndarray, time: int, radii: list[float], k: int, order: str
 ) -> tuple[list[int], int]:
-    """One centroid's neighbours by the definition."""
+    """One centroid's neighbors by the definition."""
     squared = distances(centroid, points)
     hits = []
     for j in range(len(points)):

@@ -27,8 +27,16 @@ def rigid(rng: np.random.Generator, scale: float = 0.3, angle: float | None = No
     return motion
 
 
-def truth_sequence(name: str, seed: int = 0, parts: int = 3, frames: int = 3, label: int = 0, split: str = "test",
-                   pad: int = 3, points: int = 40) -> CloudSequence:  # fmt: skip
+def truth_sequence(
+    name: str,
+    seed: int = 0,
+    parts: int = 3,
+    frames: int = 3,
+    label: int = 0,
+    split: str = "test",
+    pad: int = 3,
+    points: int = 40,
+) -> CloudSequence:
     """Independent points of each part in each frame, moved by the part's pose; poses padded with identities."""
     rng = np.random.default_rng(seed)
     pose = np.tile(np.eye(4), (frames, pad, 1, 1))

@@ -145,7 +145,9 @@ def _to(func, args, kwargs):
     like = kwargs.pop("other", None)
     if rest and isinstance(rest[0], Tensor):
         like = rest.pop(0)
-    device, dtype = (kwargs.pop("device", None), kwargs.pop("dtype", None)) if like is None else (like.device, like.dtype)
+    device, dtype = (
+        (kwargs.pop("device", None), kwargs.pop("dtype", None)) if like is None else (like.device, like.dtype)
+    )
     if rest and not isinstance(rest[0], torch.dtype):
         device = rest.pop(0)
     if rest:
@@ -190,8 +192,9 @@ _OWN_WAY = {
     functional.one_hot: _one_hot,
     functional.embedding_bag: _embedding_bag,
     # asked by nn.Module.to: whether a parameter may keep its shell and get other data
-    torch._has_compatible_shallow_copy_type: lambda func, args, kwargs: isinstance(args[0], Resident)
-    == isinstance(args[1], Resident),
+    torch._has_compatible_shallow_copy_type: lambda func, args, kwargs: (
+        isinstance(args[0], Resident) == isinstance(args[1], Resident)
+    ),
 }
 _TOLD = {
     "is_available": lambda: True,

@@ -34,16 +34,28 @@ def toy_scene(
     sh[:, 1:] = 0.05 * rng.normal(size=sh[:, 1:].shape)
     chosen = np.linspace(0, count - 1, controls).astype(int)
     single = {
-        "mean": mean, "log_scale": np.log(np.tile([0.05, 0.03, 0.03], (count, 1))),
-        "quaternion": np.tile([1.0, 0, 0, 0], (count, 1)), "opacity_logit": np.full(count, 2.2), "sh": sh,
-        "frame_mean": moved, "frame_quaternion": turned, "part_probability": np.eye(2)[part] * 0.9 + 0.05,
-        "part_motion": motion, "rigid_weight": np.linspace(0, 1, frames * count).reshape(frames, count),
-        "control_point": mean[chosen], "control_radius": np.full(controls, 0.1),
-        "control_position": moved[:, chosen], "control_quaternion": turned[:, chosen],
-    }  # fmt: skip
+        "mean": mean,
+        "log_scale": np.log(np.tile([0.05, 0.03, 0.03], (count, 1))),
+        "quaternion": np.tile([1.0, 0, 0, 0], (count, 1)),
+        "opacity_logit": np.full(count, 2.2),
+        "sh": sh,
+        "frame_mean": moved,
+        "frame_quaternion": turned,
+        "part_probability": np.eye(2)[part] * 0.9 + 0.05,
+        "part_motion": motion,
+        "rigid_weight": np.linspace(0, 1, frames * count).reshape(frames, count),
+        "control_point": mean[chosen],
+        "control_radius": np.full(controls, 0.1),
+        "control_position": moved[:, chosen],
+        "control_quaternion": turned[:, chosen],
+    }
     return GaussianScene(
-        **{key: np.float32(value) for key, value in single.items()}, part=part.astype(np.int16),
-        time=np.linspace(0, 1, frames), camera_intrinsics=np.tile(pinhole(DEFAULT_FOVY, size, size), (2, 1, 1)),
-        camera_world_to_camera=np.stack([orbit_pose(0.0, 0.0), orbit_pose(0.8, 0.2)]), size=(size, size), reference=0,
+        **{key: np.float32(value) for key, value in single.items()},
+        part=part.astype(np.int16),
+        time=np.linspace(0, 1, frames),
+        camera_intrinsics=np.tile(pinhole(DEFAULT_FOVY, size, size), (2, 1, 1)),
+        camera_world_to_camera=np.stack([orbit_pose(0.0, 0.0), orbit_pose(0.8, 0.2)]),
+        size=(size, size),
+        reference=0,
         metrics={"psnr": 31.5},
-    )  # fmt: skip
+    )

@@ -1,4 +1,4 @@
-"""What the tests and the bench of the rasteriser share: scenes, cameras, written-out compositing, the checker."""
+"""What the tests and the bench of the rasterizer share: scenes, cameras, written-out compositing, the checker."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def scene(count: int, kind: str = "mixed", channels: int = 3, seed: int = 0, sca
 def render(
     function: Callable, tensors: list[Tensor], views: tuple[Tensor, Tensor], size: tuple[int, int], dtype, **options
 ):
-    """Colours, alphas and {name: gradient} of a fixed random loss, inputs cast to `dtype`."""
+    """Colors, alphas and {name: gradient} of a fixed random loss, inputs cast to `dtype`."""
     leaves = [t.to(dtype, copy=True).requires_grad_() for t in tensors]
     colors, alphas, notes = function(*leaves, *(v.to(dtype) for v in views), *size, **options)
     generator = torch.Generator().manual_seed(9)
@@ -89,7 +89,7 @@ def assert_renders(function: Callable, tensors: list[Tensor], views, size: tuple
 def brute_force(
     tensors: list[Tensor], view: Tensor, K: Tensor, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (H,W,D) and alphas (H,W) by the definition, one pixel and one Gaussian at a time, nothing shared with ours.
+    """Colors (H,W,D) and alphas (H,W) by the definition, one pixel and one Gaussian at a time, nothing shared with ours.
 
     The projection's Jacobian is a finite difference of the projection; only for Gaussians inside the picture.
     """
@@ -118,8 +118,8 @@ def brute_force(
     for row in range(height):
         for column in range(width):
             light = 1.0
-            for _, n, centre, inverse in splats:
-                d = np.array([column + 0.5, row + 0.5]) - centre
+            for _, n, center, inverse in splats:
+                d = np.array([column + 0.5, row + 0.5]) - center
                 alpha = min(0.999, opacities[n] * math.exp(-0.5 * d @ inverse @ d))
                 if alpha < 1 / 255:
                     continue

@@ -1,4 +1,4 @@
-"""A backbone of one stage: the nearest neighbours of every point, one layer shared by all of them, two poolings."""
+"""A backbone of one stage: the nearest neighbors of every point, one layer shared by all of them, two poolings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dpcli.ops import knn
 
 
 class TinyBackbone(Backbone):
-    """max over the clip of max over the neighbours j of relu(W (x_j - x_i)), then a linear layer."""
+    """max over the clip of max over the neighbors j of relu(W (x_j - x_i)), then a linear layer."""
 
     def __init__(self, config: KinetConfig) -> None:
         super().__init__()
@@ -20,7 +20,7 @@ class TinyBackbone(Backbone):
         self.shared, self.classify = nn.Linear(3, 32), nn.Linear(32, config.num_classes)
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        """All points of all frames are centroids; their neighbours may lie in any frame."""
+        """All points of all frames are centroids; their neighbors may lie in any frame."""
         idx = knn(points, points, self.neighbors)[1]
         return [Grouping(points, times, centers=points, center_times=times, idx=idx)]
 

@@ -15,10 +15,10 @@ from dpcli.classify.data.videos import check_classes, report_short, select_video
 from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet, plane_picture, view_axes
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud, Question, activation_cloud
 from dpcli.classify.explain.tsne import (
-    NEIGHBOURS,
+    NEIGHBORS,
     chosen_perplexity,
     joined,
-    neighbour_accuracy,
+    neighbor_accuracy,
     plane,
     silhouette,
     video_features,
@@ -37,10 +37,25 @@ from dpcli.store.pipes import FIGURES, PICTURES, check_target
 
 
 def run_pac(
-    data: str, model_name: str, output: str, *, picture: Path | None, animation: Path | None, samples: str, split: str,
-    stream: str | None, rule: str, target: str | None, stage: int | None, frames: int, view: str | None, seed: int, device: str,
-    force: bool, backbone: str | None = None,
-) -> None:  # fmt: skip
+    data: str,
+    model_name: str,
+    output: str,
+    *,
+    picture: Path | None,
+    animation: Path | None,
+    samples: str,
+    split: str,
+    stream: str | None,
+    rule: str,
+    target: str | None,
+    stage: int | None,
+    frames: int,
+    view: str | None,
+    seed: int,
+    device: str,
+    force: bool,
+    backbone: str | None = None,
+) -> None:
     """`dpc classify explain pac`."""
     if target is not None and rule == "activation":
         raise UsageError("--class: the rule activation (thesis A.1.4) knows no class; add --rule gradient")
@@ -56,8 +71,16 @@ def run_pac(
         sequences = chosen_samples(reader, samples, _pool(reader, samples, split, info, model_name))
         source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=seed)
         report_short(source, info.config.num_frames)
-        config = {"streams": list(streams), "rule": rule, "class": target, "stage": stage, "samples": samples, "split": split,
-                  "weights": provenance.file_digest(find_model(model_name)), "model": info.notes}  # fmt: skip
+        config = {
+            "streams": list(streams),
+            "rule": rule,
+            "class": target,
+            "stage": stage,
+            "samples": samples,
+            "split": split,
+            "weights": provenance.file_digest(find_model(model_name)),
+            "model": info.notes,
+        }
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
         clouds, clips = [], source.clips(1)
         model.to(chosen)
@@ -66,15 +89,26 @@ def run_pac(
                 clouds.append(activation_cloud(model, source, clip, streams, question, chosen))
                 bar.advance(1)
                 stop.check("nothing was kept", again="to start over")
-        write_clouds(place, clouds, class_names=info.class_names, length_unit=reader.length_unit, seed=seed, rule=rule,
-                     source=_source(data), provenance=history, force=force)  # fmt: skip
+        write_clouds(
+            place,
+            clouds,
+            class_names=info.class_names,
+            length_unit=reader.length_unit,
+            seed=seed,
+            rule=rule,
+            source=_source(data),
+            provenance=history,
+            force=force,
+        )
         if picture:
             activation_sheet(picture, clouds, info.class_names, axes, frames)
         if animation:
             activation_animation(animation, clouds, info.class_names, axes)
     if output != "-":
-        print(f"{output}: activations of {sum(len(c.sequence.points) for c in clouds):,} points in {len(clouds)} clips of "
-              f"{info.config.num_frames} frames")  # fmt: skip
+        print(
+            f"{output}: activations of {sum(len(c.sequence.points) for c in clouds):,} points in {len(clouds)} clips of "
+            f"{info.config.num_frames} frames"
+        )
 
 
 def _target(wanted: str | None, class_names: list[str]) -> str | int:
@@ -150,10 +184,22 @@ def write_clouds(path: Path, clouds: Sequence[ActivationCloud], *, rule: str, **
 
 
 def run_tsne(
-    data: str, model_name: str, output: str, *, picture: Path | None, stream: str | None, split: str, perplexity: float | None,
-    clips_per_video: int | None, batch: int, seed: int, device: str, force: bool, json_output: bool,
+    data: str,
+    model_name: str,
+    output: str,
+    *,
+    picture: Path | None,
+    stream: str | None,
+    split: str,
+    perplexity: float | None,
+    clips_per_video: int | None,
+    batch: int,
+    seed: int,
+    device: str,
+    force: bool,
+    json_output: bool,
     backbone: str | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """`dpc classify explain tsne`."""
     _check_targets(output, force, (picture, "--picture", FIGURES))
     chosen = choose_device(device)
@@ -174,11 +220,27 @@ def run_tsne(
         labels = reader.labels[kept]
         _remark(labels)
         said = {s: _embedding(features[s], labels, width, seed) for s in streams}
-        config = {"streams": list(streams), "split": split, "perplexity": width, "clips_per_video": clips_per_video,
-                  "weights": provenance.file_digest(find_model(model_name)), "model": info.notes}  # fmt: skip
+        config = {
+            "streams": list(streams),
+            "split": split,
+            "perplexity": width,
+            "clips_per_video": clips_per_video,
+            "weights": provenance.file_digest(find_model(model_name)),
+            "model": info.notes,
+        }
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
-        write_embedding(place, [reader.names[i] for i in kept], labels, [reader.splits[i] for i in kept], said,
-                        class_names=info.class_names, source=_source(data), seed=seed, provenance=history, force=force)  # fmt: skip
+        write_embedding(
+            place,
+            [reader.names[i] for i in kept],
+            labels,
+            [reader.splits[i] for i in kept],
+            said,
+            class_names=info.class_names,
+            source=_source(data),
+            seed=seed,
+            provenance=history,
+            force=force,
+        )
         if picture:
             captions = {s: _caption(said[s]) for s in streams}
             coordinates = {s: said[s].coordinates for s in streams}
@@ -193,7 +255,7 @@ def run_tsne(
 
 
 def _embedding(features: np.ndarray, labels: np.ndarray, perplexity: float, seed: int) -> StreamEmbedding:
-    figures = {"neighbour_accuracy": neighbour_accuracy(features, labels), "silhouette": silhouette(features, labels)}
+    figures = {"neighbor_accuracy": neighbor_accuracy(features, labels), "silhouette": silhouette(features, labels)}
     values = {"perplexity": perplexity, **{key: value for key, value in figures.items() if value is not None}}
     return StreamEmbedding(features, plane(features, perplexity, seed), values)
 
@@ -202,26 +264,32 @@ def _remark(labels: np.ndarray) -> None:
     """What the figures can't say, and why."""
     unknown, classes = int((labels < 0).sum()), len(np.unique(labels[labels >= 0]))
     if unknown:
-        log.info(f"{unknown} of {len(labels)} videos have no label: grey in the picture, left out of the figures")
+        log.info(f"{unknown} of {len(labels)} videos have no label: gray in the picture, left out of the figures")
     if classes < 2:
         log.info(
-            f"{'one class' if classes else 'no labels'}: no neighbours' accuracy and no silhouette, which compare classes"
+            f"{'one class' if classes else 'no labels'}: no neighbors' accuracy and no silhouette, which compare classes"
         )
 
 
 def _caption(said: StreamEmbedding) -> str:
-    accuracy, value = said.values.get("neighbour_accuracy"), said.values.get("silhouette")
-    first = f"{NEIGHBOURS} nearest neighbours {'-' if accuracy is None else f'{100 * accuracy:.1f} %'}"
+    accuracy, value = said.values.get("neighbor_accuracy"), said.values.get("silhouette")
+    first = f"{NEIGHBORS} nearest neighbors {'-' if accuracy is None else f'{100 * accuracy:.1f} %'}"
     return f"{first}, silhouette {'-' if value is None else f'{value:.3f}'}"
 
 
 def _report(said: dict[str, StreamEmbedding], labels: np.ndarray, perplexity: float) -> dict[str, Any]:
     metrics = {
-        f"{s}_{key}": one.values.get(key) for s, one in said.items() for key in ("neighbour_accuracy", "silhouette")
+        f"{s}_{key}": one.values.get(key) for s, one in said.items() for key in ("neighbor_accuracy", "silhouette")
     }
     units = {key: "-1..1" if key.endswith("silhouette") else "fraction" for key in metrics}
-    return {"metrics": metrics, "units": units, "videos": len(labels), "labelled": int((labels >= 0).sum()),
-            "neighbours": NEIGHBOURS, "perplexity": perplexity}  # fmt: skip
+    return {
+        "metrics": metrics,
+        "units": units,
+        "videos": len(labels),
+        "labeled": int((labels >= 0).sum()),
+        "neighbors": NEIGHBORS,
+        "perplexity": perplexity,
+    }
 
 
 def _streams(text: str | None, info: ModelInfo) -> tuple[str, ...]:

@@ -21,20 +21,25 @@ from dpcli.store.pipes import refuse_repeats
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
 MEANS = ("arithmetic", "geometric")
-_STEPS = 10_000  # of expectation-maximisation; some hundred are usual
+_STEPS = 10_000  # of expectation-maximization; some hundred are usual
 _POWER = 100.0  # scores are taken to no higher power: where every model is right, none would be high enough
 _OFF = 1e-2  # how far from 1 the sum of a sample's probabilities may be: 16-bit numbers of another program
 _LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
 
 
 def run_fusion(
-    inputs: Sequence[str], output: str, *, weights: str | None, force: bool, weights_from: str | None = None,
+    inputs: Sequence[str],
+    output: str,
+    *,
+    weights: str | None,
+    force: bool,
+    weights_from: str | None = None,
     mean: str = "arithmetic",
-) -> None:  # fmt: skip
+) -> None:
     """Scores files of the same videos, in any order, become one whose `streams` are its inputs; of one file, its streams
     get another mean.
 
-    weights: `parse_weights`; weights_from: scores files with commas between, as many as inputs and of other, labelled
+    weights: `parse_weights`; weights_from: scores files with commas between, as many as inputs and of other, labeled
     videos, on which `likelihood_weights` chooses; mean: `pooled`.
     """
     if mean not in MEANS:
@@ -43,7 +48,9 @@ def run_fusion(
         raise UsageError("--weights says them and --weights-from chooses them; give one of the two")
     judges = weights_from.split(",") if weights_from is not None else []
     if weights_from is not None and len(judges) != len(inputs):
-        raise UsageError(f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order")
+        raise UsageError(
+            f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order"
+        )
     if list(inputs).count("-") > 1:
         raise UsageError("-: stdin is one file; name the others")
     refuse_repeats([*inputs, output])
@@ -61,14 +68,25 @@ def run_fusion(
             held = [ScoresReader(name) for name in judges]
             _tell_other_models(held, judges, readers, called)
             shares = _chosen_weights(held, judges, streams, sources[0], mean)
-        config = {"fuse": streams, "mean": mean, "weights": shares.tolist(), "sources": [reader.provenance for reader in readers]}
+        config = {
+            "fuse": streams,
+            "mean": mean,
+            "weights": shares.tolist(),
+            "sources": [reader.provenance for reader in readers],
+        }
         if judges:
             config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
         entry = provenance.record(config, 0, dict(zip(stream_names(short_names(called)), paths)))
         if not force and _already_there(target, entry):
             return
-        with ScoresWriter(target, class_names=sources[0].class_names, source=", ".join(Path(name).name for name in called),
-                          provenance=entry, streams=streams, force=force) as writer:  # fmt: skip
+        with ScoresWriter(
+            target,
+            class_names=sources[0].class_names,
+            source=", ".join(Path(name).name for name in called),
+            provenance=entry,
+            streams=streams,
+            force=force,
+        ) as writer:
             _write(writer, sources, rows, streams, shares, mean)
     if output != "-":
         said = "" if np.ptp(shares) == 0 else f", weights {', '.join(f'{n} {w:.3g}' for n, w in zip(streams, shares))}"
@@ -84,8 +102,10 @@ def _streams(
         for stream, scores in (("scores", reader.scores), *reader.streams.items()):
             bad = np.flatnonzero((scores < 0).any(1) | (np.abs(scores.sum(1, dtype=np.float64) - 1) > _OFF))
             if len(bad):
-                raise DataError(f"{name}: {stream} of {reader.names[bad[0]]!r} are no probabilities ({len(bad)} such samples); "
-                                "expected numbers from 0 up whose sum is 1, as softmax makes of logits")  # fmt: skip
+                raise DataError(
+                    f"{name}: {stream} of {reader.names[bad[0]]!r} are no probabilities ({len(bad)} such samples); "
+                    "expected numbers from 0 up whose sum is 1, as softmax makes of logits"
+                )
     if len(readers) > 1:
         return stream_names(short_names(called)), list(readers), matching_rows(readers, called)
     if len(readers[0].streams) < 2:
@@ -130,7 +150,7 @@ def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -
 def pooled(scores: np.ndarray, weights: np.ndarray, mean: str) -> np.ndarray:
     """Mean f64 (S,C) of what K models say, scores (K,S,C), by weights (K) of sum 1; the models' order makes no difference.
 
-    geometric: the product of the scores to the power of their weights, normalised to sum 1: softmax of the mean of logits. A
+    geometric: the product of the scores to the power of their weights, normalized to sum 1: softmax of the mean of logits. A
     class needs every model's consent, where arithmetic lets the surest one decide.
     """
     if mean == "arithmetic":
@@ -167,10 +187,10 @@ def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
-    """Weights f64 (K), sum 1, of the arithmetic mean that gives labelled samples the greatest likelihood.
+    """Weights f64 (K), sum 1, of the arithmetic mean that gives labeled samples the greatest likelihood.
 
     probabilities: (K,S), what each of K models gives the true class of each sample. The logarithm of the likelihood, sum_s log
-    sum_k w_k p_ks, is concave in w, so expectation-maximisation from equal weights ends at its maximum.
+    sum_k w_k p_ks, is concave in w, so expectation-maximization from equal weights ends at its maximum.
     """
     found = np.clip(np.asarray(probabilities, np.float64), _LEAST, None)
     weights = np.full(len(found), 1 / len(found))
@@ -190,7 +210,9 @@ def _tell_other_models(
     for theirs, judge, reader, name in zip(held, judges, readers, called):
         one, other = _model_digest(theirs), _model_digest(reader)
         if one and other and one != other:
-            log.warn(f"{judge}: scores of another model than {name}'s; its weights are right only for a model like that one")
+            log.warn(
+                f"{judge}: scores of another model than {name}'s; its weights are right only for a model like that one"
+            )
 
 
 def _model_digest(reader: ScoresReader) -> str | None:
@@ -202,19 +224,21 @@ def _model_digest(reader: ScoresReader) -> str | None:
 def _chosen_weights(
     held: Sequence[ScoresReader], judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str
 ) -> np.ndarray:
-    """Weights chosen on labelled videos that are not among the fused ones. DataError when they don't fit."""
+    """Weights chosen on labeled videos that are not among the fused ones. DataError when they don't fit."""
     names, sources, rows = _streams(held, judges)
     if len(judges) == 1 and names != list(streams):
         raise DataError(f"{judges[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
     _same_classes(fused.class_names, sources[0].class_names, "what is fused", judges[0])
     both = sorted(set(fused.names) & set(sources[0].names))
     if both:
-        raise DataError(f"{judges[0]}: {both[0]!r} is among the fused videos, too ({len(both)} such videos); weights are chosen "
-                        "on other videos, such as those held out of training (predict --split validation)")  # fmt: skip
+        raise DataError(
+            f"{judges[0]}: {both[0]!r} is among the fused videos, too ({len(both)} such videos); weights are chosen "
+            "on other videos, such as those held out of training (predict --split validation)"
+        )
     labels = _labels(sources, rows)
     known = np.flatnonzero(labels >= 0)
     if not len(known):
-        raise DataError(f"{judges[0]}: no video has a label; weights are chosen on labelled videos")
+        raise DataError(f"{judges[0]}: no video has a label; weights are chosen on labeled videos")
     scores = np.stack([source.scores[at][known] for source, at in zip(sources, rows)])
     if mean == "geometric":
         return geometric_weights(scores, labels[known])
@@ -264,8 +288,10 @@ def _same_videos(one: list[str], two: list[str], first: str, other: str) -> None
         there = set(others)
         missing = [name for name in names if name not in there]
         if missing:
-            raise DataError(f"{lacker}: no scores of {missing[0]!r}, which {holder} has ({len(missing)} such videos); "
-                            "predict the same videos with each model")  # fmt: skip
+            raise DataError(
+                f"{lacker}: no scores of {missing[0]!r}, which {holder} has ({len(missing)} such videos); "
+                "predict the same videos with each model"
+            )
 
 
 def _same_truth(
@@ -275,13 +301,17 @@ def _same_truth(
     differ = np.flatnonzero((mine != theirs) & (mine >= 0) & (theirs >= 0))
     if len(differ):
         at = differ[0]
-        raise DataError(f"{other}: label {theirs[at]} of {one.names[rows[at]]!r}, in {first} it is {mine[at]} "
-                        f"({len(differ)} such videos); these are scores of different data")  # fmt: skip
+        raise DataError(
+            f"{other}: label {theirs[at]} of {one.names[rows[at]]!r}, in {first} it is {mine[at]} "
+            f"({len(differ)} such videos); these are scores of different data"
+        )
     for row, match in zip(rows, others):
         a, b = one.splits[row], two.splits[match]
         if a and b and a != b:
-            raise DataError(f"{other}: {one.names[row]!r} is of split {b!r}, in {first} of {a!r}; "
-                            "these are scores of different data")  # fmt: skip
+            raise DataError(
+                f"{other}: {one.names[row]!r} is of split {b!r}, in {first} of {a!r}; "
+                "these are scores of different data"
+            )
 
 
 def _already_there(target: Path, entry: dict) -> bool:
@@ -293,9 +323,13 @@ def _already_there(target: Path, entry: dict) -> bool:
 
 
 def _write(
-    writer: ScoresWriter, sources: Sequence[ScoresReader], rows: Sequence[np.ndarray], streams: Sequence[str],
-    shares: np.ndarray, mean: str,
-) -> None:  # fmt: skip
+    writer: ScoresWriter,
+    sources: Sequence[ScoresReader],
+    rows: Sequence[np.ndarray],
+    streams: Sequence[str],
+    shares: np.ndarray,
+    mean: str,
+) -> None:
     """In the first file's order; unknown labels and splits are taken from the files that know them."""
     own = np.stack([source.scores[at] for source, at in zip(sources, rows)])  # (files, S, C)
     main = pooled(own, shares, mean)

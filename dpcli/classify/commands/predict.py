@@ -25,9 +25,19 @@ from dpcli.store.journal import sweep
 
 
 def run_prediction(
-    data: str, model_name: str, output: str, *, split: str, clips_per_video: int | None, drop_short: bool, batch: int, seed: int,
-    device: str, force: bool, backbone: str | None = None,
-) -> None:  # fmt: skip
+    data: str,
+    model_name: str,
+    output: str,
+    *,
+    split: str,
+    clips_per_video: int | None,
+    drop_short: bool,
+    batch: int,
+    seed: int,
+    device: str,
+    force: bool,
+    backbone: str | None = None,
+) -> None:
     """`dpc classify predict`."""
     chosen = choose_device(device)
     model, info = load_model(model_name, backbone)
@@ -38,17 +48,39 @@ def run_prediction(
         sequences = select_videos(reader, split, info, model_name)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=seed)
         report_short(source, info.config.num_frames)
-        config = {"split": split, "clips_per_video": clips_per_video, "drop_short": drop_short, "dropped": source.dropped,
-                  "model": info.notes, "weights": provenance.file_digest(find_model(model_name)), "fusion": info.config.fusion}  # fmt: skip
+        config = {
+            "split": split,
+            "clips_per_video": clips_per_video,
+            "drop_short": drop_short,
+            "dropped": source.dropped,
+            "model": info.notes,
+            "weights": provenance.file_digest(find_model(model_name)),
+            "fusion": info.config.fusion,
+        }
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
         if not force and _already_scored(target, history[-1]):
             return
         keep_freed_memory()
-        with ScoresWriter(target, class_names=info.class_names, seed=seed, source=reader.path.name if data != "-" else "stdin",
-                          provenance=history, streams=streams, force=force, resume=output != "-") as writer:  # fmt: skip
+        with ScoresWriter(
+            target,
+            class_names=info.class_names,
+            seed=seed,
+            source=reader.path.name if data != "-" else "stdin",
+            provenance=history,
+            streams=streams,
+            force=force,
+            resume=output != "-",
+        ) as writer:
             try:
                 _score(
-                    model.to(chosen), source, writer, streams, clips_per_video, batch, chosen, split if split == "validation" else None
+                    model.to(chosen),
+                    source,
+                    writer,
+                    streams,
+                    clips_per_video,
+                    batch,
+                    chosen,
+                    split if split == "validation" else None,
                 )
             except Exception as error:
                 writer.keep = not isinstance(error, DataError)  # too little memory says nothing about what was scored
@@ -76,9 +108,15 @@ def _already_scored(target: Path, entry: dict) -> bool:
 
 
 def _score(
-    model: Kinet, source: ClipSource, writer: ScoresWriter, streams: tuple[str, ...], count: int | None, batch: int,
-    device: torch.device, split: str | None,
-) -> None:  # fmt: skip
+    model: Kinet,
+    source: ClipSource,
+    writer: ScoresWriter,
+    streams: tuple[str, ...],
+    count: int | None,
+    batch: int,
+    device: torch.device,
+    split: str | None,
+) -> None:
     """split: what to call the videos' split; None: as their file does."""
     reader, before = source.reader, set(writer.written_names)
     done = {i for i in source.sequences if reader.names[i] in before}
@@ -89,7 +127,11 @@ def _score(
         for video in predict_videos(model, source, count, batch, device, streams, done):
             i = video.sequence
             writer.write(
-                reader.names[i], video.fused, label=int(reader.labels[i]), split=split or reader.splits[i], streams=video.streams
+                reader.names[i],
+                video.fused,
+                label=int(reader.labels[i]),
+                split=split or reader.splits[i],
+                streams=video.streams,
             )
             bar.advance(1, clips=video.clips)
             if writer.resume:
@@ -99,9 +141,18 @@ def _score(
 
 
 def run_profile(
-    model_name: str | None, *, preset: str, variant: str | None, classes: int, frames: int | None, points: int | None, steps: bool,
-    device: str, json_output: bool, backbone: str | None = None,
-) -> None:  # fmt: skip
+    model_name: str | None,
+    *,
+    preset: str,
+    variant: str | None,
+    classes: int,
+    frames: int | None,
+    points: int | None,
+    steps: bool,
+    device: str,
+    json_output: bool,
+    backbone: str | None = None,
+) -> None:
     """`dpc classify profile`."""
     from dpcli.classify import cost as profile
 

@@ -41,26 +41,44 @@ class Lines:
         self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
         latency = round(1000 * seconds, 1)
         if self.as_json:
-            row = {"frame": made.frame, **self._tops(made.scores), "mean": self._top(made.mean[0]), "clips": made.clips,
-                   "latency_ms": latency, "waiting": waiting}  # fmt: skip
+            row = {
+                "frame": made.frame,
+                **self._tops(made.scores),
+                "mean": self._top(made.mean[0]),
+                "clips": made.clips,
+                "latency_ms": latency,
+                "waiting": waiting,
+            }
             print(json.dumps(row), flush=True)
             return
         behind = f", {waiting} frames waiting" if waiting else ""
-        print(f"frame {made.frame}: {self._text(made.scores)}; so far {self._name(made.mean[0])}; "
-              f"{latency:.0f} ms{behind}", flush=True)  # fmt: skip
+        print(
+            f"frame {made.frame}: {self._text(made.scores)}; so far {self._name(made.mean[0])}; "
+            f"{latency:.0f} ms{behind}",
+            flush=True,
+        )
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
         """The mean over all clips, (1+S,C), and how it ended."""
         average, highest = 1000 * self.seconds / max(self.count, 1), 1000 * self.highest
         if self.as_json:
             scores = {name: round(float(value), 6) for name, value in zip(self.class_names, mean[0])}
-            row = {"end": end, "frames": frames, "clips": clips, **self._tops(mean), "scores": scores,
-                   "latency_ms": {"mean": round(average, 1), "highest": round(highest, 1)}}  # fmt: skip
+            row = {
+                "end": end,
+                "frames": frames,
+                "clips": clips,
+                **self._tops(mean),
+                "scores": scores,
+                "latency_ms": {"mean": round(average, 1), "highest": round(highest, 1)},
+            }
             print(json.dumps(row), flush=True)
             return
         plural = "" if clips == 1 else "s"
-        print(f"{end}: {frames} frames, {clips} clip{plural}: {self._text(mean)}; "
-              f"latency {average:.0f} ms on average, at most {highest:.0f}", flush=True)  # fmt: skip
+        print(
+            f"{end}: {frames} frames, {clips} clip{plural}: {self._text(mean)}; "
+            f"latency {average:.0f} ms on average, at most {highest:.0f}",
+            flush=True,
+        )
 
     def _top(self, scores: np.ndarray) -> dict:
         best = int(scores.argmax())
@@ -78,9 +96,20 @@ class Lines:
 
 
 def run_stream(
-    data: str, model_name: str, output: str | None, *, hop: int, window: int | None, follow: float, seed: int, device: str,
-    force: bool, json_output: bool, files: CloudFiles, backbone: str | None = None,
-) -> None:  # fmt: skip
+    data: str,
+    model_name: str,
+    output: str | None,
+    *,
+    hop: int,
+    window: int | None,
+    follow: float,
+    seed: int,
+    device: str,
+    force: bool,
+    json_output: bool,
+    files: CloudFiles,
+    backbone: str | None = None,
+) -> None:
     """Predict until the stream ends, a frame is bad or a signal comes; what was predicted is kept and summed up each time."""
     model, info = load_model(model_name, backbone)
     predictor = StreamPredictor(model, info, window=window, hop=hop, seed=seed, device=choose_device(device))
@@ -97,9 +126,15 @@ def run_stream(
         if not predictor.clips:
             raise problem or DataError(f"{source}: not one frame came; the program before the pipe wrote nothing")
         if target is not None:
-            config = {"stream": True, "hop": hop, "window": predictor.window.size, "frames": predictor.window.count,
-                      "model": info.notes, "weights": provenance.file_digest(find_model(model_name)),
-                      "fusion": info.config.fusion}  # fmt: skip
+            config = {
+                "stream": True,
+                "hop": hop,
+                "window": predictor.window.size,
+                "frames": predictor.window.count,
+                "model": info.notes,
+                "weights": provenance.file_digest(find_model(model_name)),
+                "fusion": info.config.fusion,
+            }
             target.provenance.append(provenance.record(config, seed))
             fused, *single = predictor.mean
             target.write(Path(source).stem, fused, streams=dict(zip(predictor.streams, single)))

@@ -36,10 +36,25 @@ _PRETRAINING = {"num_frames": 1, "temporal_radius": 0}
 
 
 def run_training(
-    data: str, output: str, *, preset: str, backbone: str | None, variant: str | None, network: dict, schedule: dict,
-    augment: str | None, timing: str, drop_short: bool, validation: str | None, static_from: str | None, init: str | None,
-    pretrain: bool, seed: int, device: str, force: bool,
-) -> None:  # fmt: skip
+    data: str,
+    output: str,
+    *,
+    preset: str,
+    backbone: str | None,
+    variant: str | None,
+    network: dict,
+    schedule: dict,
+    augment: str | None,
+    timing: str,
+    drop_short: bool,
+    validation: str | None,
+    static_from: str | None,
+    init: str | None,
+    pretrain: bool,
+    seed: int,
+    device: str,
+    force: bool,
+) -> None:
     """`dpc classify train`, alone or as one of torchrun's processes."""
     if timing not in ("clips", "uniform"):
         raise UsageError(f"--timing {timing}: expected clips or uniform")
@@ -53,8 +68,10 @@ def run_training(
     augmentation = find_augmentation(augment) if augment is not None else find_preset(preset).augmentation
     plan = training_schedule(preset, schedule, chosen)
     if augmentation.speed and (timing == "uniform" or plan.clips_per_video is None):
-        raise UsageError(f"--augment {augment}: speed changes random clips of consecutive frames; leave it out with --timing uniform"
-                         " or --clips-per-video 0")  # fmt: skip
+        raise UsageError(
+            f"--augment {augment}: speed changes random clips of consecutive frames; leave it out with --timing uniform"
+            " or --clips-per-video 0"
+        )
     with input_file(data) as path, process_group(chosen) as processes:
         chosen = processes.place(chosen)
         reader = CloudsReader(path)
@@ -62,9 +79,18 @@ def run_training(
         rule = validation or default_rule(reader)
         parts = carve_validation(reader, rule, seed)
         _check_labels(reader, *parts)
-        record = {"network": json.loads(config.to_json()), "schedule": _content(plan), "augmentation": asdict(augmentation),
-                  "timing": timing, "validation": rule, "drop_short": drop_short, "seed": seed, "static_from": static_from,
-                  "init": init, "data": provenance.file_digest(path)}  # fmt: skip
+        record = {
+            "network": json.loads(config.to_json()),
+            "schedule": _content(plan),
+            "augmentation": asdict(augmentation),
+            "timing": timing,
+            "validation": rule,
+            "drop_short": drop_short,
+            "seed": seed,
+            "static_from": static_from,
+            "init": init,
+            "data": provenance.file_digest(path),
+        }
         plan.share(processes.count)
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         options = {"timing": timing, "drop_short": drop_short, "seed": seed}
@@ -74,12 +100,20 @@ def run_training(
         report_short(training, config.num_frames)
         torch.manual_seed(seed)
         model = _new_model(config, static_from, init, backbone, folder).to(chosen)
-        notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "validation": rule,
-                 "trained_on": f"{len(parts[0])} videos"}  # fmt: skip
+        notes = {
+            "command": provenance.command_line(),
+            "data": record["data"],
+            "seed": seed,
+            "validation": rule,
+            "trained_on": f"{len(parts[0])} videos",
+        }
         info = ModelInfo(config, class_table(reader), timing, notes)
         _announce(chosen, processes, len(parts[0]), len(parts[1]), rule, plan)
         keep_freed_memory()
-        with folder if processes.first else nullcontext(), stop_requested() as stop:  # last: --force deletes an earlier model
+        with (
+            folder if processes.first else nullcontext(),
+            stop_requested() as stop,
+        ):  # last: --force deletes an earlier model
             processes.wait()  # the others find the folder as it is to be
             trainer = Trainer(model, info, folder, plan, training, held, chosen, stop, processes)
             trainer.run()
@@ -109,7 +143,7 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
     missing = [names[label] for label in sorted(judged - seen)]
     if missing:
         log.warn(
-            f"{len(missing)} of {len(names)} classes have no training video and can't be recognised: {', '.join(missing[:8])}"
+            f"{len(missing)} of {len(names)} classes have no training video and can't be recognized: {', '.join(missing[:8])}"
         )
 
 
@@ -141,7 +175,7 @@ def _new_model(
         _copy_fitting(mine, theirs, f"{option} {name}")
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:
             log.warn(
-                f"{option} {name}: its static stream learned from neighbours up to {other.config.static_radius} frames away, here"
+                f"{option} {name}: its static stream learned from neighbors up to {other.config.static_radius} frames away, here"
                 f" {config.static_radius}; --static-temporal-radius {other.config.static_radius} goes on as it was"
             )
     return model

@@ -15,7 +15,7 @@ _LIMITS = {"scale": 1, "dropout": 1, "crop": 1, "speed": 10}  # what a range mus
 class Augmentation:
     """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays as it is.
 
-    The defaults are ours (chosen on a validation subject: docs/experiments.md). `PEERS` scales the axes only, from the
+    The defaults are ours (chosen on a validation subject: docs/experiments/classify.md). `PEERS` scales the axes only, from the
     camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does.
     """
 
@@ -27,8 +27,12 @@ class Augmentation:
     jitter: float = 0.002  # length units, standard deviation for each point
     dropout: float = 0.2  # largest share of points replaced by their predecessor
     crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
-    speed: float = 0.0  # with --timing clips, random clips: up to 1+s times as fast or slow (frames left out or repeated)
-    origin: bool = False  # scale and turn about the camera, so that a far body moves by metres; else about the clip's mean
+    speed: float = (
+        0.0  # with --timing clips, random clips: up to 1+s times as fast or slow (frames left out or repeated)
+    )
+    origin: bool = (
+        False  # scale and turn about the camera, so that a far body moves by meters; else about the clip's mean
+    )
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -79,7 +83,9 @@ def find_augmentation(text: str) -> Augmentation:
     preset, *changes = text.split(",")
     known = [field.name for field in fields(Augmentation)]
     if preset not in PRESETS:
-        raise UsageError(f"--augment {preset}: expected one of {', '.join(PRESETS)}, then changes such as ours,speed=0.3")
+        raise UsageError(
+            f"--augment {preset}: expected one of {', '.join(PRESETS)}, then changes such as ours,speed=0.3"
+        )
     values: dict[str, float | bool] = {}
     for change in changes:
         name, _, number = change.partition("=")

@@ -54,9 +54,16 @@ class ClipSource:
     """
 
     def __init__(
-        self, reader: CloudsReader, sequences: Sequence[int], config: KinetConfig, *, timing: str = "clips",
-        augmentation: Augmentation = NONE, drop_short: bool = False, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        reader: CloudsReader,
+        sequences: Sequence[int],
+        config: KinetConfig,
+        *,
+        timing: str = "clips",
+        augmentation: Augmentation = NONE,
+        drop_short: bool = False,
+        seed: int = 0,
+    ) -> None:
         self.reader, self.config, self.timing = reader, config, timing
         self.augmentation, self.seed = augmentation, seed
         lengths = reader.frame_counts

@@ -10,11 +10,11 @@ from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
 
 
-def labelled(reader: CloudsReader, split: str) -> list[int]:
+def labeled(reader: CloudsReader, split: str) -> list[int]:
     """Sequences of this split that have a label. DataError when there are none."""
     chosen = [i for i, name in enumerate(reader.splits) if name == split and reader.labels[i] >= 0]
     if not chosen:
-        raise DataError(f"{reader.path}: no labelled sample of split {split!r}; {_instead(reader)}")
+        raise DataError(f"{reader.path}: no labeled sample of split {split!r}; {_instead(reader)}")
     return chosen
 
 
@@ -34,11 +34,11 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
     `rule`: `none`; `split` (the file's own split `validation`); `subject` (the training subject with the highest number);
     `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
     """
-    chosen = labelled(reader, "train")
+    chosen = labeled(reader, "train")
     if rule == "none":
         return chosen, []
     if rule == "split":
-        return chosen, labelled(reader, "validation")
+        return chosen, labeled(reader, "validation")
     if rule.startswith("fold"):
         return _one_fold(reader, chosen, rule, seed)
     if rule.startswith("subject"):
@@ -116,11 +116,11 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
 
 
 def default_rule(reader: CloudsReader) -> str:
-    """`split` when the file has labelled validation videos, `subject` when the training videos have several known subjects,
+    """`split` when the file has labeled validation videos, `subject` when the training videos have several known subjects,
     else 15 % of each class."""
     if any(name == "validation" and label >= 0 for name, label in zip(reader.splits, reader.labels)):
         return "split"
-    subjects = {int(reader.subjects[i]) for i in labelled(reader, "train")}
+    subjects = {int(reader.subjects[i]) for i in labeled(reader, "train")}
     return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
 
 

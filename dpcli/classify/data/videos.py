@@ -34,10 +34,14 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
     """
     rule = str(info.notes.get("validation", "none"))
     if rule == "none":
-        raise UsageError(f"--split validation: {model_name} held no video out (--validation none); ask for another split")
+        raise UsageError(
+            f"--split validation: {model_name} held no video out (--validation none); ask for another split"
+        )
     if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
-        raise DataError(f"{reader.path}: not the file that {model_name} was trained on, and its validation videos were drawn "
-                        f"from that (--validation {rule}); predict on that file")  # fmt: skip
+        raise DataError(
+            f"{reader.path}: not the file that {model_name} was trained on, and its validation videos were drawn "
+            f"from that (--validation {rule}); predict on that file"
+        )
     return carve_validation(reader, rule, int(info.notes.get("seed", 0)))[1]
 
 

@@ -40,7 +40,7 @@ class _Call:
 def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, target: int | None) -> Layer:
     """The features of a stage (0 the first, None the last) of stream `static` or `dynamic` on one clip (1,T,P,3).
 
-    Without `target`: the last layer's activations before pooling, at their largest over each neighbourhood; in the dynamic
+    Without `target`: the last layer's activations before pooling, at their largest over each neighborhood; in the dynamic
     stream the merged feature after that layer's fit, which has one vector a centroid. With `target`, a class: the features
     after pooling and the gradient of that class's logit. The network must be in eval mode. UsageError when it lacks the stage.
     """

@@ -78,7 +78,7 @@ def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
 
 
 def heat(values: np.ndarray) -> np.ndarray:
-    """Colours u8 (P,3) of values 0..1, blue to red."""
+    """Colors u8 (P,3) of values 0..1, blue to red."""
     from matplotlib import colormaps
 
     table = (colormaps["turbo"](np.linspace(0.06, 0.94, 256))[:, :3] * 255).astype(np.uint8)
@@ -100,7 +100,7 @@ def _drawer(cloud: ActivationCloud, axes: np.ndarray) -> Callable[[str, int], np
     return draw
 
 
-def _dots(places: np.ndarray, depth: np.ndarray, colours: np.ndarray) -> np.ndarray:
+def _dots(places: np.ndarray, depth: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """Small squares at pixel places (N,2), the nearest on top."""
     image = np.empty((_CELL, _CELL, 3), np.uint8)
     image[:] = _BACKGROUND
@@ -108,14 +108,14 @@ def _dots(places: np.ndarray, depth: np.ndarray, colours: np.ndarray) -> np.ndar
     order = np.argsort(-depth, kind="stable")
     steps = np.stack(np.meshgrid(np.arange(size), np.arange(size)), -1).reshape(-1, 2) - size // 2
     pixels = (np.floor(places[order]).astype(int)[:, None] + steps).reshape(-1, 2)
-    painted = np.repeat(colours[order], len(steps), axis=0)
+    painted = np.repeat(colors[order], len(steps), axis=0)
     inside = ((pixels >= 0) & (pixels < _CELL)).all(1)
     image[pixels[inside, 1], pixels[inside, 0]] = painted[inside]
     return image
 
 
 def _sheet(blocks: list[tuple[str, list[str], dict[str, list[np.ndarray]]]]) -> Any:
-    """Blocks of a title, column heads and labelled rows of cells, with the scale of colours at the foot."""
+    """Blocks of a title, column heads and labeled rows of cells, with the scale of colors at the foot."""
     from PIL import Image, ImageDraw
 
     step = _CELL + _GAP
@@ -155,7 +155,7 @@ def _font(size: int) -> Any:
 
 
 def _save_gif(path: Path, images: list[np.ndarray]) -> None:
-    """All images with one table of colours, so that nothing flickers."""
+    """All images with one table of colors, so that nothing flickers."""
     from PIL import Image
 
     table = Image.fromarray(np.concatenate(images[:: max(1, len(images) // 4)], axis=1)).quantize(255)
@@ -168,9 +168,16 @@ def _save_mp4(path: Path, images: list[np.ndarray]) -> None:
 
     height, width = (side // 2 * 2 for side in images[0].shape[:2])  # 4:2:0 wants even sides
     writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=_RATE, codec="libx264", pix_fmt_out="yuv420p", macro_block_size=1, quality=None,
-        output_params=["-crf", "18", "-preset", "veryfast", "-threads", "2"], ffmpeg_log_level="error",
-    )  # fmt: skip
+        str(path),
+        (width, height),
+        fps=_RATE,
+        codec="libx264",
+        pix_fmt_out="yuv420p",
+        macro_block_size=1,
+        quality=None,
+        output_params=["-crf", "18", "-preset", "veryfast", "-threads", "2"],
+        ffmpeg_log_level="error",
+    )
     writer.send(None)
     for image in images:
         writer.send(np.ascontiguousarray(image[:height, :width]))
@@ -196,7 +203,7 @@ def plane_picture(
     class_names: Sequence[str],
     captions: dict[str, str],
 ) -> None:
-    """A panel per stream with a dot per video (S,2), coloured by class, grey where there is no label; one legend."""
+    """A panel per stream with a dot per video (S,2), colored by class, gray where there is no label; one legend."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -210,11 +217,11 @@ def plane_picture(
         if unknown.any():
             axes.scatter(*xy[unknown].T, s=16, color="0.65", label="no label", linewidths=0)
         for place, label in enumerate(present):
-            colour, marker = _style(place, len(present))
+            color, marker = _style(place, len(present))
             axes.scatter(
                 *xy[labels == label].T,
                 s=22,
-                color=[colour],
+                color=[color],
                 marker=marker,
                 linewidths=0,
                 label=_short(label, class_names),
@@ -230,7 +237,7 @@ def plane_picture(
 
 
 def _style(place: int, count: int) -> tuple[tuple[float, ...], str]:
-    """Ten hues a marker (twenty classes: circles and squares), so that neighbours in the legend differ."""
+    """Ten hues a marker (twenty classes: circles and squares), so that neighbors in the legend differ."""
     from matplotlib import colormaps
 
     return colormaps["tab10"](place % 10)[:3], _MARKERS[place // 10 % len(_MARKERS)]

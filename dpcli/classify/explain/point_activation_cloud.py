@@ -1,6 +1,6 @@
 """Point activation clouds: how strongly each point of a clip acts in the static and in the dynamic stream.
 
-Rule `activation` (thesis A.1.4, eq. A.2): the largest activation over a centroid's neighbourhood and over all channels, in
+Rule `activation` (thesis A.1.4, eq. A.2): the largest activation over a centroid's neighborhood and over all channels, in
 the layer before the first max-pooling and in the corresponding one of the dynamic branch. It knows no class. Rule
 `gradient` (Grad-CAM, Selvaraju et al. 2017): relu(sum_k a_k f_k) with a_k the mean over centroids of a class logit's
 gradient with respect to channel k of the last stage's features f.
@@ -91,8 +91,14 @@ def activation_cloud(
         )
     if "fused" in streams:
         found["fused"] = (found["static"] + found["dynamic"]) / 2
-    return ActivationCloud(sequence, clip.frames, {stream: found[stream] for stream in streams}, target, predicted,
-                           float(probability[predicted]))  # fmt: skip
+    return ActivationCloud(
+        sequence,
+        clip.frames,
+        {stream: found[stream] for stream in streams},
+        target,
+        predicted,
+        float(probability[predicted]),
+    )
 
 
 @torch.no_grad()
@@ -153,7 +159,7 @@ def _interpolated(query: Tensor, known: Tensor, values: Tensor) -> Tensor:
 
 
 def frame_length(config: KinetConfig) -> float:
-    """A frame as a length, in the network's unit: such that a neighbourhood of the first stage ends as far off in time (one
+    """A frame as a length, in the network's unit: such that a neighborhood of the first stage ends as far off in time (one
     frame beyond its temporal radius) as in space."""
     return config.radii[0] / (config.temporal_radius + 1)
 
@@ -166,13 +172,14 @@ def rescaled(values: np.ndarray) -> np.ndarray:
 
 def raw_points(source: ClipSource, clip: Clip) -> np.ndarray:
     """The points f32 (T,P,3) that prediction draws from a clip, in the file's coordinates."""
-    plain = ClipSource(source.reader, [clip.sequence], source.config.changed(normalize="none"), timing=source.timing,
-                       seed=source.seed)  # fmt: skip
+    plain = ClipSource(
+        source.reader, [clip.sequence], source.config.changed(normalize="none"), timing=source.timing, seed=source.seed
+    )
     return plain.load(clip, clip.sequence, *clip.frames)
 
 
 def _in_network_coordinates(sequence: CloudSequence, drawn: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """All points of each frame, f32 (N_t,3), moved as normalisation moved the drawn ones: an affine map of each axis."""
+    """All points of each frame, f32 (N_t,3), moved as normalization moved the drawn ones: an affine map of each axis."""
     before, after = drawn.reshape(-1, 3).astype(np.float64), points.reshape(-1, 3).astype(np.float64)
     ends = before.argmin(0), before.argmax(0)
     axes = np.arange(3)

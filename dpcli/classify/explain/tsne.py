@@ -1,7 +1,7 @@
 """Video features in the plane: the vectors before the last layer, averaged over a video's clips, by t-SNE (thesis A.3.2).
 
-t-SNE (van der Maaten and Hinton, 2008) keeps neighbours, not distances: so two figures of the features themselves stand
-beside the picture, the leave-one-out accuracy of the five nearest neighbours and the silhouette.
+t-SNE (van der Maaten and Hinton, 2008) keeps neighbors, not distances: so two figures of the features themselves stand
+beside the picture, the leave-one-out accuracy of the five nearest neighbors and the silhouette.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dpcli.runtime.progress import Progress
 from dpcli.runtime.seeds import scikit_learn_state
 from dpcli.runtime.signals import stop_requested
 
-NEIGHBOURS = 5
+NEIGHBORS = 5
 _PERPLEXITY = 30.0  # by default, and less where there are few videos
 _FEWEST = 4  # videos
 
@@ -75,10 +75,15 @@ def plane(features: np.ndarray, perplexity: float, seed: int) -> np.ndarray:
         raise DataError(
             f"all {len(features)} videos have the same feature vector; the stream has not been trained, or is dead"
         )
-    # scaled as a whole, which changes no neighbour, so that the search for bandwidths starts near its goal
+    # scaled as a whole, which changes no neighbor, so that the search for bandwidths starts near its goal
     scaled = (features - features.mean(0)) / features.std()
     fit = TSNE(
-        2, perplexity=perplexity, init="pca", learning_rate="auto", random_state=scikit_learn_state(seed), method=_method(len(features))
+        2,
+        perplexity=perplexity,
+        init="pca",
+        learning_rate="auto",
+        random_state=scikit_learn_state(seed),
+        method=_method(len(features)),
     )
     return fit.fit_transform(scaled.astype(np.float64)).astype(np.float32)
 
@@ -87,8 +92,8 @@ def _method(videos: int) -> str:
     return "exact" if videos < 500 else "barnes_hut"
 
 
-def neighbour_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBOURS) -> float | None:
-    """Share of the labelled videos whose k nearest other labelled ones vote for their class; None where it says nothing.
+def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBORS) -> float | None:
+    """Share of the labeled videos whose k nearest other labeled ones vote for their class; None where it says nothing.
 
     Euclidean distances in float64, ties to the lower index; a tied vote goes to the tied class with the nearest member.
     Fewer than k+1 videos: all others vote. None with fewer than two videos or classes.
@@ -117,7 +122,7 @@ def _distances(vectors: np.ndarray) -> np.ndarray:
 
 
 def silhouette(features: np.ndarray, labels: np.ndarray) -> float | None:
-    """Mean over labelled videos of (b - a) / max(a, b), -1..1 (Rousseeuw, 1987): a the mean Euclidean distance to the own
+    """Mean over labeled videos of (b - a) / max(a, b), -1..1 (Rousseeuw, 1987): a the mean Euclidean distance to the own
     class, b to the nearest other one; 0 for a class of one. None unless there are two classes, one with two videos."""
     from sklearn.metrics import silhouette_score
 

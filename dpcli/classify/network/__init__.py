@@ -1,4 +1,4 @@
-"""This folder holds the network Kinet: the static backbone, the dynamic stream of space-time surfaces, their configuration and weights file.
+"""This folder holds the network Kinet: static backbone, stream of space-time surfaces, configuration, weights file.
 
 Nothing here trains or reads videos.
 """

@@ -15,7 +15,7 @@ class KinetConfig:
     """Network and input of a Kinet. Defaults are the thesis's text, but for `static_temporal_radius` (0 there, which the preset
     says; models made before it was a choice have None); `release()` is the published code's choices.
 
-    Lengths are in the input's unit after normalisation, times in frames.
+    Lengths are in the input's unit after normalization, times in frames.
     """
 
     num_classes: int = 20
@@ -30,16 +30,18 @@ class KinetConfig:
     neighbors: int = 64
     radii: tuple[float, float] = (0.5, 1.0)  # at time distance 0
     temporal_radius: int = 1  # frames
-    static_temporal_radius: int | None = None  # of the static stream's own neighbourhoods; None: one set serves both streams
+    static_temporal_radius: int | None = (
+        None  # of the static stream's own neighborhoods; None: one set serves both streams
+    )
     grouping: str = (
-        "balanced"  # which neighbours within the radius: first | nearest | balanced (equal shares of each frame)
+        "balanced"  # which neighbors within the radius: first | nearest | balanced (equal shares of each frame)
     )
     widths: tuple[tuple[int, ...], ...] = ((64, 128), (128, 256), (512, 1024))  # the backbone's own, a tuple a stage
     # dynamic branch
     head: tuple[int, int] | None = None  # widths of its head; None: the last of `widths`
     group_size: int = 4  # d of eq. 3.5
     reduction: float = 0.5  # c relative to the static width
-    xyz_group: bool = False  # one more group: the neighbour's relative coordinates
+    xyz_group: bool = False  # one more group: the neighbor's relative coordinates
     time_input: bool = False  # frame index beside the static feature, into the reduction
     weighting: str = "deviation"  # deviation (eq. 3.8) | projection (release) | none (Table 3.1 vi)
     normals: bool = True  # False: Table 3.1 v, the reduced features are pooled instead of fitted
@@ -84,10 +86,12 @@ class KinetConfig:
         self._check_reach("--static-temporal-radius", self.static_radius)
 
     def _check_reach(self, option: str, radius: int) -> None:
-        """Whether the frames of a neighbourhood have a slot each, and points for all slots."""
+        """Whether the frames of a neighborhood have a slot each, and points for all slots."""
         reach = 2 * radius + 1
         if self.grouping == "balanced" and self.neighbors < reach:
-            raise UsageError(f"{option} {radius}: balanced grouping shares {self.neighbors} neighbours among {reach} frames")
+            raise UsageError(
+                f"{option} {radius}: balanced grouping shares {self.neighbors} neighbors among {reach} frames"
+            )
         near = min(reach, self.num_frames) * self.points_per_frame
         if self.neighbors > near:
             raise UsageError(f"--neighbors {self.neighbors}: the frames within {option} {radius} hold {near} points")
@@ -104,12 +108,12 @@ class KinetConfig:
 
     @property
     def static_radius(self) -> int:
-        """Frames before and after that the static stream's neighbourhoods reach."""
+        """Frames before and after that the static stream's neighborhoods reach."""
         return self.temporal_radius if self.static_temporal_radius is None else self.static_temporal_radius
 
     @property
     def own_static_groups(self) -> bool:
-        """Whether the static stream has neighbourhoods of its own."""
+        """Whether the static stream has neighborhoods of its own."""
         return self.static_radius != self.temporal_radius
 
     @property
@@ -121,9 +125,16 @@ class KinetConfig:
     def release(cls, **changes: object) -> KinetConfig:
         """The released code: groups of 3, a raw xyz group, absolute time, projection weights, cross-scale merge, logits."""
         choices = {
-            "variant": "release", "group_size": 3, "xyz_group": True, "time_input": True, "weighting": "projection",
-            "merge": "cross", "guard": "release", "fusion": "logits", "grouping": "first",
-        }  # fmt: skip
+            "variant": "release",
+            "group_size": 3,
+            "xyz_group": True,
+            "time_input": True,
+            "weighting": "projection",
+            "merge": "cross",
+            "guard": "release",
+            "fusion": "logits",
+            "grouping": "first",
+        }
         return cls(**{**choices, **changes})
 
     def changed(self, **changes: object) -> KinetConfig:

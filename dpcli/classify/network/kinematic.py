@@ -1,6 +1,6 @@
 """The dynamic stream: kinematic learning units that fit space-time surfaces to a frozen static network's activations.
 
-A unit (thesis figure 3.4) reduces the features of a neighbourhood, splits them into groups, fits one surface a group with
+A unit (thesis figure 3.4) reduces the features of a neighborhood, splits them into groups, fits one surface a group with
 weights from the previous unit's deviations, and hands on the normals. `Kinematics` runs the units; how their normals
 become one feature per centroid is the business of `merge`.
 """
@@ -24,7 +24,7 @@ from dpcli.ops import gather_points
 
 
 class DeviationWeights(nn.Module):
-    """Logits of neighbour weights from deviations by one linear map over groups (eq. 3.8)."""
+    """Logits of neighbor weights from deviations by one linear map over groups (eq. 3.8)."""
 
     def __init__(self, previous: int, groups: int) -> None:
         super().__init__()
@@ -80,9 +80,14 @@ class KinematicUnit(nn.Module):
         return self.groups * (self.config.group_size + 1)
 
     def forward(
-        self, activation: Tensor, relative: Tensor, times: Tensor, center_times: Tensor, previous: Tensor | None,
+        self,
+        activation: Tensor,
+        relative: Tensor,
+        times: Tensor,
+        center_times: Tensor,
+        previous: Tensor | None,
         last: bool = False,
-    ) -> Surface:  # fmt: skip
+    ) -> Surface:
         """activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous deviations; last: nobody
         wants this unit's deviations."""
         config = self.config
@@ -126,7 +131,7 @@ class Kinematics(nn.Module):
         he_init(self)
 
     def forward(self, stages: list[Stage]) -> Tensor:
-        """Class logits (B,C) from the backbone's neighbourhoods and activations."""
+        """Class logits (B,C) from the backbone's neighborhoods and activations."""
         return self.head(stages[-1].grouping.centers, self.features(stages))
 
     def features(self, stages: list[Stage]) -> Tensor:
@@ -148,7 +153,7 @@ class Kinematics(nn.Module):
         return self.merge([stage.grouping for stage in stages], [surface.normals for surface in surfaces])
 
     def _to_next_stage(self, deviations: Tensor, before: Grouping, group: Grouping) -> Tensor:
-        """Deviations of the next stage's neighbours: those are centroids here, each with a deviation of its own.
+        """Deviations of the next stage's neighbors: those are centroids here, each with a deviation of its own.
 
         The release takes slot 0, whatever point that is; the text means the point itself: the slot nearest to the centroid.
         """

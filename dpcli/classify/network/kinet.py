@@ -22,7 +22,7 @@ class Kinet(nn.Module):
         self.dynamic = Kinematics(config, self.static.tap_widths)
 
     def group(self, points: Tensor) -> list[Grouping]:
-        """Neighbourhoods of a batch of clips: points (B,T,P,3), frame after frame."""
+        """Neighborhoods of a batch of clips: points (B,T,P,3), frame after frame."""
         return self.static.group(*clip_points(points))
 
     def static_logits(self, points: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Layers that the networks of this room share: linear layers over neighbourhoods, the head of a clip, the initialisation."""
+"""Layers that the networks of this room share: linear layers over neighborhoods, the head of a clip, the initialization."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dpcli.ops.grouped_mlp import Norm, grouped_mlp
 
 
 class SharedLayers(nn.Module):
-    """Two linear layers shared by all neighbours, each with batch norm and ReLU, over [relative xyz, feature]."""
+    """Two linear layers shared by all neighbors, each with batch norm and ReLU, over [relative xyz, feature]."""
 
     def __init__(self, inputs: int, widths: tuple[int, int]) -> None:
         super().__init__()
@@ -19,15 +19,17 @@ class SharedLayers(nn.Module):
         self.linear2, self.norm2 = nn.Linear(widths[0], widths[1]), nn.BatchNorm1d(widths[1], eps=1e-3)
 
     def _arguments(self) -> tuple:
-        return tuple((layer.weight, layer.bias) if isinstance(layer, nn.Linear) else self._norm(layer)
-                     for layer in (self.linear1, self.norm1, self.linear2, self.norm2))  # fmt: skip
+        return tuple(
+            (layer.weight, layer.bias) if isinstance(layer, nn.Linear) else self._norm(layer)
+            for layer in (self.linear1, self.norm1, self.linear2, self.norm2)
+        )
 
     def _norm(self, norm: nn.BatchNorm1d) -> Norm:
         mean, var = (None, None) if self.training else (norm.running_mean, norm.running_var)
         return Norm(norm.weight, norm.bias, mean, var, norm.eps)
 
     def pool(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
-        """Maximum over the neighbours, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
+        """Maximum over the neighbors, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
         if self.training and isinstance(self.norm1, SyncNorm):
             return self._pool_together(points, centers, idx, features)
         pooled, statistics = grouped_mlp(points, centers, idx, features, *self._arguments())
@@ -62,7 +64,7 @@ class GlobalHead(SharedLayers):
     def embed(self, centers: Tensor, features: Tensor) -> Tensor:
         """The clip's feature vector, (B, widths[1])."""
         batch, count = centers.shape[:2]
-        if self.training:  # as one group: its centre is the origin, its neighbours are all centroids
+        if self.training:  # as one group: its center is the origin, its neighbors are all centroids
             everyone = torch.arange(count, device=centers.device).expand(batch, 1, count)
             return self.pool(centers, centers.new_zeros(batch, 1, 3), everyone, features)[:, 0]
         values = torch.cat([centers, features], -1)
@@ -74,7 +76,7 @@ class GlobalHead(SharedLayers):
 
 
 def he_init(module: nn.Module) -> None:
-    """Variance-scaling initialisation of every linear layer (fan-in, factor 2, truncated normal), zero biases."""
+    """Variance-scaling initialization of every linear layer (fan-in, factor 2, truncated normal), zero biases."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.trunc_normal_(layer.weight, std=(2 / layer.in_features) ** 0.5)

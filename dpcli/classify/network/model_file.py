@@ -32,9 +32,12 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
     """Weights as float32; configuration, class names and notes in the header."""
     header = {
-        "format": _FORMAT, "config": info.config.to_json(), "timing": info.timing,
-        "class_names": json.dumps(info.class_names), "notes": json.dumps(info.notes, sort_keys=True),
-    }  # fmt: skip
+        "format": _FORMAT,
+        "config": info.config.to_json(),
+        "timing": info.timing,
+        "class_names": json.dumps(info.class_names),
+        "notes": json.dumps(info.notes, sort_keys=True),
+    }
     save_weights(path, model.state_dict(), header)
 
 

@@ -16,8 +16,8 @@ from dpcli.ops import gather_mean, three_nn_interpolate
 class ResidualMerge(nn.Module):
     """h_l = relu(C_l n_l + R_l h_{l-1}) (thesis figure 3.4).
 
-    Where a unit's centroids are the next stage's neighbours, h is averaged over the neighbourhood first: a single normal
-    is noisy, and a maximum would pick the noise. With `norm` the sum is batch-normalised before the ReLU.
+    Where a unit's centroids are the next stage's neighbors, h is averaged over the neighborhood first: a single normal
+    is noisy, and a maximum would pick the noise. With `norm` the sum is batch-normalized before the ReLU.
     """
 
     def __init__(self, channels: list[int], tap_widths: Sequence[Sequence[int]], norm: bool) -> None:

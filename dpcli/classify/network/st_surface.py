@@ -1,7 +1,7 @@
-"""The space-time surface: weighted least-squares fit of A f + b = t over a neighbourhood, its normal, and the deviations.
+"""The space-time surface: weighted least-squares fit of A f + b = t over a neighborhood, its normal, and the deviations.
 
 Equations 3.4-3.7 of the thesis, for K groups of d features at once. Everything is differentiable, batched over leading
-dimensions, and free of parameters. n counts neighbours; times are in frames.
+dimensions, and free of parameters. n counts neighbors; times are in frames.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dpcli.ops import small_inverse, small_solve
 from dpcli.ops.small_inverses import GUARDS, MIN_DET
 from dpcli.runtime.mixed_precision import full_precision
 
-_RIDGE = 1e-3  # of the mean diagonal; large enough for float32's elimination at rank-deficient neighbourhoods, small beside the data
+_RIDGE = 1e-3  # of the mean diagonal; large enough for float32's elimination at rank-deficient neighborhoods, small beside the data
 
 
 @full_precision
@@ -24,10 +24,10 @@ def fit_surface(
     solver: str = "inverse",
     guard: str = "signed",
 ) -> Tensor:  # (...,K,d+1)
-    """Coefficients [A, b] minimising sum_j w_j (A f_j + b - t_j)^2 (eq. 3.5) for each group, in closed form (eq. 3.6).
+    """Coefficients [A, b] minimizing sum_j w_j (A f_j + b - t_j)^2 (eq. 3.5) for each group, in closed form (eq. 3.6).
 
     `inverse` inverts the normal matrix by thesis A.1.1, where a small determinant is replaced as `guard` says;
-    `ridge` adds 1e-3 of the mean diagonal to it, which bounds the result where the neighbours don't span the space
+    `ridge` adds 1e-3 of the mean diagonal to it, which bounds the result where the neighbors don't span the space
     (repeated points, dead features), and solves by elimination. `weights=None` means 1.
     """
     design = torch.cat([features, torch.ones_like(features[..., :1])], -1).transpose(-3, -2)
@@ -53,7 +53,7 @@ def surface_normal(coefficients: Tensor) -> Tensor:
 
 @full_precision
 def deviations(coefficients: Tensor, features: Tensor, times: Tensor) -> Tensor:
-    """Fitting deviation A f_j + b - t_j of each neighbour: (...,K,d+1), (...,n,K,d), (...,n) -> (...,n,K)."""
+    """Fitting deviation A f_j + b - t_j of each neighbor: (...,K,d+1), (...,n,K,d), (...,n) -> (...,n,K)."""
     plane = coefficients[..., None, :, :]
     return (features * plane[..., :-1]).sum(-1) + plane[..., -1] - times[..., None]
 

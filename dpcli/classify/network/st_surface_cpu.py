@@ -1,4 +1,4 @@
-"""The core of a kinematic unit: reduce a neighbourhood's features, group them, and fit a weighted plane to each group.
+"""The core of a kinematic unit: reduce a neighborhood's features, group them, and fit a weighted plane to each group.
 
 `fit_reduced` has a plain torch form (the reference, and the path on a GPU) and a CPU form that goes through the centroids
 in pieces that stay in the cache, from the features to the deviations. Both give the same numbers; tests compare them in
@@ -43,10 +43,10 @@ def fit_reduced(
     logits: Tensor | None,  # (B,M,n,K)
     fit: Fit,
 ) -> tuple[Tensor, Tensor | None]:
-    """Planes A f + b = t through K groups of d features f of each centroid's n neighbours (thesis eq. 3.5, 3.6).
+    """Planes A f + b = t through K groups of d features f of each centroid's n neighbors (thesis eq. 3.5, 3.6).
 
-    f = relu(W a + b') of the activation a, in L groups; with `relative` one more, the neighbour's coordinates (and zeros,
-    where d > 3). A neighbour weighs sigmoid(logits), or 1. Returns the coefficients [A, b] (B,M,K,d+1) and the deviations
+    f = relu(W a + b') of the activation a, in L groups; with `relative` one more, the neighbor's coordinates (and zeros,
+    where d > 3). A neighbor weighs sigmoid(logits), or 1. Returns the coefficients [A, b] (B,M,K,d+1) and the deviations
     A f + b - t (B,M,n,K), or None. Differentiable in weight, bias and logits; by the reference, which is taken where the
     activation asks for a gradient, in that, too.
     """
@@ -66,9 +66,13 @@ def fit_reduced(
 
 
 def fit_reduced_reference(
-    activation: Tensor, linear: tuple[Tensor, Tensor], relative: Tensor | None, times: Tensor, logits: Tensor | None,
+    activation: Tensor,
+    linear: tuple[Tensor, Tensor],
+    relative: Tensor | None,
+    times: Tensor,
+    logits: Tensor | None,
     fit: Fit,
-) -> tuple[Tensor, Tensor | None]:  # fmt: skip
+) -> tuple[Tensor, Tensor | None]:
     """`fit_reduced` layer by layer."""
     features = torch.relu(torch.nn.functional.linear(activation, *linear))
     if relative is not None:
@@ -179,9 +183,17 @@ class _Case:
         torch.mm(self.activation[rows], self.weight, out=made[0])
         features, weights, moments = map(_flat, made)
         self.row_kernels.fit_rows(
-            features, self.bias, self.layout.floor, _cut(self.near, rows, 3), self.layout.learned, self.times[rows],
-            _cut(self.logits, rows, groups), weights, moments, *self.sizes,
-        )  # fmt: skip
+            features,
+            self.bias,
+            self.layout.floor,
+            _cut(self.near, rows, 3),
+            self.layout.learned,
+            self.times[rows],
+            _cut(self.logits, rows, groups),
+            weights,
+            moments,
+            *self.sizes,
+        )
 
 
 def _flat(tensor: Tensor) -> np.ndarray:
@@ -199,7 +211,9 @@ class _SurfaceFit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, activation, weight, bias, near, times, logits, neighbors, layout, fit):
-        tensors = tuple(None if one is None else one.detach() for one in (activation, weight, bias, near, times, logits))
+        tensors = tuple(
+            None if one is None else one.detach() for one in (activation, weight, bias, near, times, logits)
+        )
         case = _Case(tensors, neighbors, layout, fit)
         planes = torch.empty(case.count, layout.size + 1, layout.groups)
         away = torch.empty(len(times) if fit.deviations else 0, layout.groups)
@@ -246,9 +260,17 @@ class _SurfaceFit(torch.autograd.Function):
                 case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right)
                 to_features = room.features[: rows.stop - rows.start]
                 case.row_kernels.fit_back(
-                    some, weight, case.times[rows], _flat(planes)[plane], away, to_matrix, to_right, _flat(to_features),
-                    _cut(logits, rows, layout.groups), *case.sizes,
-                )  # fmt: skip
+                    some,
+                    weight,
+                    case.times[rows],
+                    _flat(planes)[plane],
+                    away,
+                    to_matrix,
+                    to_right,
+                    _flat(to_features),
+                    _cut(logits, rows, layout.groups),
+                    *case.sizes,
+                )
                 torch.addmm(to_weight, to_features.t(), case.activation[rows], out=to_weight)
                 torch.addmm(to_bias, room.ones[:, : len(to_features)], to_features, out=to_bias)
 
@@ -269,4 +291,8 @@ class _Gradients:
     def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For so many centroids: of their planes, normal matrices and right sides."""
         numbers = count * self.size
-        return self.planes[:numbers], self.matrix[: numbers * len(self.matrix) // len(self.planes)], self.right[:numbers]
+        return (
+            self.planes[:numbers],
+            self.matrix[: numbers * len(self.matrix) // len(self.planes)],
+            self.right[:numbers],
+        )

@@ -1,6 +1,6 @@
 """Batch norm over the clips of all processes, so that a run shared by several is the run of one with the same batch.
 
-torch's own synchronised batch norm needs GPUs; this one asks for nothing but a sum over processes.
+torch's own synchronized batch norm needs GPUs; this one asks for nothing but a sum over processes.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _summed(values: Tensor) -> Tensor:
     return _Sum.apply(values)
 
 
-def synchronise_norms(module: nn.Module) -> nn.Module:
+def synchronize_norms(module: nn.Module) -> nn.Module:
     """Replace every batch norm inside by one over all processes, with the same parameters, statistics and names."""
     for name, child in module.named_children():
         if isinstance(child, nn.modules.batchnorm._BatchNorm) and not isinstance(child, SyncNorm):
@@ -65,5 +65,5 @@ def synchronise_norms(module: nn.Module) -> nn.Module:
             shared.num_batches_tracked = child.num_batches_tracked
             setattr(module, name, shared)
         else:
-            synchronise_norms(child)
+            synchronize_norms(child)
     return module

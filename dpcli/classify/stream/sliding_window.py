@@ -85,9 +85,15 @@ class StreamPredictor:
     """
 
     def __init__(
-        self, model: Kinet, info: ModelInfo, *, window: int | None = None, hop: int = 1, seed: int = 0,
+        self,
+        model: Kinet,
+        info: ModelInfo,
+        *,
+        window: int | None = None,
+        hop: int = 1,
+        seed: int = 0,
         device: torch.device | str = "cpu",
-    ) -> None:  # fmt: skip
+    ) -> None:
         if hop < 1:
             raise UsageError(f"--hop {hop}: expected at least 1 frame")
         self.model, self.info, self.hop, self.device = model.to(device), info, hop, device

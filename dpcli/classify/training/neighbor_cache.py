@@ -1,7 +1,7 @@
-"""Neighbourhoods of clips that training comes back to: searched once, then read from a nameless file of the run folder.
+"""Neighborhoods of clips that training comes back to: searched once, then read from a nameless file of the run folder.
 
 A static network is frozen while the dynamic stream learns, and what it groups follows from a clip's points alone. Where an
-epoch shows one of a few fixed draws of every clip (`train --draws`), its neighbourhoods are those of the draw's first time.
+epoch shows one of a few fixed draws of every clip (`train --draws`), its neighborhoods are those of the draw's first time.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Search = Callable[[Tensor], list[Grouping]]
 
 
 class NeighborCache:
-    """What `search` finds for each of `clips` numbered clips of one shape: centroids and indices of neighbours, on disk.
+    """What `search` finds for each of `clips` numbered clips of one shape: centroids and indices of neighbors, on disk.
 
     Memory: a byte a clip. The file has no name and goes with the process, killed or not; a run that is continued fills a new
     one. DiskFull (with a sentence) at the first batch when `folder` has no room for it.
@@ -37,7 +37,7 @@ class NeighborCache:
         self._records = np.empty(0)
 
     def __call__(self, points: Tensor, clips: Tensor) -> list[Grouping]:
-        """Neighbourhoods of a batch, points (B,T,P,3) and clips i64 (B), their numbers: equal to `search(points)`."""
+        """Neighborhoods of a batch, points (B,T,P,3) and clips i64 (B), their numbers: equal to `search(points)`."""
         numbers = clips.cpu().numpy()
         new = np.flatnonzero(~self._known[numbers])
         if len(new):
@@ -55,7 +55,9 @@ class NeighborCache:
 
     def _new_file(self, record: np.dtype) -> np.ndarray:
         size = len(self._known) * record.itemsize
-        log.info(f"keeping neighbours in {self.folder}: {size / 1e6:.0f} MB, {record.itemsize / 1e6:.2g} MB a clip and draw")
+        log.info(
+            f"keeping neighbors in {self.folder}: {size / 1e6:.0f} MB, {record.itemsize / 1e6:.2g} MB a clip and draw"
+        )
         try:
             with tempfile.TemporaryFile(dir=self.folder) as file:
                 file.truncate(size)
@@ -94,7 +96,7 @@ def _sources(cloud: tuple[Tensor, Tensor], groups: list[Grouping]) -> list[_Sour
         if not (_same(own, cloud) or (before is not None and _same(own, before))):
             raise UsageError(
                 "--draws: this backbone groups points that are neither the clip's nor the centroids of the stage before,"
-                " so its neighbourhoods can't be kept; leave out --draws"
+                " so its neighborhoods can't be kept; leave out --draws"
             )
         found.append(_Source(_same(own, cloud), _same(centers, own)))
         before = centers

@@ -1,4 +1,4 @@
-"""One optimiser step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
+"""One optimizer step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from dpcli.classify.network.backbones.interface import BACKBONES, Grouping
 from dpcli.classify.network.kinet import Kinet
-from dpcli.classify.network.sync_norm import synchronise_norms
+from dpcli.classify.network.sync_norm import synchronize_norms
 from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
@@ -58,24 +58,31 @@ class LossWatch:
 
 
 class StageStep:
-    """Optimiser and forward pass of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
+    """Optimizer and forward pass of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
 
     def __init__(
-        self, model: Kinet, stage: int, schedule: Schedule, device: torch.device, processes: Processes,
+        self,
+        model: Kinet,
+        stage: int,
+        schedule: Schedule,
+        device: torch.device,
+        processes: Processes,
         neighbors: NeighborCache | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.schedule, self.device, self.processes = schedule, device, processes
         self.neighbors = neighbors
         module = _Logits(model, stage)
         if processes.count > 1:
-            synchronise_norms(module)
+            synchronize_norms(module)
         self.optimizer = _new_optimizer(module.branch, schedule)
         self.parameters = list(module.branch.parameters())
         self.module: nn.Module = module
         if processes.count > 1:
             self.module = _shared(module, model, stage, device)
 
-    def __call__(self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None) -> tuple[float, int, bool]:
+    def __call__(
+        self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None
+    ) -> tuple[float, int, bool]:
         """points (b,T,P,3), labels (b), learning rate -> (sum of losses, rightly classified, whether weights were changed).
 
         clips i64 (b): numbers by which `neighbors` knows them.
@@ -114,7 +121,7 @@ class StageStep:
 
 
 def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -> nn.Module:
-    """The module whose gradients are averaged over processes; batch norms are synchronised by themselves."""
+    """The module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
     config = model.config  # some switches leave parameters without a gradient
     unused = (stage == 1 and (config.merge == "cross" or not config.normals)) or config.backbone not in BACKBONES
     where = [device.index] if device.type == "cuda" else None

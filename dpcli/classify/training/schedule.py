@@ -24,10 +24,14 @@ class Schedule:
     clips_per_video: int | None = 1  # per epoch; None: every start
     validate_every: int = 1  # epochs
     validation_clips: int = 4  # per video
-    accumulate: int = 1  # parts a batch is computed in, one after the other: less memory; batch norm sees one part at a time
+    accumulate: int = (
+        1  # parts a batch is computed in, one after the other: less memory; batch norm sees one part at a time
+    )
     amp: bool = False  # matrix products in bfloat16
     workers: int = 0  # processes that load clips; 0: this one
-    draws: int | None = None  # dynamic stage: fixed draws of each clip in turn, neighbours searched once; None: one an epoch
+    draws: int | None = (
+        None  # dynamic stage: fixed draws of each clip in turn, neighbors searched once; None: one an epoch
+    )
 
     def __post_init__(self) -> None:
         dynamic = self.learning_rate_dynamic
@@ -60,7 +64,7 @@ class Schedule:
         return self.batch // parts
 
     def rate(self, stage: int, step: int, steps: int) -> float:
-        """Learning rate at an optimiser step of a stage (0 static, 1 dynamic) with `steps` in all."""
+        """Learning rate at an optimizer step of a stage (0 static, 1 dynamic) with `steps` in all."""
         top = self.learning_rate if stage == 0 or self.learning_rate_dynamic is None else self.learning_rate_dynamic
         if self.decay == "constant":
             return top

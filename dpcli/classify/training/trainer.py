@@ -2,7 +2,7 @@
 
 Thesis section 3.4.2.3 and A.1.3. A run can be stopped at any step and continued to the same result: every clip's
 randomness comes from (seed, epoch, position), what a step drops from (seed, stage, epoch, step), and the state holds weights,
-optimiser and the step. Several processes
+optimizer and the step. Several processes
 (torchrun) share each batch and take the steps that one process would take.
 """
 
@@ -48,9 +48,17 @@ class Trainer:
     """Runs both stages of one model. `training` and `validation` are clip sources (validation may be None)."""
 
     def __init__(
-        self, model: Kinet, info: ModelInfo, folder: RunFolder, schedule: Schedule, training: ClipSource,
-        validation: ClipSource | None, device: torch.device, stop: StopRequest, processes: Processes | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        model: Kinet,
+        info: ModelInfo,
+        folder: RunFolder,
+        schedule: Schedule,
+        training: ClipSource,
+        validation: ClipSource | None,
+        device: torch.device,
+        stop: StopRequest,
+        processes: Processes | None = None,
+    ) -> None:
         self.model, self.info, self.folder, self.schedule = model.to(device), info, folder, schedule
         self.training, self.validation, self.device, self.stop = training, validation, device, stop
         self.processes = processes or Processes()
@@ -142,7 +150,9 @@ class Trainer:
         """One step of all processes together; whether one of them was asked to stop."""
         assert self.optimize is not None
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
-        torch.manual_seed(int(np.random.SeedSequence(where).generate_state(1)[0]))  # dropout, whenever the run was begun
+        torch.manual_seed(
+            int(np.random.SeedSequence(where).generate_state(1)[0])
+        )  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate, clips)
         shares = (loss, float(correct), float(len(labels)), float(self.stop.requested))
         loss, correct, count, stopping = self.processes.sums(shares, self.device)
@@ -209,8 +219,15 @@ class Trainer:
         if self.validation is not None and (last or (self.epoch + 1) % self.schedule.validate_every == 0):
             accuracy = self.validate()[STREAMS[self.stage]]
         seconds = self.spent + time.monotonic() - started
-        row = {"stage": STREAMS[self.stage], "epoch": self.epoch + 1, "loss": self.sums[0] / self.sums[2], "learning_rate": rate,
-               "train_accuracy": self.sums[1] / self.sums[2], "validation_accuracy": accuracy, "seconds": round(seconds, 2)}  # fmt: skip
+        row = {
+            "stage": STREAMS[self.stage],
+            "epoch": self.epoch + 1,
+            "loss": self.sums[0] / self.sums[2],
+            "learning_rate": rate,
+            "train_accuracy": self.sums[1] / self.sums[2],
+            "validation_accuracy": accuracy,
+            "seconds": round(seconds, 2),
+        }
         self.epoch, self.step, self.sums, self.spent = self.epoch + 1, 0, [0.0, 0.0, 0.0], 0.0
         better = accuracy is not None and accuracy >= self.best[self.stage]
         if better:
@@ -275,11 +292,18 @@ class Trainer:
     def _save(self, together: bool = True) -> None:
         """together: every process is here; none goes on, or ends, before the work is safe."""
         if self.processes.first:
-            self.folder.save_state({
-                "stage": self.stage, "epoch": self.epoch, "step": self.step, "best": self.best, "sums": self.sums,
-                "spent": self.spent, "model": self.model.state_dict(),
-                "optimizer": self.optimize.optimizer.state_dict() if self.optimize is not None else None,
-            })  # fmt: skip
+            self.folder.save_state(
+                {
+                    "stage": self.stage,
+                    "epoch": self.epoch,
+                    "step": self.step,
+                    "best": self.best,
+                    "sums": self.sums,
+                    "spent": self.spent,
+                    "model": self.model.state_dict(),
+                    "optimizer": self.optimize.optimizer.state_dict() if self.optimize is not None else None,
+                }
+            )
         if together:
             self.processes.wait()
 

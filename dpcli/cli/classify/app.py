@@ -65,7 +65,9 @@ def train(
     ] = None,
     amp: Annotated[
         bool | None,
-        typer.Option("--amp/--no-amp", help="Matrix products in bfloat16. Default: on GPUs that have it (Ampere and later)."),
+        typer.Option(
+            "--amp/--no-amp", help="Matrix products in bfloat16. Default: on GPUs that have it (Ampere and later)."
+        ),
     ] = None,
     lr: Annotated[float | None, typer.Option(help="Adam's learning rate. Default: the preset's.")] = None,
     lr_dynamic: Annotated[
@@ -98,7 +100,7 @@ def train(
         ),
     ] = None,
     grouping: Annotated[
-        str | None, typer.Option(help="Neighbours in the radius: first, nearest or balanced over frames.")
+        str | None, typer.Option(help="Neighbors in the radius: first, nearest or balanced over frames.")
     ] = None,
     solver: Annotated[str | None, typer.Option(help="Surface fit: inverse (thesis A.1.1) or ridge.")] = None,
     reduction: Annotated[
@@ -106,13 +108,13 @@ def train(
     ] = None,
     group_size: Annotated[int | None, typer.Option(help="Features per fitted surface (d).")] = None,
     temporal_radius: Annotated[
-        int | None, typer.Option(help="Frames before and after that count as neighbours.")
+        int | None, typer.Option(help="Frames before and after that count as neighbors.")
     ] = None,
     static_temporal_radius: Annotated[
         int | None,
         typer.Option(
-            help="The same for the static stream alone (pointnet2): 0 keeps its neighbourhoods within a frame, so that it sees no"
-            " motion. Default: 0 with --preset thesis, else as --temporal-radius (one set of neighbourhoods for both streams)."
+            help="The same for the static stream alone (pointnet2): 0 keeps its neighborhoods within a frame, so that it sees no"
+            " motion. Default: 0 with --preset thesis, else as --temporal-radius (one set of neighborhoods for both streams)."
         ),
     ] = None,
     radius: Annotated[
@@ -122,35 +124,44 @@ def train(
         tuple[int, int] | None,
         typer.Option(
             metavar="N N",
-            help="Neighbourhoods of a clip in the two stages (pointnet2). No weight depends on it: train with few, then go on"
+            help="Neighborhoods of a clip in the two stages (pointnet2). No weight depends on it: train with few, then go on"
             " by --init with the preset's (thesis 1024 512, quick 256 128).",
         ),
     ] = None,
     neighbors: Annotated[
         int | None,
-        typer.Option(help="Points of a neighbourhood: likewise, but for spidercnn. Default: the preset's (thesis 64, quick 32)."),
+        typer.Option(
+            help="Points of a neighborhood: likewise, but for spidercnn. Default: the preset's (thesis 64, quick 32)."
+        ),
     ] = None,
     dropout: Annotated[float | None, typer.Option(help="Dropout before each head's last layer.")] = None,
     no_normals: Annotated[
         bool, typer.Option("--no-normals", help="Ablation v: pool reduced features instead of fitting surfaces.")
     ] = False,
-    no_weights: Annotated[bool, typer.Option("--no-weights", help="Ablation vi: every neighbour weighs 1.")] = False,
+    no_weights: Annotated[bool, typer.Option("--no-weights", help="Ablation vi: every neighbor weighs 1.")] = False,
     static_from: Annotated[
         str | None, typer.Option(help="A trained model whose static stream to start from (ablations ii, iv).")
     ] = None,
     init: Annotated[
-        str | None, typer.Option(help="A trained or shipped model whose both streams to start from, e.g. of another --frames,"
-                              " or of other classes (the last layers are fresh then).")
+        str | None,
+        typer.Option(
+            help="A trained or shipped model whose both streams to start from, e.g. of another --frames,"
+            " or of other classes (the last layers are fresh then)."
+        ),
     ] = None,
     draws: Annotated[
         int,
         typer.Option(
-            help="Dynamic stage: so many fixed draws of every clip (start, points, augmentation) in turn, their neighbours searched"
-            " once and kept in a nameless file of the folder (preset thesis: 0.44 MB a clip and draw, quick 0.03). 0: a new draw every epoch."
+            help="Dynamic stage: so many fixed draws of every clip (start, points, augmentation) in turn, their neighbors searched"
+            " once and kept in a nameless file of the folder (preset thesis: 0.44 MB a clip and draw, quick 0.03)."
+            " 0: a new draw every epoch."
         ),
     ] = 0,
     workers: Annotated[
-        int | None, typer.Option(help="Processes that load clips. Default: 0 on a CPU; with a GPU 4, or as many as there are CPUs.")
+        int | None,
+        typer.Option(
+            help="Processes that load clips. Default: 0 on a CPU; with a GPU 4, or as many as there are CPUs."
+        ),
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",
@@ -161,22 +172,56 @@ def train(
     Several GPUs or machines: torchrun --nproc-per-node N -m dpcli classify train ...; the batch is shared among them.
     """
     network = {
-        "num_frames": frames, "points_per_frame": points, "normalize": normalize, "grouping": grouping, "solver": solver,
-        "group_size": group_size, "reduction": reduction, "temporal_radius": temporal_radius,
-        "static_temporal_radius": static_temporal_radius, "dropout": dropout,
-        "radii": None if radius is None else (radius, 2 * radius), "centroids": centroids, "neighbors": neighbors,
-        "normals": False if no_normals else None, "weighting": "none" if no_weights or no_normals else None,
-    }  # fmt: skip
+        "num_frames": frames,
+        "points_per_frame": points,
+        "normalize": normalize,
+        "grouping": grouping,
+        "solver": solver,
+        "group_size": group_size,
+        "reduction": reduction,
+        "temporal_radius": temporal_radius,
+        "static_temporal_radius": static_temporal_radius,
+        "dropout": dropout,
+        "radii": None if radius is None else (radius, 2 * radius),
+        "centroids": centroids,
+        "neighbors": neighbors,
+        "normals": False if no_normals else None,
+        "weighting": "none" if no_weights or no_normals else None,
+    }
     schedule = {
-        "batch": batch, "learning_rate": lr, "learning_rate_dynamic": lr_dynamic, "decay": decay, "workers": workers,
-        "clips_per_video": clips_per_video, "epochs": (epochs, epochs_dynamic), "accumulate": accumulate, "amp": amp,
-        "label_smoothing": label_smoothing, "draws": draws or None,
-    }  # fmt: skip
+        "batch": batch,
+        "learning_rate": lr,
+        "learning_rate_dynamic": lr_dynamic,
+        "decay": decay,
+        "workers": workers,
+        "clips_per_video": clips_per_video,
+        "epochs": (epochs, epochs_dynamic),
+        "accumulate": accumulate,
+        "amp": amp,
+        "label_smoothing": label_smoothing,
+        "draws": draws or None,
+    }
     from dpcli.classify.commands.train import run_training
 
-    run_training(data, output, preset=preset, backbone=backbone, variant=variant, network=network, schedule=schedule,
-                 augment=augment, timing=timing, drop_short=drop_short, validation=validation, static_from=static_from, init=init,
-                 pretrain=pretrain, seed=seed, device=device, force=force)  # fmt: skip
+    run_training(
+        data,
+        output,
+        preset=preset,
+        backbone=backbone,
+        variant=variant,
+        network=network,
+        schedule=schedule,
+        augment=augment,
+        timing=timing,
+        drop_short=drop_short,
+        validation=validation,
+        static_from=static_from,
+        init=init,
+        pretrain=pretrain,
+        seed=seed,
+        device=device,
+        force=force,
+    )
 
 
 @app.command()
@@ -213,8 +258,20 @@ def predict(
             "drop-short": drop_short,
             "batch": batch != 8,
         }
-        classify_stream.predict_stream(data, model, output, refused=refused, hop=hop, window=window, follow=follow, seed=seed,
-                                       device=device, force=force, json_output=json_output, backbone=backbone)  # fmt: skip
+        classify_stream.predict_stream(
+            data,
+            model,
+            output,
+            refused=refused,
+            hop=hop,
+            window=window,
+            follow=follow,
+            seed=seed,
+            device=device,
+            force=force,
+            json_output=json_output,
+            backbone=backbone,
+        )
         return
     classify_stream.require_stream(hop=hop, window=window, follow=follow, json=json_output)
     if output is None:
@@ -223,26 +280,44 @@ def predict(
         raise UsageError("--batch must be at least 1 and --clips-per-video at least 0")
     from dpcli.classify.commands.predict import run_prediction
 
-    run_prediction(data, model, output, split=split, clips_per_video=clips_per_video or None, drop_short=drop_short, batch=batch,
-                   seed=seed, device=device, force=force, backbone=backbone)  # fmt: skip
+    run_prediction(
+        data,
+        model,
+        output,
+        split=split,
+        clips_per_video=clips_per_video or None,
+        drop_short=drop_short,
+        batch=batch,
+        seed=seed,
+        device=device,
+        force=force,
+        backbone=backbone,
+    )
 
 
 @app.command()
 def fuse(
     scores: Annotated[
         list[str],
-        typer.Argument(help="Scores files of the same videos, or one, whose streams are averaged anew; one may be - for a pipe."),
+        typer.Argument(
+            help="Scores files of the same videos, or one, whose streams are averaged anew; one may be - for a pipe."
+        ),
     ],
     output: Output,
     weights: Annotated[
         str | None,
-        typer.Option("--weights", help="One per file, with commas, as 0.7,0.3; or by name, as static=0.3,dynamic=0.7. "
-                     "Default: all alike."),
+        typer.Option(
+            "--weights",
+            help="One per file, with commas, as 0.7,0.3; or by name, as static=0.3,dynamic=0.7. Default: all alike.",
+        ),
     ] = None,
     weights_from: Annotated[
         str | None,
-        typer.Option("--weights-from", help="Scores of other, labelled videos by the same models, as many files as are fused, with "
-                     "commas between: the weights that suit them best (greatest likelihood)."),
+        typer.Option(
+            "--weights-from",
+            help="Scores of other, labeled videos by the same models, as many files as are fused, with "
+            "commas between: the weights that suit them best (greatest likelihood).",
+        ),
     ] = None,
     mean: Annotated[
         str, typer.Option(help="arithmetic (thesis), or geometric: mean of logits, as in the published code.")
@@ -268,12 +343,24 @@ def profile(
     classes: Annotated[int, typer.Option("--classes", help="Number of classes.")] = 20,
     frames: Annotated[int | None, typer.Option(help="Frames per clip. Default: the preset's.")] = None,
     points: Annotated[int | None, typer.Option(help="Points per frame. Default: the preset's.")] = None,
-    steps: Annotated[bool, typer.Option("--steps", help="Also clips/s of training and inference, and where the time goes.")] = False,
+    steps: Annotated[
+        bool, typer.Option("--steps", help="Also clips/s of training and inference, and where the time goes.")
+    ] = False,
     device: Device = "auto",
     json_output: Json = False,
 ) -> None:
     """Parameters and operations (true counts, the papers' beside), latency and peak memory."""
     from dpcli.classify.commands.predict import run_profile
 
-    run_profile(model, preset=preset, variant=variant, classes=classes, frames=frames, points=points, steps=steps, device=device,
-                json_output=json_output, backbone=backbone)  # fmt: skip
+    run_profile(
+        model,
+        preset=preset,
+        variant=variant,
+        classes=classes,
+        frames=frames,
+        points=points,
+        steps=steps,
+        device=device,
+        json_output=json_output,
+        backbone=backbone,
+    )

@@ -74,9 +74,25 @@ def pac(
     """Point activation clouds: each point of a video's middle clip with its activation, 0 to 1 over the clip."""
     from dpcli.classify.commands.explain import run_pac
 
-    run_pac(data, model, output, picture=picture, animation=animation, samples=samples, split=split, stream=stream, rule=rule,
-            target=target, stage=stage, frames=frames, view=view, seed=seed, device=device, force=force,
-            backbone=backbone)  # fmt: skip
+    run_pac(
+        data,
+        model,
+        output,
+        picture=picture,
+        animation=animation,
+        samples=samples,
+        split=split,
+        stream=stream,
+        rule=rule,
+        target=target,
+        stage=stage,
+        frames=frames,
+        view=view,
+        seed=seed,
+        device=device,
+        force=force,
+        backbone=backbone,
+    )
 
 
 @app.command()
@@ -91,7 +107,7 @@ def tsne(
     stream: Stream = None,
     split: Split = "auto",
     perplexity: Annotated[
-        float | None, typer.Option(help="Neighbours that t-SNE keeps near. Default: 30, at most a third of the videos.")
+        float | None, typer.Option(help="Neighbors that t-SNE keeps near. Default: 30, at most a third of the videos.")
     ] = None,
     clips_per_video: Annotated[int, typer.Option(min=0, help="Clips averaged for a video; 0 takes every start.")] = 4,
     batch: Annotated[int, typer.Option(help="Clips at a time.")] = 8,
@@ -101,11 +117,24 @@ def tsne(
     force: Force = False,
     json_output: Json = False,
 ) -> None:
-    """Videos in the plane by t-SNE of the vectors before the last layer; beside it, how well neighbours and classes agree."""
+    """Videos in the plane by t-SNE of the vectors before the last layer; beside it, how well neighbors and classes agree."""
     if batch < 1:
         raise UsageError(f"--batch {batch}: expected at least 1")
     from dpcli.classify.commands.explain import run_tsne
 
-    run_tsne(data, model, output, picture=picture, stream=stream, split=split, perplexity=perplexity,
-             clips_per_video=clips_per_video or None, batch=batch, seed=seed, device=device, force=force,
-             json_output=json_output, backbone=backbone)  # fmt: skip
+    run_tsne(
+        data,
+        model,
+        output,
+        picture=picture,
+        stream=stream,
+        split=split,
+        perplexity=perplexity,
+        clips_per_video=clips_per_video or None,
+        batch=batch,
+        seed=seed,
+        device=device,
+        force=force,
+        json_output=json_output,
+        backbone=backbone,
+    )

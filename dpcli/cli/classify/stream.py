@@ -41,9 +41,20 @@ def require_stream(**given: object) -> None:
 
 
 def predict_stream(
-    data: str, model: str, output: str | None, *, refused: dict[str, bool], hop: int | None, window: int | None,
-    follow: float | None, seed: int, device: str, force: bool, json_output: bool, backbone: str | None = None,
-) -> None:  # fmt: skip
+    data: str,
+    model: str,
+    output: str | None,
+    *,
+    refused: dict[str, bool],
+    hop: int | None,
+    window: int | None,
+    follow: float | None,
+    seed: int,
+    device: str,
+    force: bool,
+    json_output: bool,
+    backbone: str | None = None,
+) -> None:
     """Check the options and run. `refused` maps options of batch prediction to whether they were given."""
     for name in (name for name, given in refused.items() if given):
         raise UsageError(f"--{name} does not go with --stream, which is one video, as it comes")
@@ -55,8 +66,20 @@ def predict_stream(
         raise UsageError(f"--follow {follow:g}: expected seconds, 0 or more (inf: until a signal)")
     from dpcli.classify.commands.stream import run_stream
 
-    run_stream(data, model, output, hop=hop or 1, window=window, follow=follow or 0.0, seed=seed, device=device, force=force,
-               json_output=json_output, files=cloud_files(), backbone=backbone)  # fmt: skip
+    run_stream(
+        data,
+        model,
+        output,
+        hop=hop or 1,
+        window=window,
+        follow=follow or 0.0,
+        seed=seed,
+        device=device,
+        force=force,
+        json_output=json_output,
+        files=cloud_files(),
+        backbone=backbone,
+    )
 
 
 def cloud_files() -> CloudFiles:
@@ -69,7 +92,7 @@ def cloud_files() -> CloudFiles:
 
 
 def _read_points(path: Path) -> np.ndarray:
-    """The points of a file, those with NaN left out as `dpc prepare clouds` does: organised clouds mark gaps so."""
+    """The points of a file, those with NaN left out as `dpc prepare clouds` does: organized clouds mark gaps so."""
     from dpcli.prepare.decode.cloud_files import read_cloud
     from dpcli.prepare.scans.clouds import drop_invalid
 

@@ -27,7 +27,9 @@ from dpcli.cli.options import Json, Picture, Seed
 app = typer.Typer(no_args_is_help=True)
 
 Parts = Annotated[str, typer.Argument(help="Parts file, or - for a pipe.")]
-Truth = Annotated[Path, typer.Option("--truth", help="Clouds file with the true parts; poses or scene_flow for motion.")]
+Truth = Annotated[
+    Path, typer.Option("--truth", help="Clouds file with the true parts; poses or scene_flow for motion.")
+]
 Split = Annotated[
     str | None, typer.Option("--split", help="Sequences of the truth that count, or all. Default: test if any.")
 ]
@@ -97,8 +99,15 @@ def segmentation(
 
     resampling = Resampling(resamples, confidence, seed)
     with input_file(parts) as path:
-        report = evaluate_segmentation(path, truth, protocol=protocol, ignore_below=ignore_below, split=split,
-                                       intersect=intersect, resampling=resampling)  # fmt: skip
+        report = evaluate_segmentation(
+            path,
+            truth,
+            protocol=protocol,
+            ignore_below=ignore_below,
+            split=split,
+            intersect=intersect,
+            resampling=resampling,
+        )
         if picture is not None:
             segmentation_picture(report, picture)
         if as_object:

@@ -49,15 +49,13 @@ def video(
     intersect: Intersect = False,
     lpips: Annotated[str | None, typer.Option("--lpips", help="alex, vgg or squeeze. Default: the protocol's.")] = None,
     fvd: Annotated[
-        str | None,
-        typer.Option("--fvd", help="styleganv, videogpt, disco or consistent4d. Default: the protocol's."),
+        str | None, typer.Option("--fvd", help="styleganv, videogpt, disco or consistent4d. Default: the protocol's.")
     ] = None,
     every: Annotated[
         int, typer.Option("--every", min=1, help="Windows of FVD and FID-VID start at each so many frames.")
     ] = 1,
     weights: Annotated[
-        Path | None,
-        typer.Option("--weights", help="Folder of networks. Default: $DPC_WEIGHTS, else the user's cache."),
+        Path | None, typer.Option("--weights", help="Folder of networks. Default: $DPC_WEIGHTS, else the user's cache.")
     ] = None,
     confidence: Confidence = 0.95,
     resamples: Resamples = 2000,
@@ -80,9 +78,18 @@ def video(
     check_picture_of(names, picture)
     strip = Strip(BACKGROUNDS[chosen.background]) if picture is not None else None
     with input_file(predicted) as path:
-        report = evaluate_video(path, truth, metrics=names, protocol=chosen, intersect=intersect, seed=seed,
-                                watch=strip, weights=weights, device=_device(names, device),
-                                resampling=Resampling(resamples, confidence, seed))  # fmt: skip
+        report = evaluate_video(
+            path,
+            truth,
+            metrics=names,
+            protocol=chosen,
+            intersect=intersect,
+            seed=seed,
+            watch=strip,
+            weights=weights,
+            device=_device(names, device),
+            resampling=Resampling(resamples, confidence, seed),
+        )
         if strip is not None:
             strip.save(picture)
         if as_object:

@@ -31,7 +31,7 @@ def register(parent: typer.Typer) -> None:
 
 @app.command("list")
 def list_command(weights: Folder = None, as_object: Json = False) -> None:
-    """Which weights there are, what for, under what licence, and which are here (judged by their size)."""
+    """Which weights there are, what for, under what license, and which are here (judged by their size)."""
     from dpcli.evaluate.networks.weights import check_all, known, weights_folder
 
     folder = weights_folder(weights)
@@ -99,13 +99,18 @@ def _show(found: dict[Weights, Checked], folder: Path, as_object: bool) -> None:
     from dpcli.evaluate.networks.weights import bytes_text
 
     rows = [
-        [entry.name, entry.used_by, bytes_text(sum(each.size for each in entry.files), entry.about),
-         entry.licence.split("(")[0].split(";")[0].strip(), checked.state]
+        [
+            entry.name,
+            entry.used_by,
+            bytes_text(sum(each.size for each in entry.files), entry.about),
+            entry.license.split("(")[0].split(";")[0].strip(),
+            checked.state,
+        ]
         for entry, checked in found.items()
-    ]  # fmt: skip
-    table = TextTable("Weights of learned metrics", ["weights", "for", "size", "licence", "state"], rows)
+    ]
+    table = TextTable("Weights of learned metrics", ["weights", "for", "size", "license", "state"], rows)
     lines = [line for entry, checked in found.items() for line in _lines(entry, checked, folder)]
-    closing = "A licence is the project's; --json says where none is stated for the weights themselves."
+    closing = "A license is the project's; --json says where none is stated for the weights themselves."
     print_tables([table], [*lines, closing, f"Folder: {folder}"], sys.stdout)
 
 
@@ -118,8 +123,24 @@ def _lines(entry: Weights, checked: Checked, folder: Path) -> list[str]:
 
 
 def _object(entry: Weights, found: Checked, folder: Path) -> dict[str, Any]:
-    files = [{"path": str(folder / each.file), "url": each.url, "size": each.size, "size_is_exact": not each.about,
-              "published_sha256": each.sha256 or None} for each in entry.files]  # fmt: skip
-    return {"name": entry.name, "used_by": entry.used_by, "licence": entry.licence, "state": found.state,
-            "found": found.said, "sha256": found.digest or None, "by_hand": entry.by_hand, "files": files,
-            "note": entry.note}  # fmt: skip
+    files = [
+        {
+            "path": str(folder / each.file),
+            "url": each.url,
+            "size": each.size,
+            "size_is_exact": not each.about,
+            "published_sha256": each.sha256 or None,
+        }
+        for each in entry.files
+    ]
+    return {
+        "name": entry.name,
+        "used_by": entry.used_by,
+        "license": entry.license,
+        "state": found.state,
+        "found": found.said,
+        "sha256": found.digest or None,
+        "by_hand": entry.by_hand,
+        "files": files,
+        "note": entry.note,
+    }

@@ -14,9 +14,13 @@ app = typer.Typer(no_args_is_help=True)
 
 @app.command()
 def fit(
-    views: Annotated[str, typer.Argument(help="A views file (dpc prepare video | animation | artemis), or - for a pipe.")],
+    views: Annotated[
+        str, typer.Argument(help="A views file (dpc prepare video | animation | artemis), or - for a pipe.")
+    ],
     output: Output,
-    preset: Annotated[str, typer.Option(help="thesis (appendix C), quick (two CPU cores) or tiny (a trial).")] = "quick",
+    preset: Annotated[
+        str, typer.Option(help="thesis (appendix C), quick (two CPU cores) or tiny (a trial).")
+    ] = "quick",
     prior: Annotated[
         str, typer.Option(help="What is known beside the input view: none, views (role train in the file) or zero123.")
     ] = "none",
@@ -34,7 +38,7 @@ def fit(
     most_gaussians: Annotated[int | None, typer.Option(help="Gaussians at most.")] = None,
     parts: Annotated[int | None, typer.Option(help="Rigid parts at most.")] = None,
     control_points: Annotated[int | None, typer.Option(help="Control points at most.")] = None,
-    neighbours: Annotated[int | None, typer.Option(help="Control points that move one Gaussian.")] = None,
+    neighbors: Annotated[int | None, typer.Option(help="Control points that move one Gaussian.")] = None,
     partition: Annotated[str | None, typer.Option(help="static: a point keeps its part; time: it may change.")] = None,
     temporal_weight: Annotated[float | None, typer.Option(help="lambda_temporal of eq. 5.3.")] = None,
     spatial_weight: Annotated[float | None, typer.Option(help="lambda_spatial of eq. 5.4.")] = None,
@@ -42,11 +46,12 @@ def fit(
     no_temporal: Annotated[bool, typer.Option("--no-temporal", help="Without eq. 5.3 (row b).")] = False,
     no_spatial: Annotated[bool, typer.Option("--no-spatial", help="Without eq. 5.4.")] = False,
     no_fusion: Annotated[
-        bool, typer.Option("--no-fusion", help="Rigid and non-rigid motion added (eq. 5.5) instead of weighed (rows b, c).")
+        bool,
+        typer.Option("--no-fusion", help="Rigid and non-rigid motion added (eq. 5.5) instead of weighed (rows b, c)."),
     ] = False,
     no_sparse: Annotated[bool, typer.Option("--no-sparse", help="Dense to the end (rows a to d).")] = False,
-    no_regularise: Annotated[
-        bool, typer.Option("--no-regularise", help="Without the losses that keep one view's object from going flat.")
+    no_regularize: Annotated[
+        bool, typer.Option("--no-regularize", help="Without the losses that keep one view's object from going flat.")
     ] = False,
     run: Annotated[
         str | None, typer.Option("--run", help="Folder for checkpoints, log and previews. Default: OUTPUT with .fit")
@@ -60,17 +65,42 @@ def fit(
     from dpcli.generate4d.commands.fit import run_fit
 
     changes = {
-        "size": size, "start": start, "dense_steps": dense_steps, "sparse_steps": sparse_steps, "batch": batch,
-        "gaussians": gaussians, "most_gaussians": most_gaussians, "parts": parts, "control_points": control_points,
-        "neighbours": neighbours, "partition": partition, "temporal_weight": temporal_weight,
+        "size": size,
+        "start": start,
+        "dense_steps": dense_steps,
+        "sparse_steps": sparse_steps,
+        "batch": batch,
+        "gaussians": gaussians,
+        "most_gaussians": most_gaussians,
+        "parts": parts,
+        "control_points": control_points,
+        "neighbors": neighbors,
+        "partition": partition,
+        "temporal_weight": temporal_weight,
         "spatial_weight": spatial_weight,
-    }  # fmt: skip
-    switches = {"rigid": no_rigid, "temporal": no_temporal, "spatial": no_spatial, "fusion": no_fusion, "sparse": no_sparse}
+    }
+    switches = {
+        "rigid": no_rigid,
+        "temporal": no_temporal,
+        "spatial": no_spatial,
+        "fusion": no_fusion,
+        "sparse": no_sparse,
+    }
     changes |= {name: False for name, off in switches.items() if off}
     run_fit(
-        views, output, preset_name=preset, changes=changes, prior=prior, prior_model=prior_model,
-        regularise=not no_regularise, run=run, picture=picture, seed=seed, device=device, force=force,
-    )  # fmt: skip
+        views,
+        output,
+        preset_name=preset,
+        changes=changes,
+        prior=prior,
+        prior_model=prior_model,
+        regularize=not no_regularize,
+        run=run,
+        picture=picture,
+        seed=seed,
+        device=device,
+        force=force,
+    )
 
 
 app.command("render")(generate4d_output.render)

@@ -23,7 +23,7 @@ def render(
         str, typer.Option("--path", help="The camera: turntable, orbit (also up and down), swing, fixed or reference.")
     ] = "turntable",
     azimuth: Annotated[
-        float | None, typer.Option(help="Degrees; 0 is at +z, positive towards +x. Default: the reference camera's.")
+        float | None, typer.Option(help="Degrees; 0 is at +z, positive toward +x. Default: the reference camera's.")
     ] = None,
     elevation: Annotated[float | None, typer.Option(help="Degrees above the horizon. Default: the same.")] = None,
     radius: Annotated[float | None, typer.Option(help="Distance to the origin. Default: the same.")] = None,
@@ -36,7 +36,7 @@ def render(
     time: Annotated[
         float | None, typer.Option("--time", help="Stand still at this second. Default: the clip plays, looped.")
     ] = None,
-    colour: Annotated[str, typer.Option("--colour", help="appearance, part, rigid (weight) or depth.")] = "appearance",
+    color: Annotated[str, typer.Option("--color", help="appearance, part, rigid (weight) or depth.")] = "appearance",
     background: Annotated[
         str, typer.Option("--background", help="white, black, r,g,b, or none: transparent, for .png and folders.")
     ] = "white",
@@ -60,10 +60,22 @@ def render(
 
     angles = [None if degrees is None else math.radians(degrees) for degrees in (azimuth, elevation, fovy)]
     run_render(
-        scene, output, path=path, lens=Lens(angles[0], angles[1], radius, angles[2], size), colour=colour,
-        background=background, trajectories=trajectories, frames=frames, fps=fps, time=time, picture=picture,
-        columns=columns, cameras=cameras, device=device, force=force,
-    )  # fmt: skip
+        scene,
+        output,
+        path=path,
+        lens=Lens(angles[0], angles[1], radius, angles[2], size),
+        color=color,
+        background=background,
+        trajectories=trajectories,
+        frames=frames,
+        fps=fps,
+        time=time,
+        picture=picture,
+        columns=columns,
+        cameras=cameras,
+        device=device,
+        force=force,
+    )
 
 
 def export(
@@ -108,11 +120,12 @@ def view(
     min_opacity: Annotated[float, typer.Option("--min-opacity", min=0, max=1, help="Leave fainter Gaussians out.")] = 1
     / 255,
     fps: Annotated[
-        float | None, typer.Option("--fps", min=1, max=120, help="Frames of the clip per second. Default: its own, within 1 to 60.")
+        float | None,
+        typer.Option("--fps", min=1, max=120, help="Frames of the clip per second. Default: its own, within 1 to 60."),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write one HTML file that shows a scene in any browser, without server or network: turn, zoom, play, colour by part."""
+    """Write one HTML file that shows a scene in any browser, without server or network: turn, zoom, play, color by part."""
     from dpcli.generate4d.commands.output import run_view
 
     run_view(scene, output, title=title, least=min_opacity, fps=fps, force=force)

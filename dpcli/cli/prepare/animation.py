@@ -39,7 +39,7 @@ def _filming(
         bool, typer.Option("--travel/--no-travel", help="Keep where it goes; without, it stays as on a treadmill.")
     ] = True,
     samples: Annotated[int, typer.Option("--samples", min=1, max=8, help="N x N rays per pixel.")] = 2,
-    shading: Annotated[float, typer.Option("--shading", help="0 plain colours .. 1 full light and shade.")] = 0.5,
+    shading: Annotated[float, typer.Option("--shading", help="0 plain colors .. 1 full light and shade.")] = 0.5,
     tracks: Annotated[int, typer.Option("--tracks", min=0, help="Surface points of ground truth; 0: none.")] = 4096,
     part_tolerance: Annotated[
         float,
@@ -93,9 +93,13 @@ def animation(
     camera = _options(filming, output, yaw=0.0)
     config = animation_config(model, clip, frames, camera)
     write_views(
-        lambda: animation_clip(model, clip, frames, camera, _processes(jobs)), output, config=config, source="animation",
-        seed=camera.seed, force=force,
-    )  # fmt: skip
+        lambda: animation_clip(model, clip, frames, camera, _processes(jobs)),
+        output,
+        config=config,
+        source="animation",
+        seed=camera.seed,
+        force=force,
+    )
 
 
 def animal(
@@ -115,9 +119,13 @@ def animal(
     camera = _options(filming, output, yaw=55.0)
     config = animal_config(motion, frames, cycles, camera)
     write_views(
-        lambda: animal_clip(motion, frames, cycles, camera, _processes(jobs)), output, config=config,
-        source="synthetic animal", seed=camera.seed, force=force,
-    )  # fmt: skip
+        lambda: animal_clip(motion, frames, cycles, camera, _processes(jobs)),
+        output,
+        config=config,
+        source="synthetic animal",
+        seed=camera.seed,
+        force=force,
+    )
 
 
 def _options(values: dict[str, Any], output: str, yaw: float) -> Any:

@@ -201,7 +201,7 @@ def nvgesture(
     erode: Annotated[int, typer.Option("--erode", min=0, help="Passes of 3x3 erosion, pixels off the rim.")] = 1,
     coordinates: Annotated[
         str,
-        typer.Option("--coordinates", help="image: row, column, grey level. camera: pinhole, depth 255 - grey level."),
+        typer.Option("--coordinates", help="image: row, column, gray level. camera: pinhole, depth 255 - gray level."),
     ] = "image",
 ) -> Any:
     """NvGesture: 25 hand gestures in 8-bit depth, 1,532 clips of 20 subjects."""
@@ -223,27 +223,30 @@ def depth(
     fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view, degrees. Default: 60.")] = None,
     depth_scale: Annotated[
         float | None,
-        typer.Option("--depth-scale", help="Raw units per metre. Default: 1000 (integers; 8-bit 100), 1 (floats)."),
+        typer.Option("--depth-scale", help="Raw units per meter. Default: 1000 (integers; 8-bit 100), 1 (floats)."),
     ] = None,
     invert: Annotated[bool, typer.Option("--invert", help="Larger values are nearer.")] = False,
-    near: Annotated[float, typer.Option("--near", help="Drop what is nearer, metres.")] = 0.0,
-    far: Annotated[float, typer.Option("--far", help="Drop what is farther, metres.")] = float("inf"),
+    near: Annotated[float, typer.Option("--near", help="Drop what is nearer, meters.")] = 0.0,
+    far: Annotated[float, typer.Option("--far", help="Drop what is farther, meters.")] = float("inf"),
     background: Annotated[
         str, typer.Option("--background", help="Remove what stays still: none, median or first (frame).")
     ] = "none",
     margin: Annotated[
-        float, typer.Option("--margin", help="Foreground is nearer than the background by this, metres.")
+        float, typer.Option("--margin", help="Foreground is nearer than the background by this, meters.")
     ] = 0.05,
     fps: Annotated[
         float | None, typer.Option("--fps", help="Frames per second. Default: the video's, else 30.")
     ] = None,
     stride: Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")] = 1,
     label_from_folder: Annotated[
-        bool, typer.Option("--label-from-folder", help="FOLDER/CLASS/VIDEO, or FOLDER/train/CLASS/VIDEO and FOLDER/test/CLASS/VIDEO.")
+        bool,
+        typer.Option(
+            "--label-from-folder", help="FOLDER/CLASS/VIDEO, or FOLDER/train/CLASS/VIDEO and FOLDER/test/CLASS/VIDEO."
+        ),
     ] = False,
     labels: Annotated[Path | None, typer.Option("--labels", help="CSV: name,label[,subject][,split].")] = None,
 ) -> Any:
-    """Any depth video, 8 or 16 bits, to points in metres."""
+    """Any depth video, 8 or 16 bits, to points in meters."""
     from dpcli.prepare.actions.depth import DepthVideos
     from dpcli.prepare.decode.pinhole_camera import Intrinsics
 
@@ -256,9 +259,20 @@ def depth(
             raise UsageError("--fx, --cx and --cy belong together (--fy defaults to --fx); or use --fov")
         camera = Intrinsics(*(float(v) for v in pixels if v is not None))
     return DepthVideos(
-        tuple(inputs), camera, fov, depth_scale, invert, near, far, background, margin, fps, stride, labels,
+        tuple(inputs),
+        camera,
+        fov,
+        depth_scale,
+        invert,
+        near,
+        far,
+        background,
+        margin,
+        fps,
+        stride,
+        labels,
         label_from_folder,
-    )  # fmt: skip
+    )
 
 
 @_reads(app)
@@ -276,7 +290,10 @@ def clouds(
     ] = None,
     stride: Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")] = 1,
     label_from_folder: Annotated[
-        bool, typer.Option("--label-from-folder", help="RAW/CLASS/SEQUENCE/frames, or RAW/train/CLASS/... and RAW/test/CLASS/...")
+        bool,
+        typer.Option(
+            "--label-from-folder", help="RAW/CLASS/SEQUENCE/frames, or RAW/train/CLASS/... and RAW/test/CLASS/..."
+        ),
     ] = False,
     labels: Annotated[Path | None, typer.Option("--labels", help="CSV: name,label[,subject][,split].")] = None,
 ) -> Any:
@@ -299,8 +316,7 @@ def sapien(
     test_categories: Annotated[str, typer.Option("--test-categories", help="Split test, as A,B,C.")] = "",
     validation_categories: Annotated[str, typer.Option("--validation-categories", help="Split validation.")] = "",
     fractions: Annotated[
-        str,
-        typer.Option("--fractions", help="Of the other objects: train,validation,test. Default: see below."),
+        str, typer.Option("--fractions", help="Of the other objects: train,validation,test. Default: see below.")
     ] = "",
     seed: Seed = 0,
 ) -> Any:
@@ -346,8 +362,7 @@ def articulated(
     articulation: dict[str, Any],
     objects: Annotated[int, typer.Option("--objects", min=1, help="Different objects, the kinds in turn.")] = 220,
     sequences_per_object: Annotated[
-        int,
-        typer.Option("--sequences-per-object", "--pairs-per-object", min=1, help="Sequences of --frames of each."),
+        int, typer.Option("--sequences-per-object", "--pairs-per-object", min=1, help="Sequences of --frames of each.")
     ] = 4,
     kinds: Annotated[
         str, typer.Option("--kinds", help="Only these, as laptop,scissors,lamp. Default: all 22, arm to window.")

@@ -26,7 +26,10 @@ def merge(
         Path | None, typer.Option("--labels", help="TOML or JSON: which class of which file becomes which.")
     ] = None,
     prefix: Annotated[
-        bool, typer.Option("--prefix", help="Samples are named FILE/NAME (FOLDER/NAME of files called alike): names may repeat.")
+        bool,
+        typer.Option(
+            "--prefix", help="Samples are named FILE/NAME (FOLDER/NAME of files called alike): names may repeat."
+        ),
     ] = False,
     compression: Annotated[
         str, typer.Option("--compression", help="Of the coordinates: none, lzf or gzip. Shards: as they were made.")
@@ -73,13 +76,19 @@ def split(
     from dpcli.prepare.commands.split import SplitChoice
     from dpcli.prepare.commands.split import split as divide
 
-    named = {"train": _numbers(train_subjects, "--train-subjects"),
-             "validation": _numbers(validation_subjects, "--validation-subjects")}  # fmt: skip
+    named = {
+        "train": _numbers(train_subjects, "--train-subjects"),
+        "validation": _numbers(validation_subjects, "--validation-subjects"),
+    }
     subjects = {name: numbers for name, numbers in named.items() if numbers} or None
     shares = _shares(fractions) if fractions else None
     counts = divide(
-        clouds, output, SplitChoice(subjects, listed, shares, stratify, by_subject, seed), compression=compression, force=force
-    )  # fmt: skip
+        clouds,
+        output,
+        SplitChoice(subjects, listed, shares, stratify, by_subject, seed),
+        compression=compression,
+        force=force,
+    )
     for name, count in counts.items():
         typer.echo(f"{name or 'in no split, left out'}: {count} sequences")
 

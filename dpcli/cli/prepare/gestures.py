@@ -49,7 +49,7 @@ def ntu60(
         str, typer.Option("--intrinsics", help="peers (focal 280), kinect2, or a JSON with fx fy cx cy, pixels.")
     ] = "peers",
     scale: Annotated[
-        float, typer.Option("--scale", help="Millimetres per unit of length in the output; 1000: metres.")
+        float, typer.Option("--scale", help="Millimeters per unit of length in the output; 1000: meters.")
     ] = 655.35,
 ) -> Any:
     """NTU RGB+D 60: 60 actions in masked Kinect v2 depth, 56,880 videos of 40 subjects."""

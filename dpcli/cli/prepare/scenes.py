@@ -18,8 +18,8 @@ _Meshes = Annotated[
 _Coordinates = Annotated[
     str, typer.Option("--coordinates", help="published: x left, y up, z forward. camera: x right, y down, z forward.")
 ]
-_Far = Annotated[float, typer.Option("--far", help="Drop what is farther from the camera, metres.")]
-_Near = Annotated[float, typer.Option("--near", help="Drop what is not this far ahead of the scanner, metres.")]
+_Far = Annotated[float, typer.Option("--far", help="Drop what is farther from the camera, meters.")]
+_Near = Annotated[float, typer.Option("--near", help="Drop what is not this far ahead of the scanner, meters.")]
 
 
 def register(app: typer.Typer, reads: Callable[..., Callable[..., Any]]) -> None:
@@ -124,7 +124,7 @@ def kitti_det(
     far: _Far = 35.0,
     coordinates: _Coordinates = "published",
 ) -> Any:
-    """KITTI 3D detection: 7,481 Velodyne scans, objects are what the labelled boxes hold."""
+    """KITTI 3D detection: 7,481 Velodyne scans, objects are what the labeled boxes hold."""
     from dpcli.prepare.scans.kitti_det import KittiDetection
     from dpcli.prepare.scans.kitti_files import View
 
@@ -146,7 +146,7 @@ def semantickitti(
     far: _Far = 35.0,
     coordinates: _Coordinates = "published",
 ) -> Any:
-    """SemanticKITTI: Velodyne scans of 11 drives, objects are the labelled instances."""
+    """SemanticKITTI: Velodyne scans of 11 drives, objects are the labeled instances."""
     from dpcli.prepare.scans.kitti_files import View
     from dpcli.prepare.scans.semantickitti import SemanticKitti
 

@@ -31,8 +31,8 @@ def video(
     output: _Output = "",
     frames: _Frames = 32,
     size: _Size = 512,
-    recentre: Annotated[
-        bool, typer.Option("--recentre/--no-recentre", help="One crop around the object for the whole clip.")
+    recenter: Annotated[
+        bool, typer.Option("--recenter/--no-recenter", help="One crop around the object for the whole clip.")
     ] = True,
     border: _Border = 0.2,
     background: Annotated[
@@ -40,11 +40,11 @@ def video(
         typer.Option("--background", help="Of frames without alpha: auto, white, black, r,g,b, or keep (no cut-out)."),
     ] = "auto",
     tolerance: Annotated[
-        float, typer.Option("--tolerance", help="Of the background's colour, as a share of the value range.")
+        float, typer.Option("--tolerance", help="Of the background's color, as a share of the value range.")
     ] = 0.06,
     holes: Annotated[
         str,
-        typer.Option("--holes", help="Enclosed regions of the background's colour: auto, keep (filled), cut (gaps)."),
+        typer.Option("--holes", help="Enclosed regions of the background's color: auto, keep (filled), cut (gaps)."),
     ] = "auto",
     mask: Annotated[Path | None, typer.Option("--mask", help="Folder of a mask per frame, object white.")] = None,
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second. Default: the file's, else 16.")] = None,
@@ -69,9 +69,23 @@ def video(
     from dpcli.prepare.views.video import VideoOptions, video_clip, video_config
 
     options = VideoOptions(
-        frames, size, recentre, border, background, tolerance, holes, mask, fps, on_error, name, elevation, radius,
-        fovy, views, views_cameras,
-    )  # fmt: skip
+        frames,
+        size,
+        recenter,
+        border,
+        background,
+        tolerance,
+        holes,
+        mask,
+        fps,
+        on_error,
+        name,
+        elevation,
+        radius,
+        fovy,
+        views,
+        views_cameras,
+    )
     options.check()
     if check:
         from dpcli.prepare.views.views_check import ClipIndex
@@ -115,9 +129,18 @@ def artemis(
     from dpcli.prepare.views.artemis import ArtemisOptions, artemis_clip, artemis_config
 
     options = ArtemisOptions(
-        motion, frames, size, border, reference, _numbers(cameras, "--cameras"),
-        _numbers(train_cameras, "--train-cameras"), tracks, fps, on_error, seed,
-    )  # fmt: skip
+        motion,
+        frames,
+        size,
+        border,
+        reference,
+        _numbers(cameras, "--cameras"),
+        _numbers(train_cameras, "--train-cameras"),
+        tracks,
+        fps,
+        on_error,
+        seed,
+    )
     config = artemis_config(animal, options)
     write_views(lambda: artemis_clip(animal, options), output, config=config, source="artemis", seed=seed, force=force)
 

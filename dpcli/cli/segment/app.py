@@ -14,7 +14,10 @@ app = typer.Typer(no_args_is_help=True)
 
 Amp = Annotated[
     bool | None,
-    typer.Option("--amp/--no-amp", help="Products in bfloat16, geometry in float32. Default: on GPUs that have it (Ampere and later)."),
+    typer.Option(
+        "--amp/--no-amp",
+        help="Products in bfloat16, geometry in float32. Default: on GPUs that have it (Ampere and later).",
+    ),
 ]
 _FLOW = "First flow: icp (rigid pieces), nearest (point), or a trained estimator's file or folder (dpc segment flow)."
 
@@ -26,7 +29,9 @@ def train(
     config: Annotated[
         str, typer.Option(help="compact (under 0.25 M parameters) or release (1.43 M, as published).")
     ] = "compact",
-    supervised: Annotated[bool, typer.Option("--supervised", help="Learn from part ids and poses (or scene flow) instead.")] = False,
+    supervised: Annotated[
+        bool, typer.Option("--supervised", help="Learn from part ids and poses (or scene flow) instead.")
+    ] = False,
     flow: Annotated[str, typer.Option(help=_FLOW)] = "icp",
     flow_decay: Annotated[
         float, typer.Option(help="alpha of eq. 4.6: 1 keeps the first flow (past), 0 takes the newest (current).")
@@ -86,20 +91,43 @@ def train(
     if no_motion_head:
         network["motion_width"] = 0
     schedule = {
-        "epochs": epochs, "pairs_per_epoch": pairs_per_epoch or None, "batch": batch, "learning_rate": lr,
+        "epochs": epochs,
+        "pairs_per_epoch": pairs_per_epoch or None,
+        "batch": batch,
+        "learning_rate": lr,
         "augment": not no_augment,
-    }  # fmt: skip
+    }
     objective = {
-        "form": loss, "smooth": smooth, "invariance": invariance, "supervised": supervised,
-        "cold_start": cold_start, "cold_until": cold_until, "consensus": consensus, "tau": tau,
-        "flow_decay": flow_decay, "motion_after": motion_after, "update_after": update_after,
+        "form": loss,
+        "smooth": smooth,
+        "invariance": invariance,
+        "supervised": supervised,
+        "cold_start": cold_start,
+        "cold_until": cold_until,
+        "consensus": consensus,
+        "tau": tau,
+        "flow_decay": flow_decay,
+        "motion_after": motion_after,
+        "update_after": update_after,
         "consensus_after": consensus_after,
-    }  # fmt: skip
+    }
     run_training(
-        data, output, config=config, network=network, schedule=schedule, objective=objective, flow=flow, points=points,
-        validation=validation, start_from=start_from, flows_of=flows_of, seed=seed, device=device, force=force,
+        data,
+        output,
+        config=config,
+        network=network,
+        schedule=schedule,
+        objective=objective,
+        flow=flow,
+        points=points,
+        validation=validation,
+        start_from=start_from,
+        flows_of=flows_of,
+        seed=seed,
+        device=device,
+        force=force,
         amp=amp,
-    )  # fmt: skip
+    )
 
 
 @app.command()
@@ -127,7 +155,7 @@ def predict(
     points: Annotated[
         int, typer.Option(min=32, help="Points of a frame the segmenter sees; its answer is carried back to all.")
     ] = 512,
-    no_vote: Annotated[bool, typer.Option("--no-vote", help="Don't blend masks of neighbouring frames.")] = False,
+    no_vote: Annotated[bool, typer.Option("--no-vote", help="Don't blend masks of neighboring frames.")] = False,
     no_split: Annotated[
         bool, typer.Option("--no-split", help="Keep a part whole even if its points move as several bodies.")
     ] = False,
@@ -138,7 +166,7 @@ def predict(
         Path | None, typer.Option("--turntable", help="Write an animation (.gif) to this file.")
     ] = None,
     ply: Annotated[
-        Path | None, typer.Option("--ply", help="Write every frame as a coloured .ply into this folder.")
+        Path | None, typer.Option("--ply", help="Write every frame as a colored .ply into this folder.")
     ] = None,
     amp: Amp = None,
     seed: Seed = 0,
@@ -156,12 +184,32 @@ def predict(
         raise UsageError(f"--model {model}: --method {method} uses no network; give one of both")
     options = dict(word.split("=", 1) if "=" in word else (word, "") for word in method_option or [])
     divide = not no_split and method is None
-    refinement = {"points": points, "pairs": pairs, "icp": icp, "vote": not no_vote, "split": divide, "smallest": smallest}
+    refinement = {
+        "points": points,
+        "pairs": pairs,
+        "icp": icp,
+        "vote": not no_vote,
+        "split": divide,
+        "smallest": smallest,
+    }
     run_prediction(
-        data, model or ("" if method else default_model()), output, method=method, method_options=options, num_parts=parts,
-        flow=flow, refinement=refinement, split=split, seed=seed, device=device, force=force, picture=picture, ply=ply,
-        turntable=turntable, amp=amp,
-    )  # fmt: skip
+        data,
+        model or ("" if method else default_model()),
+        output,
+        method=method,
+        method_options=options,
+        num_parts=parts,
+        flow=flow,
+        refinement=refinement,
+        split=split,
+        seed=seed,
+        device=device,
+        force=force,
+        picture=picture,
+        ply=ply,
+        turntable=turntable,
+        amp=amp,
+    )
 
 
 @app.command()
@@ -169,7 +217,7 @@ def flow(
     data: Annotated[str, typer.Argument(help="A clouds file of sequences of two frames or more, or - for a pipe.")],
     output: Annotated[str, typer.Option("-o", "--output", help="Folder for checkpoints, logs and curves.")],
     config: Annotated[str, typer.Option(help="compact or release (FlowStep3D's widths).")] = "compact",
-    steps: Annotated[int, typer.Option(min=1, help="Optimiser steps.")] = 2000,
+    steps: Annotated[int, typer.Option(min=1, help="Optimizer steps.")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="Pairs per step.")] = 8,
     seed: Seed = 0,
     device: Device = "auto",
@@ -214,8 +262,18 @@ def estimate_flow(
     """Scene flow of every frame to the next, as the field scene_flow of a clouds file (last frame: to the one before)."""
     from dpcli.segment.commands.estimate_flow import run_flow_estimate
 
-    run_flow_estimate(data, output, flow=flow, points=points, as_points=as_points, split=split, seed=seed, device=device,
-                      jobs=jobs, force=force)  # fmt: skip
+    run_flow_estimate(
+        data,
+        output,
+        flow=flow,
+        points=points,
+        as_points=as_points,
+        split=split,
+        seed=seed,
+        device=device,
+        jobs=jobs,
+        force=force,
+    )
 
 
 @app.command()

@@ -22,7 +22,7 @@ def check_picture(path: Path) -> None:
 
 
 def confusion_picture(report: ClassificationReport, path: Path) -> None:
-    """Draw the confusion matrix of the main scores: colour = share of the row's truth, number = samples."""
+    """Draw the confusion matrix of the main scores: color = share of the row's truth, number = samples."""
     from matplotlib.figure import Figure
 
     confusion = report.main.confusion
@@ -58,8 +58,15 @@ def _headline(report: ClassificationReport) -> str:
 
 def _number_cells(axes, confusion: np.ndarray, shares: np.ndarray, size: float) -> None:
     for row, column in np.argwhere(confusion > 0):
-        axes.text(column, row, str(confusion[row, column]), ha="center", va="center", fontsize=size,
-                  color="white" if shares[row, column] > 0.55 else "#203040")  # fmt: skip
+        axes.text(
+            column,
+            row,
+            str(confusion[row, column]),
+            ha="center",
+            va="center",
+            fontsize=size,
+            color="white" if shares[row, column] > 0.55 else "#203040",
+        )
 
 
 def _name_axes(axes, titles: list[str]) -> None:

@@ -24,8 +24,10 @@ class ClassificationStatistics:
     def __add__(self, other: ClassificationStatistics) -> ClassificationStatistics:
         """Statistics of both sets of samples together; ValueError when they are of different classes or k."""
         if self.confusion.shape != other.confusion.shape or self.top_k != other.top_k:
-            raise ValueError(f"cannot add statistics of {len(self.confusion)} and {len(other.confusion)} classes, "
-                             f"top {self.top_k} and {other.top_k}")  # fmt: skip
+            raise ValueError(
+                f"cannot add statistics of {len(self.confusion)} and {len(other.confusion)} classes, "
+                f"top {self.top_k} and {other.top_k}"
+            )
         return ClassificationStatistics(self.confusion + other.confusion, self.top_hits + other.top_hits, self.top_k)
 
 
@@ -93,8 +95,10 @@ def _check(scores: np.ndarray, labels: np.ndarray) -> None:
         raise DataError("no samples to evaluate: a share of nothing is undefined")
     finite = np.isfinite(scores).all(axis=1)
     if not finite.all():
-        raise DataError(f"{int((~finite).sum())} of {len(scores)} samples have NaN or infinite scores, "
-                        f"the first is number {int(finite.argmin())}")  # fmt: skip
+        raise DataError(
+            f"{int((~finite).sum())} of {len(scores)} samples have NaN or infinite scores, "
+            f"the first is number {int(finite.argmin())}"
+        )
     wrong = (labels < 0) | (labels >= scores.shape[1])
     if wrong.any():
         first = int(wrong.argmax())
@@ -118,12 +122,22 @@ def classification_compute(statistics: ClassificationStatistics) -> Classificati
     recall = divide(hits, support)
     ranked = len(confusion) > statistics.top_k
     return ClassificationMetrics(
-        samples=samples, correct=correct, accuracy=float(divide(correct, samples)),
-        interval=wilson_interval(correct, samples), balanced_accuracy=mean_defined(recall), macro_f1=mean_defined(f1),
-        top_k=statistics.top_k, top_accuracy=float(divide(statistics.top_hits, samples)) if ranked else None,
-        support=support, predicted=predicted, hits=hits, recall=recall, precision=divide(hits, predicted), f1=f1,
+        samples=samples,
+        correct=correct,
+        accuracy=float(divide(correct, samples)),
+        interval=wilson_interval(correct, samples),
+        balanced_accuracy=mean_defined(recall),
+        macro_f1=mean_defined(f1),
+        top_k=statistics.top_k,
+        top_accuracy=float(divide(statistics.top_hits, samples)) if ranked else None,
+        support=support,
+        predicted=predicted,
+        hits=hits,
+        recall=recall,
+        precision=divide(hits, predicted),
+        f1=f1,
         confusion=confusion,
-    )  # fmt: skip
+    )
 
 
 def classification_metrics(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> ClassificationMetrics:

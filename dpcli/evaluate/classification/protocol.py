@@ -101,9 +101,11 @@ def evaluate_classification(
         labels=labels,
         scores=scores.scores[keep],
         resampling=resampling,
-        intervals={name: resampling.intervals(classification_weighted(rows, labels), len(labels))
-                   for name, rows in streams.items()},
-    )  # fmt: skip
+        intervals={
+            name: resampling.intervals(classification_weighted(rows, labels), len(labels))
+            for name, rows in streams.items()
+        },
+    )
 
 
 def _metrics(scores: np.ndarray, labels: np.ndarray, confidence: float) -> ClassificationMetrics:
@@ -144,15 +146,19 @@ def _matched_truth(
     where = {name: index for index, name in enumerate(names)}
     unknown = [name for name in scores.names if name not in where]
     if unknown and not intersect:
-        raise DataError(f"{truth}: has no {listing(unknown)}, which {scores.path} scores; was it predicted from another? "
-                        "--intersect evaluates what both have")  # fmt: skip
+        raise DataError(
+            f"{truth}: has no {listing(unknown)}, which {scores.path} scores; was it predicted from another? "
+            "--intersect evaluates what both have"
+        )
     wanted = _counted(split, splits)
     scored = set(scores.names)
     unscored = [name for name, own in zip(names, splits, strict=True) if wanted in ("all", own) and name not in scored]
     if unscored and not intersect:
         kind = "samples" if wanted == "all" else f"{wanted} samples"
-        raise DataError(f"{scores.path}: scores no {listing(unscored)} among the {kind} of {truth}; "
-                        "predict them too, or choose another --split")  # fmt: skip
+        raise DataError(
+            f"{scores.path}: scores no {listing(unscored)} among the {kind} of {truth}; "
+            "predict them too, or choose another --split"
+        )
     if len(unknown) == len(scores.names):
         raise DataError(f"{scores.path}: scores {listing(unknown)}, of which {truth} has none")
     found = np.array([name in where for name in scores.names])
@@ -160,8 +166,10 @@ def _matched_truth(
     labels = np.where(found, labels[rows], -1).astype(np.int64)
     if labels.max() >= len(scores.class_names):
         worst = int(labels.argmax())
-        raise DataError(f"{truth}: label {labels[worst]} of {scores.names[worst]!r}; "
-                        f"{scores.path} has the classes 0..{len(scores.class_names) - 1}")  # fmt: skip
+        raise DataError(
+            f"{truth}: label {labels[worst]} of {scores.names[worst]!r}; "
+            f"{scores.path} has the classes 0..{len(scores.class_names) - 1}"
+        )
     left_out = [LeftOut("the truth doesn't have", unknown), LeftOut("not scored", unscored)]
     return labels, [splits[row] for row in rows], found, left_out
 
@@ -227,8 +235,15 @@ def intervals_json(
     """How intervals were found, and under `metrics` the two ends of each; None = undefined."""
     if not resampling.resamples:
         return {"resamples": 0, "metrics": {}}
-    return {"method": method, "confidence": resampling.confidence, "resamples": resampling.resamples,
-            "seed": resampling.seed, "resampled": of, "number": number, "metrics": ends_json(intervals)}  # fmt: skip
+    return {
+        "method": method,
+        "confidence": resampling.confidence,
+        "resamples": resampling.resamples,
+        "seed": resampling.seed,
+        "resampled": of,
+        "number": number,
+        "metrics": ends_json(intervals),
+    }
 
 
 def ends_json(intervals: Mapping[str, Interval]) -> dict[str, list[float] | None]:

@@ -53,8 +53,10 @@ def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
         return []
     if number < 2:
         return [f"Intervals: undefined; there is one of these {of} only, and nothing says how another would differ."]
-    return [f"Intervals: {100 * resampling.confidence:.4g} %, bootstrap (BCa, {resampling.resamples} resamples of the "
-            f"{number} {of}, seed {resampling.seed}): what other {of} of this kind would give, not another training."]  # fmt: skip
+    return [
+        f"Intervals: {100 * resampling.confidence:.4g} %, bootstrap (BCa, {resampling.resamples} resamples of the "
+        f"{number} {of}, seed {resampling.seed}): what other {of} of this kind would give, not another training."
+    ]
 
 
 def tables(report: ClassificationReport) -> list[TextTable]:
@@ -80,16 +82,30 @@ def notes(report: ClassificationReport) -> list[str]:
 def _streams(report: ClassificationReport) -> TextTable:
     top = report.main.top_accuracy is not None
     interval = f"{100 * report.resampling.confidence:.4g} % interval"
-    header = ["stream", "accuracy", "correct", interval, *([f"top-{report.main.top_k}"] if top else []),
-              "balanced accuracy", "macro F1"]  # fmt: skip
+    header = [
+        "stream",
+        "accuracy",
+        "correct",
+        interval,
+        *([f"top-{report.main.top_k}"] if top else []),
+        "balanced accuracy",
+        "macro F1",
+    ]
     return TextTable("Accuracy", header, [_stream_row(name, values) for name, values in report.streams.items()])
 
 
 def _stream_row(name: str, values: ClassificationMetrics) -> list[str]:
     low, high = values.interval
     top = [] if values.top_accuracy is None else [percent(values.top_accuracy)]
-    return [name, percent(values.accuracy), f"{values.correct}/{values.samples}", f"{100 * low:.1f} - {percent(high)}",
-            *top, percent(values.balanced_accuracy), percent(values.macro_f1)]  # fmt: skip
+    return [
+        name,
+        percent(values.accuracy),
+        f"{values.correct}/{values.samples}",
+        f"{100 * low:.1f} - {percent(high)}",
+        *top,
+        percent(values.balanced_accuracy),
+        percent(values.macro_f1),
+    ]
 
 
 def _intervals(report: ClassificationReport) -> list[TextTable]:
@@ -109,10 +125,15 @@ def _intervals(report: ClassificationReport) -> list[TextTable]:
 def _classes(report: ClassificationReport) -> TextTable:
     main = report.main
     rows = [
-        [_class_title(label, name), percent(main.recall[label]), f"{main.hits[label]}/{main.support[label]}",
-         percent(main.precision[label]), percent(main.f1[label])]
+        [
+            _class_title(label, name),
+            percent(main.recall[label]),
+            f"{main.hits[label]}/{main.support[label]}",
+            percent(main.precision[label]),
+            percent(main.f1[label]),
+        ]
         for label, name in enumerate(report.class_names)
-    ]  # fmt: skip
+    ]
     return TextTable("By class", ["class", "accuracy (recall)", "correct", "precision", "F1"], rows)
 
 
@@ -153,8 +174,15 @@ def _rich(table: TextTable):
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(title=Text(table.title), title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False,
-                 title_style="bold", show_edge=False)  # fmt: skip
+    made = Table(
+        title=Text(table.title),
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1),
+        pad_edge=False,
+        title_style="bold",
+        show_edge=False,
+    )
     for position, name in enumerate(table.header):
         made.add_column(Text(name), justify="left" if position == 0 else "right", no_wrap=True)
     for row in table.rows:

@@ -95,10 +95,17 @@ def evaluate_compare(
     tasks = [{one.task: one for one in side} for side in sides]
     if not set(tasks[0]) & set(tasks[1]):
         raise DataError(f"{sources[0]} is for {min(tasks[0])}, {sources[1]} for {min(tasks[1])}: nothing to compare")
-    parts = [pair(one, tasks[1][task], resampling, intersect=question.intersect)
-             for task, one in tasks[0].items() if task in tasks[1]]  # fmt: skip
-    notes = [f"{task.capitalize()}: only {source} can be evaluated, so it isn't compared."
-             for source, own, other in zip(sources, tasks, tasks[::-1], strict=True) for task in own if task not in other]  # fmt: skip
+    parts = [
+        pair(one, tasks[1][task], resampling, intersect=question.intersect)
+        for task, one in tasks[0].items()
+        if task in tasks[1]
+    ]
+    notes = [
+        f"{task.capitalize()}: only {source} can be evaluated, so it isn't compared."
+        for source, own, other in zip(sources, tasks, tasks[::-1], strict=True)
+        for task in own
+        if task not in other
+    ]
     return CompareReport(sources, question, resampling, parts, (sides[0][0].provenance, sides[1][0].provenance), notes)
 
 
@@ -139,12 +146,13 @@ def _differences(a: Measured, b: Measured, counts: np.ndarray) -> dict[str, np.n
 def _same_facts(a: Measured, b: Measured) -> None:
     if a.task != b.task:
         raise DataError(f"{a.source} is for {a.task}, {b.source} for {b.task}: nothing to compare")
-    for what, one, other in (("metrics", list(a.units), list(b.units)),
-                             *((f"unit of {key}", a.units[key], b.units.get(key)) for key in a.units),
-                             *((what, own, b.same.get(what)) for what, own in a.same.items())):  # fmt: skip
+    for what, one, other in (
+        ("metrics", list(a.units), list(b.units)),
+        *((f"unit of {key}", a.units[key], b.units.get(key)) for key in a.units),
+        *((what, own, b.same.get(what)) for what, own in a.same.items()),
+    ):
         if one != other:
-            raise DataError(f"{what}: {_first_difference(one, other, a.source, b.source)}; "
-                            "they can't be compared")  # fmt: skip
+            raise DataError(f"{what}: {_first_difference(one, other, a.source, b.source)}; they can't be compared")
 
 
 def _first_difference(one: object, other: object, source: str, another: str) -> str:
@@ -157,12 +165,14 @@ def _first_difference(one: object, other: object, source: str, another: str) -> 
 
 
 def _same_samples(a: Measured, b: Measured, intersect: bool) -> tuple[Measured, Measured, list[LeftOut]]:
-    only_a, only_b = ([name for name in one.names if name not in set_of] for one, set_of in
-                      ((a, set(b.names)), (b, set(a.names))))  # fmt: skip
+    only_a, only_b = (
+        [name for name in one.names if name not in set_of] for one, set_of in ((a, set(b.names)), (b, set(a.names)))
+    )
     if (only_a or only_b) and not intersect:
         lacking, having, names = (b, a, only_a) if only_a else (a, b, only_b)
-        raise DataError(f"{lacking.source}: has no {listing(names)}, which {having.source} has; "
-                        "--intersect compares what both have")  # fmt: skip
+        raise DataError(
+            f"{lacking.source}: has no {listing(names)}, which {having.source} has; --intersect compares what both have"
+        )
     common = [name for name in a.names if name not in set(only_a)]
     if not common:
         raise DataError(f"{a.source} and {b.source} have not one of their {a.kind} in common")
@@ -189,8 +199,10 @@ def _once(entries: Sequence[LeftOut]) -> list[LeftOut]:
 def _same_of_samples(a: Measured, b: Measured, what: str) -> None:
     for name, one, other in zip(a.names, a.of_sample[what], b.of_sample[what], strict=True):
         if one != other:
-            raise DataError(f"{what} of {name!r}: {_first_difference(one, other, a.source, b.source)}; "
-                            "predict both from the same file")  # fmt: skip
+            raise DataError(
+                f"{what} of {name!r}: {_first_difference(one, other, a.source, b.source)}; "
+                "predict both from the same file"
+            )
 
 
 def _change(
@@ -266,18 +278,26 @@ def compare_json(report: CompareReport) -> dict[str, Any]:
             "lower_is_better": sorted(LOWER_IS_BETTER & set(changes)),
         },
         "metrics": {key: _change_json(change) for key, change in changes.items()},
-        "intervals": intervals_json(resampling, first.kind, len(first.names), differences, "paired bootstrap, percentile"),
+        "intervals": intervals_json(
+            resampling, first.kind, len(first.names), differences, "paired bootstrap, percentile"
+        ),
         "mcnemar": None if first.mcnemar is None else vars(first.mcnemar),
-        "most_changed": {part.changed_by: [{"name": name, "a": a, "b": b} for name, a, b in part.changed]
-                         for part in report.parts if part.changed_by},
+        "most_changed": {
+            part.changed_by: [{"name": name, "a": a, "b": b} for name, a, b in part.changed]
+            for part in report.parts
+            if part.changed_by
+        },
         "samples": samples_json(first.kind, first.names),
         "units": {key: change.unit for key, change in changes.items()},
         "denominators": {part.task: {part.kind: len(part.names)} for part in report.parts},
-        "left_out": [{"task": part.task, "reason": e.reason, "count": len(e.names), "names": e.names}
-                     for part in report.parts for e in part.left_out],
+        "left_out": [
+            {"task": part.task, "reason": e.reason, "count": len(e.names), "names": e.names}
+            for part in report.parts
+            for e in part.left_out
+        ],
         "notes": report.notes,
         "provenance": list(report.provenance),
-    }  # fmt: skip
+    }
 
 
 def _change_json(change: Change) -> dict[str, Any]:
@@ -285,5 +305,8 @@ def _change_json(change: Change) -> dict[str, Any]:
     shown = {key: None if np.isnan(value) else value for key, value in numbers.items()}
     counts = {key: getattr(change, key) for key in ("a_better", "b_better", "ties")}
     wilcoxon = change.wilcoxon_p
-    return shown | {"interval": ends_json({"": change.interval})[""], **counts,
-                    "wilcoxon_p": None if wilcoxon is None or np.isnan(wilcoxon) else wilcoxon}  # fmt: skip
+    return shown | {
+        "interval": ends_json({"": change.interval})[""],
+        **counts,
+        "wilcoxon_p": None if wilcoxon is None or np.isnan(wilcoxon) else wilcoxon,
+    }

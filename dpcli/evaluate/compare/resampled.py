@@ -72,8 +72,9 @@ def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol:
     release = protocol == "release"
     whole = segmentation_merge(sequences)
     unit = np.repeat(np.arange(len(sequences)), [len(one.iou) for one in sequences])
-    hit, said, iou = (np.bincount(unit, weights, len(sequences))
-                      for weights in (whole.matched, None, whole.iou * whole.matched))  # fmt: skip
+    hit, said, iou = (
+        np.bincount(unit, weights, len(sequences)) for weights in (whole.matched, None, whole.iou * whole.matched)
+    )
     sums = np.stack([hit, said, iou, [one.truth_parts for one in sequences]], axis=1).astype(np.float64)
     over_sequences = means({"miou": whole.object_iou, "ri": whole.object_rand})
     ap = _WeightedPrecision(whole, unit, keep_order=release)
@@ -141,8 +142,11 @@ def motion_weighted(sequences: Sequence[MotionStatistics], tau: float, batch: in
 
 def flow_keys(tau: float) -> list[tuple[str, int, int]]:
     """(metric, row, column of `hits`) of AccS, AccR, Outlier; those of the protocol's own `tau` without a number."""
-    return [(name if own == tau else f"{name}_{own:g}", row, column)
-            for row, own in enumerate(TAUS) for column, name in enumerate(("accs", "accr", "outlier"))]  # fmt: skip
+    return [
+        (name if own == tau else f"{name}_{own:g}", row, column)
+        for row, own in enumerate(TAUS)
+        for column, name in enumerate(("accs", "accr", "outlier"))
+    ]
 
 
 def _flow_sums(sequences: Sequence[MotionStatistics], tau: float) -> dict[str, np.ndarray]:
@@ -155,8 +159,10 @@ def _flow_sums(sequences: Sequence[MotionStatistics], tau: float) -> dict[str, n
 
 
 def _part_sums(sequences: Sequence[MotionStatistics]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    tops = {"part_rotation": np.degrees([one.rotation.sum() for one in sequences]),
-            "part_displacement": np.array([one.displacement.sum() for one in sequences])}  # fmt: skip
+    tops = {
+        "part_rotation": np.degrees([one.rotation.sum() for one in sequences]),
+        "part_displacement": np.array([one.displacement.sum() for one in sequences]),
+    }
     return tops, dict.fromkeys(tops, np.array([len(one.rotation) for one in sequences]))
 
 
@@ -170,8 +176,10 @@ def _in_batches(sequences: Sequence[MotionStatistics], tau: float, batch: int, p
         for row in counts.astype(np.int64):
             pairs = _pairs_of(lengths, row)
             found = motion_compute(MotionStatistics(*(column[pairs] for column in columns), none, none), batch)
-            shares = {key: getattr(found.shares[TAUS[at]], ("accs", "accr", "outlier")[column])
-                      for key, at, column in flow_keys(tau)}  # fmt: skip
+            shares = {
+                key: getattr(found.shares[TAUS[at]], ("accs", "accr", "outlier")[column])
+                for key, at, column in flow_keys(tau)
+            }
             rows.append({"epe3d": found.epe3d, "epe3d_no_motion": found.still, **shares})
         return {key: np.array([row[key] for row in rows]) for key in rows[0]} | parts(counts)
 

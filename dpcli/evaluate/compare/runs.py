@@ -56,8 +56,10 @@ class RunsReport:
     def spreads(self) -> dict[str, Spread]:
         """By metric; undefined where a run has no number."""
         columns = {key: [run.metrics[key] for run in self.runs] for key in self.units}
-        return {key: spread([math.nan if v is None else v for v in column], self.confidence, self.units[key] == "fraction")
-                for key, column in columns.items()}  # fmt: skip
+        return {
+            key: spread([math.nan if v is None else v for v in column], self.confidence, self.units[key] == "fraction")
+            for key, column in columns.items()
+        }
 
 
 def spread(values: Sequence[float], confidence: float = 0.95, share: bool = False) -> Spread:
@@ -87,14 +89,18 @@ def evaluate_runs(
 
     DataError when they are of different kinds, tasks, protocols, units or samples.
     """
-    runs = [run for path, source in zip(paths, sources or map(str, paths), strict=True)
-            for run in (_file_runs if is_pictures(path) or _is_hdf5(path) else _json_runs)(path, source, question)]  # fmt: skip
+    runs = [
+        run
+        for path, source in zip(paths, sources or map(str, paths), strict=True)
+        for run in (_file_runs if is_pictures(path) or _is_hdf5(path) else _json_runs)(path, source, question)
+    ]
     for run in runs[1:]:
         _same_experiment(runs[0], run)
     runs = _distinct_titles(runs)
     samples = runs[0].identity.get("samples") or {}
-    return RunsReport(runs[0].task, runs, runs[0].units, confidence, str(samples.get("kind", "")),
-                      int(samples.get("number", 0)))  # fmt: skip
+    return RunsReport(
+        runs[0].task, runs, runs[0].units, confidence, str(samples.get("kind", "")), int(samples.get("number", 0))
+    )
 
 
 def _is_hdf5(path: Path) -> bool:
@@ -127,12 +133,16 @@ def _json_runs(path: Path, source: str, question: Question) -> list[Run]:
         lines = [line for line in path.read_text().splitlines() if line.strip()]
         objects = [json.loads(line) for line in lines]
     except (UnicodeDecodeError, json.JSONDecodeError):
-        raise DataError(f"{source}: neither a file of this program nor JSON objects, one a line; expected what "
-                        "`dpc evaluate ... --json` prints") from None  # fmt: skip
+        raise DataError(
+            f"{source}: neither a file of this program nor JSON objects, one a line; expected what "
+            "`dpc evaluate ... --json` prints"
+        ) from None
     if not objects:
         raise DataError(f"{source}: empty; the command that should have filled it failed")
-    return [_json_run(own, source if len(objects) == 1 else f"{source}:{row}", question.metrics)
-            for row, own in enumerate(objects, 1)]  # fmt: skip
+    return [
+        _json_run(own, source if len(objects) == 1 else f"{source}:{row}", question.metrics)
+        for row, own in enumerate(objects, 1)
+    ]
 
 
 def _json_run(own: Any, source: str, wanted: Sequence[str] | None) -> Run:
@@ -149,10 +159,20 @@ def _json_run(own: Any, source: str, wanted: Sequence[str] | None) -> Run:
     if bad:
         raise DataError(f"{source}: {', '.join(bad)} of {len(metrics)} metrics not finite; evaluate again")
     counts = own.get("denominators") or {}
-    identity = {"kind": "JSON", "protocol": own["protocol"], "samples": own.get("samples"),
-                "denominators": {key: counts[key] for key in _COUNTS if key in counts}}  # fmt: skip
-    return Run(_title(own, source), source, str(own.get("task", "")), metrics,
-               {key: str(own["units"][key]) for key in metrics}, identity)  # fmt: skip
+    identity = {
+        "kind": "JSON",
+        "protocol": own["protocol"],
+        "samples": own.get("samples"),
+        "denominators": {key: counts[key] for key in _COUNTS if key in counts},
+    }
+    return Run(
+        _title(own, source),
+        source,
+        str(own.get("task", "")),
+        metrics,
+        {key: str(own["units"][key]) for key in metrics},
+        identity,
+    )
 
 
 def _is_number(value: Any) -> bool:
@@ -166,12 +186,17 @@ def _title(own: dict[str, Any], source: str) -> str:
 
 
 def _same_experiment(first: Run, other: Run) -> None:
-    for what, one, two in (("task", first.task, other.task), ("metrics", list(first.units), list(other.units)),
-                           *((f"unit of {key}", first.units[key], other.units.get(key)) for key in first.units),
-                           *((key, own, other.identity.get(key)) for key, own in first.identity.items())):  # fmt: skip
+    for what, one, two in (
+        ("task", first.task, other.task),
+        ("metrics", list(first.units), list(other.units)),
+        *((f"unit of {key}", first.units[key], other.units.get(key)) for key in first.units),
+        *((key, own, other.identity.get(key)) for key, own in first.identity.items()),
+    ):
         if one != two:
-            raise DataError(f"{other.source}: another {what} than {first.source}: {_differing(one, two)}; "
-                            "runs are the same experiment on the same samples")  # fmt: skip
+            raise DataError(
+                f"{other.source}: another {what} than {first.source}: {_differing(one, two)}; "
+                "runs are the same experiment on the same samples"
+            )
 
 
 def _differing(one: Any, two: Any) -> str:
@@ -190,9 +215,12 @@ def _short(value: Any) -> str:
 def _distinct_titles(runs: Sequence[Run]) -> list[Run]:
     """Runs of equal titles are told apart by their place."""
     titles = [run.title for run in runs]
-    return [run if titles.count(run.title) == 1
-            else Run(f"{run.title} #{place}", run.source, run.task, run.metrics, run.units, run.identity)
-            for place, run in enumerate(runs, 1)]  # fmt: skip
+    return [
+        run
+        if titles.count(run.title) == 1
+        else Run(f"{run.title} #{place}", run.source, run.task, run.metrics, run.units, run.identity)
+        for place, run in enumerate(runs, 1)
+    ]
 
 
 def runs_json(report: RunsReport) -> dict[str, Any]:
@@ -215,9 +243,10 @@ def runs_json(report: RunsReport) -> dict[str, Any]:
             "of": report.task,
             "sd": "over runs, n - 1 in the denominator",
             "interval": f"of the mean, Student's t, {100 * report.confidence:.4g} %",
-        } | ({"each": first.identity["protocol"]} if "protocol" in first.identity else {}),
+        }
+        | ({"each": first.identity["protocol"]} if "protocol" in first.identity else {}),
         "metrics": metrics,
         "samples": first.identity.get("samples"),
         "units": report.units,
         "denominators": {"runs": len(report.runs), **({report.kind: report.number} if report.number else {})},
-    }  # fmt: skip
+    }

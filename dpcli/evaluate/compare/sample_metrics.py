@@ -20,8 +20,9 @@ from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 
 CLASSIFICATION = ("accuracy", f"top{TOP_K}_accuracy", "balanced_accuracy", "macro_f1")
 MOTION = ("epe3d", "accs", "accr", "outlier", "part_rotation", "part_displacement")
-LOWER_IS_BETTER = frozenset({"epe3d", "outlier", "part_rotation", "part_displacement", "lpips", "clip_spherical",
-                             "fvd", "warping"})  # fmt: skip
+LOWER_IS_BETTER = frozenset(
+    {"epe3d", "outlier", "part_rotation", "part_displacement", "lpips", "clip_spherical", "fvd", "warping"}
+)
 VIDEO = (
     "psnr",
     "psnr_foreground",
@@ -90,11 +91,20 @@ class Measured:
             return self.metric(spread)
 
         return Measured(
-            self.source, self.task, self.kind, list(names), metric,
-            {key: value[rows] for key, value in self.alone.items()}, self.units, self.same,
+            self.source,
+            self.task,
+            self.kind,
+            list(names),
+            metric,
+            {key: value[rows] for key, value in self.alone.items()},
+            self.units,
+            self.same,
             {key: [value[row] for row in rows] for key, value in self.of_sample.items()},
-            self.left_out, self.seed, self.provenance, None if self.right is None else self.right[rows],
-        )  # fmt: skip
+            self.left_out,
+            self.seed,
+            self.provenance,
+            None if self.right is None else self.right[rows],
+        )
 
 
 def is_pictures(path: Path) -> bool:
@@ -108,8 +118,10 @@ def measured_kind(path: Path, source: str) -> str:
     """scores | parts | video. DataError for a file that is none of them."""
     kind = "views" if is_pictures(path) else file_kind(path)
     if kind not in ("scores", "parts", *_VIDEO_FILES):
-        raise DataError(f"{source}: a {kind} file; expected scores or parts (`dpc classify predict`, `dpc segment "
-                        "predict`), a scene (`dpc generate4d fit`) or a video")  # fmt: skip
+        raise DataError(
+            f"{source}: a {kind} file; expected scores or parts (`dpc classify predict`, `dpc segment "
+            "predict`), a scene (`dpc generate4d fit`) or a video"
+        )
     return "video" if kind in _VIDEO_FILES else kind
 
 
@@ -127,15 +139,21 @@ def measure(path: Path, source: str, question: Question) -> list[Measured]:
     if kind == "scores":
         return [_classification(path, source, question)]
     if question.truth is None:
-        wanted = "a video holds no truth; name the true one" if kind == "video" else (
-            "a parts file holds no truth; name the clouds file")  # fmt: skip
+        wanted = (
+            "a video holds no truth; name the true one"
+            if kind == "video"
+            else ("a parts file holds no truth; name the clouds file")
+        )
         raise UsageError(f"{source}: {wanted} with --truth FILE")
     if kind == "video":
         return [_video(path, source, question)]
     wanted = question.metrics or (*SHARES, *(MOTION if _has_motion(path, question.truth) else ()))
     makers = ((_segmentation, SHARES), (_motion, MOTION))
-    return [make(path, source, question, asked) for make, own in makers
-            if (asked := [name for name in wanted if name in own])]  # fmt: skip
+    return [
+        make(path, source, question, asked)
+        for make, own in makers
+        if (asked := [name for name in wanted if name in own])
+    ]
 
 
 def _has_motion(path: Path, truth: Path) -> bool:
@@ -154,34 +172,66 @@ def _classification(path: Path, source: str, question: Question) -> Measured:
     if not asked:
         raise UsageError(f"{source}: top-{TOP_K} accuracy of {len(report.class_names)} classes is always 1")
     return Measured(
-        source, "classification", "samples", report.names, classification_weighted(report.scores, report.labels),
-        {key: hit.astype(np.float64) for key, hit in found.items() if key in asked}, dict.fromkeys(asked, "fraction"),
+        source,
+        "classification",
+        "samples",
+        report.names,
+        classification_weighted(report.scores, report.labels),
+        {key: hit.astype(np.float64) for key, hit in found.items() if key in asked},
+        dict.fromkeys(asked, "fraction"),
         {"split": report.split, "class names": report.class_names},
-        {"true label": report.labels.tolist()}, report.left_out, *_history(ScoresReader(path).provenance), right,
-    )  # fmt: skip
+        {"true label": report.labels.tolist()},
+        report.left_out,
+        *_history(ScoresReader(path).provenance),
+        right,
+    )
 
 
 def _segmentation(path: Path, source: str, question: Question, asked: Sequence[str]) -> Measured:
     report = evaluate_segmentation(
-        path, question.truth, protocol=question.protocol, ignore_below=question.ignore_below, split=question.split,
+        path,
+        question.truth,
+        protocol=question.protocol,
+        ignore_below=question.ignore_below,
+        split=question.split,
         intersect=question.intersect,
-    )  # fmt: skip
+    )
     metric = segmentation_weighted(report.sequences, question.protocol)
-    return Measured(source, "segmentation", "sequences", report.names, metric, _alone(metric, len(report.names), asked),
-                    dict.fromkeys(asked, "fraction"), {"split": report.split}, {}, report.left_out,
-                    *_parts_history(path))  # fmt: skip
+    return Measured(
+        source,
+        "segmentation",
+        "sequences",
+        report.names,
+        metric,
+        _alone(metric, len(report.names), asked),
+        dict.fromkeys(asked, "fraction"),
+        {"split": report.split},
+        {},
+        report.left_out,
+        *_parts_history(path),
+    )
 
 
 def _motion(path: Path, source: str, question: Question, asked: Sequence[str]) -> Measured:
-    report = evaluate_motion(path, question.truth, protocol=question.protocol, split=question.split,
-                             intersect=question.intersect)  # fmt: skip
+    report = evaluate_motion(
+        path, question.truth, protocol=question.protocol, split=question.split, intersect=question.intersect
+    )
     batch = RELEASE_BATCH if question.protocol == "release" else None
     metric = motion_weighted(report.statistics, MAIN_TAU[question.protocol], batch)
     lengths = {"epe3d": report.length_unit, "part_rotation": "degree", "part_displacement": report.length_unit}
-    return Measured(source, "motion", "sequences", report.names, metric, _alone(metric, len(report.names), asked),
-                    {name: lengths.get(name, "fraction") for name in asked}, {"split": report.split},
-                    {"frame pairs": [pairs.tolist() for pairs in report.pairs]}, report.left_out,
-                    *_parts_history(path))  # fmt: skip
+    return Measured(
+        source,
+        "motion",
+        "sequences",
+        report.names,
+        metric,
+        _alone(metric, len(report.names), asked),
+        {name: lengths.get(name, "fraction") for name in asked},
+        {"split": report.split},
+        {"frame pairs": [pairs.tolist() for pairs in report.pairs]},
+        report.left_out,
+        *_parts_history(path),
+    )
 
 
 def _video(path: Path, source: str, question: Question) -> Measured:
@@ -191,8 +241,13 @@ def _video(path: Path, source: str, question: Question) -> Measured:
 
     if question.ignore_below or question.split:
         raise UsageError(f"{source}: a video; --ignore-below and --split are for parts files")
-    report = evaluate_video(path, question.truth, metrics=question.metrics or ("psnr", "ssim"),
-                            protocol=question.protocol, intersect=question.intersect)  # fmt: skip
+    report = evaluate_video(
+        path,
+        question.truth,
+        metrics=question.metrics or ("psnr", "ssim"),
+        protocol=question.protocol,
+        intersect=question.intersect,
+    )
     for name, reason in report.missing.items():
         raise DataError(f"{source}: {name} not computed: {reason}")
     values, units = view_values(report)
@@ -234,9 +289,13 @@ def history_seed(provenance: Sequence[dict]) -> int | None:
 
 
 def of_values(
-    source: str, task: str, kind: str, values: Mapping[str, Mapping[str, float]], units: Mapping[str, str],
+    source: str,
+    task: str,
+    kind: str,
+    values: Mapping[str, Mapping[str, float]],
+    units: Mapping[str, str],
     same: Mapping[str, object] | None = None,
-) -> Measured:  # fmt: skip
+) -> Measured:
     """The same of a table {sample name: {metric: value}} whose metrics are means over the samples (pictures, views).
 
     DataError naming the samples with an infinite value, or without a sample; NaN = the sample doesn't count.

@@ -15,8 +15,21 @@ from dpcli.evaluate.compare.sample_metrics import LOWER_IS_BETTER
 
 _NAMES_SHOWN = 10
 _LOWER = " \N{DOWNWARDS ARROW}"  # lower is better
-_TITLES = {"ap": "AP", "pq": "PQ", "f1": "F1", "pre": "Pre", "rec": "Rec", "miou": "mIoU", "ri": "RI", "epe3d": "EPE3D",
-           "accs": "AccS", "accr": "AccR", "macro_f1": "macro F1", "psnr": "PSNR", "ssim": "SSIM"}  # fmt: skip
+_TITLES = {
+    "ap": "AP",
+    "pq": "PQ",
+    "f1": "F1",
+    "pre": "Pre",
+    "rec": "Rec",
+    "miou": "mIoU",
+    "ri": "RI",
+    "epe3d": "EPE3D",
+    "accs": "AccS",
+    "accr": "AccR",
+    "macro_f1": "macro F1",
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+}
 
 
 def metric_title(key: str, unit: str) -> str:
@@ -64,8 +77,16 @@ def compare_tables(report: CompareReport) -> list[TextTable]:
 def _change_row(key: str, own: Change) -> list[str]:
     counts = ["-" if count is None else str(count) for count in (own.a_better, own.b_better, own.ties)]
     title = metric_title(key, own.unit) + (_LOWER if key in LOWER_IS_BETTER else "")
-    return [title, number(own.a, own.unit), number(own.b, own.unit), number(own.difference, own.unit, signed=True),
-            ends(own.interval, own.unit), p_value(own.p), *counts, p_value(own.wilcoxon_p)]  # fmt: skip
+    return [
+        title,
+        number(own.a, own.unit),
+        number(own.b, own.unit),
+        number(own.difference, own.unit, signed=True),
+        ends(own.interval, own.unit),
+        p_value(own.p),
+        *counts,
+        p_value(own.wilcoxon_p),
+    ]
 
 
 def _changed(part: Paired) -> TextTable:
@@ -119,8 +140,11 @@ def runs_tables(report: RunsReport) -> list[TextTable]:
     rows += [
         [f"mean of {len(report.runs)}", *(number(spreads[key].mean, units[key]) for key in keys)],
         ["± sd", *(number(spreads[key].sd, units[key]) for key in keys)],
-        [f"{100 * report.confidence:.4g} % interval", *(_plain_ends(spreads[key].interval, units[key]) for key in keys)],
-    ]  # fmt: skip
+        [
+            f"{100 * report.confidence:.4g} % interval",
+            *(_plain_ends(spreads[key].interval, units[key]) for key in keys),
+        ],
+    ]
     return [TextTable(f"{report.task.capitalize()} of {len(report.runs)} runs", header, rows)]
 
 
@@ -132,12 +156,17 @@ def runs_notes(report: RunsReport) -> list[str]:
     """What a run is, and what the spread says."""
     lines = [f"{run.title}: {run.source}" for run in report.runs]
     number_of = f"{report.number} {report.kind}" if report.number else "the same samples"
-    lines.append(f"All on {number_of}. sd over runs (n - 1 in the denominator); interval of the mean: Student's t, "
-                 f"{len(report.runs) - 1} degrees of freedom. It says what other runs would give on these samples.")  # fmt: skip
+    lines.append(
+        f"All on {number_of}. sd over runs (n - 1 in the denominator); interval of the mean: Student's t, "
+        f"{len(report.runs) - 1} degrees of freedom. It says what other runs would give on these samples."
+    )
     if len(report.runs) == 1:
         lines.append("One run only: its spread is undefined.")
-    lines += [f"{metric_title(key, '')}: undefined in some runs, so without a mean."
-              for key in report.units if any(run.metrics[key] is None for run in report.runs)]  # fmt: skip
+    lines += [
+        f"{metric_title(key, '')}: undefined in some runs, so without a mean."
+        for key in report.units
+        if any(run.metrics[key] is None for run in report.runs)
+    ]
     return lines
 
 
@@ -146,8 +175,10 @@ def compare_picture(report: CompareReport, path: Path) -> None:
     from matplotlib.figure import Figure
 
     rows = {key: own for part in report.parts for key, own in part.changes.items()}
-    panels = [{key: own for key, own in rows.items() if own.unit == unit}
-              for unit in dict.fromkeys(own.unit for own in rows.values())]  # fmt: skip
+    panels = [
+        {key: own for key, own in rows.items() if own.unit == unit}
+        for unit in dict.fromkeys(own.unit for own in rows.values())
+    ]
     part = report.parts[0]
     figure = Figure(figsize=(4 * (len(panels) + 1), 1.8 + 0.45 * max(5, *map(len, panels))), layout="constrained")
     axes = figure.subplots(1, len(panels) + 1, squeeze=False)[0]

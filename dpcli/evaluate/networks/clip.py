@@ -85,13 +85,13 @@ def preprocess(
     pictures: np.ndarray,  # u8 or floats [B, H, W, 3]
     side: int = 224,
 ) -> np.ndarray:  # f32 [B, 3, side, side]
-    """CLIP's view of RGB pictures: short side to `side` (Pillow's bicubic), centre square, colours normalised.
+    """CLIP's view of RGB pictures: short side to `side` (Pillow's bicubic), center square, colors normalized.
 
     DataError for floats that are not finite or not in 0..1; ValueError for another shape.
     """
     if pictures.ndim != 4 or pictures.shape[3] != 3:
         raise ValueError(f"pictures of shape {pictures.shape}; expected (B,H,W,3)")
-    squares = [_centre(_resized(picture, side), side) for picture in _eight_bits(pictures)]
+    squares = [_center(_resized(picture, side), side) for picture in _eight_bits(pictures)]
     values = np.stack(squares).astype(np.float32) / 255 if squares else np.empty((0, side, side, 3), np.float32)
     values = (values - np.array(MEAN, np.float32)) / np.array(DEVIATION, np.float32)
     return np.ascontiguousarray(values.transpose(0, 3, 1, 2))
@@ -118,7 +118,7 @@ def _resized(picture: np.ndarray, side: int) -> np.ndarray:
     return np.asarray(Image.fromarray(np.ascontiguousarray(picture)).resize(size, Image.Resampling.BICUBIC))
 
 
-def _centre(picture: np.ndarray, side: int) -> np.ndarray:
+def _center(picture: np.ndarray, side: int) -> np.ndarray:
     top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
     return picture[top : top + side, left : left + side]
 

@@ -102,8 +102,10 @@ class Lpips(nn.Module):
             raise ValueError(f"pictures of shape {tuple(pictures.shape)}; expected (B,3,H,W)")
         height, width = pictures.shape[2:]
         if min(height, width) < self.trunk.smallest:
-            raise DataError(f"LPIPS ({self.net}) needs pictures of at least {self.trunk.smallest} pixels a side, "
-                            f"but these have {height} x {width}")  # fmt: skip
+            raise DataError(
+                f"LPIPS ({self.net}) needs pictures of at least {self.trunk.smallest} pixels a side, "
+                f"but these have {height} x {width}"
+            )
         if not pictures.is_floating_point():
             raise DataError(f"LPIPS needs floats in 0..1, but these are {pictures.dtype}; divide by 255")
         if not pictures.isfinite().all():

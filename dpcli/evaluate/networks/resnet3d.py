@@ -63,7 +63,7 @@ class ResNet3D50(nn.Module):
             yield f"layer{stage}", x
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`x` f32 (B,3,16,112,112), 0..255 less the mean colour -> (B,2048)."""
+        """`x` f32 (B,3,16,112,112), 0..255 less the mean color -> (B,2048)."""
         for _, found in self.stages(x):
             x = found
         return x.mean(dim=(2, 3, 4))

@@ -53,12 +53,18 @@ def alexnet() -> Trunk:
     """AlexNet in torchvision's one-tower form (Krizhevsky 2014); maps relu1 to relu5."""
     return Trunk(
         [
-            *_conv(3, 64, 11, stride=4, padding=2), nn.MaxPool2d(3, 2),
-            *_conv(64, 192, 5, padding=2), nn.MaxPool2d(3, 2),
-            *_conv(192, 384, 3, padding=1), *_conv(384, 256, 3, padding=1), *_conv(256, 256, 3, padding=1),
+            *_conv(3, 64, 11, stride=4, padding=2),
+            nn.MaxPool2d(3, 2),
+            *_conv(64, 192, 5, padding=2),
+            nn.MaxPool2d(3, 2),
+            *_conv(192, 384, 3, padding=1),
+            *_conv(384, 256, 3, padding=1),
+            *_conv(256, 256, 3, padding=1),
         ],
-        taps=(1, 4, 7, 9, 11), channels=(64, 192, 384, 256, 256), smallest=31,
-    )  # fmt: skip
+        taps=(1, 4, 7, 9, 11),
+        channels=(64, 192, 384, 256, 256),
+        smallest=31,
+    )
 
 
 def vgg16() -> Trunk:
@@ -77,12 +83,23 @@ def squeezenet() -> Trunk:
     """SqueezeNet 1.1 (Iandola et al. 2016); maps after the first ReLU and after fires 3, 5, 6, 7, 8 and 9."""
     return Trunk(
         [
-            *_conv(3, 64, 3, stride=2), _ceil_pool(), Fire(64, 16, 64), Fire(128, 16, 64),
-            _ceil_pool(), Fire(128, 32, 128), Fire(256, 32, 128),
-            _ceil_pool(), Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256),
+            *_conv(3, 64, 3, stride=2),
+            _ceil_pool(),
+            Fire(64, 16, 64),
+            Fire(128, 16, 64),
+            _ceil_pool(),
+            Fire(128, 32, 128),
+            Fire(256, 32, 128),
+            _ceil_pool(),
+            Fire(256, 48, 192),
+            Fire(384, 48, 192),
+            Fire(384, 64, 256),
+            Fire(512, 64, 256),
         ],
-        taps=(1, 4, 7, 9, 10, 11, 12), channels=(64, 128, 256, 384, 384, 512, 512), smallest=17,
-    )  # fmt: skip
+        taps=(1, 4, 7, 9, 10, 11, 12),
+        channels=(64, 128, 256, 384, 384, 512, 512),
+        smallest=17,
+    )
 
 
 def _conv(before: int, channels: int, size: int, **more: int) -> list[nn.Module]:

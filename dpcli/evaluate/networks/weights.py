@@ -38,7 +38,7 @@ class Weights:
     file: str
     url: str
     size: int
-    licence: str
+    license: str
     sha256: str
     used_by: str
     note: str = ""
@@ -69,7 +69,7 @@ def known() -> dict[str, Weights]:
 
 
 def _entry(name: str, fields: dict[str, Any]) -> Weights:
-    shared = {key: fields[key] for key in ("licence", "used_by")}
+    shared = {key: fields[key] for key in ("license", "used_by")}
     beside = tuple(Weights(name=name, **shared, **more) for more in fields.pop("beside", []))
     return Weights(name=name, beside=beside, **fields)
 

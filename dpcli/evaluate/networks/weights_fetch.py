@@ -32,8 +32,10 @@ def _fetch_file(weights: Weights, path: Path) -> None:
         log.info(f"{path}: already there")
         return
     if weights.by_hand:
-        raise DpcError(f"{weights.name}: its publisher has no direct link; download {weights.file} from {weights.url} "
-                       f"by hand and put it at {path}")  # fmt: skip
+        raise DpcError(
+            f"{weights.name}: its publisher has no direct link; download {weights.file} from {weights.url} "
+            f"by hand and put it at {path}"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.part")
     try:
@@ -72,8 +74,10 @@ def _why(weights: Weights, error: Exception, part: Path) -> str:
         reason = f"no connection ({getattr(error, 'reason', None) or error})"
     else:
         reason = f"can't write {part} ({error.strerror or error})"
-    return (f"{weights.url}: {reason}; on a machine with no network, download it elsewhere, put it in a folder as "
-            f"{weights.file}, and give the folder with --weights")  # fmt: skip
+    return (
+        f"{weights.url}: {reason}; on a machine with no network, download it elsewhere, put it in a folder as "
+        f"{weights.file}, and give the folder with --weights"
+    )
 
 
 def _checked(weights: Weights, part: Path) -> Checked:

@@ -25,8 +25,14 @@ def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[st
     titles = _titles(collected.results)
     sections = [_section(number, own, title) for number, (own, title) in enumerate(zip(collected.results, titles), 1)]
     named = list(zip(titles, objects, strict=True))
-    return Report(title, _summary(sections), sections, [beside_table(own, named, bool(beside)) for own in tables],
-                  collected.duplicates, __version__)  # fmt: skip
+    return Report(
+        title,
+        _summary(sections),
+        sections,
+        [beside_table(own, named, bool(beside)) for own in tables],
+        collected.duplicates,
+        __version__,
+    )
 
 
 def _titles(results: Sequence[Result]) -> list[str]:
@@ -69,11 +75,29 @@ def _section(number: int, result: Result, title: str) -> Section:
         for own in found.get("left_out", [])
     ]
     commands = [str(own["command"]) for own in found.get("provenance", []) if own.get("command")]
-    return Section(f"result-{number}", title, found["task"], data, headline(found), [*special, *blocks, *result.extras],
-                   [*said, *left, *result.notes, *notes], detail_lists(found), commands)  # fmt: skip
+    return Section(
+        f"result-{number}",
+        title,
+        found["task"],
+        data,
+        headline(found),
+        [*special, *blocks, *result.extras],
+        [*said, *left, *result.notes, *notes],
+        detail_lists(found),
+        commands,
+    )
 
 
 def _summary(sections: Sequence[Section]) -> Table:
-    rows = [[Cell(own.title, link=own.anchor), own.task, own.headline.metric, own.headline.value, own.headline.interval or "-",
-             Cell(own.data or "-")] for own in sections]  # fmt: skip
+    rows = [
+        [
+            Cell(own.title, link=own.anchor),
+            own.task,
+            own.headline.metric,
+            own.headline.value,
+            own.headline.interval or "-",
+            Cell(own.data or "-"),
+        ]
+        for own in sections
+    ]
     return table("Summary", ("result", "task", "metric", "value", "interval", "over"), rows, key="summary")

@@ -9,12 +9,34 @@ from typing import Any
 
 MISSING = "-"
 TITLES = {
-    "ap": "AP", "pq": "PQ", "f1": "F1", "pre": "Pre", "rec": "Rec", "miou": "mIoU", "ri": "RI", "epe3d": "EPE3D",
-    "epe3d_no_motion": "EPE3D of no motion", "accs": "AccS", "accr": "AccR", "outlier": "Outlier", "psnr": "PSNR",
-    "psnr_foreground": "PSNR on object", "ssim": "SSIM", "ms_ssim": "MS-SSIM", "lpips": "LPIPS", "fvd": "FVD",
-    "fid_vid": "FID-VID", "clip": "CLIP", "macro_f1": "macro F1", "top5_accuracy": "top-5 accuracy", "sd": "sd", "p": "p",
-    "adjusted_rand_index": "adjusted Rand index", "epe": "EPE", "tau": "tau",
-}  # fmt: skip
+    "ap": "AP",
+    "pq": "PQ",
+    "f1": "F1",
+    "pre": "Pre",
+    "rec": "Rec",
+    "miou": "mIoU",
+    "ri": "RI",
+    "epe3d": "EPE3D",
+    "epe3d_no_motion": "EPE3D of no motion",
+    "accs": "AccS",
+    "accr": "AccR",
+    "outlier": "Outlier",
+    "psnr": "PSNR",
+    "psnr_foreground": "PSNR on object",
+    "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
+    "lpips": "LPIPS",
+    "fvd": "FVD",
+    "fid_vid": "FID-VID",
+    "clip": "CLIP",
+    "macro_f1": "macro F1",
+    "top5_accuracy": "top-5 accuracy",
+    "sd": "sd",
+    "p": "p",
+    "adjusted_rand_index": "adjusted Rand index",
+    "epe": "EPE",
+    "tau": "tau",
+}
 _DIGITS = {"dB": 2, "degree": 2, "percent": 2}
 
 

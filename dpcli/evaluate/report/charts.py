@@ -27,8 +27,9 @@ def histogram(values: Sequence[float], unit: str = "", bins: int = _BINS) -> str
         f'<rect class="mark" x="{place(a):.1f}" y="{_level(count / most):.1f}" width="{max(place(b) - place(a) - 1, 0.5):.1f}" '
         f'height="{_level(0) - _level(count / most):.1f}"><title>{text_of(float(a), unit)} to {text_of(float(b), unit)}: '
         f"{count}</title></rect>"
-        for count, a, b in zip(counts.tolist(), edges[:-1], edges[1:], strict=True) if count
-    )  # fmt: skip
+        for count, a, b in zip(counts.tolist(), edges[:-1], edges[1:], strict=True)
+        if count
+    )
     middle = (
         f'<line class="middle" x1="{place(median):.1f}" x2="{place(median):.1f}" y1="{_TOP}" y2="{_level(0):.1f}"/>'
     )
@@ -70,8 +71,10 @@ def _axes(left: float, right: float, low: float, high: float, unit: str, side: s
         f'<text x="{place(value):.1f}" y="{base + 16:.1f}" text-anchor="{anchor}">{escape(text_of(_round(value), unit))}</text>'
         for value, anchor in ((left, "start"), ((left + right) / 2, "middle"), (right, "end"))
     )
-    ends = "".join(f'<text x="{_LEFT - 5}" y="{_level(share) + 4:.1f}" text-anchor="end">{escape(text_of(value, side))}</text>'
-                   for share, value in ((0, low), (1, high)))  # fmt: skip
+    ends = "".join(
+        f'<text x="{_LEFT - 5}" y="{_level(share) + 4:.1f}" text-anchor="end">{escape(text_of(value, side))}</text>'
+        for share, value in ((0, low), (1, high))
+    )
     return f'<line class="axis" x1="{_LEFT}" x2="{_WIDTH - 10}" y1="{base:.1f}" y2="{base:.1f}"/>{ticks}{ends}'
 
 
@@ -88,15 +91,19 @@ def _caption(words: str) -> str:
 
 
 def confusion_grid(confusion: np.ndarray, names: Sequence[str], unit: str = "samples") -> str:
-    """Counts i64 (C,C), rows truth, as a table coloured by the share of the row; a line of words for the cell in focus."""
+    """Counts i64 (C,C), rows truth, as a table colored by the share of the row; a line of words for the cell in focus."""
     shares = np.nan_to_num(divide(confusion, confusion.sum(axis=1, keepdims=True)))
     titles = [f"{label} {name}".strip() for label, name in enumerate(names)]
     head = "".join(f'<th scope="col" title="{escape(title)}">{label}</th>' for label, title in enumerate(titles))
     rows = "".join(
-        f'<tr><th scope="row">{escape(title)}</th>' + "".join(_grid_cell(*own, row == column) for column, own in
-        enumerate(zip(confusion[row].tolist(), shares[row].tolist(), strict=True))) + "</tr>"
+        f'<tr><th scope="row">{escape(title)}</th>'
+        + "".join(
+            _grid_cell(*own, row == column)
+            for column, own in enumerate(zip(confusion[row].tolist(), shares[row].tolist(), strict=True))
+        )
+        + "</tr>"
         for row, title in enumerate(titles)
-    )  # fmt: skip
+    )
     return (
         f'<div class="wide" tabindex="0" role="region" aria-label="Confusion matrix"><table class="grid" data-unit="{escape(unit)}">'
         f'<thead><tr><th scope="col">truth \\ predicted</th>{head}</tr></thead><tbody>{rows}</tbody></table></div>'

@@ -48,10 +48,17 @@ def _streams(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Table:
 
 
 def _classes(classes: list[Mapping[str, Any]]) -> Table:
-    rows = [[Cell(f"{row.get('label', number)} {row.get('name', '')}".strip(), float(number)),
-             cell(row.get("recall"), "fraction", bar=True), cell(row.get("support")), cell(row.get("hits")),
-             cell(row.get("precision"), "fraction"), cell(row.get("f1"), "fraction")]
-            for number, row in enumerate(classes)]  # fmt: skip
+    rows = [
+        [
+            Cell(f"{row.get('label', number)} {row.get('name', '')}".strip(), float(number)),
+            cell(row.get("recall"), "fraction", bar=True),
+            cell(row.get("support")),
+            cell(row.get("hits")),
+            cell(row.get("precision"), "fraction"),
+            cell(row.get("f1"), "fraction"),
+        ]
+        for number, row in enumerate(classes)
+    ]
     return table(
         "By class", ("class", "accuracy (recall)", "samples", "correct", "precision", "F1"), rows, key="per_class"
     )
@@ -71,13 +78,15 @@ def _matrix(found: Any, classes: int) -> np.ndarray | None:
         or (classes and len(matrix) != classes)
         or (matrix < 0).any()
     ):
-        raise DataError(f"metrics.confusion has shape {matrix.shape}; expected counts, one row and column for each of "
-                        f"{classes or 'the'} classes")  # fmt: skip
+        raise DataError(
+            f"metrics.confusion has shape {matrix.shape}; expected counts, one row and column for each of "
+            f"{classes or 'the'} classes"
+        )
     return matrix
 
 
 def _confusions(confusion: np.ndarray, names: list[str]) -> list[Table | Figure]:
-    note = "Rows: truth, columns: prediction; colour: share of the row's truth, number: samples."
+    note = "Rows: truth, columns: prediction; color: share of the row's truth, number: samples."
     if len(confusion) > _MOST_CLASSES:
         grid = []
     else:
@@ -91,9 +100,22 @@ def _confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
     cells = [tuple(own) for own in np.argwhere(wrong > 0).tolist()]
     cells.sort(key=lambda own: (-wrong[own], own))
     support = confusion.sum(axis=1)
-    rows = [[f"{names[a] or a}", f"{names[b] or b}", cell(int(wrong[a, b])), cell(float(wrong[a, b] / support[a]), "fraction", bar=True)]
-            for a, b in cells[:_MOST_PAIRS]]  # fmt: skip
+    rows = [
+        [
+            f"{names[a] or a}",
+            f"{names[b] or b}",
+            cell(int(wrong[a, b])),
+            cell(float(wrong[a, b] / support[a]), "fraction", bar=True),
+        ]
+        for a, b in cells[:_MOST_PAIRS]
+    ]
     if not rows:
         return []
-    return [table(f"Confused most ({len(rows)} of {len(cells)} pairs)", ("truth", "predicted as", "samples", "of the truth"), rows,
-                  key="confused")]  # fmt: skip
+    return [
+        table(
+            f"Confused most ({len(rows)} of {len(cells)} pairs)",
+            ("truth", "predicted as", "samples", "of the truth"),
+            rows,
+            key="confused",
+        )
+    ]

@@ -60,8 +60,9 @@ def part_blocks(
         known = [own for own in errors if not np.isnan(own.mean)]
         shown = _chosen(known)
         unit = comparison.truth.length_unit
-        clouds = [(title, own, frame, _cloud(comparison, own, frame, unit if motion else ""))
-                  for title, own, frame in shown]  # fmt: skip
+        clouds = [
+            (title, own, frame, _cloud(comparison, own, frame, unit if motion else "")) for title, own, frame in shown
+        ]
     return [*_spreads(known, unit), _sequence_table(known, unit), *([_figure(clouds)] if clouds else [])]
 
 
@@ -142,8 +143,16 @@ def _spreads(errors: Sequence[SequenceError], unit: str) -> list[Figure]:
 def _sequence_table(errors: Sequence[SequenceError], unit: str) -> Table:
     order = sorted(errors, key=lambda own: (own.mean, own.name))[:_ROWS]
     motion = any(len(own.epe) for own in errors)
-    rows = [[own.name, cell(len(own.iou)), cell(own.mean, "fraction", bar=True), cell(float(np.nanmin(own.iou)), "fraction"),
-             *([cell(mean_defined(own.epe)) if len(own.epe) else "-"] if motion else [])] for own in order]  # fmt: skip
+    rows = [
+        [
+            own.name,
+            cell(len(own.iou)),
+            cell(own.mean, "fraction", bar=True),
+            cell(float(np.nanmin(own.iou)), "fraction"),
+            *([cell(mean_defined(own.epe)) if len(own.epe) else "-"] if motion else []),
+        ]
+        for own in order
+    ]
     header = [
         "sequence",
         "frames",
@@ -159,7 +168,7 @@ def _figure(clouds: list[tuple[str, SequenceError, int, Cloud]]) -> Figure:
     html = "".join(_markup(*own) for own in clouds)
     note = (
         "Truth, prediction and error of the worst sequences by mIoU and of those in the middle, each at the frame nearest to its "
-        "mean; predicted parts have the colour of the true part they cover best. Drag or use the arrow keys to turn."
+        "mean; predicted parts have the color of the true part they cover best. Drag or use the arrow keys to turn."
     )
     return Figure("Error clouds", f'<div class="clouds">{html}</div>', note)
 
@@ -189,5 +198,5 @@ def packed(cloud: Cloud) -> bytes:
 
 
 def palette_words() -> str:
-    """The colours of unknown points and of the parts, for the page's script."""
+    """The colors of unknown points and of the parts, for the page's script."""
     return " ".join(f"{r},{g},{b}" for r, g, b in [UNKNOWN, *PALETTE.tolist()])

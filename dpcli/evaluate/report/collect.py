@@ -16,8 +16,10 @@ from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.pipes import standard_input
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_EXPECTED = ("expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
-             "or a video as PRED=TRUTH")  # fmt: skip
+_EXPECTED = (
+    "expected what `dpc evaluate ... --json` prints (one object a line), a scores file, a parts file with --truth, "
+    "or a video as PRED=TRUTH"
+)
 _MAPPINGS, _LISTS = ("metrics", "protocol", "units", "denominators", "intervals"), ("left_out", "provenance")
 _VIDEO = ("views", "gaussians")
 
@@ -41,9 +43,13 @@ class Collected:
 
 
 def collect(
-    arguments: Sequence[str], truth: Path | None = None, *, split: str | None = None, pictures: bool = True,
+    arguments: Sequence[str],
+    truth: Path | None = None,
+    *,
+    split: str | None = None,
+    pictures: bool = True,
     stdin: BinaryIO | None = None,
-) -> Collected:  # fmt: skip
+) -> Collected:
     """The results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
 
     truth: of the parts files, and of scores files if given with them only. pictures: also what needs the files behind a
@@ -60,7 +66,7 @@ def collect(
 
 def _results(
     argument: str, truth: Path | None, split: str | None, pictures: bool, stdin: BinaryIO | None
-) -> list[Result]:  # fmt: skip
+) -> list[Result]:
     if argument == "-":
         return _objects((stdin or standard_input()).read(), "stdin", pictures)
     path, own = _named(argument)

@@ -41,8 +41,12 @@ def headline(found: Mapping[str, Any]) -> Headline:
         for name in ("difference", "mean"):
             if isinstance(record, Mapping) and is_number(record.get(name)):
                 unit = _unit(units, key)
-                return Headline(f"{name} of {_with_unit(key, unit)}", cell(record[name], unit),
-                                interval_text(record.get("interval"), unit), of)  # fmt: skip
+                return Headline(
+                    f"{name} of {_with_unit(key, unit)}",
+                    cell(record[name], unit),
+                    interval_text(record.get("interval"), unit),
+                    of,
+                )
     return Headline("-", Cell("-"), "", of)
 
 
@@ -116,8 +120,10 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
     made = [_records_table("metric", records, units)] if records else []
     names = found.get("runs", [])
     if isinstance(names, list) and all(isinstance(own.get("values"), list) for own in grouped.values()):
-        runs = [(str(name), {key: own["values"][row] for key, own in grouped.items() if row < len(own["values"])})
-                for row, name in enumerate(names)]  # fmt: skip
+        runs = [
+            (str(name), {key: own["values"][row] for key, own in grouped.items() if row < len(own["values"])})
+            for row, name in enumerate(names)
+        ]
         made += [_records_table("run", runs, units)] if any(name or own for name, own in runs) else []
     if (records := _records([found.get("mcnemar")])) is not None:
         made.append(_records_table("McNemar's exact test", records, {}))
@@ -130,7 +136,7 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
 
 def _scalar_row(
     name: str, value: Any, key: str, units: Mapping, intervals: Mapping, metrics: Mapping
-) -> list[Cell | str]:  # fmt: skip
+) -> list[Cell | str]:
     unit = _unit(units, key)
     own = interval_text(metrics.get(f"{key}_interval") or intervals.get(key), unit) or "-"
     words = {"fraction": "share", "1": "", "": ""}.get(unit, unit)
@@ -210,9 +216,14 @@ def _spreads(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> li
 def _series(key: str, value: Any) -> dict[str, list[float | None]]:
     """Name -> values, for lists of numbers; {} for anything else."""
     named = value if isinstance(value, Mapping) else {title_of(key): value}
-    good = {title_of(name): list(ys) for name, ys in named.items()
-            if isinstance(ys, list) and 2 < len(ys) <= _LONGEST_CURVE and all(y is None or is_number(y) for y in ys)
-            and any(y is not None for y in ys)}  # fmt: skip
+    good = {
+        title_of(name): list(ys)
+        for name, ys in named.items()
+        if isinstance(ys, list)
+        and 2 < len(ys) <= _LONGEST_CURVE
+        and all(y is None or is_number(y) for y in ys)
+        and any(y is not None for y in ys)
+    }
     return good if len(good) == len(named) else {}
 
 
@@ -227,8 +238,10 @@ def _with_unit(key: str, unit: str) -> str:
 
 def detail_lists(found: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Protocol, units, denominators, notes, what was left out, and provenance, in words."""
-    made = [(title, [(title_of(key), _words(value)) for key, value in found.get(name, {}).items()])
-            for title, name in (("Protocol", "protocol"), ("Units", "units"), ("Denominators", "denominators"))]  # fmt: skip
+    made = [
+        (title, [(title_of(key), _words(value)) for key, value in found.get(name, {}).items()])
+        for title, name in (("Protocol", "protocol"), ("Units", "units"), ("Denominators", "denominators"))
+    ]
     made.append(("Left out", [_left_out(entry) for entry in found.get("left_out", [])] or [("nothing", "")]))
     how = {key: value for key, value in found.get("intervals", {}).items() if _is_scalar(value)}
     made.append(("Intervals", [(title_of(key), _words(value)) for key, value in how.items()]))

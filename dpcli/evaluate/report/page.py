@@ -53,8 +53,10 @@ def _section(section: Section) -> str:
     )
     notes = "".join(f"<li>{escape(note)}</li>" for note in section.notes)
     body = _figures_in_pairs(section.blocks)
-    return (f'<section id="{section.anchor}">{head}{f"<ul class=faint>{notes}</ul>" if notes else ""}{body}'
-            f"{_details(section)}</section>")  # fmt: skip
+    return (
+        f'<section id="{section.anchor}">{head}{f"<ul class=faint>{notes}</ul>" if notes else ""}{body}'
+        f"{_details(section)}</section>"
+    )
 
 
 def _figures_in_pairs(blocks: Sequence[Table | Figure]) -> str:

@@ -60,8 +60,8 @@ function makeGrid(table) {
 
 // Error clouds: truth, prediction and error of one frame, turned together.
 const PALETTE = "<!--PALETTE-->".split(" ");
-const partColour = (id) => (id === 0 ? PALETTE[0] : PALETTE[1 + (id - 1) % (PALETTE.length - 1)]);
-const errorColour = (share) => `${Math.round(150 + 63 * share)},${Math.round(158 - 110 * share)},${Math.round(170 - 150 * share)}`;
+const partColor = (id) => (id === 0 ? PALETTE[0] : PALETTE[1 + (id - 1) % (PALETTE.length - 1)]);
+const errorColor = (share) => `${Math.round(150 + 63 * share)},${Math.round(158 - 110 * share)},${Math.round(170 - 150 * share)}`;
 
 function unpack(figure) {
   const count = Number(figure.dataset.points), text = atob(figure.dataset.cloud);
@@ -76,9 +76,9 @@ function makeCloud(figure) {
   const cloud = unpack(figure), canvas = one(figure, "canvas"), pen = canvas.getContext("2d");
   const titles = ["truth", "prediction", "error"];
   let yaw = 0.6, pitch = -0.35, drag = null;
-  const colour = (panel, i) => {
+  const color = (panel, i) => {
     const value = cloud.values[panel * cloud.count + i];
-    return panel < 2 ? partColour(value) : errorColour(value / 255);
+    return panel < 2 ? partColor(value) : errorColor(value / 255);
   };
   function draw() {
     const ratio = devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
@@ -95,7 +95,7 @@ function makeCloud(figure) {
     for (let panel = 0; panel < 3; panel++) {
       const middle = width * (panel + 0.5) / 3;
       for (const [right, up, away, i] of placed) {
-        pen.fillStyle = `rgba(${colour(panel, i)},${0.95 - 0.45 * (away + 0.6)})`;
+        pen.fillStyle = `rgba(${color(panel, i)},${0.95 - 0.45 * (away + 0.6)})`;
         pen.fillRect(middle + right * side - size / 2, height / 2 - up * side - size / 2 + 6, size, size);
       }
       pen.fillStyle = getComputedStyle(canvas).color;

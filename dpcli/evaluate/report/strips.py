@@ -47,5 +47,7 @@ def _markup(title: str, cells: Sequence[tuple[int, np.ndarray]]) -> str:
     frames = ", ".join(str(frame) for frame, _ in cells)
     words = escape(f"{title}; frames {frames}")
     height, width = sheet.shape[:2]
-    return (f'<figure class="strip"><figcaption>{words}</figcaption><div class="wide" tabindex="0" role="region" aria-label="{words}">'
-            f'<img alt="{words}" width="{width}" height="{height}" src="data:image/jpeg;base64,{data}"></div></figure>')  # fmt: skip
+    return (
+        f'<figure class="strip"><figcaption>{words}</figcaption><div class="wide" tabindex="0" role="region" aria-label="{words}">'
+        f'<img alt="{words}" width="{width}" height="{height}" src="data:image/jpeg;base64,{data}"></div></figure>'
+    )

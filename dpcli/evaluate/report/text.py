@@ -7,11 +7,30 @@ from collections.abc import Sequence
 from dpcli.evaluate.report.blocks import Cell, Report, Section, Table
 
 _LATEX = {
-    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
-    "\u00b1": r"$\pm$", "\u00d7": r"$\times$", "\u00b0": r"$^\circ$", "\u2026": r"\ldots{}", "\u2013": "--", "\u00b7": r"$\cdot$",
-    "\u2265": r"$\geq$", "\u2264": r"$\leq$", "\n": " ", '"': r"\textquotedbl{}",
-}  # fmt: skip
+    "\\": r"\textbackslash{}",
+    "_": r"\_",
+    "%": r"\%",
+    "&": r"\&",
+    "#": r"\#",
+    "$": r"\$",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    "\u00b1": r"$\pm$",
+    "\u00d7": r"$\times$",
+    "\u00b0": r"$^\circ$",
+    "\u2026": r"\ldots{}",
+    "\u2013": "--",
+    "\u00b7": r"$\cdot$",
+    "\u2265": r"$\geq$",
+    "\u2264": r"$\leq$",
+    "\n": " ",
+    '"': r"\textquotedbl{}",
+}
 _MARKDOWN = "\\`*_[]<>|#"
 
 
@@ -94,8 +113,17 @@ def _latex_table(table: Table, caption: str, note: str = "") -> str:
         rows.append(_latex_row(row))
     words = latex(caption) + (f". {latex(note)}" if note else "")
     inside = [r"\toprule", _joined([latex(name) for name in table.header]), r"\midrule", *rows, r"\bottomrule"]
-    return "\n".join([r"\begin{table}[htbp]", r"\centering\footnotesize", rf"\caption{{{words}}}", rf"\begin{{tabular}}{{{columns}}}",
-                      *inside, r"\end{tabular}", r"\end{table}"])  # fmt: skip
+    return "\n".join(
+        [
+            r"\begin{table}[htbp]",
+            r"\centering\footnotesize",
+            rf"\caption{{{words}}}",
+            rf"\begin{{tabular}}{{{columns}}}",
+            *inside,
+            r"\end{tabular}",
+            r"\end{table}",
+        ]
+    )
 
 
 def _latex_row(row: Sequence[Cell]) -> str:

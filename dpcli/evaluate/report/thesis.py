@@ -53,9 +53,12 @@ class ThesisTable:
 
     def numbers(self) -> list[ThesisRow]:
         """Every number of the table."""
-        return [ThesisRow(self.number, row["method"], row["setting"], metric, float(value), unit, row.get("own", False))
-                for row in self.rows for metric, unit, value in zip(self.metrics, self.units, row["values"], strict=True)
-                if is_number(value)]  # fmt: skip
+        return [
+            ThesisRow(self.number, row["method"], row["setting"], metric, float(value), unit, row.get("own", False))
+            for row in self.rows
+            for metric, unit, value in zip(self.metrics, self.units, row["values"], strict=True)
+            if is_number(value)
+        ]
 
     def knows(self, found: Mapping[str, Any]) -> bool:
         """Whether a result is of this table's task and data: by a command of its provenance, or by its class names."""
@@ -76,7 +79,7 @@ def thesis_tables() -> tuple[ThesisTable, ...]:
         tables = read_toml(path)["table"]
     made = []
     for own in tables:
-        known = own.pop("recognise", {})
+        known = own.pop("recognize", {})
         own = {key: tuple(value) if isinstance(value, list) else value for key, value in own.items()}
         made.append(
             ThesisTable(**own, commands=tuple(known.get("commands", ())), classes=tuple(known.get("classes", ())))
@@ -95,15 +98,17 @@ def chosen_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -
         if wrong:
             raise UsageError(f"--beside {wrong[0]}: expected none or some of {', '.join(known)}")
         return [known[name] for name in beside if name != "none"]
-    return [own for own in known.values()
-            if "ablation" not in own.protocol and any(own.knows(found) for found in objects)]  # fmt: skip
+    return [
+        own for own in known.values() if "ablation" not in own.protocol and any(own.knows(found) for found in objects)
+    ]
 
 
 def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, Any]]], asked: bool = False) -> Table:
     """(title, object) of ours that are of the table's data (of its task, when the table was asked for), then its rows:
     the thesis's own methods before those it cites."""
-    ours = [(title, found) for title, found in objects
-            if thesis.knows(found) or asked and found.get("task") == thesis.task]  # fmt: skip
+    ours = [
+        (title, found) for title, found in objects if thesis.knows(found) or asked and found.get("task") == thesis.task
+    ]
     rows = [row for title, found in ours for row in _own_rows(thesis, title, found)]
     rows += [_thesis_row(thesis, own) for own in sorted(thesis.rows, key=lambda row: not row.get("own"))]
     header = (
@@ -116,8 +121,10 @@ def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, 
         "; ".join(dict.fromkeys(f"{title}: {_protocol(found)}" for title, found in ours))
         or "no result of ours is of this task"
     )
-    note = (f"Thesis: {thesis.protocol}. Ours: {said}. Rows marked thesis are copied from its {_where(thesis)}, not measured here; "
-            "protocol, split and length unit may differ from ours.")  # fmt: skip
+    note = (
+        f"Thesis: {thesis.protocol}. Ours: {said}. Rows marked thesis are copied from its {_where(thesis)}, not measured here; "
+        "protocol, split and length unit may differ from ours."
+    )
     return table(f"{thesis.title}: ours beside the thesis's {_where(thesis)}", header, rows, note, key=thesis.id)
 
 
@@ -141,10 +148,14 @@ def _own_rows(thesis: ThesisTable, title: str, found: Mapping[str, Any]) -> list
         setting = f"{' and '.join(map(title_of, thesis.reference))} on the reference view"
     streams, units = metrics.get("streams", {}), found.get("units", {})
     named = [(f"{title}, {name}", own) for name, own in streams.items()] if len(streams) > 1 else [(title, metrics)]
-    columns = [(metric, units.get(metric, ""), unit, _digits(thesis, place))
-               for place, (metric, unit) in enumerate(zip(thesis.metrics, thesis.units, strict=True))]  # fmt: skip
-    return [[Cell(name, mark="ours"), "ours", setting, *(_converted(own.get(metric), *rest) for metric, *rest in columns)]
-            for name, own in named]  # fmt: skip
+    columns = [
+        (metric, units.get(metric, ""), unit, _digits(thesis, place))
+        for place, (metric, unit) in enumerate(zip(thesis.metrics, thesis.units, strict=True))
+    ]
+    return [
+        [Cell(name, mark="ours"), "ours", setting, *(_converted(own.get(metric), *rest) for metric, *rest in columns)]
+        for name, own in named
+    ]
 
 
 def _at_tau(metrics: Mapping[str, Any], tau: float) -> dict[str, Any]:

@@ -91,16 +91,20 @@ def segmentation_update(
         match = match_parts(frame.truth, frame.part, frame.probability, **options)
         if match.truth_parts == 0:
             if protocol == "release":
-                raise DataError(f"frame {number} has no true part that counts, where the published protocol fails; "
-                                "use --protocol dpc, which skips such frames")  # fmt: skip
+                raise DataError(
+                    f"frame {number} has no true part that counts, where the published protocol fails; "
+                    "use --protocol dpc, which skips such frames"
+                )
             skipped += 1
             continue
         matches.append(match)
         present += len(np.unique(frame.part[frame.part >= 0]))
         ious.append(mean_iou(frame.truth, frame.part, **options))
         rands.append(rand_index(frame.truth, frame.part, ignore_below=ignore_below))
-    joined = [np.concatenate([np.zeros(0, kind), *(getattr(match, key) for match in matches)])
-              for key, kind in (("iou", np.float64), ("matched", bool), ("confidence", np.float64))]  # fmt: skip
+    joined = [
+        np.concatenate([np.zeros(0, kind), *(getattr(match, key) for match in matches)])
+        for key, kind in (("iou", np.float64), ("matched", bool), ("confidence", np.float64))
+    ]
     means = [np.array([mean_defined(np.array(values))]) for values in (ious, rands)]
     parts = sum(match.truth_parts for match in matches)
     return SegmentationStatistics(*joined, *means, parts, len(matches), skipped, present - len(joined[0]), unknown)
@@ -136,13 +140,22 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
     ratio = (lambda top, bottom: top / max(bottom, FLOOR)) if release else (lambda a, b: float(divide(a, b)))
     precision, recall = ratio(hits, count), ratio(hits, truth)
     return SegmentationMetrics(
-        ap=ap, pq=ratio(float(statistics.iou[matched].sum()), (count + truth) / 2),
+        ap=ap,
+        pq=ratio(float(statistics.iou[matched].sum()), (count + truth) / 2),
         f1=ratio(2 * precision * recall, precision + recall) if release else ratio(2 * hits, count + truth),
-        pre=precision, rec=recall, miou=mean_defined(statistics.object_iou),
-        ri=mean_defined(statistics.object_rand), predictions=count, true_positives=hits, truth_parts=truth,
-        frames=statistics.frames, skipped=statistics.skipped, dropped=statistics.dropped,
-        unknown=statistics.unknown, objects=int((~np.isnan(statistics.object_iou)).sum()),
-    )  # fmt: skip
+        pre=precision,
+        rec=recall,
+        miou=mean_defined(statistics.object_iou),
+        ri=mean_defined(statistics.object_rand),
+        predictions=count,
+        true_positives=hits,
+        truth_parts=truth,
+        frames=statistics.frames,
+        skipped=statistics.skipped,
+        dropped=statistics.dropped,
+        unknown=statistics.unknown,
+        objects=int((~np.isnan(statistics.object_iou)).sum()),
+    )
 
 
 def average_precision(

@@ -100,14 +100,23 @@ def flow_update(predicted: np.ndarray, truth: np.ndarray) -> MotionStatistics:
     relative = error / (length + _TINY)
     hits = [_hits(error, relative, tau) for tau in TAUS]
     none = np.zeros(0)
-    return MotionStatistics(np.array([len(truth)]), np.array([error.sum()]), np.array([length.sum()]),
-                            np.array([hits], np.int64), none, none)  # fmt: skip
+    return MotionStatistics(
+        np.array([len(truth)]),
+        np.array([error.sum()]),
+        np.array([length.sum()]),
+        np.array([hits], np.int64),
+        none,
+        none,
+    )
 
 
 def _hits(error: np.ndarray, relative: np.ndarray, tau: float) -> list[int]:
     strict, relaxed, outlier = _RELATIVE
-    found = ((error < tau) | (relative < strict), (error < 2 * tau) | (relative < relaxed),
-             (error > 6 * tau) | (relative > outlier))  # fmt: skip
+    found = (
+        (error < tau) | (relative < strict),
+        (error < 2 * tau) | (relative < relaxed),
+        (error > 6 * tau) | (relative > outlier),
+    )
     return [int(points.sum()) for points in found]
 
 
@@ -137,10 +146,14 @@ def part_motion_update(
     apart = np.einsum("mij,mj->mi", (said - real)[:, :3], np.append(centroids, np.ones((len(rows), 1)), axis=1))
     none = np.zeros(0)
     return MotionStatistics(
-        none.astype(np.int64), none, none, np.zeros((0, len(TAUS), 3), np.int64),
-        rotation_angle(said[:, :3, :3], real[:, :3, :3]), np.linalg.norm(apart, axis=1),
+        none.astype(np.int64),
+        none,
+        none,
+        np.zeros((0, len(TAUS), 3), np.int64),
+        rotation_angle(said[:, :3, :3], real[:, :3, :3]),
+        np.linalg.norm(apart, axis=1),
         unmatched=len(found.truth_ids) - len(rows),
-    )  # fmt: skip
+    )
 
 
 def rotation_angle(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -167,15 +180,21 @@ def motion_compute(statistics: MotionStatistics, batch: int | None = None) -> Mo
     (6 pairs); differs when the last batch is smaller or frames have different sizes.
     """
     mean = _Mean(statistics.points, batch)
-    shares = {tau: FlowShares(*(mean(statistics.hits[:, row, column]) for column in range(3)))
-              for row, tau in enumerate(TAUS)}  # fmt: skip
+    shares = {
+        tau: FlowShares(*(mean(statistics.hits[:, row, column]) for column in range(3))) for row, tau in enumerate(TAUS)
+    }
     return MotionMetrics(
-        epe3d=mean(statistics.error), still=mean(statistics.still), shares=shares,
-        rotation=mean_defined(statistics.rotation), displacement=mean_defined(statistics.displacement),
-        points=int(statistics.points.sum()), pairs=int((statistics.points > 0).sum()),
-        parts=len(statistics.rotation) + statistics.unmatched, unmatched=statistics.unmatched,
+        epe3d=mean(statistics.error),
+        still=mean(statistics.still),
+        shares=shares,
+        rotation=mean_defined(statistics.rotation),
+        displacement=mean_defined(statistics.displacement),
+        points=int(statistics.points.sum()),
+        pairs=int((statistics.points > 0).sum()),
+        parts=len(statistics.rotation) + statistics.unmatched,
+        unmatched=statistics.unmatched,
         unknown=statistics.unknown,
-    )  # fmt: skip
+    )
 
 
 class _Mean:

@@ -79,8 +79,9 @@ def evaluate_motion(
         raise UsageError(f"--protocol {protocol}: expected {' or '.join(PROTOCOLS)}")
     names, labels, found, pairs, without = [], [], [], [], []
     resampling, without_truth = resampling or Resampling(0), 0
-    with Comparison(path, truth, split=split, intersect=intersect, fields=("part", "pose"),
-                    instead=("scene_flow",)) as comparison:  # fmt: skip
+    with Comparison(
+        path, truth, split=split, intersect=intersect, fields=("part", "pose"), instead=("scene_flow",)
+    ) as comparison:
         from_poses = "pose" in comparison.fields
         for compared in comparison:
             predicted = len(compared.said.pairs)
@@ -107,10 +108,24 @@ def evaluate_motion(
         for label in sorted({label for label in labels if label >= 0})
     }
     main = motion_compute(motion_merge(found), batch)
-    return MotionReport(protocol, split, str(truth), unit, main, classes, class_names, left_out, len(found),
-                        names, found, pairs, resampling,
-                        resampling.intervals(motion_weighted(found, MAIN_TAU[protocol], batch), len(found)),
-                        from_poses, without_truth)  # fmt: skip
+    return MotionReport(
+        protocol,
+        split,
+        str(truth),
+        unit,
+        main,
+        classes,
+        class_names,
+        left_out,
+        len(found),
+        names,
+        found,
+        pairs,
+        resampling,
+        resampling.intervals(motion_weighted(found, MAIN_TAU[protocol], batch), len(found)),
+        from_poses,
+        without_truth,
+    )
 
 
 def _to_the_next_frame(compared: Compared) -> Compared:
@@ -137,8 +152,9 @@ def _pairs(compared: Compared) -> Iterator[MotionStatistics]:
         points, part, predicted = truth.points[span], truth.part[span], compared.predicted.part[span]
         known = part >= 0
         real = true_motion(truth.pose, source, target)
-        yield replace(flow_update(flow[known], true_flow(points[known], part[known], real)),
-                      unknown=int((~known).sum()))  # fmt: skip
+        yield replace(
+            flow_update(flow[known], true_flow(points[known], part[known], real)), unknown=int((~known).sum())
+        )
         yield part_motion_update(points, part, predicted, real, motions)
 
 
@@ -175,21 +191,38 @@ def motion_json(report: MotionReport, source: str, provenance: Sequence[dict] = 
             "outlier": "share of points with error > 6 tau or > 10 % of the true flow",
             "part_motion": "mean over true parts of each pair, matched to predicted parts one to one by IoU",
         },
-        "metrics": _numbers(report.main, tau) | {
+        "metrics": _numbers(report.main, tau)
+        | {
             "per_class": [
-                {"label": label, "name": names[label] if label < len(names) else "", **_numbers(own, tau), **_counts(own)}
+                {
+                    "label": label,
+                    "name": names[label] if label < len(names) else "",
+                    **_numbers(own, tau),
+                    **_counts(own),
+                }
                 for label, own in report.classes.items()
-            ],
+            ]
         },
         "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
         "samples": samples_json("sequences", report.names),
-        "units": {"epe3d": unit, "epe3d_no_motion": unit, "accs": "fraction", "accr": "fraction", "outlier": "fraction",
-                  "tau": unit, "part_rotation": "degree", "part_displacement": unit},
-        "denominators": {"sequences": report.sequences, **_counts(report.main),
-                         "pairs_without_truth": report.without_truth},
+        "units": {
+            "epe3d": unit,
+            "epe3d_no_motion": unit,
+            "accs": "fraction",
+            "accr": "fraction",
+            "outlier": "fraction",
+            "tau": unit,
+            "part_rotation": "degree",
+            "part_displacement": unit,
+        },
+        "denominators": {
+            "sequences": report.sequences,
+            **_counts(report.main),
+            "pairs_without_truth": report.without_truth,
+        },
         "left_out": [{"reason": e.reason, "count": len(e.names), "names": e.names} for e in report.left_out],
         "provenance": list(provenance),
-    }  # fmt: skip
+    }
 
 
 def _numbers(metrics: MotionMetrics, tau: float) -> dict[str, Any]:
@@ -212,5 +245,10 @@ def _defined(value: float) -> float | None:
 
 
 def _counts(metrics: MotionMetrics) -> dict[str, int]:
-    return {"pairs": metrics.pairs, "points": metrics.points, "true_part_motions": metrics.parts,
-            "unmatched_part_motions": metrics.unmatched, "points_without_truth": metrics.unknown}  # fmt: skip
+    return {
+        "pairs": metrics.pairs,
+        "points": metrics.points,
+        "true_part_motions": metrics.parts,
+        "unmatched_part_motions": metrics.unmatched,
+        "points_without_truth": metrics.unknown,
+    }

@@ -47,8 +47,10 @@ def overlap(truth: np.ndarray, part: np.ndarray) -> Overlap:
     both = (truth_rows >= 0) & (columns >= 0)
     cells = truth_rows[both] * len(ids) + columns[both]
     shared = np.bincount(cells, minlength=len(truth_ids) * len(ids)).reshape(len(truth_ids), len(ids))
-    sizes = [np.bincount(rows[rows >= 0], minlength=len(own)).astype(np.float64)
-             for rows, own in ((truth_rows, truth_ids), (columns, ids))]  # fmt: skip
+    sizes = [
+        np.bincount(rows[rows >= 0], minlength=len(own)).astype(np.float64)
+        for rows, own in ((truth_rows, truth_ids), (columns, ids))
+    ]
     return Overlap(shared.astype(np.float64), *sizes, truth_ids, ids, truth_rows, columns)
 
 
@@ -96,8 +98,10 @@ def _iou(shared: np.ndarray, truth_sizes: np.ndarray, sizes: np.ndarray) -> np.n
 
 def _confidence(found: Overlap, probability: np.ndarray, points_of: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Mean probability of the ids of `columns` over the points of the columns `points_of`, f64 (columns)."""
-    means = [probability[found.columns == rows, found.ids[column]].astype(np.float64).mean()
-             for rows, column in zip(points_of, columns, strict=True)]  # fmt: skip
+    means = [
+        probability[found.columns == rows, found.ids[column]].astype(np.float64).mean()
+        for rows, column in zip(points_of, columns, strict=True)
+    ]
     return np.array(means, np.float64)
 
 

@@ -85,11 +85,24 @@ def evaluate_segmentation(
         class_names = comparison.truth.class_names
     main = segmentation_merge(found)
     if main.frames == 0:
-        raise DataError(f"{truth}: not one frame has a true part"
-                        + (f" of at least {ignore_below} points" if ignore_below else ""))  # fmt: skip
-    return SegmentationReport(protocol, ignore_below, split, str(truth), segmentation_compute(main, protocol), main,
-                              _by_class(labels, found, protocol), class_names, left_out, names, found, resampling,
-                              resampling.intervals(segmentation_weighted(found, protocol), len(found)))  # fmt: skip
+        raise DataError(
+            f"{truth}: not one frame has a true part" + (f" of at least {ignore_below} points" if ignore_below else "")
+        )
+    return SegmentationReport(
+        protocol,
+        ignore_below,
+        split,
+        str(truth),
+        segmentation_compute(main, protocol),
+        main,
+        _by_class(labels, found, protocol),
+        class_names,
+        left_out,
+        names,
+        found,
+        resampling,
+        resampling.intervals(segmentation_weighted(found, protocol), len(found)),
+    )
 
 
 def _object(compared: Compared, protocol: str, ignore_below: int) -> SegmentationStatistics:
@@ -98,8 +111,10 @@ def _object(compared: Compared, protocol: str, ignore_below: int) -> Segmentatio
     truths = [compared.truth.part[span] for span in spans]
     if protocol == "release":
         truths = compressed_over_pairs(truths)
-    frames = [Frame(ids, compared.predicted.part[span], compared.said.probability[span])
-              for ids, span in zip(truths, spans, strict=True)]  # fmt: skip
+    frames = [
+        Frame(ids, compared.predicted.part[span], compared.said.probability[span])
+        for ids, span in zip(truths, spans, strict=True)
+    ]
     try:
         return segmentation_update(frames, ignore_below=ignore_below, protocol=protocol)
     except DataError as error:
@@ -119,9 +134,7 @@ def compressed_over_pairs(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
     return made
 
 
-def _by_class(
-    labels: list[int], found: list[SegmentationStatistics], protocol: str
-) -> dict[int, SegmentationMetrics]:  # fmt: skip
+def _by_class(labels: list[int], found: list[SegmentationStatistics], protocol: str) -> dict[int, SegmentationMetrics]:
     return {
         label: segmentation_compute(
             segmentation_merge(one for own, one in zip(labels, found, strict=True) if own == label), protocol
@@ -146,11 +159,12 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
             "ap_pq_f1_pre_rec": "pooled over all frames of all sequences",
             "miou_ri": "mean over the frames of a sequence, then over sequences",
         },
-        "metrics": shares(report.main) | {
+        "metrics": shares(report.main)
+        | {
             "per_class": [
                 {"label": label, "name": names[label] if label < len(names) else "", **shares(own), **_counts(own)}
                 for label, own in report.classes.items()
-            ],
+            ]
         },
         "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
         "samples": samples_json("sequences", report.names),
@@ -158,7 +172,7 @@ def segmentation_json(report: SegmentationReport, source: str, provenance: Seque
         "denominators": _counts(report.main),
         "left_out": [{"reason": e.reason, "count": len(e.names), "names": e.names} for e in report.left_out],
         "provenance": list(provenance),
-    }  # fmt: skip
+    }
 
 
 def shares(metrics: SegmentationMetrics) -> dict[str, float | None]:
@@ -169,8 +183,12 @@ def shares(metrics: SegmentationMetrics) -> dict[str, float | None]:
 def _counts(metrics: SegmentationMetrics) -> dict[str, int]:
     values = asdict(metrics)
     return {
-        "sequences": values["objects"], "frames": values["frames"], "true_parts": values["truth_parts"],
-        "predictions": values["predictions"], "true_positives": values["true_positives"],
-        "frames_without_truth": values["skipped"], "predictions_on_ignored_ground": values["dropped"],
+        "sequences": values["objects"],
+        "frames": values["frames"],
+        "true_parts": values["truth_parts"],
+        "predictions": values["predictions"],
+        "true_positives": values["true_positives"],
+        "frames_without_truth": values["skipped"],
+        "predictions_on_ignored_ground": values["dropped"],
         "points_without_truth": values["unknown"],
-    }  # fmt: skip
+    }

@@ -37,8 +37,13 @@ def segmentation_tables(report: SegmentationReport) -> list[TextTable]:
     rows = [_segmentation_row(*row) for row in class_rows(report.main, report.classes, report.class_names)]
     main = TextTable("Parts (AP, PQ, F1, Pre, Rec at IoU 0.5)", header, rows)
     values = shares(report.main)
-    return [main, *_intervals(report, [[title, percent(values[key]), percent_ends(report.intervals.get(key))]
-                                       for key, title in TITLES.items()])]  # fmt: skip
+    return [
+        main,
+        *_intervals(
+            report,
+            [[title, percent(values[key]), percent_ends(report.intervals.get(key))] for key, title in TITLES.items()],
+        ),
+    ]
 
 
 def _intervals(report: SegmentationReport | MotionReport, rows: list[list[str]]) -> list[TextTable]:
@@ -104,8 +109,11 @@ def motion_tables(report: MotionReport) -> list[TextTable]:
 
 def _motion_interval_rows(report: MotionReport, unit: str) -> list[list[str]]:
     main, found = report.main, report.intervals
-    lengths = (("epe3d", f"EPE3D{unit}", main.epe3d), ("part_rotation", "rotation (deg)", np.degrees(main.rotation)),
-               ("part_displacement", f"displacement{unit}", main.displacement))  # fmt: skip
+    lengths = (
+        ("epe3d", f"EPE3D{unit}", main.epe3d),
+        ("part_rotation", "rotation (deg)", np.degrees(main.rotation)),
+        ("part_displacement", f"displacement{unit}", main.displacement),
+    )
     lengths = lengths if report.from_poses else lengths[:1]
     rows = [[title, _number(value), _ends(found.get(key))] for key, title, value in lengths]
     names = ("AccS", "AccR", "Outlier")
@@ -137,8 +145,11 @@ def _number(value: float) -> str:
 def motion_notes(report: MotionReport) -> list[str]:
     """What was counted and how, and what was left out."""
     main = report.main
-    how = ("over the points of 6 pairs, then over these batches, as the published code" if report.protocol == "release"
-           else "over all points")  # fmt: skip
+    how = (
+        "over the points of 6 pairs, then over these batches, as the published code"
+        if report.protocol == "release"
+        else "over all points"
+    )
     lines = [
         f"Split {report.split!r}, truth: {report.truth}. {main.pairs} frame pairs of {report.sequences} sequences; "
         f"means {how}. no motion: EPE3D of predicting none.",

@@ -33,16 +33,24 @@ class Comparison:
     """
 
     def __init__(
-        self, path: str | Path, truth: str | Path, *, split: str | None = None, intersect: bool = False,
-        fields: Sequence[str] = ("part",), instead: Sequence[str] = (),
-    ) -> None:  # fmt: skip
+        self,
+        path: str | Path,
+        truth: str | Path,
+        *,
+        split: str | None = None,
+        intersect: bool = False,
+        fields: Sequence[str] = ("part",),
+        instead: Sequence[str] = (),
+    ) -> None:
         self.predicted, self.truth = PartsReader(path), CloudsReader(truth)
         missing = [field for field in fields if field not in self.truth.fields]
         serves = bool(instead) and all(field in self.truth.fields for field in instead)
         if missing and not serves:
             other = f", nor {' and '.join(instead)}" if instead else ""
-            raise DataError(f"{truth}: no {' and no '.join(missing)} in it{other}, so it can't be the truth; "
-                            "`dpc prepare` writes them for data sets that have them")  # fmt: skip
+            raise DataError(
+                f"{truth}: no {' and no '.join(missing)} in it{other}, so it can't be the truth; "
+                "`dpc prepare` writes them for data sets that have them"
+            )
         self.fields = tuple(instead if missing else fields)
         self._same_unit()
         self.split = split or ("test" if "test" in self.truth.splits else "all")
@@ -53,8 +61,10 @@ class Comparison:
         """A unit that a file doesn't name may be any."""
         unit, other = self.predicted.length_unit, self.truth.length_unit
         if unit and other and unit != other:
-            raise DataError(f"{self.predicted.path}: length_unit {unit!r}, but {other!r} in {self.truth.path}; "
-                            "predict again from that file")  # fmt: skip
+            raise DataError(
+                f"{self.predicted.path}: length_unit {unit!r}, but {other!r} in {self.truth.path}; "
+                "predict again from that file"
+            )
 
     def _match(self, intersect: bool) -> list[tuple[int, int]]:
         """(index in the parts file, index in the truth) of what counts."""
@@ -62,8 +72,9 @@ class Comparison:
         names = self.predicted.names
         unknown = [name for name in names if name not in where]
         said = set(names)
-        wanted = [name for name, own in zip(self.truth.names, self.truth.splits, strict=True)
-                  if self.split in ("all", own)]  # fmt: skip
+        wanted = [
+            name for name, own in zip(self.truth.names, self.truth.splits, strict=True) if self.split in ("all", own)
+        ]
         unsaid = [name for name in wanted if name not in said]
         if not intersect:
             self._same_names(unknown, unsaid)
@@ -73,17 +84,23 @@ class Comparison:
         self._leave_out(f"not of split {self.split!r}", [n for n in names if n in where and n not in counted])
         rows = [(index, where[name]) for index, name in enumerate(names) if name in counted]
         if not rows:
-            raise DataError(f"{self.predicted.path}: no sequence of split {self.split!r} of {self.truth.path}; "
-                            "--split all takes every one")  # fmt: skip
+            raise DataError(
+                f"{self.predicted.path}: no sequence of split {self.split!r} of {self.truth.path}; "
+                "--split all takes every one"
+            )
         return rows
 
     def _same_names(self, unknown: list[str], unsaid: list[str]) -> None:
         if unknown:
-            raise DataError(f"{self.truth.path}: has no {listing(unknown)}, which {self.predicted.path} has; "
-                            "was it predicted from another? --intersect compares what both have")  # fmt: skip
+            raise DataError(
+                f"{self.truth.path}: has no {listing(unknown)}, which {self.predicted.path} has; "
+                "was it predicted from another? --intersect compares what both have"
+            )
         if unsaid:
-            raise DataError(f"{self.predicted.path}: has no {listing(unsaid)} of split {self.split!r} of "
-                            f"{self.truth.path}; predict them too, or --intersect compares what both have")  # fmt: skip
+            raise DataError(
+                f"{self.predicted.path}: has no {listing(unsaid)} of split {self.split!r} of "
+                f"{self.truth.path}; predict them too, or --intersect compares what both have"
+            )
 
     def _leave_out(self, reason: str, names: list[str]) -> None:
         if names:

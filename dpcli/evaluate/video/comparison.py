@@ -79,11 +79,19 @@ class VideoReport:
 
 
 def evaluate_video(
-    path: str | Path, truth: str | Path, *, metrics: Sequence[str] | None = None,
-    protocol: str | VideoProtocol = "dpc", background: str | None = None, intersect: bool = False, seed: int = 0,
+    path: str | Path,
+    truth: str | Path,
+    *,
+    metrics: Sequence[str] | None = None,
+    protocol: str | VideoProtocol = "dpc",
+    background: str | None = None,
+    intersect: bool = False,
+    seed: int = 0,
     watch: Callable[[View, int, int, Picture, Picture], None] | None = None,
-    weights: Path | None = None, device: str = "cpu", resampling: Resampling = NO_INTERVALS,
-) -> VideoReport:  # fmt: skip
+    weights: Path | None = None,
+    device: str = "cpu",
+    resampling: Resampling = NO_INTERVALS,
+) -> VideoReport:
     """Metrics of a predicted video against the true one; each of the kinds `video_sources.open_source` knows.
 
     metrics: names of PICTURE_METRICS, LEARNED and SCENE_METRICS; None = all that these files allow, but MS-SSIM and the
@@ -105,8 +113,21 @@ def evaluate_video(
         learned, missing = _learned_scores(run, [name for name in names if name in LEARNED], weights, device)
         scene = _scene_scores(said, real, names, seed)
         unit = real.header.length_unit if real.header else ""
-        report = VideoReport(chosen, tuple(names), str(truth), run.size, views, left_out, run.notes(), learned, missing,
-                             scene, unit, list(said.history), resampling)  # fmt: skip
+        report = VideoReport(
+            chosen,
+            tuple(names),
+            str(truth),
+            run.size,
+            views,
+            left_out,
+            run.notes(),
+            learned,
+            missing,
+            scene,
+            unit,
+            list(said.history),
+            resampling,
+        )
         report.intervals = _intervals(report)
         return report
 
@@ -167,11 +188,14 @@ def _metrics(asked: Sequence[str] | None, said: Source, real: Source) -> list[st
         if name == "psnr_foreground" and not real.has_alpha:
             raise DataError(f"{real.path}: no alpha, so nobody knows the object's pixels; leave out psnr_foreground")
         if name in SCENE_METRICS and not scene:
-            raise DataError(f"--metrics {name} needs a gaussians file and a views file, not a {said.kind} "
-                            f"and a {real.kind}")  # fmt: skip
+            raise DataError(
+                f"--metrics {name} needs a gaussians file and a views file, not a {said.kind} and a {real.kind}"
+            )
         if name in SCENE_METRICS and name not in possible:
-            raise DataError(f"{real.path}: no surface {name} in it; `dpc prepare animation`, artemis and synthetic "
-                            f"animal write them; leave {name} out of --metrics")  # fmt: skip
+            raise DataError(
+                f"{real.path}: no surface {name} in it; `dpc prepare animation`, artemis and synthetic "
+                f"animal write them; leave {name} out of --metrics"
+            )
     return list(asked)
 
 
@@ -200,7 +224,7 @@ class _Run:
     watch: Callable[[View, int, int, Picture, Picture], None]
     left_out: list[LeftOut]
     size: tuple[int, int] = (0, 0)
-    brightest: tuple[int, int] = (0, 0)  # 8-bit colour of the prediction, of the truth, until one is plausible
+    brightest: tuple[int, int] = (0, 0)  # 8-bit color of the prediction, of the truth, until one is plausible
     hollow: int = 0  # predicted pictures without an object
     swapped: str = ""  # the first picture that seems to have red and blue swapped
 
@@ -243,8 +267,10 @@ class _Run:
 
     def _say_damaged(self, damaged: list[str]) -> None:
         if damaged and not self.intersect:
-            raise DataError(f"{self.said.path}: {len(damaged)} frames with NaN or infinite pixels, the first "
-                            f"{damaged[0]}; make them again, or leave them out with --intersect")  # fmt: skip
+            raise DataError(
+                f"{self.said.path}: {len(damaged)} frames with NaN or infinite pixels, the first "
+                f"{damaged[0]}; make them again, or leave them out with --intersect"
+            )
         if damaged:
             self.left_out.append(LeftOut("frames in which the prediction has NaN or infinite pixels", damaged))
 
@@ -255,10 +281,16 @@ class _Run:
             return int(other)
         if not self.intersect:
             title = self.real.views[theirs].title
-            raise DataError(f"{self.said.path}: view {title!r} has {own} frames, {other} in {self.real.path}; the first "
-                            f"without a partner is frame {min(own, other)}; --intersect compares the first {min(own, other)}")  # fmt: skip
-        self.left_out.append(LeftOut(f"frames of view {self.real.views[theirs].title!r} that one side lacks",
-                                     [str(frame) for frame in range(min(own, other), max(own, other))]))  # fmt: skip
+            raise DataError(
+                f"{self.said.path}: view {title!r} has {own} frames, {other} in {self.real.path}; the first "
+                f"without a partner is frame {min(own, other)}; --intersect compares the first {min(own, other)}"
+            )
+        self.left_out.append(
+            LeftOut(
+                f"frames of view {self.real.views[theirs].title!r} that one side lacks",
+                [str(frame) for frame in range(min(own, other), max(own, other))],
+            )
+        )
         return min(own, other)
 
     def _work(
@@ -271,17 +303,23 @@ class _Run:
             yield lambda f=frame, p=predicted, t=truth: score_frame(f, p, t, self.protocol, self.metrics)
 
     def _checked(
-        self, ours: int, theirs: int, count: int, damaged: list[str],
+        self,
+        ours: int,
+        theirs: int,
+        count: int,
+        damaged: list[str],
         watch: Callable[[View, int, int, Picture, Picture], None] = lambda *_: None,
-    ) -> Iterator[tuple[int, Picture, Picture]]:  # fmt: skip
+    ) -> Iterator[tuple[int, Picture, Picture]]:
         """Frame, predicted, true picture of a pair of views; frames whose prediction isn't finite go to `damaged`."""
         frames, view = range(count), self.real.views[theirs]
         pairs = zip(frames, self.said.pictures(ours, frames), self.real.pictures(theirs, frames), strict=True)
         for frame, predicted, truth in pairs:
             self._same_size(predicted, truth, f"view {view.title!r}, frame {frame}")
             if truth.unusable:
-                raise DataError(f"{self.real.path}: view {view.title!r}, frame {frame}: {truth.unusable} pixels are NaN "
-                                "or infinite; make the truth again")  # fmt: skip
+                raise DataError(
+                    f"{self.real.path}: view {view.title!r}, frame {frame}: {truth.unusable} pixels are NaN "
+                    "or infinite; make the truth again"
+                )
             watch(view, frame, count, predicted, truth)
             if predicted.unusable:
                 damaged.append(f"view {view.title} frame {frame} ({predicted.unusable} pixels)")
@@ -291,8 +329,10 @@ class _Run:
     def _same_size(self, predicted: Picture, truth: Picture, where: str) -> None:
         if self.protocol.size is None and predicted.size != truth.size:
             ours, theirs = (f"{width}x{height}" for width, height in (predicted.size, truth.size))
-            raise DataError(f"{self.said.path}: {where} is {ours}, but {theirs} in {self.real.path}; render or resize "
-                            "to that size, or --protocol consistent4d resizes both")  # fmt: skip
+            raise DataError(
+                f"{self.said.path}: {where} is {ours}, but {theirs} in {self.real.path}; render or resize "
+                "to that size, or --protocol consistent4d resizes both"
+            )
         if self.size == (0, 0):
             check_size(truth.size, self.protocol, self.metrics, str(self.real.path))
         self.size = truth.size
@@ -311,23 +351,29 @@ class _Run:
         if not scores and counts:
             raise DataError(f"{self.said.path}: every frame has NaN or infinite pixels; nothing to compare")
         if self.brightest[0] == 1 < self.brightest[1]:
-            raise DataError(f"{self.said.path}: 8-bit pictures with no value above 1; colours in 0..1 were saved without "
-                            "multiplying by 255")  # fmt: skip
+            raise DataError(
+                f"{self.said.path}: 8-bit pictures with no value above 1; colors in 0..1 were saved without "
+                "multiplying by 255"
+            )
         if "psnr_foreground" in self.metrics and scores and not any(score.metrics.object_pixels for score in scores):
-            raise DataError(f"{self.real.path}: no frame has an object (alpha is below one half everywhere); mask it "
-                            "(`dpc prepare video`), or leave out psnr_foreground")  # fmt: skip
+            raise DataError(
+                f"{self.real.path}: no frame has an object (alpha is below one half everywhere); mask it "
+                "(`dpc prepare video`), or leave out psnr_foreground"
+            )
 
     def notes(self) -> list[str]:
         lines = []
         if isinstance(self.said, SceneSource) and self.metrics:
             lines.append("The scene is rendered at the truth's cameras and times, in float32.")
         if not self.said.has_alpha:
-            lines.append(f"The prediction ({self.said.kind}) has no alpha: its colours are compared as they are.")
+            lines.append(f"The prediction ({self.said.kind}) has no alpha: its colors are compared as they are.")
         if not self.real.has_alpha:
             lines.append(f"The truth ({self.real.kind}) has no alpha: background and object are compared alike.")
         if self.swapped:
-            lines.append(f"Red and blue look swapped in the prediction ({self.swapped}): with them exchanged it is much "
-                         "closer to the truth; was it saved as BGR?")  # fmt: skip
+            lines.append(
+                f"Red and blue look swapped in the prediction ({self.swapped}): with them exchanged it is much "
+                "closer to the truth; was it saved as BGR?"
+            )
         if self.hollow:
             lines.append(f"Predicted pictures without an object (alpha 0 everywhere): {self.hollow}.")
         return lines

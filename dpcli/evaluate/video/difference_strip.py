@@ -56,11 +56,11 @@ class Strip:
             ) from None
 
 
-def _small(colours: np.ndarray) -> np.ndarray:
+def _small(colors: np.ndarray) -> np.ndarray:
     """f32 (3,H,W) in 0..1 -> f32 (S,S,3), the longer side filling the cell."""
     from PIL import Image
 
-    image = Image.fromarray((np.nan_to_num(colours).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8))
+    image = Image.fromarray((np.nan_to_num(colors).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8))
     image.thumbnail((_SIDE, _SIDE))
     cell = np.full((_SIDE, _SIDE, 3), 0.5, np.float32)
     cell[: image.height, : image.width] = np.asarray(image, np.float32) / 255

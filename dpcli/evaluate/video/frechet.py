@@ -62,8 +62,9 @@ class FeatureStatistics:
     def __add__(self, other: FeatureStatistics) -> FeatureStatistics:
         """Statistics of both sets together. DataError when they have different numbers of features."""
         if self.rows.shape[1] != other.rows.shape[1]:
-            raise DataError(f"features of {self.rows.shape[1]} and of {other.rows.shape[1]} values: two networks' "
-                            "can't be compared")  # fmt: skip
+            raise DataError(
+                f"features of {self.rows.shape[1]} and of {other.rows.shape[1]} values: two networks' can't be compared"
+            )
         rows = np.concatenate([self.rows, other.rows])
         total, outer = (_sum(getattr(self, key), getattr(other, key)) for key in ("total", "outer"))
         return _folded(FeatureStatistics(rows, self.count + other.count, total, outer))
@@ -73,8 +74,10 @@ class FeatureStatistics:
 
     def _check_spread(self) -> None:
         if self.samples < 2:
-            raise DataError(f"{self.samples} sample where a distribution needs at least 2: compare more videos, cut them "
-                            "into windows, or take one against one by the closed form (fvd variant consistent4d)")  # fmt: skip
+            raise DataError(
+                f"{self.samples} sample where a distribution needs at least 2: compare more videos, cut them "
+                "into windows, or take one against one by the closed form (fvd variant consistent4d)"
+            )
 
 
 def feature_update(features: np.ndarray, before: FeatureStatistics | None = None) -> FeatureStatistics:
@@ -84,8 +87,10 @@ def feature_update(features: np.ndarray, before: FeatureStatistics | None = None
         raise ValueError(f"features must have shape (N,D), but have {rows.shape}")
     broken = ~np.isfinite(rows).all(1)
     if broken.any():
-        raise DataError(f"features of {int(broken.sum())} of {len(rows)} samples are NaN or infinite, the first is sample "
-                        f"{int(broken.argmax())}: look at its pictures, or fetch the network's weights again")  # fmt: skip
+        raise DataError(
+            f"features of {int(broken.sum())} of {len(rows)} samples are NaN or infinite, the first is sample "
+            f"{int(broken.argmax())}: look at its pictures, or fetch the network's weights again"
+        )
     found = _folded(FeatureStatistics(rows))
     return found if before is None else before + found
 

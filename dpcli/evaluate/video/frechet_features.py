@@ -54,26 +54,57 @@ class FeatureVariant:
     single: str = "error"
 
 
-_SHORT = "short side 224 bilinear, no antialias, centre crop, -1..1"
+_SHORT = "short side 224 bilinear, no antialias, center crop, -1..1"
 _WHOLE = "8 bits, 224x224 PIL bicubic in floats, aspect not kept, -1..1"
 _DISCO = "I3D, average pool 1x7x7, batch norm eps 1e-3, 400 logits"
 VARIANTS = {
     variant.name: variant
     for variant in (
-        FeatureVariant("styleganv", "fvd", "i3d-torchscript", _SHORT, "i3d_torchscript.pt as it is, 400 logits", None, 10,
-                       root="scipy", single="mean"),
-        FeatureVariant("videogpt", "fvd", "i3d-400", f"8 bits, cut off; {_SHORT}",
-                       "I3D, average pool 2x7x7, batch norm eps 1e-5, 400 logits", None, 10, root="svd", single="mean"),
+        FeatureVariant(
+            "styleganv",
+            "fvd",
+            "i3d-torchscript",
+            _SHORT,
+            "i3d_torchscript.pt as it is, 400 logits",
+            None,
+            10,
+            root="scipy",
+            single="mean",
+        ),
+        FeatureVariant(
+            "videogpt",
+            "fvd",
+            "i3d-400",
+            f"8 bits, cut off; {_SHORT}",
+            "I3D, average pool 2x7x7, batch norm eps 1e-5, 400 logits",
+            None,
+            10,
+            root="svd",
+            single="mean",
+        ),
         FeatureVariant("disco", "fvd", "i3d-400", _WHOLE, _DISCO, 16, 16, root="scipy"),
         FeatureVariant("consistent4d", "fvd", "i3d-400", _WHOLE, _DISCO, None, 2, aggregation="closed form"),
-        FeatureVariant("r3d50", "fid_vid_r3d50", "resnet50-kinetics",
-                       "8 bits, 112x112 PIL bicubic in floats, aspect not kept, 0..255 less the mean colour",
-                       "3D ResNet-50, 2048 features", 16, 16),
-        FeatureVariant("inception", "fid_vid_inception", "inception",
-                       "8 bits, 299x299 bilinear, antialias, (x - 128) / 128 (torchmetrics)",
-                       "Inception-v3 (TensorFlow 2015-12-05), 2048 features of each frame", 1, 2, aggregation="mean"),
+        FeatureVariant(
+            "r3d50",
+            "fid_vid_r3d50",
+            "resnet50-kinetics",
+            "8 bits, 112x112 PIL bicubic in floats, aspect not kept, 0..255 less the mean color",
+            "3D ResNet-50, 2048 features",
+            16,
+            16,
+        ),
+        FeatureVariant(
+            "inception",
+            "fid_vid_inception",
+            "inception",
+            "8 bits, 299x299 bilinear, antialias, (x - 128) / 128 (torchmetrics)",
+            "Inception-v3 (TensorFlow 2015-12-05), 2048 features of each frame",
+            1,
+            2,
+            aggregation="mean",
+        ),
     )
-}  # fmt: skip
+}
 
 
 def feature_variant(name: str) -> FeatureVariant:
@@ -235,8 +266,10 @@ class ClipFeatures:
         """The next frame, f32 (3,H,W) in 0..1. Raises as `prepare`; DataError for a video too long to be one clip."""
         clip = self.network.variant.clip
         if clip is None and self.frames == LONGEST:
-            raise DataError(f"fvd variant {self.network.variant.name} takes a whole video at once, {LONGEST} frames at "
-                            "most: cut it, or take variant disco, whose windows have 16 frames")  # fmt: skip
+            raise DataError(
+                f"fvd variant {self.network.variant.name} takes a whole video at once, {LONGEST} frames at "
+                "most: cut it, or take variant disco, whose windows have 16 frames"
+            )
         self._waiting.append(prepare(self.network.variant, picture))
         self.frames, self._row, self._new = self.frames + 1, self._row + 1, self._new + 1
         self._longest = max(self._longest, self._row)
@@ -247,9 +280,11 @@ class ClipFeatures:
         """Frames are missing here: no window reaches across. DataError for a variant whose clip is the whole video."""
         variant = self.network.variant
         if variant.clip is None:
-            raise DataError(f"frames are missing inside a view, and {variant.metric} variant {variant.name} takes a whole "
-                            "video at once: make them again, or take variant disco, whose windows have 16 frames")  # fmt: skip
-        if variant.clip > 1:  # single frames have no neighbours to lose
+            raise DataError(
+                f"frames are missing inside a view, and {variant.metric} variant {variant.name} takes a whole "
+                "video at once: make them again, or take variant disco, whose windows have 16 frames"
+            )
+        if variant.clip > 1:  # single frames have no neighbors to lose
             self._waiting.clear()
             self._row = self._new = 0
 

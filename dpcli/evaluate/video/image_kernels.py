@@ -15,15 +15,15 @@ _REACH = TAPS // 2
 
 @arithmetic_kernel
 def composite(rgba, background, out):
-    """Straight-alpha rgba u8 (H,W,4) over background f32 (3) -> out f32 (3,H,W); all colours in 0..1."""
+    """Straight-alpha rgba u8 (H,W,4) over background f32 (3) -> out f32 (3,H,W); all colors in 0..1."""
     height, width, _ = rgba.shape
     for channel in range(3):
         behind = background[channel]
         for row in range(height):
             for column in range(width):
                 alpha = np.float32(rgba[row, column, 3]) * np.float32(1 / 255)
-                colour = np.float32(rgba[row, column, channel]) * np.float32(1 / 255)
-                out[channel, row, column] = alpha * colour + (np.float32(1) - alpha) * behind
+                color = np.float32(rgba[row, column, channel]) * np.float32(1 / 255)
+                out[channel, row, column] = alpha * color + (np.float32(1) - alpha) * behind
 
 
 @arithmetic_kernel
@@ -46,9 +46,13 @@ def _across(line, taps, out):
     a, b, c, d, e, f = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for x in range(len(out)):
         out[x] = (
-            a * (line[x] + line[x + 10]) + b * (line[x + 1] + line[x + 9]) + c * (line[x + 2] + line[x + 8])
-            + d * (line[x + 3] + line[x + 7]) + e * (line[x + 4] + line[x + 6]) + f * line[x + 5]
-        )  # fmt: skip
+            a * (line[x] + line[x + 10])
+            + b * (line[x + 1] + line[x + 9])
+            + c * (line[x + 2] + line[x + 8])
+            + d * (line[x + 3] + line[x + 7])
+            + e * (line[x + 4] + line[x + 6])
+            + f * line[x + 5]
+        )
 
 
 @arithmetic_kernel
@@ -61,18 +65,22 @@ def _down(ring, first, taps, out):
     r9, r10 = ring[(first + 9) % TAPS], ring[(first + 10) % TAPS]
     for x in range(len(out)):
         out[x] = (
-            a * (r0[x] + r10[x]) + b * (r1[x] + r9[x]) + c * (r2[x] + r8[x])
-            + d * (r3[x] + r7[x]) + e * (r4[x] + r6[x]) + f * r5[x]
-        )  # fmt: skip
+            a * (r0[x] + r10[x])
+            + b * (r1[x] + r9[x])
+            + c * (r2[x] + r8[x])
+            + d * (r3[x] + r7[x])
+            + e * (r4[x] + r6[x])
+            + f * r5[x]
+        )
 
 
 @arithmetic_kernel
-def _lines(predicted, truth, pad, centre, lines):
-    """A row's difference, its square, centred sum, its square -> lines f32 (4,W+2 pad), mirrored at the edges."""
+def _lines(predicted, truth, pad, center, lines):
+    """A row's difference, its square, centered sum, its square -> lines f32 (4,W+2 pad), mirrored at the edges."""
     width = len(predicted)
     for x in range(width):
         apart = predicted[x] - truth[x]
-        both = (predicted[x] - centre) + (truth[x] - centre)
+        both = (predicted[x] - center) + (truth[x] - center)
         lines[0, pad + x], lines[1, pad + x] = apart, apart * apart
         lines[2, pad + x], lines[3, pad + x] = both, both * both
     for kind in range(4):
@@ -82,7 +90,7 @@ def _lines(predicted, truth, pad, centre, lines):
 
 
 @arithmetic_kernel
-def _similarity(moments, centre, c1, c2, whole, contrast):
+def _similarity(moments, center, c1, c2, whole, contrast):
     """Add the similarity and its contrast-structure factor at each column to whole, contrast f64 (W).
 
     With d = p - t and s = p + t: luminance 1 - E[d]^2 / (E[p]^2 + E[t]^2 + c1), contrast-structure
@@ -94,7 +102,7 @@ def _similarity(moments, centre, c1, c2, whole, contrast):
         apart, both = moments[0, x], moments[2, x]
         spread = max(moments[1, x] - apart * apart, zero)
         joint = max(moments[3, x] - both * both, zero)
-        total = both + centre + centre
+        total = both + center + center
         squares = half * (total * total + apart * apart)
         structure = one - spread / (half * (joint + spread) + c2)
         contrast[x] += structure
@@ -102,11 +110,11 @@ def _similarity(moments, centre, c1, c2, whole, contrast):
 
 
 @arithmetic_kernel
-def similarity_sums(predicted, truth, taps, pad, centre, c1, c2):
+def similarity_sums(predicted, truth, taps, pad, center, c1, c2):
     """Sums over all windows of f32 (C,H,W) pictures of the similarity and of its contrast-structure factor.
 
     taps f32 (6): the window's weights from its edge to its middle. pad 0: windows inside the picture only; 5: one
-    window per pixel, the picture mirrored at its edges (which are not repeated). centre: about the mean value, taken
+    window per pixel, the picture mirrored at its edges (which are not repeated). center: about the mean value, taken
     off before squaring.
     """
     channels, height, width = predicted.shape
@@ -117,14 +125,14 @@ def similarity_sums(predicted, truth, taps, pad, centre, c1, c2):
     for channel in range(channels):
         for row in range(-pad, height + pad):
             source = abs(row) if row < height else 2 * height - 2 - row
-            _lines(predicted[channel, source], truth[channel, source], pad, centre, lines)
+            _lines(predicted[channel, source], truth[channel, source], pad, center, lines)
             slot = (row + pad) % TAPS
             for kind in range(4):
                 _across(lines[kind], taps, ring[kind, slot])
             if row + pad >= TAPS - 1:
                 for kind in range(4):
                     _down(ring[kind], (slot + 1) % TAPS, taps, moments[kind])
-                _similarity(moments, centre, c1, c2, whole, contrast)
+                _similarity(moments, center, c1, c2, whole, contrast)
     return whole.sum(), contrast.sum()
 
 

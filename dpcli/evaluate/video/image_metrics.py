@@ -82,8 +82,10 @@ def check_pair(predicted: np.ndarray, truth: np.ndarray, data_range: float) -> N
         if not np.isfinite(values).all():
             raise DataError(f"the {name} has {int((~np.isfinite(values)).sum())} values that are NaN or infinite")
         if largest[-1] > 1.5 * data_range:
-            raise DataError(f"the {name} has values up to {largest[-1]:g}, but data_range is {data_range:g}; "
-                            "divide by 255, or give data_range=255")  # fmt: skip
+            raise DataError(
+                f"the {name} has values up to {largest[-1]:g}, but data_range is {data_range:g}; "
+                "divide by 255, or give data_range=255"
+            )
     if data_range == 255 and 0 < max(largest) <= 1:
         raise DataError(
             f"both pictures have values up to {max(largest):g}, but data_range is 255; multiply by 255, or data_range=1"

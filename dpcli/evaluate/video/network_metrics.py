@@ -20,10 +20,16 @@ from dpcli.evaluate.proportions import mean_defined
 
 FRECHET = ("fvd", "fid_vid_r3d50", "fid_vid_inception")
 TITLES = {
-    "lpips": "LPIPS", "clip": "CLIP similarity to the truth", "clip_spherical": "CLIP spherical distance to the truth",
-    "clip_views": "CLIP similarity across views", "clip_temporal": "CLIP similarity over time", "fvd": "FVD",
-    "fid_vid_r3d50": "FID-VID (3D ResNet-50)", "fid_vid_inception": "FID-VID (Inception)", "warping": "warping error",
-}  # fmt: skip
+    "lpips": "LPIPS",
+    "clip": "CLIP similarity to the truth",
+    "clip_spherical": "CLIP spherical distance to the truth",
+    "clip_views": "CLIP similarity across views",
+    "clip_temporal": "CLIP similarity over time",
+    "fvd": "FVD",
+    "fid_vid_r3d50": "FID-VID (3D ResNet-50)",
+    "fid_vid_inception": "FID-VID (Inception)",
+    "warping": "warping error",
+}
 LEARNED = tuple(TITLES)
 
 
@@ -73,7 +79,7 @@ class LearnedMetric(ABC):
 
 
 class _Gap:
-    """Tells whether frames of a view were left out before the one at hand: it then has no neighbour before it."""
+    """Tells whether frames of a view were left out before the one at hand: it then has no neighbor before it."""
 
     def __init__(self) -> None:
         self._next: int | None = None
@@ -135,7 +141,7 @@ class LpipsMetric(_PerFrame):
 
     def choices(self) -> dict[str, Any]:
         given = "0..1, as DisCo gives them by mistake" if self._networks.lpips_range01 else "-1..1"
-        return {"network": f"{self._networks.lpips}, v0.1", "colours": given}
+        return {"network": f"{self._networks.lpips}, v0.1", "colors": given}
 
 
 class _Embedded:
@@ -157,7 +163,7 @@ class _Embedded:
         return self._last  # type: ignore[return-value]
 
     def choices(self) -> dict[str, Any]:
-        return {"network": f"CLIP ViT-B/32, {self.variant}", "colours": "BGR by mistake" if self.bgr else "RGB"}
+        return {"network": f"CLIP ViT-B/32, {self.variant}", "colors": "BGR by mistake" if self.bgr else "RGB"}
 
 
 class ClipMetric(_PerFrame):
@@ -204,8 +210,14 @@ class ClipTemporal(LearnedMetric):
         means = {view: np.mean(rows, axis=0) for view, rows in self._found.items()}
         both = np.mean(list(means.values()), axis=0)
         counts = {"views": len(means), "pairs": sum(map(len, self._found.values()))}
-        return LearnedScore("clip_temporal", float(both[0]), {view: float(m[0]) for view, m in means.items()},
-                            float(both[1]), counts, self._embedded.choices())  # fmt: skip
+        return LearnedScore(
+            "clip_temporal",
+            float(both[0]),
+            {view: float(m[0]) for view, m in means.items()},
+            float(both[1]),
+            counts,
+            self._embedded.choices(),
+        )
 
 
 class ClipViews(LearnedMetric):
@@ -224,7 +236,9 @@ class ClipViews(LearnedMetric):
         self._views += 1
 
     def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
-        self._sums[frame] = self._sums.get(frame, 0) + np.stack(self._embedded.pair(predicted, truth)).astype(np.float64)
+        self._sums[frame] = self._sums.get(frame, 0) + np.stack(self._embedded.pair(predicted, truth)).astype(
+            np.float64
+        )
         self._seen[frame] += 1
 
     def end(self) -> None:
@@ -304,13 +318,17 @@ class WarpingMetric(LearnedMetric):
         from dpcli.evaluate.video.warping import warping_compute, warping_merge
 
         each = {view: warping_compute(part) for view, part in self._parts.items()}
-        value, own = (mean_defined(np.array([getattr(one, key) for one in each.values()]))
-                      for key in ("squared", "truth_squared"))  # fmt: skip
+        value, own = (
+            mean_defined(np.array([getattr(one, key) for one in each.values()])) for key in ("squared", "truth_squared")
+        )
         shown = [one for one in each.values() if not np.isnan(one.squared)]
         counts = {"views": len(shown), "pairs": sum(one.pairs for one in shown)}
-        choices = {"flow": "OpenCV DIS of the truth, forward-backward check", "error": "mean square, colours in 0..1",
-                   "mean": "over the pixels of each view, then over views",
-                   "occluded": round(warping_compute(warping_merge(self._parts.values())).occluded, 4)}  # fmt: skip
+        choices = {
+            "flow": "OpenCV DIS of the truth, forward-backward check",
+            "error": "mean square, colors in 0..1",
+            "mean": "over the pixels of each view, then over views",
+            "occluded": round(warping_compute(warping_merge(self._parts.values())).occluded, 4),
+        }
         return LearnedScore("warping", value, {view: one.squared for view, one in each.items()}, own, counts, choices)
 
 
@@ -336,7 +354,7 @@ def _load(name: str, networks: Networks, folder: Path, device: str, embedded: di
         return FrechetMetric(name, networks, folder, device)
     if name == "warping":
         return WarpingMetric()
-    if name == "clip_spherical":  # 4DGen's: other weights, colours swapped by its reader
+    if name == "clip_spherical":  # 4DGen's: other weights, colors swapped by its reader
         networks = Networks(clip="laion")
     key = networks.clip, name == "clip_spherical"
     if key not in embedded:

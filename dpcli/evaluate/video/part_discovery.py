@@ -12,8 +12,8 @@ from dpcli.evaluate.segmentation.part_matching import overlap
 from dpcli.runtime.seeds import scikit_learn_state
 from dpcli.store.gaussians import GaussianScene
 
-PART_NEIGHBOURS = 8
-TRACK_NEIGHBOURS = 4
+PART_NEIGHBORS = 8
+TRACK_NEIGHBORS = 4
 SOLID = 0.1  # opacity of a Gaussian that may carry a surface; fainter ones float anywhere
 
 
@@ -90,7 +90,7 @@ def surface_parts(scene: GaussianScene, points: np.ndarray, time: float) -> np.n
 
     -1 where those have none; a tie goes to the lowest id.
     """
-    index, weight = attach(points, scene.at(time)[0], scene.opacity, PART_NEIGHBOURS)
+    index, weight = attach(points, scene.at(time)[0], scene.opacity, PART_NEIGHBORS)
     votes = np.zeros((len(points), scene.num_parts + 1))
     rows = np.arange(len(points))[:, None]
     np.add.at(votes, (rows, scene.part[index].astype(np.int64) + 1), weight)
@@ -138,7 +138,7 @@ def carry(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.nda
     of a rigidly moving scene are carried exactly.
     """
     means, turns = scene.at(float(times[0]))
-    index, weight = attach(points, means, scene.opacity, TRACK_NEIGHBOURS)
+    index, weight = attach(points, means, scene.opacity, TRACK_NEIGHBORS)
     back = np.swapaxes(_rotations(turns), 1, 2)
     local = np.einsum("mkij,mkj->mki", back[index], points[:, None].astype(np.float64) - means[index])
     carried = np.empty((len(times), *points.shape))
@@ -152,9 +152,17 @@ def carry(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.nda
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
     """f64 (N,3,3) of unit quaternions w x y z (N,4)."""
     w, x, y, z = quaternions.astype(np.float64).T
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return np.stack(rows, -1).reshape(-1, 3, 3)
 
 

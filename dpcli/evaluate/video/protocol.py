@@ -26,9 +26,9 @@ class VideoProtocol:
     """views: which of the truth's are compared, all | reference | test (all when there is no test view).
 
     size: side that both pictures are resized to by PIL's default (bicubic), None = as they are, and equal. eight_bit:
-    colours are rounded to 0..255 after compositing. data_range: None = of each frame, as torchmetrics without one: the
+    colors are rounded to 0..255 after compositing. data_range: None = of each frame, as torchmetrics without one: the
     truth's largest less smallest value for PSNR, the wider of both pictures' for SSIM. border: as `image_metrics.ssim`.
-    grey: SSIM of luminance instead of each colour. networks: those of the learned metrics; learned_views: which of the
+    gray: SSIM of luminance instead of each color. networks: those of the learned metrics; learned_views: which of the
     truth's they compare, if others than `views`.
     """
 
@@ -38,7 +38,7 @@ class VideoProtocol:
     eight_bit: bool = False
     data_range: float | None = 1.0
     border: str = "valid"
-    grey: bool = False
+    gray: bool = False
     networks: Networks = Networks()
     learned_views: str | None = None
     background: str = "white"
@@ -49,15 +49,23 @@ PROTOCOLS = {
     protocol.name: protocol
     for protocol in (
         VideoProtocol("dpc"),
-        VideoProtocol("thesis", views="reference", eight_bit=True, data_range=255.0, networks=_LINEAGE,
-                      learned_views="all"),
-        VideoProtocol("consistent4d", views="test", size=512, eight_bit=True, data_range=None, border="reflect",
-                      networks=_LINEAGE),
-        VideoProtocol("disco", size=256, eight_bit=True, data_range=255.0, grey=True,
-                      networks=Networks(lpips="vgg", lpips_range01=True, fvd="disco")),
+        VideoProtocol(
+            "thesis", views="reference", eight_bit=True, data_range=255.0, networks=_LINEAGE, learned_views="all"
+        ),
+        VideoProtocol(
+            "consistent4d", views="test", size=512, eight_bit=True, data_range=None, border="reflect", networks=_LINEAGE
+        ),
+        VideoProtocol(
+            "disco",
+            size=256,
+            eight_bit=True,
+            data_range=255.0,
+            gray=True,
+            networks=Networks(lpips="vgg", lpips_range01=True, fvd="disco"),
+        ),
         VideoProtocol("torchmetrics", border="reflect"),
     )
-}  # fmt: skip
+}
 
 
 def video_protocol(
@@ -104,11 +112,11 @@ def check_picture_of(metrics: Sequence[str] | None, picture: object) -> None:
 
 
 def comparable(picture: Picture, protocol: VideoProtocol) -> np.ndarray:
-    """Colours f32 (3,H,W) of a picture as the protocol compares them: in 0..1, or 0..255 when it rounds to 8 bits."""
-    colours = picture.over(BACKGROUNDS[protocol.background])
+    """Colors f32 (3,H,W) of a picture as the protocol compares them: in 0..1, or 0..255 when it rounds to 8 bits."""
+    colors = picture.over(BACKGROUNDS[protocol.background])
     if not protocol.eight_bit:
-        return colours
-    rounded = (colours * 255 + 0.5).astype(np.uint8)
+        return colors
+    rounded = (colors * 255 + 0.5).astype(np.uint8)
     return np.ascontiguousarray(_resized(rounded.transpose(1, 2, 0), protocol.size).transpose(2, 0, 1), np.float32)
 
 
@@ -128,27 +136,27 @@ def score_frame(
     mask = _resized(truth.mask(), protocol.size, nearest=True) if "psnr_foreground" in metrics else None
     peak = own = protocol.data_range
     if protocol.data_range is None:
-        peak = float(np.ptp(theirs)) or np.nan  # a frame of one colour has no range, so no PSNR
+        peak = float(np.ptp(theirs)) or np.nan  # a frame of one color has no range, so no PSNR
         own = max(float(np.ptp(ours)), float(np.ptp(theirs)))
     if not own:
         metrics = [name for name in metrics if name not in ("ssim", "ms_ssim")]
     options = {"data_range": peak, "similarity_range": own, "mask": mask, "border": protocol.border}
-    if not protocol.grey:
+    if not protocol.gray:
         return picture_update(frame, ours, theirs, metrics=metrics, **options)
     found = picture_update(frame, ours, theirs, metrics=(), **options)
-    grey = picture_update(frame, _luminance(ours), _luminance(theirs), metrics=metrics, **options)
-    return replace(found, similarity=grey.similarity, windows=grey.windows, multi_scale=grey.multi_scale)
+    gray = picture_update(frame, _luminance(ours), _luminance(theirs), metrics=metrics, **options)
+    return replace(found, similarity=gray.similarity, windows=gray.windows, multi_scale=gray.multi_scale)
 
 
-def _luminance(colours: np.ndarray) -> np.ndarray:
+def _luminance(colors: np.ndarray) -> np.ndarray:
     """RGB f32 (3,H,W) -> f32 (1,H,W), with scikit-image's weights."""
-    return np.tensordot(np.float32([0.2125, 0.7154, 0.0721]), colours, 1)[None]
+    return np.tensordot(np.float32([0.2125, 0.7154, 0.0721]), colors, 1)[None]
 
 
 def scaled(picture: Picture, protocol: VideoProtocol) -> np.ndarray:
-    """`comparable` colours f32 (3,H,W), always in 0..1: what the learned metrics look at."""
-    colours = comparable(picture, protocol)
-    return colours / np.float32(255) if protocol.eight_bit else colours
+    """`comparable` colors f32 (3,H,W), always in 0..1: what the learned metrics look at."""
+    colors = comparable(picture, protocol)
+    return colors / np.float32(255) if protocol.eight_bit else colors
 
 
 def check_size(size: tuple[int, int], protocol: VideoProtocol, metrics: Sequence[str], where: str) -> None:
@@ -156,22 +164,24 @@ def check_size(size: tuple[int, int], protocol: VideoProtocol, metrics: Sequence
     side = protocol.size or min(size)
     for name, least in SMALLEST.items():
         if name in metrics and side < least:
-            raise DataError(f"{where}: pictures of {size[0]}x{size[1]}; {name} needs at least {least} pixels a side: "
-                            "leave it out of --metrics")  # fmt: skip
+            raise DataError(
+                f"{where}: pictures of {size[0]}x{size[1]}; {name} needs at least {least} pixels a side: "
+                "leave it out of --metrics"
+            )
 
 
 def choices(protocol: VideoProtocol) -> dict[str, Any]:
     """Every choice of a protocol in words, for a result that stands alone."""
     ranges = "of each frame: truth's max - min (PSNR), the wider of both pictures' (SSIM)"
     borders = {"valid": "windows inside the picture", "reflect": "a window per pixel, picture mirrored at its edges"}
-    of = "of luminance" if protocol.grey else "of each colour"
+    of = "of luminance" if protocol.gray else "of each color"
     return {
         "name": protocol.name,
         "views": protocol.views,
         "views_of_learned_metrics": protocol.learned_views or protocol.views,
         "background": protocol.background,
         "size": f"both resized to {protocol.size} (bicubic)" if protocol.size else "as they are, equal",
-        "colours": "RGB, 8 bits" if protocol.eight_bit else "RGB, float32",
+        "colors": "RGB, 8 bits" if protocol.eight_bit else "RGB, float32",
         "data_range": ranges if protocol.data_range is None else protocol.data_range,
         "psnr": f"of each frame over all its values, at most {PSNR_CAP:g} dB",
         "psnr_foreground": "psnr over the pixels where the truth's alpha is at least one half",

@@ -52,7 +52,7 @@ class Picture:
         return 0 if self.values is None else int((~np.isfinite(self.values)).any(-1).sum())
 
     def over(self, background: Sequence[float]) -> np.ndarray:
-        """Colours f32 (3,H,W) in 0..1 over a background colour (3) in 0..1."""
+        """Colors f32 (3,H,W) in 0..1 over a background color (3) in 0..1."""
         behind = np.asarray(background, np.float32)
         if self.values is None:
             from dpcli.evaluate.video.image_kernels import composite
@@ -137,15 +137,17 @@ class SceneSource(Source):
         own, wanted = self.scene.time, self.header.time
         slack = 0.5 * min((np.diff(t).min() for t in (own, wanted) if len(t) > 1), default=np.inf)
         if wanted[0] < own[0] - slack or wanted[-1] > own[-1] + slack:
-            raise DataError(f"{self.path}: holds {own[0]:.4g} to {own[-1]:.4g} s, but {truth} has frames from "
-                            f"{wanted[0]:.4g} to {wanted[-1]:.4g} s; was it fitted to another clip?")  # fmt: skip
+            raise DataError(
+                f"{self.path}: holds {own[0]:.4g} to {own[-1]:.4g} s, but {truth} has frames from "
+                f"{wanted[0]:.4g} to {wanted[-1]:.4g} s; was it fitted to another clip?"
+            )
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
         for frame in frames:
             yield Picture(values=self._render(view, float(self.header.time[frame])))
 
     def _render(self, view: int, time: float) -> np.ndarray:
-        """Premultiplied colours and alpha f32 (H,W,4)."""
+        """Premultiplied colors and alpha f32 (H,W,4)."""
         import torch
 
         from dpcli.ops.splatting.rasterization import rasterization
@@ -155,8 +157,8 @@ class SceneSource(Source):
         arrays = (*scene.at(time), scene.scale, scene.opacity, scene.sh, *cameras)
         with torch.no_grad():
             tensors = (torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays)
-            colours, alphas, _ = rasterization(*tensors, width, height, sh_degree=scene.sh_degree)
-        return torch.cat([colours[0, ..., :3], alphas[0]], -1).numpy()
+            colors, alphas, _ = rasterization(*tensors, width, height, sh_degree=scene.sh_degree)
+        return torch.cat([colors[0, ..., :3], alphas[0]], -1).numpy()
 
 
 class FolderSource(Source):
@@ -199,13 +201,13 @@ def _folder_view(name: str) -> View:
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, bool]:
-    """rgba u8 (H,W,4), and whether the file has an alpha channel. DataError when unreadable or not 8-bit colour."""
+    """rgba u8 (H,W,4), and whether the file has an alpha channel. DataError when unreadable or not 8-bit color."""
     from PIL import Image
 
     try:
         with Image.open(path) as image:
             if image.mode.startswith(("I", "F")):
-                raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit colour picture")
+                raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = "A" in image.getbands() or "transparency" in image.info
             return np.asarray(image.convert("RGBA")), has_alpha
     except (OSError, SyntaxError, ValueError) as error:
@@ -226,8 +228,10 @@ class ArraySource(Source):
         array = array[None] if array.ndim == 4 else array
         known = array.dtype == np.uint8 or array.dtype.kind == "f"
         if array.ndim != 5 or array.shape[-1] not in (3, 4) or not known or array.size == 0:
-            raise DataError(f"{path}: {array.dtype} {array.shape}; expected uint8, or floats in 0..1, of shape "
-                            "([views,] frames, height, width, 3 or 4)")  # fmt: skip
+            raise DataError(
+                f"{path}: {array.dtype} {array.shape}; expected uint8, or floats in 0..1, of shape "
+                "([views,] frames, height, width, 3 or 4)"
+            )
         self.array, count = array, len(array)
         self.views = [_folder_view("" if count == 1 else str(index)) for index in range(count)]
         self.frames = [array.shape[1]] * count
@@ -244,11 +248,13 @@ class ArraySource(Source):
                 continue
             largest = float(np.nanmax(values, initial=0))
             if 1.5 < largest < np.inf:
-                raise DataError(f"{self.path}: frame {frame} has values up to {largest:g}; floats are taken as 0..1: "
-                                "divide by 255, or store them as uint8")  # fmt: skip
+                raise DataError(
+                    f"{self.path}: frame {frame} has values up to {largest:g}; floats are taken as 0..1: "
+                    "divide by 255, or store them as uint8"
+                )
             with np.errstate(invalid="ignore"):  # NaN is found, and said, by whoever compares
-                coloured = values[..., :3] * values[..., 3:]
-            yield Picture(values=np.concatenate([coloured, values[..., 3:]], -1, dtype=np.float32))
+                colored = values[..., :3] * values[..., 3:]
+            yield Picture(values=np.concatenate([colored, values[..., 3:]], -1, dtype=np.float32))
 
 
 class VideoSource(Source):
@@ -304,6 +310,8 @@ def open_source(path: Path, *, truth: Source | None = None) -> Source:
     if truth is None:
         raise DataError(f"{path}: a Gaussian scene has no pictures, so it can't be the truth; give the views file")
     if not isinstance(truth, ViewsSource):
-        raise DataError(f"{truth.path}: a {truth.kind} has no cameras to render {path} with; give the views file, "
-                        "or render the scene first (`dpc generate4d render`)")  # fmt: skip
+        raise DataError(
+            f"{truth.path}: a {truth.kind} has no cameras to render {path} with; give the views file, "
+            "or render the scene first (`dpc generate4d render`)"
+        )
     return SceneSource(path, truth.header, truth.path)

@@ -15,7 +15,7 @@ from dpcli.evaluate.video.comparison import VideoReport, ViewScore, view_values
 from dpcli.evaluate.video.image_metrics import PSNR_CAP
 from dpcli.evaluate.video.network_metrics import TITLES as LEARNED_TITLES
 from dpcli.evaluate.video.network_metrics import LearnedScore
-from dpcli.evaluate.video.part_discovery import PART_NEIGHBOURS, SOLID, TRACK_NEIGHBOURS, PartScore, TrackScore
+from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
 from dpcli.evaluate.video.protocol import PICTURE_METRICS, choices
 
 TITLES = {"psnr": "PSNR (dB)", "psnr_foreground": "PSNR on object (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM"}
@@ -40,8 +40,16 @@ def video_tables(report: VideoReport) -> list[TextTable]:
 def _pictures(report: VideoReport) -> TextTable:
     names = [name for name in report.names if name in PICTURE_METRICS]
     header = ["view", "role", "frames", *(TITLES[name] for name in names), "worst frame"]
-    rows = [[view.title, view.role, str(view.metrics.frames), *_cells(asdict(view.metrics), names),
-             str(view.metrics.worst) if view.metrics.worst >= 0 else "-"] for view in report.views]  # fmt: skip
+    rows = [
+        [
+            view.title,
+            view.role,
+            str(view.metrics.frames),
+            *_cells(asdict(view.metrics), names),
+            str(view.metrics.worst) if view.metrics.worst >= 0 else "-",
+        ]
+        for view in report.views
+    ]
     for role, means in report.roles.items():
         several = [view for view in report.views if view.role == role]
         if 1 < len(several) < len(report.views):
@@ -66,8 +74,10 @@ def _learned(report: VideoReport) -> TextTable:
 def _intervals(report: VideoReport) -> TextTable:
     means = report.mean() | {name: score.value for name, score in report.learned.items()}
     titles = TITLES | LEARNED_TITLES
-    rows = [[titles[name], _number(means[name]), f"{own.low:.4g} - {own.high:.4g}" if own.defined else "-"]
-            for name, own in report.intervals.items()]  # fmt: skip
+    rows = [
+        [titles[name], _number(means[name]), f"{own.low:.4g} - {own.high:.4g}" if own.defined else "-"]
+        for name, own in report.intervals.items()
+    ]
     return TextTable("All views", ["metric", "mean", f"{100 * report.resampling.confidence:.4g} % interval"], rows)
 
 
@@ -87,17 +97,23 @@ def _cells(values: Mapping[str, float], names: list[str]) -> list[str]:
 def _parts(score: PartScore) -> TextTable:
     header = ["parts of", "adjusted Rand index", "parts", "points"]
     counts = (str(score.true_parts), str(score.points))
-    return TextTable("Parts", header, [
-        ["the scene", _number(score.ari), str(score.discovered), str(score.points)],
-        ["k-means on positions", _number(score.ari_kmeans), *counts],
-        ["one part", _number(score.ari_one_part), "1", str(score.points)],
-    ])  # fmt: skip
+    return TextTable(
+        "Parts",
+        header,
+        [
+            ["the scene", _number(score.ari), str(score.discovered), str(score.points)],
+            ["k-means on positions", _number(score.ari_kmeans), *counts],
+            ["one part", _number(score.ari_one_part), "1", str(score.points)],
+        ],
+    )
 
 
 def _tracks(score: TrackScore, unit: str) -> TextTable:
     header = ["tracks of", f"EPE{f' ({unit})' if unit else ''}", "of the diameter", "points", "frames"]
-    rows = [[name, _number(error), _percent(error, score.diameter), str(score.points), str(score.frames)]
-            for name, error in (("the scene", score.epe), ("no motion", score.static))]  # fmt: skip
+    rows = [
+        [name, _number(error), _percent(error, score.diameter), str(score.points), str(score.frames)]
+        for name, error in (("the scene", score.epe), ("no motion", score.static))
+    ]
     return TextTable("Surface tracks", header, rows)
 
 
@@ -121,13 +137,13 @@ def video_notes(report: VideoReport) -> list[str]:
     lines += [f"{LEARNED_TITLES[name]} not computed: {reason}" for name, reason in report.missing.items()]
     if "parts" in report.scene:
         lines.append(
-            f"Parts: each true surface point takes the part of its {PART_NEIGHBOURS} nearest Gaussians (opacity >= {SOLID:g}, "
+            f"Parts: each true surface point takes the part of its {PART_NEIGHBORS} nearest Gaussians (opacity >= {SOLID:g}, "
             f"weight opacity / distance) in the first frame; k-means is told the true number of parts; "
             f"{report.scene['parts'].unknown} points without a true part left out."
         )
     if "tracks" in report.scene:
         lines.append(
-            f"Tracks: points of the first frame, carried by their {TRACK_NEIGHBOURS} nearest Gaussians; mean over points and "
+            f"Tracks: points of the first frame, carried by their {TRACK_NEIGHBORS} nearest Gaussians; mean over points and "
             f"later frames; diameter {_number(report.scene['tracks'].diameter)} {report.length_unit}".rstrip()
             + " (diagonal of the bounding box in the first frame)."
         )
@@ -143,7 +159,7 @@ def _picture_notes(report: VideoReport) -> list[str]:
     said, (width, height) = choices(report.protocol), report.size
     counts = f"{len(report.views)} view{'s' if len(report.views) > 1 else ''}, {_frames(report.views)} frames"
     lines = [
-        f"{counts} of {width}x{height} pixels over {said['background']}, {said['colours']}, size: {said['size']}; "
+        f"{counts} of {width}x{height} pixels over {said['background']}, {said['colors']}, size: {said['size']}; "
         f"data range {said['data_range']}; means {said['mean']}.",
         *(f"{TITLES[name].removesuffix(' (dB)')}: {said[name]}." for name in report.names if name in PICTURE_METRICS),
     ]
@@ -169,8 +185,11 @@ def video_json(report: VideoReport, source: str) -> dict[str, Any]:
     metrics |= {name: None for name in report.missing}
     units = {name: _UNITS.get(name, "1") for name in report.names if name in (*_UNITS, *LEARNED_TITLES)}
     pixels = report.size[0] * report.size[1] if not report.protocol.size else report.protocol.size**2
-    denominators = {"views": len(report.views), "frames": sum(view.metrics.frames for view in report.views),
-                    "pixels": pixels if report.views else 0}  # fmt: skip
+    denominators = {
+        "views": len(report.views),
+        "frames": sum(view.metrics.frames for view in report.views),
+        "pixels": pixels if report.views else 0,
+    }
     if report.learned:
         metrics["per_view_learned"] = {name: _defined(s.per_view) for name, s in report.learned.items() if s.per_view}
         metrics["of_the_truth"] = _defined({n: s.truth for n, s in report.learned.items() if s.truth is not None})
@@ -179,8 +198,13 @@ def video_json(report: VideoReport, source: str) -> dict[str, Any]:
         metrics[name] = _parts_json(score) if isinstance(score, PartScore) else _tracks_json(score)
         denominators[name] = {key: value for key, value in asdict(score).items() if isinstance(value, int)}
     if "tracks" in report.scene:
-        units |= {"epe": report.length_unit, "epe_no_motion": report.length_unit, "epe_of_diameter": "fraction",
-                  "epe_no_motion_of_diameter": "fraction", "diameter": report.length_unit}  # fmt: skip
+        units |= {
+            "epe": report.length_unit,
+            "epe_no_motion": report.length_unit,
+            "epe_of_diameter": "fraction",
+            "epe_no_motion_of_diameter": "fraction",
+            "diameter": report.length_unit,
+        }
     names = list(view_values(report)[0])
     return {
         "task": "video",
@@ -203,8 +227,8 @@ def video_json(report: VideoReport, source: str) -> dict[str, Any]:
 
 def _scene_choices(report: VideoReport) -> dict[str, str]:
     said = {
-        "parts": f"{PART_NEIGHBOURS} nearest Gaussians of opacity >= {SOLID:g}, weight opacity / distance, first frame",
-        "tracks": f"first frame's points carried by {TRACK_NEIGHBOURS} nearest Gaussians, mean over points and later frames",
+        "parts": f"{PART_NEIGHBORS} nearest Gaussians of opacity >= {SOLID:g}, weight opacity / distance, first frame",
+        "tracks": f"first frame's points carried by {TRACK_NEIGHBORS} nearest Gaussians, mean over points and later frames",
     }
     return {name: said[name] for name in report.scene}
 
@@ -218,13 +242,20 @@ def _view(view: ViewScore, names: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _parts_json(score: PartScore) -> dict[str, Any]:
-    return _defined({"adjusted_rand_index": score.ari, "adjusted_rand_index_kmeans": score.ari_kmeans,
-                     "adjusted_rand_index_one_part": score.ari_one_part})  # fmt: skip
+    return _defined(
+        {
+            "adjusted_rand_index": score.ari,
+            "adjusted_rand_index_kmeans": score.ari_kmeans,
+            "adjusted_rand_index_one_part": score.ari_one_part,
+        }
+    )
 
 
 def _tracks_json(score: TrackScore) -> dict[str, Any]:
-    shares = {f"{name}_of_diameter": float(divide(error, score.diameter))
-              for name, error in (("epe", score.epe), ("epe_no_motion", score.static))}  # fmt: skip
+    shares = {
+        f"{name}_of_diameter": float(divide(error, score.diameter))
+        for name, error in (("epe", score.epe), ("epe_no_motion", score.static))
+    }
     return _defined({"epe": score.epe, "epe_no_motion": score.static, **shares, "diameter": score.diameter})
 
 

@@ -30,17 +30,25 @@ def match_views(
     used = {_partner(said, real, i) for i in range(len(real.views))}
     unknown = [view.title for i, view in enumerate(said.views) if i not in used]
     if unsaid and not intersect:
-        raise DataError(f"{said.path}: has no view {listing(unsaid)} of {real.path}; its views are "
-                        f"{listing([v.title for v in said.views])}; --intersect compares what both have")  # fmt: skip
+        raise DataError(
+            f"{said.path}: has no view {listing(unsaid)} of {real.path}; its views are "
+            f"{listing([v.title for v in said.views])}; --intersect compares what both have"
+        )
     if unknown and not intersect and protocol.views == "all":
-        raise DataError(f"{real.path}: has no view {listing(unknown)}, which {said.path} has; "
-                        "--intersect compares what both have")  # fmt: skip
-    left_out += [LeftOut(reason, names) for reason, names in (
-        ("views not predicted", unsaid), ("views the truth doesn't have", unknown)) if names]  # fmt: skip
+        raise DataError(
+            f"{real.path}: has no view {listing(unknown)}, which {said.path} has; --intersect compares what both have"
+        )
+    left_out += [
+        LeftOut(reason, names)
+        for reason, names in (("views not predicted", unsaid), ("views the truth doesn't have", unknown))
+        if names
+    ]
     pairs = [(found[i], i) for i in wanted if found[i] is not None]
     if not pairs:
-        raise DataError(f"{said.path} and {real.path} have no view in common; the truth's are "
-                        f"{listing([view.title for view in real.views])}")  # fmt: skip
+        raise DataError(
+            f"{said.path} and {real.path} have no view in common; the truth's are "
+            f"{listing([view.title for view in real.views])}"
+        )
     if not intersect:
         _same_cameras(said, real, pairs)
     return pairs
@@ -75,5 +83,7 @@ def _same_cameras(said: Source, real: Source, pairs: list[tuple[int, int]]) -> N
         return
     for ours, theirs in pairs:
         if not _same_camera(said, real, ours, theirs):
-            raise DataError(f"{said.path}: view {said.views[ours].title!r} has another camera than view "
-                            f"{real.views[theirs].title!r} of {real.path}; the first that differs")  # fmt: skip
+            raise DataError(
+                f"{said.path}: view {said.views[ours].title!r} has another camera than view "
+                f"{real.views[theirs].title!r} of {real.path}; the first that differs"
+            )

@@ -18,7 +18,7 @@ SLOPE, OFFSET = 0.01, 0.5  # of the tolerated loop, in squared pixels (Sundaram 
 
 @dataclass(frozen=True)
 class WarpingStatistics:
-    """Sums over pairs of neighbouring frames: what `warping_compute` divides.
+    """Sums over pairs of neighboring frames: what `warping_compute` divides.
 
     squared, absolute: of the prediction's errors over `values` numbers (pixels that both frames show, times 3 channels);
     truth_squared, truth_absolute: of the truth's own, 0 where there is none. pixels: all, seen or not.
@@ -39,7 +39,7 @@ class WarpingStatistics:
 
 @dataclass(frozen=True)
 class WarpingMetrics:
-    """Warping errors of colours in 0..1: mean squared (what the field reports) and absolute, and the truth's own.
+    """Warping errors of colors in 0..1: mean squared (what the field reports) and absolute, and the truth's own.
 
     occluded: share of the pixels left out. NaN = undefined: no pairs, no pixel seen twice, or no truth.
     """
@@ -57,7 +57,7 @@ class Warping:
     """Warping error of a video while its frames stream in; holds the frame before.
 
     E = mean over the pixels seen in both frames of (x_t(p) - x_(t-1)(p + f(p)))^2 (Lai et al. 2018, eq. 6 and 7), f the
-    flow from frame t back to t - 1 of OpenCV's DIS on 8-bit grey pictures: of the truth, else of the prediction, which
+    flow from frame t back to t - 1 of OpenCV's DIS on 8-bit gray pictures: of the truth, else of the prediction, which
     then is judged by its own motion. A pixel counts as seen when its partner lies inside the picture and the flow back
     and forth ends where it began: |f(p) + g(p + f(p))|^2 <= 0.01 (|f|^2 + |g|^2) + 0.5.
     """
@@ -76,19 +76,19 @@ class Warping:
             if picture is not None:
                 _check(picture, predicted)
         self.flow_of = "prediction" if truth is None else "truth"
-        grey = _grey(predicted if truth is None else truth)
+        gray = _gray(predicted if truth is None else truth)
         if self._before is not None:
-            self._found += _pair(self._before, (predicted, truth, grey))
-        self._before = (predicted, truth, grey)
+            self._found += _pair(self._before, (predicted, truth, gray))
+        self._before = (predicted, truth, gray)
 
     def restart(self) -> None:
-        """Frames are missing here: the next one is no neighbour of the last one."""
+        """Frames are missing here: the next one is no neighbor of the last one."""
         self._before = None
 
     def result(self) -> WarpingStatistics:
         """DataError when no two frames followed each other."""
         if not self._found.pairs:
-            raise DataError("temporal consistency compares neighbouring frames: at least 2 in a row are needed")
+            raise DataError("temporal consistency compares neighboring frames: at least 2 in a row are needed")
         return self._found
 
 
@@ -107,11 +107,11 @@ def warping_compute(found: WarpingStatistics, flow_of: str = "truth") -> Warping
     return WarpingMetrics(*errors, hidden, found.pairs, flow_of)
 
 
-def optical_flow(grey: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Flow f32 (H,W,2), x and y in pixels, with other(p + f(p)) = grey(p); u8 (H,W). OpenCV's DIS, preset medium."""
+def optical_flow(gray: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Flow f32 (H,W,2), x and y in pixels, with other(p + f(p)) = gray(p); u8 (H,W). OpenCV's DIS, preset medium."""
     import cv2
 
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(grey, other, None)
+    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(gray, other, None)
 
 
 def moved(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:
@@ -126,7 +126,7 @@ def moved(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:
 def seen_in_both(back: np.ndarray, forth: np.ndarray) -> np.ndarray:
     """bool (H,W): pixels whose partner lies inside, and whose loop back (H,W,2) and forth (H,W,2) closes.
 
-    Inside is half a pixel wider than the outermost centres: a flow near 0 doesn't push the edge out.
+    Inside is half a pixel wider than the outermost centers: a flow near 0 doesn't push the edge out.
     """
     height, width = back.shape[:2]
     where = _partners(back)
@@ -155,7 +155,7 @@ def _partners(flow: np.ndarray) -> np.ndarray:
     return (grid + flow).astype(np.float32)
 
 
-def _grey(picture: np.ndarray) -> np.ndarray:
+def _gray(picture: np.ndarray) -> np.ndarray:
     import cv2
 
     rgb = (picture.clip(0, 1) * 255 + 0.5).astype(np.uint8)

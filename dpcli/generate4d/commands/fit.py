@@ -31,9 +31,20 @@ from dpcli.store.pipes import PICTURES, check_target
 
 
 def run_fit(
-    views: str, output: str, *, preset_name: str, changes: dict[str, Any], prior: str, prior_model: str | None,
-    regularise: bool, run: str | None, picture: Path | None, seed: int, device: str, force: bool,
-) -> None:  # fmt: skip
+    views: str,
+    output: str,
+    *,
+    preset_name: str,
+    changes: dict[str, Any],
+    prior: str,
+    prior_model: str | None,
+    regularize: bool,
+    run: str | None,
+    picture: Path | None,
+    seed: int,
+    device: str,
+    force: bool,
+) -> None:
     """`dpc generate4d fit`: reads a views file, keeps checkpoints in a folder beside the output, writes the scene."""
     config = preset(preset_name, **changes)
     if prior not in PRIORS:
@@ -43,8 +54,14 @@ def run_fit(
     chosen = choose_device(device)
     where = _run_folder(output, run)
     with input_file(views) as path:
-        record = {"config": json.loads(json.dumps(asdict(config))), "prior": prior, "prior_model": prior_model,
-                  "regularise": regularise, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
+        record = {
+            "config": json.loads(json.dumps(asdict(config))),
+            "prior": prior,
+            "prior_model": prior_model,
+            "regularize": regularize,
+            "seed": seed,
+            "data": provenance.file_digest(path),
+        }
         roles = ("train",) if prior == "views" else ()
         if output != "-" and Path(output).exists() and not force:
             _finished_before(Path(output), record)
@@ -53,8 +70,10 @@ def run_fit(
             return
         targets = load_targets(path, config.size, roles)
         if prior == "views" and targets.num_views < 2:
-            raise DataError(f"{path}: --prior views needs views of the role 'train', but there is none; give them to"
-                            " `dpc prepare video --views`, or use --prior none")  # fmt: skip
+            raise DataError(
+                f"{path}: --prior views needs views of the role 'train', but there is none; give them to"
+                " `dpc prepare video --views`, or use --prior none"
+            )
         folder = RunFolder(where, record, force, columns=COLUMNS, curves=draw_curves)
         judge = _prior(prior, prior_model, targets, device)
         log.info(
@@ -63,18 +82,27 @@ def run_fit(
         )
         keep_freed_memory()
         with folder, stop_requested() as stop:
-            fit = Fit(targets, config, folder, stop, seed, judge, chosen, _previews(folder, targets), regularise)
+            fit = Fit(targets, config, folder, stop, seed, judge, chosen, _previews(folder, targets), regularize)
             model = fit.run().cpu()
-            model.refresh_neighbours()
+            model.refresh_neighbors()
         scene = to_scene(model, targets, _metrics(model, targets, fit))
         history = [*targets.history, provenance.record(record, seed, {"views": path})]
         with output_file(output) as place:
-            write_scene(place, scene, seed=seed, source=targets.name, provenance=history,
-                        length_unit=targets.length_unit, force=force)  # fmt: skip
+            write_scene(
+                place,
+                scene,
+                seed=seed,
+                source=targets.name,
+                provenance=history,
+                length_unit=targets.length_unit,
+                force=force,
+            )
         if picture is not None:
             write_preview(model, targets, picture)
-    log.info(f"reference view {scene.metrics['psnr_reference']:.2f} dB PSNR, {scene.metrics['gaussians']} Gaussians,"
-             f" {scene.metrics['seconds']:.0f} s")  # fmt: skip
+    log.info(
+        f"reference view {scene.metrics['psnr_reference']:.2f} dB PSNR, {scene.metrics['gaussians']} Gaussians,"
+        f" {scene.metrics['seconds']:.0f} s"
+    )
 
 
 def _finished_before(output: Path, record: dict) -> None:
@@ -104,7 +132,7 @@ def _previews(folder: RunFolder, targets: Targets):
 
 
 def _prior(name: str, model: str | None, targets: Targets, device: str):
-    """The generative prior, ready; None where given views or regularisers do the work."""
+    """The generative prior, ready; None where given views or regularizers do the work."""
     if name != "zero123":
         return None
     import numpy as np

@@ -37,16 +37,29 @@ _SPLATS = ("ply", "splat")  # one file for a file's name, one a frame for a fold
 
 
 def run_render(
-    scene_file: str, output: str | None, *, path: str, lens: Lens, colour: str, background: str, trajectories: bool,
-    frames: int | None, fps: float | None, time: float | None, picture: Path | None, columns: int, cameras: Path | None,
-    device: str, force: bool,
-) -> None:  # fmt: skip
+    scene_file: str,
+    output: str | None,
+    *,
+    path: str,
+    lens: Lens,
+    color: str,
+    background: str,
+    trajectories: bool,
+    frames: int | None,
+    fps: float | None,
+    time: float | None,
+    picture: Path | None,
+    columns: int,
+    cameras: Path | None,
+    device: str,
+    force: bool,
+) -> None:
     """`dpc generate4d render`: pictures along a path, a contact sheet, or a `views` file seen by given cameras."""
     from dpcli.generate4d.out.picture_colors import parse_background
     from dpcli.generate4d.out.render import Look, Renderer
     from dpcli.runtime.device import choose_device
 
-    look = Look(colour, parse_background(background), trajectories)
+    look = Look(color, parse_background(background), trajectories)
     if output is None and picture is None:
         raise UsageError("nothing to write: -o FILE for a video, a picture or a folder, --picture FILE for a sheet")
     if picture is not None:
@@ -55,17 +68,25 @@ def run_render(
         _check_views(output, {"--path": path != PATHS[0], "--frames": frames, "--fps": fps})
         if picture is None:  # a sheet has use for these
             own = {f"--{name}": value for name, value in vars(lens).items()}
-            _check_views(output, {**own, "--time": time, "--background": look.background not in (None, (255, 255, 255))})
+            _check_views(
+                output, {**own, "--time": time, "--background": look.background not in (None, (255, 255, 255))}
+            )
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
-        config = {"cameras": bool(cameras), "colour": colour, "trajectories": trajectories}
+        config = {"cameras": bool(cameras), "color": color, "trajectories": trajectories}
         digest = provenance.record(config, int(root["seed"]), {"gaussians": place})
     renderer = Renderer(scene, choose_device(device))
     if cameras is not None:
         _render_views(renderer, look, cameras, str(output), [*history, digest], root, force)
     elif output is not None:
-        _render_path(renderer, look, Path(output), plan(scene, path, lens, frames=frames, fps=fps, time=time),
-                     fps or default_rate(scene, path), force)  # fmt: skip
+        _render_path(
+            renderer,
+            look,
+            Path(output),
+            plan(scene, path, lens, frames=frames, fps=fps, time=time),
+            fps or default_rate(scene, path),
+            force,
+        )
     if picture is not None:
         _render_sheet(renderer, look, picture, lens, columns, time)
 
@@ -92,8 +113,10 @@ def _check_views(output: str | None, options: dict[str, Any]) -> None:
         raise UsageError("--cameras renders a views file: name it with -o FILE.h5, or - for a pipe")
     unused = [name for name, value in options.items() if value is not None and value is not False]
     if unused:
-        raise UsageError(f"{', '.join(unused)}: not with --cameras, whose file says from where, how large and when every picture"
-                         " is, with a transparent background; leave out one or the other")  # fmt: skip
+        raise UsageError(
+            f"{', '.join(unused)}: not with --cameras, whose file says from where, how large and when every picture"
+            " is, with a transparent background; leave out one or the other"
+        )
 
 
 def _render_views(renderer, look, cameras: Path, output: str, history: list[dict], root: dict, force: bool) -> None:
@@ -102,8 +125,16 @@ def _render_views(renderer, look, cameras: Path, output: str, history: list[dict
     with ViewsReader(cameras) as reader:
         header = reader.header
     with output_file(output) as place:
-        render_views(renderer, header, place, look, provenance=history, source=str(root["source"]),
-                     seed=int(root["seed"]), force=force)  # fmt: skip
+        render_views(
+            renderer,
+            header,
+            place,
+            look,
+            provenance=history,
+            source=str(root["source"]),
+            seed=int(root["seed"]),
+            force=force,
+        )
     log.info(f"{output}: {header.num_views} views x {header.num_frames} frames")
 
 
@@ -124,9 +155,17 @@ def _render_sheet(renderer, look, picture: Path, lens: Lens, columns: int, time:
 
 
 def run_export(
-    scene_file: str, output: str, *, form: str, time: float | None, axes: str, least: float | None, points: int | None,
-    seed: int, force: bool,
-) -> None:  # fmt: skip
+    scene_file: str,
+    output: str,
+    *,
+    form: str,
+    time: float | None,
+    axes: str,
+    least: float | None,
+    points: int | None,
+    seed: int,
+    force: bool,
+) -> None:
     """`dpc generate4d export`: what the name and `form` say."""
     if form not in FORMATS:
         raise UsageError(f"--as {form}: expected one of {', '.join(FORMATS)}")
@@ -144,11 +183,24 @@ def run_export(
         if form == "clouds":
             config = {"as": form, "axes": axes, "min_opacity": least, "points": points}
             history = [*history, provenance.record(config, seed, {"gaussians": place})]
-            sequence = as_sequence(scene, str(root["source"]) or "scene", least=0.3 if least is None else least,
-                                   points=points, rng=generator(seed), axes=axes)  # fmt: skip
+            sequence = as_sequence(
+                scene,
+                str(root["source"]) or "scene",
+                least=0.3 if least is None else least,
+                points=points,
+                rng=generator(seed),
+                axes=axes,
+            )
             with output_file(output) as target:
-                write_clouds(target, sequence, provenance=history, source=str(root["source"]), seed=seed,
-                             length_unit=str(root["length_unit"]), force=force)  # fmt: skip
+                write_clouds(
+                    target,
+                    sequence,
+                    provenance=history,
+                    source=str(root["source"]),
+                    seed=seed,
+                    length_unit=str(root["length_unit"]),
+                    force=force,
+                )
             log.info(f"{sequence.num_frames} frames of {len(sequence.frame(0))} points")
             return
     _export_others(thinned(scene, least or 0.0), Path(output), form, time, axes, force)

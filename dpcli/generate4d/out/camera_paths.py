@@ -52,11 +52,13 @@ class Lens:
     def place(self, scene: GaussianScene) -> tuple[float, float, float]:
         """(azimuth, elevation, radius) with the reference camera's where nothing was said."""
         known = orbit_of(scene.camera_world_to_camera[scene.reference])
-        return tuple(own if own is not None else default
-                     for own, default in zip((self.azimuth, self.elevation, self.radius), known))  # fmt: skip
+        return tuple(
+            own if own is not None else default
+            for own, default in zip((self.azimuth, self.elevation, self.radius), known)
+        )
 
     def sensor(self, scene: GaussianScene) -> tuple[np.ndarray, tuple[int, int]]:
-        """Intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`; centred with `fovy`."""
+        """Intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`; centered with `fovy`."""
         width, height = scene.size
         zoom = self.size / max(width, height) if self.size else 1.0
         size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
@@ -86,9 +88,14 @@ def default_rate(scene: GaussianScene, path: str) -> float:
 
 
 def plan(
-    scene: GaussianScene, path: str = "turntable", lens: Lens = Lens(), *, frames: int | None = None,
-    fps: float | None = None, time: float | None = None,
-) -> list[Shot]:  # fmt: skip
+    scene: GaussianScene,
+    path: str = "turntable",
+    lens: Lens = Lens(),
+    *,
+    frames: int | None = None,
+    fps: float | None = None,
+    time: float | None = None,
+) -> list[Shot]:
     """The pictures of a clip: the scene plays over and over, or stands still at `time`. It plays in real time where the
     clip has 1 to 60 frames per second, else at `clip_rate`: a loop has every frame, whatever the clip's own rate.
 

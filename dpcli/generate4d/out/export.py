@@ -36,8 +36,10 @@ def thinned(scene: GaussianScene, least: float) -> GaussianScene:
     if len(kept) == scene.num_gaussians:
         return scene
     own = {key: getattr(scene, key) for key in scene.__dataclass_fields__}
-    own |= {key: own[key][kept] for key in ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part",
-                                            "part_probability")}  # fmt: skip
+    own |= {
+        key: own[key][kept]
+        for key in ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part", "part_probability")
+    }
     own |= {key: own[key][:, kept] for key in ("frame_mean", "frame_quaternion", "rigid_weight")}
     return GaussianScene(**own)
 
@@ -50,9 +52,14 @@ def export_file(
 
 
 def export_sequence(
-    scene: GaussianScene, folder: Path, form: str, *, axes: str = "player", times: Sequence[float] | None = None,
+    scene: GaussianScene,
+    folder: Path,
+    form: str,
+    *,
+    axes: str = "player",
+    times: Sequence[float] | None = None,
     force: bool = False,
-) -> list[Path]:  # fmt: skip
+) -> list[Path]:
     """frame0001.ply (or .splat), ... in `folder`, with cameras.json and metrics.json; the names players line up as a clip.
 
     The folder appears whole. UsageError when it exists and `force` is off; then it is replaced.
@@ -91,9 +98,14 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def as_sequence(
-    scene: GaussianScene, name: str, *, least: float = 0.3, points: int | None = None,
-    rng: np.random.Generator | None = None, axes: str = "player",
-) -> CloudSequence:  # fmt: skip
+    scene: GaussianScene,
+    name: str,
+    *,
+    least: float = 0.3,
+    points: int | None = None,
+    rng: np.random.Generator | None = None,
+    axes: str = "player",
+) -> CloudSequence:
     """The Gaussians' means as a point cloud video: T frames of the same M points.
 
     Kept: those at least `least` opaque; of them `points` drawn without replacement by `rng`, if there are more. `track`
@@ -118,11 +130,18 @@ def as_sequence(
 
 
 def write_clouds(
-    path: Path, sequence: CloudSequence, *, provenance: Sequence[dict], source: str, seed: int, length_unit: str = "",
+    path: Path,
+    sequence: CloudSequence,
+    *,
+    provenance: Sequence[dict],
+    source: str,
+    seed: int,
+    length_unit: str = "",
     force: bool = False,
-) -> None:  # fmt: skip
+) -> None:
     """A `clouds` file of one sequence."""
     fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(sequence, key) is not None]
-    with CloudsWriter(path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance,
-                      force=force) as writer:  # fmt: skip
+    with CloudsWriter(
+        path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance, force=force
+    ) as writer:
         writer.write(sequence)

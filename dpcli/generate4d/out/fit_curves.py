@@ -13,7 +13,9 @@ def draw_curves(rows: list[dict], path: Path) -> None:
     axes = figure.subplots(1, 3)
     steps = [row["step"] for row in rows]
     change = next((row["step"] for row in rows if row["stage"] == "sparse"), None)
-    for axis, key, label in zip(axes, ("psnr", "loss", "gaussians"), ("PSNR, reference view (dB)", "loss", "Gaussians")):
+    for axis, key, label in zip(
+        axes, ("psnr", "loss", "gaussians"), ("PSNR, reference view (dB)", "loss", "Gaussians")
+    ):
         axis.plot(steps, [row[key] for row in rows])
         axis.set(xlabel="step", title=label)
         if change is not None:

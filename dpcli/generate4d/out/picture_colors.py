@@ -1,4 +1,4 @@
-"""Colours of pictures of a scene: parts, weights, depths, backgrounds."""
+"""Colors of pictures of a scene: parts, weights, depths, backgrounds."""
 
 from __future__ import annotations
 
@@ -9,14 +9,23 @@ from dpcli.errors import UsageError
 _BACKGROUNDS = {"white": (255, 255, 255), "black": (0, 0, 0)}
 # viridis at nine places (van der Walt & Smith, CC0): free motion dark, rigid motion bright
 WEIGHTS = np.array(
-    [[68, 1, 84], [71, 45, 123], [59, 82, 139], [44, 114, 142], [33, 145, 140], [40, 174, 128], [94, 201, 98],
-     [173, 220, 48], [253, 231, 37]],
+    [
+        [68, 1, 84],
+        [71, 45, 123],
+        [59, 82, 139],
+        [44, 114, 142],
+        [33, 145, 140],
+        [40, 174, 128],
+        [94, 201, 98],
+        [173, 220, 48],
+        [253, 231, 37],
+    ],
     np.uint8,
-)  # fmt: skip
+)
 
 
-def weight_colours(weight: np.ndarray) -> np.ndarray:
-    """Colour u8 (...,3) of values 0..1 (clamped): viridis, dark to bright."""
+def weight_colors(weight: np.ndarray) -> np.ndarray:
+    """Color u8 (...,3) of values 0..1 (clamped): viridis, dark to bright."""
     stops = np.linspace(0, 1, len(WEIGHTS))
     channels = [np.interp(weight, stops, WEIGHTS[:, channel]) for channel in range(3)]
     return np.stack(channels, -1).round().astype(np.uint8)

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dpcli.draw.palette import part_colours
-from dpcli.generate4d.out.picture_colors import weight_colours
+from dpcli.draw.palette import part_colors
+from dpcli.generate4d.out.picture_colors import weight_colors
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
@@ -21,13 +21,13 @@ from dpcli.store.gaussians import SH_C0, GaussianScene
 
 @dataclass
 class _Instants:
-    """N Gaussians at F times, tensors of one device, and what colours them."""
+    """N Gaussians at F times, tensors of one device, and what colors them."""
 
     mean: Tensor  # [F, N, 3]
     quaternion: Tensor  # [F, N, 4]
     scale: Tensor  # [N, 3]
     opacity: Tensor  # [N]
-    colour: Tensor  # [N, 3]
+    color: Tensor  # [N, 3]
     part: Tensor  # [F, N] whole numbers
     weight: Tensor  # [F, N]
 
@@ -35,19 +35,35 @@ class _Instants:
 def _of_model(model: Model4D, times: Tensor) -> _Instants:
     own, device = model.gaussians, model.gaussians.mean.device
     instant, field = model.at(times.to(device)), model.field(own.mean, times.to(device))
-    return _Instants(instant.mean, instant.quaternion, own.log_scale.exp(), own.opacity_logit.sigmoid(), own.colour,
-                     field.part.argmax(-1), field.weight[..., 0])  # fmt: skip
+    return _Instants(
+        instant.mean,
+        instant.quaternion,
+        own.log_scale.exp(),
+        own.opacity_logit.sigmoid(),
+        own.color,
+        field.part.argmax(-1),
+        field.weight[..., 0],
+    )
 
 
 def _of_scene(scene: GaussianScene, frames: list[int]) -> _Instants:
-    arrays = (scene.frame_mean[frames], scene.frame_quaternion[frames], scene.scale, scene.opacity,
-              0.5 + SH_C0 * scene.sh[:, 0], np.tile(scene.part, (len(frames), 1)), scene.rigid_weight[frames])  # fmt: skip
+    arrays = (
+        scene.frame_mean[frames],
+        scene.frame_quaternion[frames],
+        scene.scale,
+        scene.opacity,
+        0.5 + SH_C0 * scene.sh[:, 0],
+        np.tile(scene.part, (len(frames), 1)),
+        scene.rigid_weight[frames],
+    )
     return _Instants(*map(torch.from_numpy, arrays))
 
 
 @torch.no_grad()
-def write_preview(fitted: Model4D | GaussianScene, targets: Targets, path: Path, columns: int = 5, side: int = 128) -> None:
-    """Rows: input, render, parts in colour, rigid weight, a view from 60 degrees to the side; columns: times."""
+def write_preview(
+    fitted: Model4D | GaussianScene, targets: Targets, path: Path, columns: int = 5, side: int = 128
+) -> None:
+    """Rows: input, render, parts in color, rigid weight, a view from 60 degrees to the side; columns: times."""
     import imageio.v3 as imageio
 
     frames = np.unique(np.linspace(0, targets.num_frames - 1, columns).round().astype(int)).tolist()
@@ -57,20 +73,38 @@ def write_preview(fitted: Model4D | GaussianScene, targets: Targets, path: Path,
     own = _of_scene(fitted, frames) if isinstance(fitted, GaussianScene) else _of_model(fitted, targets.times()[frames])
     device = own.mean.device
     wanted, intrinsics, poses = wanted.to(device), intrinsics.to(device), poses.to(device)
-    parts = torch.from_numpy(part_colours(own.part.cpu().numpy()) / 255).float().to(device)
-    rigid = torch.from_numpy(weight_colours(own.weight.cpu().numpy()) / 255).float().to(device)
+    parts = torch.from_numpy(part_colors(own.part.cpu().numpy()) / 255).float().to(device)
+    rigid = torch.from_numpy(weight_colors(own.weight.cpu().numpy()) / 255).float().to(device)
     azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
-    aside = torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius)).float().expand(len(frames), 4, 4).to(device)
+    aside = (
+        torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius))
+        .float()
+        .expand(len(frames), 4, 4)
+        .to(device)
+    )
 
-    def draw(colours: Tensor, cameras: Tensor) -> Tensor:
+    def draw(colors: Tensor, cameras: Tensor) -> Tensor:
         return rasterization(
-            own.mean, own.quaternion, own.scale, own.opacity, colours, cameras, intrinsics, width, height,
+            own.mean,
+            own.quaternion,
+            own.scale,
+            own.opacity,
+            colors,
+            cameras,
+            intrinsics,
+            width,
+            height,
             backgrounds=torch.ones(len(frames), 3, device=device),
-        )[0]  # fmt: skip
+        )[0]
 
-    own_colour = own.colour.expand(len(frames), -1, -1)
-    rows = [wanted[..., :3] + 1 - wanted[..., 3:], draw(own_colour, poses), draw(parts, poses), draw(rigid, poses),
-            draw(own_colour, aside)]  # fmt: skip
+    own_color = own.color.expand(len(frames), -1, -1)
+    rows = [
+        wanted[..., :3] + 1 - wanted[..., 3:],
+        draw(own_color, poses),
+        draw(parts, poses),
+        draw(rigid, poses),
+        draw(own_color, aside),
+    ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
     part = path.with_name(f".{path.stem}.part.png")
     imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().cpu().numpy())

@@ -1,4 +1,4 @@
-"""Pictures of a scene: in its colours, by part, by rigid weight or by depth, with trails of what moves."""
+"""Pictures of a scene: in its colors, by part, by rigid weight or by depth, with trails of what moves."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from typing import Any
 import numpy as np
 import torch
 
-from dpcli.draw.palette import part_colours
+from dpcli.draw.palette import part_colors
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.out.camera_paths import Shot
-from dpcli.generate4d.out.picture_colors import weight_colours
+from dpcli.generate4d.out.picture_colors import weight_colors
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import GaussianScene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 
-COLOURS = ("appearance", "part", "rigid", "depth")
+COLORS = ("appearance", "part", "rigid", "depth")
 _TRAILS = 64  # Gaussians that draw trails in a scene without control points
 _TRAIL_SHARE = 0.4  # of the clip that a trail reaches back
 _FINE = 4  # fractional bits of line ends
-_TRAIL_SHADE = 0.45  # of the part's colour, so that trails show on it
+_TRAIL_SHADE = 0.45  # of the part's color, so that trails show on it
 
 
 @dataclass(frozen=True)
 class Look:
-    """What is drawn: colour by `colour`; background u8 (r,g,b), None = transparent; trails of control points or not."""
+    """What is drawn: color by `color`; background u8 (r,g,b), None = transparent; trails of control points or not."""
 
-    colour: str = "appearance"
+    color: str = "appearance"
     background: tuple[int, int, int] | None = (255, 255, 255)
     trajectories: bool = False
 
     def __post_init__(self) -> None:
-        if self.colour not in COLOURS:
-            raise UsageError(f"--colour {self.colour}: expected one of {', '.join(COLOURS)}")
+        if self.color not in COLORS:
+            raise UsageError(f"--color {self.color}: expected one of {', '.join(COLORS)}")
 
 
 class Renderer:
@@ -45,9 +45,9 @@ class Renderer:
         self.scene, self.device = scene, torch.device(device)
         self._scales, self._opacities = self._tensor(scene.scale), self._tensor(scene.opacity)
         self._sh = self._tensor(scene.sh)
-        self._parts = self._tensor(part_colours(scene.part) / 255)
+        self._parts = self._tensor(part_colors(scene.part) / 255)
         low, high = scene.frame_mean.min((0, 1)), scene.frame_mean.max((0, 1))
-        self._centre, self._reach = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        self._center, self._reach = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
         self._owner = _owners(scene)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
@@ -55,48 +55,55 @@ class Renderer:
 
     def picture(self, shot: Shot, look: Look = Look()) -> np.ndarray:
         """One picture u8 (H,W,3), or (H,W,4) with straight alpha when the background is None."""
-        colour, alpha = self._draw(shot, look.colour)
+        color, alpha = self._draw(shot, look.color)
         if look.background is None:
-            straight = np.where(alpha > 1e-6, colour / np.maximum(alpha, 1e-6), 0)
+            straight = np.where(alpha > 1e-6, color / np.maximum(alpha, 1e-6), 0)
             image = _bytes(np.concatenate([straight, alpha], -1))
         else:
-            image = _bytes(colour + (1 - alpha) * np.float32(look.background) / 255)
+            image = _bytes(color + (1 - alpha) * np.float32(look.background) / 255)
         return self._with_trails(image, shot) if look.trajectories else image
 
     @torch.no_grad()
-    def _draw(self, shot: Shot, colour: str) -> tuple[np.ndarray, np.ndarray]:
-        """Premultiplied colour f32 (H,W,3) and alpha f32 (H,W,1), both 0..1."""
+    def _draw(self, shot: Shot, color: str) -> tuple[np.ndarray, np.ndarray]:
+        """Premultiplied color f32 (H,W,3) and alpha f32 (H,W,1), both 0..1."""
         means, quaternions = self.scene.at(shot.time)
-        values, options = self._values(shot, colour)
+        values, options = self._values(shot, color)
         drawn, alpha, _ = rasterization(
-            self._tensor(means), self._tensor(quaternions), self._scales, self._opacities, values,
-            self._tensor(shot.world_to_camera)[None], self._tensor(shot.intrinsics)[None], *shot.size, **options,
-        )  # fmt: skip
+            self._tensor(means),
+            self._tensor(quaternions),
+            self._scales,
+            self._opacities,
+            values,
+            self._tensor(shot.world_to_camera)[None],
+            self._tensor(shot.intrinsics)[None],
+            *shot.size,
+            **options,
+        )
         drawn, alpha = drawn[0].cpu().numpy(), alpha[0].cpu().numpy()
-        if colour == "depth":
-            drawn = self._depth_colours(drawn[..., 0], shot) * alpha
+        if color == "depth":
+            drawn = self._depth_colors(drawn[..., 0], shot) * alpha
         return drawn[..., :3], alpha
 
-    def _values(self, shot: Shot, colour: str) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Colours of the Gaussians, and the rasteriser's options that go with them."""
-        if colour == "appearance":
+    def _values(self, shot: Shot, color: str) -> tuple[torch.Tensor, dict[str, Any]]:
+        """Colors of the Gaussians, and the rasterizer's options that go with them."""
+        if color == "appearance":
             return self._sh, {"sh_degree": self.scene.sh_degree}
-        if colour == "rigid":
+        if color == "rigid":
             a, b, w = self.scene.between(shot.time)
             weight = (1 - w) * self.scene.rigid_weight[a] + w * self.scene.rigid_weight[b]
-            return self._tensor(weight_colours(weight) / 255), {}
-        return self._parts, {"render_mode": "ED"} if colour == "depth" else {}
+            return self._tensor(weight_colors(weight) / 255), {}
+        return self._parts, {"render_mode": "ED"} if color == "depth" else {}
 
-    def _depth_colours(self, depth: np.ndarray, shot: Shot) -> np.ndarray:
+    def _depth_colors(self, depth: np.ndarray, shot: Shot) -> np.ndarray:
         """Near bright, far dark, the same scale in every picture of this distance; f32 (H,W,3), 0..1."""
-        middle = float((shot.world_to_camera[:3, :3] @ self._centre + shot.world_to_camera[:3, 3])[2])
-        return weight_colours(0.5 - (depth - middle) / (2 * max(self._reach, 1e-6))).astype(np.float32) / 255
+        middle = float((shot.world_to_camera[:3, :3] @ self._center + shot.world_to_camera[:3, 3])[2])
+        return weight_colors(0.5 - (depth - middle) / (2 * max(self._reach, 1e-6))).astype(np.float32) / 255
 
     def _with_trails(self, image: np.ndarray, shot: Shot) -> np.ndarray:
         import cv2
 
         a, b, w = self.scene.between(shot.time)
-        tracks, colours = self._owner
+        tracks, colors = self._owner
         first = max(0, a - max(2, round(_TRAIL_SHARE * self.scene.num_frames)))
         now = (1 - w) * tracks[a] + w * tracks[b]
         pixels, ahead = _project(np.concatenate([tracks[first : a + 1], now[None]]), shot)
@@ -104,10 +111,10 @@ class Renderer:
         for track in range(tracks.shape[1]):
             if not ahead[:, track].all():
                 continue
-            colour = tuple(int(c) for c in colours[track]) + (255,) * (image.shape[2] - 3)
+            color = tuple(int(c) for c in colors[track]) + (255,) * (image.shape[2] - 3)
             line = np.round(pixels[:, track] * 2**_FINE).astype(np.int32)
-            cv2.polylines(image, [line], False, colour, thick, cv2.LINE_AA, _FINE)
-            cv2.circle(image, line[-1].tolist(), 2 * thick * 2**_FINE, colour, -1, cv2.LINE_AA, _FINE)
+            cv2.polylines(image, [line], False, color, thick, cv2.LINE_AA, _FINE)
+            cv2.circle(image, line[-1].tolist(), 2 * thick * 2**_FINE, color, -1, cv2.LINE_AA, _FINE)
         return image
 
     def pictures(self, shots: Sequence[Shot], look: Look = Look()) -> Iterator[np.ndarray]:
@@ -116,15 +123,15 @@ class Renderer:
 
 
 def _owners(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
-    """What draws trails: positions f32 (T,M,3) and colours u8 (M,3), those of the parts, a little darker."""
+    """What draws trails: positions f32 (T,M,3) and colors u8 (M,3), those of the parts, a little darker."""
     if len(scene.control_point):
         from scipy.spatial import cKDTree
 
         nearest = cKDTree(scene.mean).query(scene.control_point)[1]
-        return scene.control_position, (part_colours(scene.part[nearest]) * _TRAIL_SHADE).astype(np.uint8)
+        return scene.control_position, (part_colors(scene.part[nearest]) * _TRAIL_SHADE).astype(np.uint8)
     opaque = np.argsort(-scene.opacity_logit, kind="stable")[: scene.num_gaussians // 2 + 1]
     chosen = opaque[np.linspace(0, len(opaque) - 1, min(_TRAILS, len(opaque))).round().astype(int)]
-    return scene.frame_mean[:, chosen], (part_colours(scene.part[chosen]) * _TRAIL_SHADE).astype(np.uint8)
+    return scene.frame_mean[:, chosen], (part_colors(scene.part[chosen]) * _TRAIL_SHADE).astype(np.uint8)
 
 
 def _project(points: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:

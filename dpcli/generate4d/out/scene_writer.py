@@ -8,7 +8,7 @@ from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.model import Model4D
-from dpcli.generate4d.scene.quaternion import normalise
+from dpcli.generate4d.scene.quaternion import normalize
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
 from dpcli.store.gaussians import GaussianScene
@@ -22,7 +22,7 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     times opacity), which is also what a fit without rigid motion can be asked for.
     """
     own, times = model.gaussians, targets.times()
-    model.refresh_neighbours()
+    model.refresh_neighbors()
     means, quaternions, weights, parts, control, turns = [], [], [], [], [], []
     for frame in range(len(times)):
         instant = model.at(times[[frame]])
@@ -39,18 +39,28 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     empty = torch.zeros(len(times), 0, 3)
     points = torch.zeros(0, 3) if model.control is None else model.control.position
     return GaussianScene(
-        mean=_array(own.mean), log_scale=_array(own.log_scale), quaternion=_array(normalise(own.quaternion)),
-        opacity_logit=_array(own.opacity_logit), sh=_array((own.colour[:, None] - 0.5) / SH0), time=targets.seconds,
-        frame_mean=_array(frame_mean), frame_quaternion=_array(normalise(torch.stack(quaternions))),
-        part=probability.argmax(1).numpy().astype(np.int16), part_probability=_array(probability),
+        mean=_array(own.mean),
+        log_scale=_array(own.log_scale),
+        quaternion=_array(normalize(own.quaternion)),
+        opacity_logit=_array(own.opacity_logit),
+        sh=_array((own.color[:, None] - 0.5) / SH0),
+        time=targets.seconds,
+        frame_mean=_array(frame_mean),
+        frame_quaternion=_array(normalize(torch.stack(quaternions))),
+        part=probability.argmax(1).numpy().astype(np.int16),
+        part_probability=_array(probability),
         part_motion=_part_motion(own.mean, frame_mean, probability, own.opacity_logit.sigmoid()),
-        rigid_weight=_array(torch.stack(weights)), control_point=_array(points),
+        rigid_weight=_array(torch.stack(weights)),
+        control_point=_array(points),
         control_radius=_array(torch.zeros(0) if model.control is None else model.control.log_radius.exp()),
         control_position=_array(torch.stack(control) if control else empty),
-        control_quaternion=_array(normalise(torch.stack(turns)) if turns else torch.zeros(len(times), 0, 4)),
-        camera_intrinsics=targets.intrinsics, camera_world_to_camera=targets.world_to_camera, size=targets.size,
-        reference=targets.reference, metrics=metrics,
-    )  # fmt: skip
+        control_quaternion=_array(normalize(torch.stack(turns)) if turns else torch.zeros(len(times), 0, 4)),
+        camera_intrinsics=targets.intrinsics,
+        camera_world_to_camera=targets.world_to_camera,
+        size=targets.size,
+        reference=targets.reference,
+        metrics=metrics,
+    )
 
 
 def _part_motion(mean: Tensor, frame_mean: Tensor, probability: Tensor, opacity: Tensor) -> np.ndarray:

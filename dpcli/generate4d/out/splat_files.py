@@ -41,13 +41,16 @@ class Splats:
         """Half a turn about x, which TO_PLAYER is."""
         w, x, y, z = self.quaternion.T
         return Splats(
-            self.mean * np.float32(TO_PLAYER.diagonal()), self.log_scale, np.stack([-x, w, -z, y], 1), self.opacity_logit,
+            self.mean * np.float32(TO_PLAYER.diagonal()),
+            self.log_scale,
+            np.stack([-x, w, -z, y], 1),
+            self.opacity_logit,
             self.sh * _SH_SIGNS[: self.sh.shape[1], None],
-        )  # fmt: skip
+        )
 
 
 def write_splat_ply(path: Path, splats: Splats) -> None:
-    """One 3DGS .ply: binary little-endian; opacity as a logit, sizes as logarithms, colour terms channel by channel.
+    """One 3DGS .ply: binary little-endian; opacity as a logit, sizes as logarithms, color terms channel by channel.
 
     DataError when it can't be written.
     """
@@ -62,13 +65,18 @@ def write_splat_ply(path: Path, splats: Splats) -> None:
         **{f"rot_{i}": values for i, values in enumerate(splats.quaternion.T)},
     }
     rows = np.stack([np.float32(values) for values in columns.values()], axis=1).astype("<f4")
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}",
-             *(f"property float {name}" for name in columns), "end_header"]  # fmt: skip
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(rows)}",
+        *(f"property float {name}" for name in columns),
+        "end_header",
+    ]
     write_whole(path, ("\n".join(lines) + "\n").encode("ascii") + rows.tobytes())
 
 
 def write_splat(path: Path, splats: Splats) -> None:
-    """One .splat: 32 bytes a Gaussian, the largest and most opaque first; the colour is the one without direction.
+    """One .splat: 32 bytes a Gaussian, the largest and most opaque first; the color is the one without direction.
 
     DataError when it can't be written.
     """
@@ -89,11 +97,21 @@ def camera_list(scene: GaussianScene, axes: str = "player") -> list[dict[str, An
     cameras = []
     for index, (lens, pose) in enumerate(zip(scene.camera_intrinsics, scene.camera_world_to_camera)):
         rotation = turn @ pose[:3, :3].T
-        cameras.append({
-            "id": index, "img_name": f"view{index}", "width": width, "height": height,
-            "position": (-rotation @ pose[:3, 3]).tolist(), "rotation": rotation.tolist(),
-            "fx": lens[0, 0], "fy": lens[1, 1], "cx": lens[0, 2], "cy": lens[1, 2], "reference": index == scene.reference,
-        })  # fmt: skip
+        cameras.append(
+            {
+                "id": index,
+                "img_name": f"view{index}",
+                "width": width,
+                "height": height,
+                "position": (-rotation @ pose[:3, 3]).tolist(),
+                "rotation": rotation.tolist(),
+                "fx": lens[0, 0],
+                "fy": lens[1, 1],
+                "cx": lens[0, 2],
+                "cy": lens[1, 2],
+                "reference": index == scene.reference,
+            }
+        )
     return cameras
 
 

@@ -203,7 +203,7 @@ class Zero123:
 
 
 def _on_white(frames: np.ndarray) -> torch.Tensor:
-    """f32 (T,3,S,S) in 0..1 of u8 RGBA (T,H,W,4); the shorter side is padded with white, the picture stays centred."""
+    """f32 (T,3,S,S) in 0..1 of u8 RGBA (T,H,W,4); the shorter side is padded with white, the picture stays centered."""
     rgba = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255
     image = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:])
     height, width = image.shape[-2:]

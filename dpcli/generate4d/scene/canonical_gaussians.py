@@ -6,28 +6,28 @@ import torch
 from torch import Tensor, nn
 
 from dpcli.generate4d.config import FitConfig
-from dpcli.generate4d.scene.control_points import mean_neighbour_distance
-from dpcli.generate4d.scene.quaternion import normalise, rotate
+from dpcli.generate4d.scene.control_points import mean_neighbor_distance
+from dpcli.generate4d.scene.quaternion import normalize, rotate
 
 SH0 = 0.28209479177387814  # of the constant spherical harmonic
-NAMES = ("mean", "log_scale", "quaternion", "opacity_logit", "colour")
+NAMES = ("mean", "log_scale", "quaternion", "opacity_logit", "color")
 
 
 class CanonicalGaussians(nn.Module):
-    """Parameters of N Gaussians: mean (N,3), log_scale (N,3), quaternion (N,4), opacity_logit (N,), colour (N,3) in 0..1.
+    """Parameters of N Gaussians: mean (N,3), log_scale (N,3), quaternion (N,4), opacity_logit (N,), color (N,3) in 0..1.
 
     `anchor` (N,3) remembers where each one (or its ancestor) was put at the start; it isn't learned.
     """
 
-    def __init__(self, mean: Tensor, colour: Tensor, opacity: float = 0.5, most_scale: float = 0.05) -> None:
+    def __init__(self, mean: Tensor, color: Tensor, opacity: float = 0.5, most_scale: float = 0.05) -> None:
         super().__init__()
-        scale = mean_neighbour_distance(mean, 3).clamp(1e-4, most_scale)
+        scale = mean_neighbor_distance(mean, 3).clamp(1e-4, most_scale)
         identity = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(mean), 1)
         self.mean = nn.Parameter(mean.clone())
         self.log_scale = nn.Parameter(scale.log()[:, None].repeat(1, 3))
         self.quaternion = nn.Parameter(identity)
         self.opacity_logit = nn.Parameter(torch.full((len(mean),), opacity).logit())
-        self.colour = nn.Parameter(colour.clone())
+        self.color = nn.Parameter(color.clone())
         self.register_buffer("anchor", mean.clone())
         self.register_buffer("gradient", torch.zeros(len(mean)))
         self.register_buffer("seen", torch.zeros(len(mean)))
@@ -37,9 +37,7 @@ class CanonicalGaussians(nn.Module):
 
     def groups(self, config: FitConfig) -> list[dict]:
         """Parameter groups for Adam, named, with their first rates."""
-        rates = (
-            config.rate_mean[0], config.rate_scale, config.rate_quaternion, config.rate_opacity, config.rate_colour,
-        )  # fmt: skip
+        rates = (config.rate_mean[0], config.rate_scale, config.rate_quaternion, config.rate_opacity, config.rate_color)
         return [{"params": [getattr(self, name)], "lr": rate, "name": name} for name, rate in zip(NAMES, rates)]
 
     @torch.no_grad()
@@ -51,7 +49,9 @@ class CanonicalGaussians(nn.Module):
         self.seen += seen.sum(0)
 
     @torch.no_grad()
-    def grow_and_prune(self, optimizer: torch.optim.Optimizer, config: FitConfig, rng: torch.Generator, grow: bool) -> None:
+    def grow_and_prune(
+        self, optimizer: torch.optim.Optimizer, config: FitConfig, rng: torch.Generator, grow: bool
+    ) -> None:
         """Copy or split the Gaussians with the largest mean screen gradient, then drop the transparent ones.
 
         Small ones are cloned, large ones (above the median size) split in two of 1/1.6 the size, as 3D Gaussian splatting
@@ -71,7 +71,7 @@ class CanonicalGaussians(nn.Module):
         size = self.log_scale.max(1).values
         split = new[size[new] > size.median()]
         offset = torch.randn(len(new), 3, generator=rng).to(self.mean.device) * self.log_scale[new].exp()
-        offset = rotate(normalise(self.quaternion[new]), offset)
+        offset = rotate(normalize(self.quaternion[new]), offset)
         self._take(optimizer, torch.cat([old, new]), fresh=len(new))
         kept = torch.full((len(mean_gradient),), -1, dtype=torch.long, device=old.device)
         kept[old] = torch.arange(len(old), device=old.device)

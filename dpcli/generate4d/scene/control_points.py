@@ -7,33 +7,33 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from dpcli.generate4d.scene.motion import Motion
-from dpcli.generate4d.scene.quaternion import multiply, normalise, to_matrix
+from dpcli.generate4d.scene.quaternion import multiply, normalize, to_matrix
 from dpcli.ops.farthest_point_sampling import fps
 from dpcli.ops.knn import knn
 
 
 class ControlPoints(nn.Module):
-    """K canonical positions (K,3) and log radii (K,), both learned; `neighbours` of them move each Gaussian."""
+    """K canonical positions (K,3) and log radii (K,), both learned; `neighbors` of them move each Gaussian."""
 
-    def __init__(self, positions: Tensor, neighbours: int = 8) -> None:
+    def __init__(self, positions: Tensor, neighbors: int = 8) -> None:
         super().__init__()
-        self.neighbours = min(neighbours, len(positions))
+        self.neighbors = min(neighbors, len(positions))
         self.position = nn.Parameter(positions.detach().clone())
-        spacing = mean_neighbour_distance(positions, 3)
+        spacing = mean_neighbor_distance(positions, 3)
         self.log_radius = nn.Parameter(spacing.clamp(min=1e-4).log())
 
     @classmethod
-    def among(cls, points: Tensor, count: int, neighbours: int = 8) -> ControlPoints:
+    def among(cls, points: Tensor, count: int, neighbors: int = 8) -> ControlPoints:
         """Farthest point sampling of at most `count` of the points (N,3)."""
         chosen = fps(points.detach()[None], min(count, len(points)))[0]
-        return cls(points[chosen], neighbours)
+        return cls(points[chosen], neighbors)
 
     def nearest(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, k]
         """Indices of the control points that will move each point."""
-        return knn(points.detach()[None], self.position.detach()[None], self.neighbours)[1][0]
+        return knn(points.detach()[None], self.position.detach()[None], self.neighbors)[1][0]
 
     def weights(self, points: Tensor, nearest: Tensor) -> Tensor:  # [N, k]
-        """omega of C.12: exp(-d^2 / radius^2), normalised over the neighbours; stable far from all of them."""
+        """omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
         squared = (points[:, None] - self.position[nearest]).square().sum(-1)
         return (-squared / (2 * self.log_radius[nearest]).exp()).softmax(-1)
 
@@ -58,10 +58,10 @@ class ControlPoints(nn.Module):
         blended = blended.reshape(-1, count, 16).transpose(0, 1)
         matrix, shift, turn = blended.split([9, 3, 4], -1)
         moved = (matrix.unflatten(-1, (3, 3)) * points[:, None]).sum(-1) + shift
-        return moved, normalise(turn)
+        return moved, normalize(turn)
 
 
-def mean_neighbour_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [N]
+def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [N]
     """Mean distance of each point to its `count` nearest others; 0.01 where there is no other."""
     count = min(count, len(points) - 1)
     if count < 1:
@@ -72,4 +72,4 @@ def mean_neighbour_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> 
 
 def turn_frames(turn: Tensor, quaternion: Tensor) -> Tensor:  # [B, N, 4], [N, 4] -> [B, N, 4]
     """A Gaussian's own quaternion after the turn."""
-    return multiply(turn, normalise(quaternion).expand_as(turn))
+    return multiply(turn, normalize(quaternion).expand_as(turn))

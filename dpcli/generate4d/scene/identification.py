@@ -26,14 +26,14 @@ def temporal_loss(
 
 def spatial_loss(
     part: Tensor,  # [B, N, S]
-    neighbours: Tensor,  # [N, H] indices of points nearby; a row's own index fills what is missing
+    neighbors: Tensor,  # [N, H] indices of points nearby; a row's own index fills what is missing
 ) -> Tensor:
-    """Mean L2 distance between the part probabilities of a point and its neighbours: eq. 5.4."""
-    difference = part[:, :, None] - part[:, neighbours]
+    """Mean L2 distance between the part probabilities of a point and its neighbors: eq. 5.4."""
+    difference = part[:, :, None] - part[:, neighbors]
     return (difference.square().sum(-1) + 1e-12).sqrt().mean()
 
 
-def ball_neighbours(points: Tensor, radius: float, count: int) -> Tensor:  # [N, 3] -> [N, count]
+def ball_neighbors(points: Tensor, radius: float, count: int) -> Tensor:  # [N, 3] -> [N, count]
     """Indices of up to `count` points within `radius`, nearest first, without the point; its own index fills the rest."""
     own = torch.arange(len(points), device=points.device)[:, None]
     if len(points) < 2:

@@ -23,13 +23,15 @@ def in_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray
 def inflated(
     rgba: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and colours (count,3) f32 that fill one picture (H,W,4, 0..1) with round thickness about the origin's depth.
+    """Positions and colors (count,3) f32 that fill one picture (H,W,4, 0..1) with round thickness about the origin's depth.
 
-    The thickness is that of `ball_thickness`. Colours are the pixel's, on the far side as well.
+    The thickness is that of `ball_thickness`. Colors are the pixel's, on the far side as well.
     """
     mask = rgba[..., 3] > 0.5
     if not mask.any():
-        raise DataError("the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again")
+        raise DataError(
+            "the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again"
+        )
     half = ball_thickness(mask)
     rows, columns = np.nonzero(mask)
     share = half[rows, columns] / half[rows, columns].sum()
@@ -71,12 +73,12 @@ def ball_thickness(mask: np.ndarray) -> np.ndarray:
 def hull(
     pictures: list[np.ndarray], intrinsics: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and colours (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
+    """Positions and colors (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
 
     The common hull of few silhouettes has corners that no view contradicts: two views at a right angle make a box of every
     body. With u the distance from a silhouette's middle line as a share of its half width, points are kept whose
     u_i^2 + u_j^2 is at most 1 for every two views that look across each other, which makes that box an ellipse.
-    A colour is the mean over views, weighted towards the view whose camera is nearest to the point.
+    A color is the mean over views, weighted toward the view whose camera is nearest to the point.
     """
     offsets = [np.dstack([picture, _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
     across = np.abs(poses[:, 2, :3] @ poses[:, 2, :3].T) < 0.7  # viewing directions at more than 45 degrees
@@ -96,13 +98,13 @@ def hull(
     if not total:
         raise DataError("the silhouettes of the views have no point in common; are the cameras right?")
     points = np.concatenate(kept)[:count]
-    colours = np.zeros_like(points)
+    colors = np.zeros_like(points)
     weights = np.zeros((len(points), 1), np.float32)
     for picture, matrix, pose in zip(pictures, intrinsics, poses):
         values, depth = _sample(picture, points, matrix, pose)
         weight = (np.exp(-8 * (depth - depth.min())) * values[:, 3])[:, None]
-        colours, weights = colours + weight * values[:, :3], weights + weight
-    return points, (colours / np.maximum(weights, 1e-8)).astype(np.float32)
+        colors, weights = colors + weight * values[:, :3], weights + weight
+    return points, (colors / np.maximum(weights, 1e-8)).astype(np.float32)
 
 
 def _share_of_width(mask: np.ndarray) -> np.ndarray:
@@ -115,7 +117,9 @@ def _share_of_width(mask: np.ndarray) -> np.ndarray:
     return np.where(mask, (1 - distance / np.maximum(width, 1e-6)).clip(0, 1), 1.0).astype(np.float32)
 
 
-def _sample(picture: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sample(
+    picture: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Pixel values (N,channels) under the points, zero outside the picture, and their depths (N,)."""
     camera = points @ pose[:3, :3].T + pose[:3, 3]
     depth = np.maximum(camera[:, 2], 1e-6)

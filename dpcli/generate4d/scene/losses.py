@@ -11,11 +11,11 @@ from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
 def picture_loss(
     rendered: Tensor,  # [C, H, W, 3] on the background
     alpha: Tensor,  # [C, H, W, 1]
-    target: Tensor,  # [C, H, W, 4] colour times alpha, alpha
+    target: Tensor,  # [C, H, W, 4] color times alpha, alpha
     background: Tensor,  # [C, 3]
     foreground: float,
 ) -> Tensor:
-    """Mean squared error of colours on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
+    """Mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
     wanted = target[..., :3] + (1 - target[..., 3:]) * background[:, None, None]
     return (rendered - wanted).square().mean() + foreground * (alpha - target[..., 3:]).square().mean()
 
@@ -23,15 +23,15 @@ def picture_loss(
 def arap_loss(
     rest: Tensor,  # [N, 3]
     moved: Tensor,  # [B, N, 3]
-    neighbours: Tensor,  # [N, H]
+    neighbors: Tensor,  # [N, H]
 ) -> Tensor:
-    """As-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbours are from one rotation of them.
+    """As-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbors are from one rotation of them.
 
-    The best rotation of each point is found without gradient. A row's own index, where neighbours lack, adds nothing.
+    The best rotation of each point is found without gradient. A row's own index, where neighbors lack, adds nothing.
     """
 
-    before = (rest[neighbours] - rest[:, None]).detach()  # [N, H, 3]
-    after = moved[:, neighbours] - moved[:, :, None]  # [B, N, H, 3]
+    before = (rest[neighbors] - rest[:, None]).detach()  # [N, H, 3]
+    after = moved[:, neighbors] - moved[:, :, None]  # [B, N, H, 3]
     with torch.no_grad():
         covariance = torch.einsum("bnhi,nhj->bnij", after, before)
         rotation = _nearest_rotation(covariance)
@@ -47,7 +47,7 @@ def _nearest_rotation(matrix: Tensor) -> Tensor:  # [..., 3, 3]
 
 def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:
     """Needles and discs along the line of sight look right in the one picture and wrong in all others: the longest axis
-    beyond `aspect` times the geometric mean is penalised (log ratio)."""
+    beyond `aspect` times the geometric mean is penalized (log ratio)."""
     log_scale = gaussians.log_scale
     return (log_scale.max(1).values - log_scale.mean(1) - torch.tensor(aspect).log()).relu().mean()
 

@@ -39,10 +39,10 @@ class Model4D(nn.Module):
     def start_control(self) -> None:
         """From now on K control points, chosen among the Gaussians, carry them all."""
         own = self.gaussians.mean
-        self.control = ControlPoints.among(own, self.config.control_points, self.config.neighbours).to(own.device)
+        self.control = ControlPoints.among(own, self.config.control_points, self.config.neighbors).to(own.device)
         self.nearest = None
 
-    def refresh_neighbours(self) -> None:
+    def refresh_neighbors(self) -> None:
         """Look again which control points are nearest to each Gaussian."""
         self.nearest = self.control.nearest(self.gaussians.mean) if self.control is not None else None
 
@@ -51,9 +51,11 @@ class Model4D(nn.Module):
         own = self.gaussians
         if self.control is None:
             motion = self.field(own.mean, times)
-            return Instant(own.mean + motion.displacement, turn_frames(motion.quaternion, own.quaternion), motion, own.mean)
+            return Instant(
+                own.mean + motion.displacement, turn_frames(motion.quaternion, own.quaternion), motion, own.mean
+            )
         if self.nearest is None or len(self.nearest) != len(own):
-            self.refresh_neighbours()
+            self.refresh_neighbors()
         motion = self.field(self.control.position, times)
         mean, turn = self.control.carry(own.mean, self.nearest, motion)
         return Instant(mean, turn_frames(turn, own.quaternion), motion, self.control.position)
@@ -61,9 +63,17 @@ class Model4D(nn.Module):
     def render(
         self, instant: Instant, viewmats: Tensor, intrinsics: Tensor, width: int, height: int, backgrounds: Tensor
     ) -> tuple[Tensor, Tensor, dict]:
-        """Colours (C,H,W,3) on the backgrounds (C,3), alphas (C,H,W,1), and the rasteriser's notes; camera c sees time c."""
+        """Colors (C,H,W,3) on the backgrounds (C,3), alphas (C,H,W,1), and the rasterizer's notes; camera c sees time c."""
         own = self.gaussians
         return rasterization(
-            instant.mean, instant.quaternion, own.log_scale.exp(), own.opacity_logit.sigmoid(), own.colour,
-            viewmats, intrinsics, width, height, backgrounds=backgrounds,
-        )  # fmt: skip
+            instant.mean,
+            instant.quaternion,
+            own.log_scale.exp(),
+            own.opacity_logit.sigmoid(),
+            own.color,
+            viewmats,
+            intrinsics,
+            width,
+            height,
+            backgrounds=backgrounds,
+        )

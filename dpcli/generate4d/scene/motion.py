@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dpcli.generate4d.scene.quaternion import multiply, normalise, rotate, to_matrix
+from dpcli.generate4d.scene.quaternion import multiply, normalize, rotate, to_matrix
 
 _POINT_FREQUENCIES, _TIME_FREQUENCIES = 10, 6  # thesis 5.5.1
 
@@ -79,12 +79,12 @@ class MotionField(nn.Module):
 
     parts: S. Without `rigid` only the deformation is left (row a of Table 5.2); without `fusion` rigid and non-rigid
     displacement are added (eq. 5.5), else blended by w (eq. 5.6, with the displacement R x + t - x in place of R x + t,
-    which is a position). A part turns about its centre, so that turning and shifting don't fight.
+    which is a position). A part turns about its center, so that turning and shifting don't fight.
     """
 
     def __init__(
-        self, parts: int, width: int, depth: int, rigid: bool = True, fusion: bool = True, by_time: bool = False,
-    ) -> None:  # fmt: skip
+        self, parts: int, width: int, depth: int, rigid: bool = True, fusion: bool = True, by_time: bool = False
+    ) -> None:
         super().__init__()
         self.parts, self.rigid, self.fusion, self.by_time = parts, rigid, fusion, by_time
         space, time = 6 * _POINT_FREQUENCIES, 2 * _TIME_FREQUENCIES
@@ -98,7 +98,7 @@ class MotionField(nn.Module):
         self.movement_turn, self.movement_shift = _head(width, 3 * parts), _head(width, 3 * parts)
         self.weighing = Perceptron(space + time, width, max(depth // 2, 2))
         self.weighing_head = _head(width, 1, bias=1.0)  # mostly rigid at first: few numbers, the large movements
-        self.register_buffer("centre", torch.zeros(parts, 3))
+        self.register_buffer("center", torch.zeros(parts, 3))
         self.register_buffer("seed", torch.zeros(parts, 3))
         self.register_buffer("seed_sharpness", torch.zeros(()))
 
@@ -109,13 +109,13 @@ class MotionField(nn.Module):
         spacing = torch.cdist(seeds, seeds).fill_diagonal_(torch.inf).min(1).values.mean()
         self.seed_sharpness.copy_(4.0 / spacing.clamp(min=1e-6) ** 2 if self.parts > 1 else torch.zeros(()))
         nn.init.zeros_(self.partition_head.weight)
-        self.update_centres(points)
+        self.update_centers(points)
 
     @torch.no_grad()
-    def update_centres(self, points: Tensor) -> None:
+    def update_centers(self, points: Tensor) -> None:
         """Turn parts about the middle of their points from now on (a change of coordinates of R, t at the next step)."""
         share = self.part_of(points, torch.zeros(1).to(points))[0]
-        self.centre.copy_(share.T @ points / share.sum(0)[:, None].clamp(min=1e-6))
+        self.center.copy_(share.T @ points / share.sum(0)[:, None].clamp(min=1e-6))
 
     def part_of(self, points: Tensor, times: Tensor) -> Tensor:  # [B, N, S]
         """m: probabilities of the parts of canonical points (N,3) at times (B,) in 0..1."""
@@ -131,7 +131,7 @@ class MotionField(nn.Module):
         hidden = self.movement(encode(times[:, None], _TIME_FREQUENCIES))
         turn = _quaternion(self.movement_turn(hidden).reshape(len(times), self.parts, 3))
         shift = self.movement_shift(hidden).reshape(len(times), self.parts, 3)
-        return turn, self.centre - rotate(turn, self.centre) + shift
+        return turn, self.center - rotate(turn, self.center) + shift
 
     def forward(self, points: Tensor, times: Tensor) -> Motion:
         """Motion of canonical points (N,3) at times (B,) in 0..1."""
@@ -144,14 +144,14 @@ class MotionField(nn.Module):
             none = torch.zeros(*rest.shape[:2], 1).to(rest)
             return Motion(rest, turn, part, none, part_turn, part_shift)
         moved = torch.einsum("bns,bsij,nj->bni", part, to_matrix(part_turn), points) + part @ part_shift
-        rigid, rigid_turn = moved - points, normalise(part @ part_turn)
+        rigid, rigid_turn = moved - points, normalize(part @ part_turn)
         if not self.fusion:
             whole = torch.ones(*rest.shape[:2], 1).to(rest)
             both = multiply(turn, rigid_turn)
             both = torch.where(both[..., :1] < 0, -both, both)
             return Motion(rigid + rest, both, part, whole, part_turn, part_shift)
         weight = self.weighing_head(self.weighing(code)).sigmoid()
-        blended = normalise(weight * rigid_turn + (1 - weight) * turn)
+        blended = normalize(weight * rigid_turn + (1 - weight) * turn)
         return Motion(weight * rigid + (1 - weight) * rest, blended, part, weight, part_turn, part_shift)
 
 
@@ -162,4 +162,4 @@ def _join(space: Tensor, time: Tensor) -> Tensor:  # [N, D], [B, E] -> [B, N, D 
 
 def _quaternion(vector: Tensor) -> Tensor:  # [..., 3] -> [..., 4]
     """Unit quaternion (1, v) / norm: the identity at zero, never ambiguous in sign, turns below 180 degrees."""
-    return normalise(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))
+    return normalize(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))

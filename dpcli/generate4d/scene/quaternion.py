@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 
-def normalise(
+def normalize(
     quaternion: Tensor,  # [..., 4]
 ) -> Tensor:  # [..., 4]
     """Unit length; a zero quaternion stays finite."""
@@ -37,10 +37,16 @@ def to_matrix(
     """Rotation matrix of a unit quaternion."""
     w, x, y, z = quaternion.unbind(-1)
     rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, -1).reshape(*quaternion.shape[:-1], 3, 3)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dpcli import __version__
-from dpcli.draw.palette import part_colours
+from dpcli.draw.palette import part_colors
 from dpcli.errors import DataError
 from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
 from dpcli.generate4d.out.picture_colors import WEIGHTS
@@ -78,9 +78,12 @@ def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     rgba = np.concatenate([scene.color.T, np.rint(scene.opacity * _BYTE).astype(np.uint8)[None]])
     return {
         "position": np.stack([(change & 255).astype(np.uint8), (change >> 8).astype(np.uint8)]),
-        "turn": _differences(turns), "weight": _differences(weight), "scale": scene.scale.T.astype("<f4"), "colour": rgba,
+        "turn": _differences(turns),
+        "weight": _differences(weight),
+        "scale": scene.scale.T.astype("<f4"),
+        "colour": rgba,
         "part": np.clip(scene.part + 1, 0, 255).astype(np.uint8),
-    }  # fmt: skip
+    }
 
 
 def _differences(values: np.ndarray) -> np.ndarray:
@@ -104,14 +107,30 @@ def describe(
     starts = np.cumsum([0, *(values.nbytes for values in arrays.values())]).tolist()
     ids, counts = np.unique(scene.part, return_counts=True)
     return {
-        "title": title, "version": __version__, "count": scene.num_gaussians, "frames": scene.num_frames,
-        "time": scene.time.tolist(), "rate": fps / own_rate(scene), "tail": 1 / own_rate(scene),
-        "low": low.tolist(), "extent": extent.tolist(), "starts": dict(zip(arrays, starts)), "bytes": starts[-1],
-        "camera": {"azimuth": azimuth, "elevation": elevation, "radius": radius,
-                   "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1]))},
-        "parts": [{"id": int(i), "count": int(c), "colour": part_colours(np.array([i]))[0].tolist()}
-                  for i, c in zip(ids, counts)],
-        "weights": WEIGHTS.tolist(), "metrics": scene.metrics, "sh_degree": scene.sh_degree,
+        "title": title,
+        "version": __version__,
+        "count": scene.num_gaussians,
+        "frames": scene.num_frames,
+        "time": scene.time.tolist(),
+        "rate": fps / own_rate(scene),
+        "tail": 1 / own_rate(scene),
+        "low": low.tolist(),
+        "extent": extent.tolist(),
+        "starts": dict(zip(arrays, starts)),
+        "bytes": starts[-1],
+        "camera": {
+            "azimuth": azimuth,
+            "elevation": elevation,
+            "radius": radius,
+            "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1])),
+        },
+        "parts": [
+            {"id": int(i), "count": int(c), "colour": part_colors(np.array([i]))[0].tolist()}
+            for i, c in zip(ids, counts)
+        ],
+        "weights": WEIGHTS.tolist(),
+        "metrics": scene.metrics,
+        "sh_degree": scene.sh_degree,
         "control_points": len(scene.control_point),
         "history": [{key: entry.get(key) for key in ("command", "version", "seed")} for entry in history],
-    }  # fmt: skip
+    }

@@ -136,7 +136,7 @@ def _interleaved(xyz, n):
 @inlined
 def _update_bucket(data, bucket, cx, cy, cz):
     """Lower the distances of one bucket; returns its new maximum."""
-    x = np.uintp(4 * BUCKET * bucket)  # unsigned: numba then drops the negative-index case and the loop vectorises
+    x = np.uintp(4 * BUCKET * bucket)  # unsigned: numba then drops the negative-index case and the loop vectorizes
     y, z, best = x + np.uintp(BUCKET), x + np.uintp(2 * BUCKET), x + np.uintp(3 * BUCKET)
     for i in range(np.uintp(BUCKET)):
         dx = data[x + i] - cx

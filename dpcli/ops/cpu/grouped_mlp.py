@@ -1,10 +1,10 @@
 """CPU kernels of `grouped_mlp`: the passes around its matrix products, on pieces of rows that stay in the cache.
 
-Rows are neighbours: row r = i * K + k is neighbour k of centroid i, centroids counted through all clouds. A piece is
+Rows are neighbors: row r = i * K + k is neighbor k of centroid i, centroids counted through all clouds. A piece is
 centroids first..last-1; its arrays start at its first row. Kernels of a piece are serial and release the GIL; the others
 run on numba's threads, cut by centroids. No two threads add to one place, and the order of every sum is fixed, so results
 repeat exactly on any number of threads. All arrays are C-contiguous float32 unless said otherwise. Unsigned indices:
-numba then drops the negative-index case and the loops over channels vectorise.
+numba then drops the negative-index case and the loops over channels vectorize.
 """
 
 from __future__ import annotations
@@ -183,9 +183,7 @@ def sort_pooled(grad, out, best, where, mean, order, values, starts, sums):
 
 
 @inlined
-def _through_relu(
-    hidden, dense, at0, at1, add0, add1, order, values, first, last, base, weight, grad_weight, zero
-):  # fmt: skip
+def _through_relu(hidden, dense, at0, at1, add0, add1, order, values, first, last, base, weight, grad_weight, zero):
     """Gradient of two runs of WIDTH channels of one row, at `at0` and `at1`, through the ReLU; adds to grad_weight.
 
     first..last: the outputs whose maximum this row is, in `order`, with their gradients in `values`.
@@ -203,9 +201,7 @@ def _through_relu(
 
 
 @piece_kernel
-def back_xyz(
-    hidden, dense, constant, order, values, starts, weight, grad_weight, points, centers, idx, first, sums
-):
+def back_xyz(hidden, dense, constant, order, values, starts, weight, grad_weight, points, centers, idx, first, sums):
     """Back through a piece's pooling, second linear layer and the ReLU of `hidden_xyz`.
 
     With g[r] = dense[r] + constant + sum over the row's pooled values of value * weight[o], where hidden[r] > 0, else 0,
@@ -233,9 +229,21 @@ def back_xyz(
                 for k in range(neighbors):
                     row = (p * neighbors + k) * channels
                     g0, g1 = _through_relu(
-                        hidden, dense, row + c0, row + c1, add0, add1, order[i], values[i], starts[i, k],
-                        starts[i, k + 1], base, weight, grad_weight, zero,
-                    )  # fmt: skip
+                        hidden,
+                        dense,
+                        row + c0,
+                        row + c1,
+                        add0,
+                        add1,
+                        order[i],
+                        values[i],
+                        starts[i, k],
+                        starts[i, k + 1],
+                        base,
+                        weight,
+                        grad_weight,
+                        zero,
+                    )
                     j = idx[b, m, k]
                     x, y, z = lanes(points[b, j, 0] - cx), lanes(points[b, j, 1] - cy), lanes(points[b, j, 2] - cz)
                     t0, x0, y0, z0 = t0 + g0, x0 + g0 * x, y0 + g0 * y, z0 + g0 * z
@@ -282,9 +290,21 @@ def back_table(
                 for k in range(neighbors):
                     row = (p * neighbors + k) * channels
                     g0, g1 = _through_relu(
-                        hidden, dense, row + c0, row + c1, add0, add1, order[i], values[i], starts[i, k],
-                        starts[i, k + 1], base, weight, grad_weight, zero,
-                    )  # fmt: skip
+                        hidden,
+                        dense,
+                        row + c0,
+                        row + c1,
+                        add0,
+                        add1,
+                        order[i],
+                        values[i],
+                        starts[i, k],
+                        starts[i, k + 1],
+                        base,
+                        weight,
+                        grad_weight,
+                        zero,
+                    )
                     t0, t1 = t0 + g0, t1 + g1
                     at = ((block * batch + b) * nodes + idx[b, m, k]) * PAIR
                     store(to_table, at, load(to_table, at) + g0)
@@ -295,7 +315,7 @@ def back_table(
 
 @parallel_kernel
 def reach(idx, centers, out):
-    """out (B,N,4) f64: how many rows have neighbour j, and the sum of their centroids. idx (B,M,K) i64, centers (B,M,3)."""
+    """out (B,N,4) f64: how many rows have neighbor j, and the sum of their centroids. idx (B,M,K) i64, centers (B,M,3)."""
     batch, count, neighbors = idx.shape
     for b in prange(batch):
         for m in range(count):
@@ -326,7 +346,7 @@ def products(first, second, shift, sums):
 def back_norm(grad, table, reach, weight, mean, scale, t0, t1):
     """Through batch norm, in place: the gradient at the table from the sums of the gradient behind it, grad (B,N,C).
 
-    A row of neighbour j and centroid i adds scale * (g - t0 - (table[j] - offset[i] - mean) * t1); the sums of offsets,
+    A row of neighbor j and centroid i adds scale * (g - t0 - (table[j] - offset[i] - mean) * t1); the sums of offsets,
     weight @ centroid, come from `reach`. table (B,N,C), weight (3,C), mean, scale, t0, t1 (C).
     """
     batch, count, channels = grad.shape

@@ -25,7 +25,7 @@ def _skip_blas() -> None:
 
 _skip_blas()
 
-# No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorise. Nothing that changes
+# No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorize. Nothing that changes
 # a value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
 _FLAGS = {"nnan", "nsz"}
 _ARITHMETIC = {"contract", "nsz", "arcp", "reassoc"}

@@ -1,4 +1,4 @@
-"""CPU kernels of `kernel_convolution`: neighbours added into kernel points, whole rows of rotations and channels at once."""
+"""CPU kernels of `kernel_convolution`: neighbors added into kernel points, whole rows of rotations and channels at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dpcli.ops.cpu.jit import arithmetic_kernel
 
 @arithmetic_kernel
 def group_forward(features, index, weight, out, first, last):
-    """features (N,F), index (P,n), weight (P,n,D) -> out (P,D,F), for centres first..last."""
+    """features (N,F), index (P,n), weight (P,n,D) -> out (P,D,F), for centers first..last."""
     for p in range(first, last):
         out[p] = 0
         for j in range(index.shape[1]):

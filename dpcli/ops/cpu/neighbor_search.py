@@ -1,7 +1,7 @@
-"""Neighbour searches in numba: space-time ball query (first or nearest hits) and nearest neighbours among buckets.
+"""Neighbor searches in numba: space-time ball query (first or nearest hits) and nearest neighbors among buckets.
 
 Distances are float32, summed as (dx*dx + dy*dy) + dz*dz, so hits and ties are the torch reference's own. Points come as
-rows of coordinates (3,N) and are measured in blocks, so that the arithmetic vectorises; a block's least distance tells
+rows of coordinates (3,N) and are measured in blocks, so that the arithmetic vectorizes; a block's least distance tells
 whether it needs a closer look. The nearest are kept as int64 keys, distance bits above index, that sort as (distance,
 index): non-negative floats sort as their bits do.
 """
@@ -42,7 +42,7 @@ def _lower_bound(times, value):
 @kernel
 def _measure(x, y, z, first, size, cx, cy, cz, out):
     """Squared distances of `size` points from `first` on into `out`; returns the least."""
-    base = np.uintp(first)  # unsigned: numba then drops the negative-index case and the loop vectorises
+    base = np.uintp(first)  # unsigned: numba then drops the negative-index case and the loop vectorizes
     for i in range(np.uintp(size)):
         dx = cx - x[base + i]
         dy = cy - y[base + i]
@@ -311,7 +311,7 @@ def _scan_bucket(x, y, z, order, first, size, cx, cy, cz, block, bits, heap, fil
 def _search(x, y, z, order, n, box, bucket, cx, cy, cz, lower, upper, block, bits, heap):
     """Keep the nearest of all n bucketed points: first some close buckets, then all that may hold a nearer point."""
     start = _box_bounds(box, cx, cy, cz, lower, upper)
-    reach = (heap.size - 1) // (2 * bucket)  # neighbours on the curve, enough for k points, are close in space
+    reach = (heap.size - 1) // (2 * bucket)  # neighbors on the curve, enough for k points, are close in space
     filled = 0
     for b in range(max(0, start - reach), min(start + reach + 1, lower.size)):
         size = min(bucket, n - b * bucket)

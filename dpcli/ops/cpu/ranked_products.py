@@ -1,4 +1,4 @@
-"""CPU kernels of SpiderCNN's products: features of the k-th neighbours times each of their Taylor channels."""
+"""CPU kernels of SpiderCNN's products: features of the k-th neighbors times each of their Taylor channels."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.ops.cpu.jit import arithmetic_kernel
 
-_EMPTY, _TOWARDS_IDENTITY = 1e-12, 1e-6  # as in `rigid`
+_EMPTY, _TOWARD_IDENTITY = 1e-12, 1e-6  # as in `rigid`
 _ROUNDING = 4 * 2.0**-23  # float32's, whatever the sums are made in: the points themselves are rounded to it
 _SWEEPS = 12  # of Jacobi rotations at most; six are the rule
 
@@ -113,7 +113,7 @@ def kabsch_kernel(source, target, weights, rotation, translation, first, last):
             continue
         if norm > 0:
             noise = math.sqrt((x0 * x0 + x1 * x1 + x2 * x2) * yy) + math.sqrt((y0 * y0 + y1 * y1 + y2 * y2) * xx)
-            pull = min(_ROUNDING * noise / norm, 1e6) + _TOWARDS_IDENTITY
+            pull = min(_ROUNDING * noise / norm, 1e6) + _TOWARD_IDENTITY
             m[0, 0], m[0, 1], m[0, 2] = m00 / norm + pull, m01 / norm, m02 / norm
             m[1, 0], m[1, 1], m[1, 2] = m10 / norm, m11 / norm + pull, m12 / norm
             m[2, 0], m[2, 1], m[2, 2] = m20 / norm, m21 / norm, m22 / norm + pull

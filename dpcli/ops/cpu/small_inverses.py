@@ -1,4 +1,4 @@
-"""Batched small inverses in numba: `TILE` matrices side by side, entry by entry, so that the arithmetic vectorises.
+"""Batched small inverses in numba: `TILE` matrices side by side, entry by entry, so that the arithmetic vectorizes.
 
 Mirrors `linalg._inverse` for n <= 8: one block partition at most, whose blocks have the closed form.
 """
@@ -104,7 +104,7 @@ def _closed(m, out, at, n, det, moved, min_det, guard):
 def _add_product(a, a_at, b, b_at, sign, out, out_at, shape):
     """Add sign * a b to `out`, for blocks that start at the entries given: shape (p,r,q) for p x r times r x q.
 
-    Offsets, not slices: a sliced tile has an unknown stride, and its loops no longer vectorise.
+    Offsets, not slices: a sliced tile has an unknown stride, and its loops no longer vectorize.
     """
     for i in range(shape[0]):
         for j in range(shape[2]):
@@ -328,7 +328,14 @@ def guarded_gradient(m, grad, n, reciprocals, min_det, out, scratch):
         _guarded_gradient(a, a_inverse, g11, p, a_acted, a_det, out, scratch)
         return
     b, c, s, s_inverse, grad_s = scratch[10], scratch[11], scratch[12], scratch[13], scratch[14]
-    g12, g21, g22, to_s, to_left, to_right = scratch[15], scratch[16], scratch[17], scratch[18], scratch[19], scratch[20]
+    g12, g21, g22, to_s, to_left, to_right = (
+        scratch[15],
+        scratch[16],
+        scratch[17],
+        scratch[18],
+        scratch[19],
+        scratch[20],
+    )
     left, right, x, y = scratch[21], scratch[22], scratch[23], scratch[24]
     _block(m, 0, p, p, q, b)
     _block(m, p, 0, q, p, c)
@@ -475,7 +482,11 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
     and grad_right (centroids*n*groups)."""
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2
-    tile, kept, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
+    tile, kept, out = (
+        np.empty((n, n, TILE), np.float32),
+        np.empty((n, n, TILE), np.float32),
+        np.empty((n, n, TILE), np.float32),
+    )
     left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
     det, acted, side = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((n, TILE), np.float32)
     given, both_sides = np.empty((n, TILE), np.float32), np.empty((2, n, TILE), np.float32)

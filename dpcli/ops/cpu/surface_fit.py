@@ -1,6 +1,6 @@
 """CPU kernels of `surface_fit`: the passes around its matrix products, on pieces of rows that stay in the cache.
 
-Rows are neighbours, `neighbors` of them for each centroid of a piece; all arrays are flat float32 and start at the piece's
+Rows are neighbors, `neighbors` of them for each centroid of a piece; all arrays are flat float32 and start at the piece's
 first row or centroid. A row's features lie feature after feature, each over all groups, whose number is a multiple of
 WIDTH: element a * groups + k is feature a of group k, so that eight groups are one vector. Kernels are serial and release
 the GIL.
@@ -96,9 +96,19 @@ def deviation_back(features, grad, out, size, groups, neighbors):
 
 @piece_kernel
 def fit_back(
-    features, weights, times, coefficients, grad_deviations, grad_matrix, grad_right, grad_features, grad_logits,
-    size, groups, neighbors,
-):  # fmt: skip
+    features,
+    weights,
+    times,
+    coefficients,
+    grad_deviations,
+    grad_matrix,
+    grad_right,
+    grad_features,
+    grad_logits,
+    size,
+    groups,
+    neighbors,
+):
     """Gradients at the products (through the ReLU) and at the logits.
 
     grad_matrix (centroids*(size+1)^2*groups), made symmetric by the caller (G + G'), and grad_right

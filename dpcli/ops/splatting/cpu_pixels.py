@@ -3,7 +3,7 @@
 Within a tile a Gaussian visits only the rows of its box. Workers take tiles off a `counter` (1 i64, zero), longest
 lists first. No two workers write to one place and every sum has a fixed order: results repeat exactly on any number of
 threads. Arrays are C-contiguous float32 unless said otherwise, `flat` ones seen as a vector; letters, `packed`, `box`,
-`pair_start` and the lists as in `kernels_splat_lists`, D channels. Opacities (1 or C,N) and colours (1 or C,N,D) may
+`pair_start` and the lists as in `kernels_splat_lists`, D channels. Opacities (1 or C,N) and colors (1 or C,N,D) may
 serve all cameras. Indices are unsigned where it matters: numba then leaves out its test for negative ones.
 """
 
@@ -47,9 +47,9 @@ def _composite(table, state, low, high, left, top, packed, g, colors, color, cha
     across_x = lanes(packed[g + _5]) + lanes(packed[g + _2]) * dx * dx
     along, square = lanes(packed[g + _3]) * dx, lanes(packed[g + _4])
     zero = lanes(_ZERO)
-    at, y, centre = np.uintp(low) * one_row, top + np.float32(low), packed[g + _1]
+    at, y, center = np.uintp(low) * one_row, top + np.float32(low), packed[g + _1]
     for _ in range(low, high):
-        dy = lanes(y - centre)
+        dy = lanes(y - center)
         alpha = lower(power(table, across_x + dy * (along + square * dy)), load(table, _CAP_AT))
         alpha = where_lower(alpha, load(table, _SKIP_AT), zero, alpha)
         before = load(state, at)
@@ -78,12 +78,12 @@ def forward(table, tasks, workers, counter, tile_start, gaussian, packed, colors
     """Composite the tiles in `tasks` (i64): out (C,H,W,D), alphas (C,H,W), and ends (T,TALL,2,8) for `backward`:
 
     each pixel's remaining transmittance, and the number (from 1) in the tile's list of the Gaussian before which it
-    stopped. packed, colors, out, alphas, ends are flat; size is C, N, H, W, D; shared: one set of colours for all.
+    stopped. packed, colors, out, alphas, ends are flat; size is C, N, H, W, D; shared: one set of colors for all.
     """
     cameras, count, height, width, depth = size
     across, channels = (width + WIDE - 1) // WIDE, np.uintp(depth)
     tiles, fields = (tile_start.size - 1) // cameras, (_2 + channels) * _WIDE
-    # of a row of 8 pixels: transmittance (negative: stopped), where, colours
+    # of a row of 8 pixels: transmittance (negative: stopped), where, colors
     for _ in prange(workers):
         state = np.empty(_TALL * fields, np.float32)
         task = claim(counter)
@@ -137,7 +137,7 @@ def forward(table, tasks, workers, counter, tile_start, gaussian, packed, colors
 @_inlined
 def _retrace(
     table, state, lasts, weights, low, high, left, top, packed, g, colors, color, channels, number, to_color, sums, pair
-):  # fmt: skip
+):
     """One Gaussian's gradients from rows low..high-1 of a tile, the state taken back to before it; to `sums` at pair."""
     one_row = (_3 + channels) * _WIDE
     dx = ramp() + lanes(left - packed[g])
@@ -145,10 +145,10 @@ def _retrace(
     along, square = lanes(packed[g + _3]) * dx, lanes(packed[g + _4])
     zero = lanes(_ZERO)
     above = lanes(np.float32(number) + _HALF)
-    y, centre = top + np.float32(low), packed[g + _1]
+    y, center = top + np.float32(low), packed[g + _1]
     flat, linear, quadratic = zero, zero, zero
     for row in range(np.uintp(low), np.uintp(high)):
-        at, weight, dy = row * one_row, zero, lanes(y - centre)
+        at, weight, dy = row * one_row, zero, lanes(y - center)
         y += _ONE
         if number <= lasts[row]:
             raw = power(table, across_x + dy * (along + square * dy))
@@ -196,19 +196,33 @@ def _color_sum(state, weights, low, high, one_row, d):
 @parallel_kernel
 def backward(
     table,
-    tasks, workers, counter, tile_start, gaussian, packed, box, pair_start, colors, size, shared, ends, grad_out,
-    grad_alphas, to_color, sums,
-):  # fmt: skip
-    """Gradients of pairs: sums (P,max(8,6+D)) of s, s dx, s dy, s dx^2, s dx dy, s dy^2 over pixels, then of the colours.
+    tasks,
+    workers,
+    counter,
+    tile_start,
+    gaussian,
+    packed,
+    box,
+    pair_start,
+    colors,
+    size,
+    shared,
+    ends,
+    grad_out,
+    grad_alphas,
+    to_color,
+    sums,
+):
+    """Gradients of pairs: sums (P,max(8,6+D)) of s, s dx, s dy, s dx^2, s dx dy, s dy^2 over pixels, then of the colors.
 
-    s = dL/d(ln alpha), zero where alpha is capped. Walks each list from its far end: B = sum of (weight x colour . grad)
-    behind a Gaussian gives dL/dalpha = T colour . grad - B / (1 - alpha). to_color: else the colours' columns are unset.
+    s = dL/d(ln alpha), zero where alpha is capped. Walks each list from its far end: B = sum of (weight x color . grad)
+    behind a Gaussian gives dL/dalpha = T color . grad - B / (1 - alpha). to_color: else the colors' columns are unset.
     packed, colors, ends, sums and the gradients are flat; size and shared as for `forward`.
     """
     cameras, count, height, width, depth = size
     across, channels = (width + WIDE - 1) // WIDE, np.uintp(depth)
     tiles, fields = (tile_start.size - 1) // cameras, (_3 + channels) * _WIDE
-    # of a row of 8 pixels: transmittance, B, where it stopped, gradients of the colours
+    # of a row of 8 pixels: transmittance, B, where it stopped, gradients of the colors
     stride = np.uintp(max(8, 6 + depth))
     for _ in prange(workers):
         state, weights = np.empty(_TALL * fields, np.float32), np.empty(_TALL * _WIDE, np.float32)
@@ -254,11 +268,45 @@ def backward(
                 low = max(0, np.int64(packed[g + _6]) - top)
                 high = min(rows, np.int64(packed[g + _7]) - top)
                 if channels == _RGB:
-                    _retrace(table, state, lasts, weights, low, high, x, y, packed, g, colors, color, _RGB, number, to_color,
-                             sums, pair)  # fmt: skip
+                    _retrace(
+                        table,
+                        state,
+                        lasts,
+                        weights,
+                        low,
+                        high,
+                        x,
+                        y,
+                        packed,
+                        g,
+                        colors,
+                        color,
+                        _RGB,
+                        number,
+                        to_color,
+                        sums,
+                        pair,
+                    )
                 else:
-                    _retrace(table, state, lasts, weights, low, high, x, y, packed, g, colors, color, channels, number,
-                             to_color, sums, pair)  # fmt: skip
+                    _retrace(
+                        table,
+                        state,
+                        lasts,
+                        weights,
+                        low,
+                        high,
+                        x,
+                        y,
+                        packed,
+                        g,
+                        colors,
+                        color,
+                        channels,
+                        number,
+                        to_color,
+                        sums,
+                        pair,
+                    )
             task = claim(counter)
 
 

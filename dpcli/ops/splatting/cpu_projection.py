@@ -44,10 +44,16 @@ def _unit(quat):
 @arithmetic_kernel
 def _rotation(w, a, b, c):
     return (
-        1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b),
-        2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a),
-        2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b),
-    )  # fmt: skip
+        1 - 2 * (b * b + c * c),
+        2 * (a * b - w * c),
+        2 * (a * c + w * b),
+        2 * (a * b + w * c),
+        1 - 2 * (a * a + c * c),
+        2 * (b * c - w * a),
+        2 * (a * c - w * b),
+        2 * (b * c + w * a),
+        1 - 2 * (a * a + b * b),
+    )
 
 
 @arithmetic_kernel
@@ -64,19 +70,26 @@ def _rows(jacobian, w):
     """J W (2,3) as six numbers."""
     a, b, c, d = jacobian[0], jacobian[1], jacobian[2], jacobian[3]
     return (
-        a * w[0] + b * w[6], a * w[1] + b * w[7], a * w[2] + b * w[8],
-        c * w[3] + d * w[6], c * w[4] + d * w[7], c * w[5] + d * w[8],
-    )  # fmt: skip
+        a * w[0] + b * w[6],
+        a * w[1] + b * w[7],
+        a * w[2] + b * w[8],
+        c * w[3] + d * w[6],
+        c * w[4] + d * w[7],
+        c * w[5] + d * w[8],
+    )
 
 
 @arithmetic_kernel
 def _turned(p, r):
     """U = (J W) R (2,3) as six numbers."""
     return (
-        p[0] * r[0] + p[1] * r[3] + p[2] * r[6], p[0] * r[1] + p[1] * r[4] + p[2] * r[7],
-        p[0] * r[2] + p[1] * r[5] + p[2] * r[8], p[3] * r[0] + p[4] * r[3] + p[5] * r[6],
-        p[3] * r[1] + p[4] * r[4] + p[5] * r[7], p[3] * r[2] + p[4] * r[5] + p[5] * r[8],
-    )  # fmt: skip
+        p[0] * r[0] + p[1] * r[3] + p[2] * r[6],
+        p[0] * r[1] + p[1] * r[4] + p[2] * r[7],
+        p[0] * r[2] + p[1] * r[5] + p[2] * r[8],
+        p[3] * r[0] + p[4] * r[3] + p[5] * r[6],
+        p[3] * r[1] + p[4] * r[4] + p[5] * r[7],
+        p[3] * r[2] + p[4] * r[5] + p[5] * r[8],
+    )
 
 
 @arithmetic_kernel
@@ -141,8 +154,22 @@ def project(
 
 @parallel_kernel
 def project_backward(
-    means, quats, scales, views, Ks, width, height, conics, radii, to_means2d, to_conics, to_depths, to_means, to_quats, to_scales
-):  # fmt: skip
+    means,
+    quats,
+    scales,
+    views,
+    Ks,
+    width,
+    height,
+    conics,
+    radii,
+    to_means2d,
+    to_conics,
+    to_depths,
+    to_means,
+    to_quats,
+    to_scales,
+):
     """Add to to_means, to_quats, to_scales (as the inputs, zero) what comes through means2d, conics and depths."""
     cameras, count = to_depths.shape
     for block in prange((count + _BLOCK - 1) // _BLOCK):
@@ -177,10 +204,16 @@ def project_backward(
                 to_scale[2] += a2 * turned[2] + b2 * turned[5]
                 a0, a1, a2, b0, b1, b2 = a0 * s0, a1 * s1, a2 * s2, b0 * s0, b1 * s1, b2 * s2  # of U
                 to_rotation = (
-                    seen[0] * a0 + seen[3] * b0, seen[0] * a1 + seen[3] * b1, seen[0] * a2 + seen[3] * b2,
-                    seen[1] * a0 + seen[4] * b0, seen[1] * a1 + seen[4] * b1, seen[1] * a2 + seen[4] * b2,
-                    seen[2] * a0 + seen[5] * b0, seen[2] * a1 + seen[5] * b1, seen[2] * a2 + seen[5] * b2,
-                )  # fmt: skip
+                    seen[0] * a0 + seen[3] * b0,
+                    seen[0] * a1 + seen[3] * b1,
+                    seen[0] * a2 + seen[3] * b2,
+                    seen[1] * a0 + seen[4] * b0,
+                    seen[1] * a1 + seen[4] * b1,
+                    seen[1] * a2 + seen[4] * b2,
+                    seen[2] * a0 + seen[5] * b0,
+                    seen[2] * a1 + seen[5] * b1,
+                    seen[2] * a2 + seen[5] * b2,
+                )
                 _add_quat(qw, qx, qy, qz, shrink, to_rotation, to_quats[q, n])
                 r = rotation
                 g0, g1, g2 = (

@@ -21,7 +21,7 @@ def pixels_numba(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:  # [C, H, W, D], [C, H, W, 1]
-    """Composited colours (no background) and alphas, float32; as `splatting_torch.pixels_torch`, with gradients."""
+    """Composited colors (no background) and alphas, float32; as `splatting_torch.pixels_torch`, with gradients."""
     tensors = [t.contiguous() for t in (means2d, conics, colors, opacities)]
     out, alphas = _Pixels.apply(*tensors, radii.contiguous(), depths.detach().contiguous(), width, height)
     return out, alphas[..., None]
@@ -85,14 +85,33 @@ class _Pixels(torch.autograd.Function):
         sums = np.empty(len(lists.gaussian) * max(8, 6 + colors.shape[2]), np.float32)
         work = (lists.tasks, ctx.workers, np.zeros(1, np.int64), lists.tile_start, lists.gaussian, lists.packed)
         incoming = [g.contiguous().numpy().reshape(-1) for g in (grad_out, grad_alphas)]
-        kernels.backward(kernels.TABLE, *work, lists.box, lists.pair_start, colors.numpy().reshape(-1), ctx.size, len(colors) == 1,
-                         ctx.ends, *incoming, to_color, sums)  # fmt: skip
+        kernels.backward(
+            kernels.TABLE,
+            *work,
+            lists.box,
+            lists.pair_start,
+            colors.numpy().reshape(-1),
+            ctx.size,
+            len(colors) == 1,
+            ctx.ends,
+            *incoming,
+            to_color,
+            sums,
+        )
         shape = conics.shape[:2]
         to_means, to_conics = np.empty((*shape, 2), np.float32), np.empty((*shape, 3), np.float32)
         to_opacities, to_colors = np.zeros(opacities.shape, np.float32), np.zeros(colors.shape, np.float32)
         kernels.gather_gradients(
-            lists.box.reshape(*shape, 4), lists.pair_start.reshape(shape), sums, conics.numpy(), opacities.numpy(),
-            to_color, to_means, to_conics, to_opacities, to_colors,
-        )  # fmt: skip
+            lists.box.reshape(*shape, 4),
+            lists.pair_start.reshape(shape),
+            sums,
+            conics.numpy(),
+            opacities.numpy(),
+            to_color,
+            to_means,
+            to_conics,
+            to_opacities,
+            to_colors,
+        )
         grads = (to_means, to_conics, to_colors, to_opacities)
         return *(torch.from_numpy(g) for g in grads), None, None, None, None

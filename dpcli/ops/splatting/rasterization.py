@@ -40,13 +40,13 @@ def rasterization(
     backgrounds: Tensor | None = None,  # [C, D]
     render_mode: str = "RGB",
 ) -> tuple[Tensor, Tensor, dict]:  # [C, H, W, D], [C, H, W, 1], notes
-    """Colours, alphas and notes of C pinhole pictures of N Gaussians (Kerbl et al. 2023), with gradients.
+    """Colors, alphas and notes of C pinhole pictures of N Gaussians (Kerbl et al. 2023), with gradients.
 
     quats w x y z of any length; scales linear (standard deviations, the unit of means); opacities 0..1; viewmats world to
-    camera, OpenCV axes; Ks without skew; pixel centres at +0.5. A leading C means that each camera sees its own (say,
-    another time). sh_degree 0..3: colours are spherical harmonics, 0.5 is added and negatives are cut.
-    render_mode: D is the depth summed by weight, ED that divided by alpha, appended to the colours in RGB+D, RGB+ED;
-    behind depth lies no background. Colours are premultiplied: without backgrounds, on black.
+    camera, OpenCV axes; Ks without skew; pixel centers at +0.5. A leading C means that each camera sees its own (say,
+    another time). sh_degree 0..3: colors are spherical harmonics, 0.5 is added and negatives are cut.
+    render_mode: D is the depth summed by weight, ED that divided by alpha, appended to the colors in RGB+D, RGB+ED;
+    behind depth lies no background. Colors are premultiplied: without backgrounds, on black.
     Order: by depth of the means, ties to the lower index. Alphas under 1/255 are skipped, over 0.999 cut (with zero
     gradient); a pixel stops before transmittance 1e-4. tile_size never changes a result, only the reference's speed.
     Notes: means2d (C,N,2) (after retain_grad() its gradient in pixels, for densification), conics (C,N,3), depths (C,N),
@@ -55,28 +55,80 @@ def rasterization(
     shapes, values that aren't finite, an unknown render_mode.
     """
     return _render(
-        False, means, quats, scales, opacities, colors, viewmats, Ks, width, height, (near_plane, far_plane, radius_clip, eps2d),
-        sh_degree, tile_size, backgrounds, render_mode,
-    )  # fmt: skip
+        False,
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        (near_plane, far_plane, radius_clip, eps2d),
+        sh_degree,
+        tile_size,
+        backgrounds,
+        render_mode,
+    )
 
 
 def rasterization_reference(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor,
-    width: int, height: int, near_plane: float = 0.01, far_plane: float = 1e10, radius_clip: float = 0.0,
-    eps2d: float = 0.3, sh_degree: int | None = None, tile_size: int = 16, backgrounds: Tensor | None = None,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    tile_size: int = 16,
+    backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
-) -> tuple[Tensor, Tensor, dict]:  # fmt: skip
+) -> tuple[Tensor, Tensor, dict]:
     """The torch twin of `rasterization`: same arguments, same result to rounding, on any device and in float64."""
     return _render(
-        True, means, quats, scales, opacities, colors, viewmats, Ks, width, height, (near_plane, far_plane, radius_clip, eps2d),
-        sh_degree, tile_size, backgrounds, render_mode,
-    )  # fmt: skip
+        True,
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        (near_plane, far_plane, radius_clip, eps2d),
+        sh_degree,
+        tile_size,
+        backgrounds,
+        render_mode,
+    )
 
 
 def _render(
-    reference: bool, means, quats, scales, opacities, colors, viewmats, Ks, width, height, limits, sh_degree, tile_size,
-    backgrounds, render_mode,
-) -> tuple[Tensor, Tensor, dict]:  # fmt: skip
+    reference: bool,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmats,
+    Ks,
+    width,
+    height,
+    limits,
+    sh_degree,
+    tile_size,
+    backgrounds,
+    render_mode,
+) -> tuple[Tensor, Tensor, dict]:
     _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, sh_degree, render_mode)
     means, quats, scales = (t if t.dim() == 3 else t[None] for t in (means, quats, scales))
     opacities = opacities if opacities.dim() == 2 else opacities[None]
@@ -92,7 +144,7 @@ def _render(
 
 
 def _finished(out: Tensor, alphas: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:
-    """Depth divided by alpha where it is to be the expected one, and the background behind the colours."""
+    """Depth divided by alpha where it is to be the expected one, and the background behind the colors."""
     if render_mode.endswith("ED"):
         out = torch.cat([out[..., :-1], out[..., -1:] / alphas.clamp(min=1e-10)], -1)
     if backgrounds is None or render_mode in ("D", "ED"):
@@ -104,7 +156,7 @@ def _finished(out: Tensor, alphas: Tensor, backgrounds: Tensor | None, render_mo
 def _features(
     colors: Tensor, means: Tensor, depths: Tensor, viewmats: Tensor, sh_degree: int | None, mode: str
 ) -> Tensor:
-    """What is composited: colours, SH evaluated, with or instead of them depth; (1 or C,N,D)."""
+    """What is composited: colors, SH evaluated, with or instead of them depth; (1 or C,N,D)."""
     if mode in ("D", "ED"):
         return depths[..., None]
     if sh_degree is not None:
@@ -147,15 +199,22 @@ def gsplat_available() -> bool:
     except Exception as error:  # its first import compiles
         _C = error
     if _C is None or isinstance(_C, Exception):
-        print("dpc: gsplat has no compiled CUDA kernels; the slower torch rasteriser is used instead", file=sys.stderr)
+        print("dpc: gsplat has no compiled CUDA kernels; the slower torch rasterizer is used instead", file=sys.stderr)
         return False
     return True
 
 
 def _pixels_gsplat(
-    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, radii: Tensor, depths: Tensor, width: int,
-    height: int, tile_size: int,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    radii: Tensor,
+    depths: Tensor,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> tuple[Tensor, Tensor]:
     from gsplat import isect_offset_encode, isect_tiles, rasterize_to_pixels
 
     cameras = len(means2d)
@@ -182,8 +241,13 @@ def _check(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, s
         raise ValueError(f"viewmats (C,4,4) and Ks (C,3,3) are {tuple(viewmats.shape)} and {tuple(Ks.shape)}")
     cameras, count = len(viewmats), means.shape[-2] if means.dim() > 1 else 0
     color_shape = (count, colors.shape[-1]) if sh_degree is None else (count, colors.shape[-2], 3)
-    tails = {"means": (means, (count, 3)), "quats": (quats, (count, 4)), "scales": (scales, (count, 3)),
-             "opacities": (opacities, (count,)), "colors": (colors, color_shape)}  # fmt: skip
+    tails = {
+        "means": (means, (count, 3)),
+        "quats": (quats, (count, 4)),
+        "scales": (scales, (count, 3)),
+        "opacities": (opacities, (count,)),
+        "colors": (colors, color_shape),
+    }
     for name, (tensor, tail) in tails.items():
         if tuple(tensor.shape) not in (tail, (cameras, *tail)):
             raise ValueError(f"{name} must have shape {tail} or {(cameras, *tail)}, but has {tuple(tensor.shape)}")

@@ -18,9 +18,16 @@ _SH = (
     (0.28209479177387814,),
     (-0.4886025119029199, 0.4886025119029199, -0.4886025119029199),
     (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396),
-    (-0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, -0.4570457994644658,
-     1.445305721320277, -0.5900435899266435),
-)  # fmt: skip
+    (
+        -0.5900435899266435,
+        2.890611442640554,
+        -0.4570457994644658,
+        0.3731763325901154,
+        -0.4570457994644658,
+        1.445305721320277,
+        -0.5900435899266435,
+    ),
+)
 
 
 def project_torch(
@@ -83,22 +90,28 @@ def rotations(quats: Tensor) -> Tensor:
     """Rotation matrices (...,3,3) of quaternions (...,4) w x y z of any length; of zero the identity."""
     w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def sh_colors(coefficients: Tensor, means: Tensor, viewmats: Tensor, degree: int) -> Tensor:
-    """Colours (1 or C,N,3) of SH coefficients (1 or C,N,K,3) seen from the cameras: max(0, 0.5 + sum of c_k Y_k(direction)).
+    """Colors (1 or C,N,3) of SH coefficients (1 or C,N,K,3) seen from the cameras: max(0, 0.5 + sum of c_k Y_k(direction)).
 
     means (1 or C,N,3); real harmonics of degree 0..3 as in 3D Gaussian splatting, direction from camera to Gaussian.
     """
     if degree == 0:
         return (0.5 + _SH[0][0] * coefficients[..., 0, :]).clamp(min=0)
-    centres = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
-    direction = torch.nn.functional.normalize(means - centres[:, None], dim=-1)
+    centers = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
+    direction = torch.nn.functional.normalize(means - centers[:, None], dim=-1)
     basis = sh_basis(direction, degree)
     return (0.5 + (basis[..., None] * coefficients[..., : basis.shape[-1], :]).sum(-2)).clamp(min=0)
 
@@ -111,9 +124,16 @@ def sh_basis(direction: Tensor, degree: int) -> Tensor:
         [torch.ones_like(x)],
         [y, z, x],
         [x * y, y * z, 2 * zz - xx - yy, x * z, xx - yy],
-        [y * (3 * xx - yy), x * y * z, y * (4 * zz - xx - yy), z * (2 * zz - 3 * xx - 3 * yy), x * (4 * zz - xx - yy),
-         z * (xx - yy), x * (xx - 3 * yy)],
-    ]  # fmt: skip
+        [
+            y * (3 * xx - yy),
+            x * y * z,
+            y * (4 * zz - xx - yy),
+            z * (2 * zz - 3 * xx - 3 * yy),
+            x * (4 * zz - xx - yy),
+            z * (xx - yy),
+            x * (xx - 3 * yy),
+        ],
+    ]
     terms = [c * t for band in range(degree + 1) for c, t in zip(_SH[band], bands[band], strict=True)]
     return torch.stack(terms, -1)
 
@@ -129,7 +149,7 @@ def pixels_torch(
     height: int,
     tile_size: int = 16,
 ) -> tuple[Tensor, Tensor]:  # [C, H, W, D], [C, H, W, 1]
-    """Composited colours (no background) and alphas. Front to back by depth, ties to the lower index."""
+    """Composited colors (no background) and alphas. Front to back by depth, ties to the lower index."""
     cameras = len(means2d)
     shared = (t.expand(cameras, *t.shape[1:]) for t in (colors, opacities))
     each = zip(means2d, conics, *shared, radii, depths, strict=True)
@@ -155,7 +175,7 @@ def _one_camera(means2d, conics, colors, opacities, radii, depths, width: int, h
 
 
 def _tile(means2d, conics, colors, opacities, columns: tuple[int, int], rows: tuple[int, int]) -> Tensor:
-    """Colours and alpha (h,w,D+1) of one tile: all its pixels against all its Gaussians, sorted from near to far."""
+    """Colors and alpha (h,w,D+1) of one tile: all its pixels against all its Gaussians, sorted from near to far."""
     at = {"dtype": means2d.dtype, "device": means2d.device}
     y, x = torch.meshgrid(torch.arange(*rows, **at) + 0.5, torch.arange(*columns, **at) + 0.5, indexing="ij")
     dx, dy = x[..., None] - means2d[:, 0], y[..., None] - means2d[:, 1]

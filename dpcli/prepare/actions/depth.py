@@ -1,4 +1,4 @@
-"""Anybody's depth video: video files, folders of depth images, or arrays, to points in metres (camera axes OpenCV)."""
+"""Anybody's depth video: video files, folders of depth images, or arrays, to points in meters (camera axes OpenCV)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def background_depth(depth: np.ndarray, kind: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class DepthVideos:
-    """Options of the reader. Lengths in metres, focal lengths and centres in pixels, the field of view in degrees."""
+    """Options of the reader. Lengths in meters, focal lengths and centers in pixels, the field of view in degrees."""
 
     inputs: tuple[Path, ...]
     intrinsics: Intrinsics | None = None
@@ -63,9 +63,9 @@ class DepthVideos:
         if self.background not in BACKGROUNDS:
             raise UsageError(f"--background {self.background}: expected one of {', '.join(BACKGROUNDS)}")
         if not 0 <= self.near < self.far:
-            raise UsageError(f"--near {self.near:g} --far {self.far:g}: expected 0 <= near < far, in metres")
+            raise UsageError(f"--near {self.near:g} --far {self.far:g}: expected 0 <= near < far, in meters")
         if self.depth_scale is not None and not self.depth_scale > 0:
-            raise UsageError(f"--depth-scale {self.depth_scale:g}: expected raw units per metre, more than 0")
+            raise UsageError(f"--depth-scale {self.depth_scale:g}: expected raw units per meter, more than 0")
         if self.fps is not None and not self.fps > 0:
             raise UsageError(f"--fps {self.fps:g}: expected more than 0")
         if self.intrinsics and self.fov is not None:
@@ -120,11 +120,11 @@ class DepthVideos:
         )
 
     def _raw(self, frames: np.ndarray, path: Path) -> tuple[np.ndarray, float]:
-        """Depth (T,H,W) as the sensor counts it, 0 = nothing seen, and how many metres one count is."""
+        """Depth (T,H,W) as the sensor counts it, 0 = nothing seen, and how many meters one count is."""
         kind = frames.dtype
         if kind.kind == "f" and not np.isfinite(frames).all():
             frames = np.nan_to_num(frames, nan=0, posinf=0, neginf=0)  # the usual marks for "no return"
-        usual = 1.0 if kind.kind == "f" else 100.0 if kind.itemsize == 1 else 1000.0  # raw units per metre
+        usual = 1.0 if kind.kind == "f" else 100.0 if kind.itemsize == 1 else 1000.0  # raw units per meter
         scale = self.depth_scale or usual
         if self.invert:
             if kind.kind != "u":
@@ -145,9 +145,9 @@ class DepthVideos:
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
             )
-        unlabelled = [item.name for item in items if item.label < 0]
-        if self._table and unlabelled:
-            lines.append(f"{len(unlabelled)} without a label in {self.labels}: {', '.join(unlabelled[:5])}")
+        unlabeled = [item.name for item in items if item.label < 0]
+        if self._table and unlabeled:
+            lines.append(f"{len(unlabeled)} without a label in {self.labels}: {', '.join(unlabeled[:5])}")
         return lines
 
 

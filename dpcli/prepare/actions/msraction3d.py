@@ -16,16 +16,34 @@ from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_fram
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
-    "high arm wave", "horizontal arm wave", "hammer", "hand catch", "forward punch", "high throw", "draw x",
-    "draw tick", "draw circle", "hand clap", "two hand wave", "side boxing", "bend", "forward kick", "side kick",
-    "jogging", "tennis swing", "tennis serve", "golf swing", "pick up and throw",
-)  # fmt: skip
+    "high arm wave",
+    "horizontal arm wave",
+    "hammer",
+    "hand catch",
+    "forward punch",
+    "high throw",
+    "draw x",
+    "draw tick",
+    "draw circle",
+    "hand clap",
+    "two hand wave",
+    "side boxing",
+    "bend",
+    "forward kick",
+    "side kick",
+    "jogging",
+    "tennis swing",
+    "tennis serve",
+    "golf swing",
+    "pick up and throw",
+)
 NAME = re.compile(r"a(\d{2})_s(\d{2})_e(\d{2})_sdepth\.(bin|mat)", re.IGNORECASE)
 # (action, subject, trial) absent from the 567 published videos; trial 0 stands for all three
 ABSENT = (
-    [(a, 4, 0) for a in range(1, 7)] + [(4, 3, 3), (5, 6, 3), (6, 6, 3), (7, 4, 3), (7, 7, 3), (15, 2, 3)]
+    [(a, 4, 0) for a in range(1, 7)]
+    + [(4, 3, 3), (5, 6, 3), (6, 6, 3), (7, 4, 3), (7, 7, 3), (15, 2, 3)]
     + [(15, s, 0) for s in (3, 4, 5)]
-)  # fmt: skip
+)
 
 
 def published() -> list[str]:
@@ -148,9 +166,13 @@ class MSRAction3D:
         if not 1 <= action <= len(CLASS_NAMES):
             problem = f"{path}: action {action} in the file name is out of range; expected 1 to {len(CLASS_NAMES)}"
         return Item(
-            name=path.name[:11].lower(), path=path, label=action - 1, subject=subject, problem=problem,
+            name=path.name[:11].lower(),
+            path=path,
+            label=action - 1,
+            subject=subject,
+            problem=problem,
             split="train" if subject in self.train_subjects else "test",
-        )  # fmt: skip
+        )
 
     def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
         notes: dict[str, int] = {}

@@ -20,16 +20,67 @@ from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offs
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
-    "drink water", "eat meal", "brush teeth", "brush hair", "drop", "pick up", "throw", "sit down", "stand up",
-    "clapping", "reading", "writing", "tear up paper", "put on jacket", "take off jacket", "put on a shoe",
-    "take off a shoe", "put on glasses", "take off glasses", "put on a hat", "take off a hat", "cheer up",
-    "hand waving", "kicking something", "reach into pocket", "hopping", "jump up", "phone call", "play with phone",
-    "type on a keyboard", "point to something", "taking a selfie", "check time", "rub two hands", "nod head",
-    "shake head", "wipe face", "salute", "put palms together", "cross hands in front", "sneeze or cough", "staggering",
-    "falling down", "headache", "chest pain", "back pain", "neck pain", "nausea", "fan self", "punch", "kick other",
-    "push other", "pat on back", "point finger", "hugging", "give object", "touch pocket", "shaking hands",
-    "walk towards", "walk apart",
-)  # fmt: skip
+    "drink water",
+    "eat meal",
+    "brush teeth",
+    "brush hair",
+    "drop",
+    "pick up",
+    "throw",
+    "sit down",
+    "stand up",
+    "clapping",
+    "reading",
+    "writing",
+    "tear up paper",
+    "put on jacket",
+    "take off jacket",
+    "put on a shoe",
+    "take off a shoe",
+    "put on glasses",
+    "take off glasses",
+    "put on a hat",
+    "take off a hat",
+    "cheer up",
+    "hand waving",
+    "kicking something",
+    "reach into pocket",
+    "hopping",
+    "jump up",
+    "phone call",
+    "play with phone",
+    "type on a keyboard",
+    "point to something",
+    "taking a selfie",
+    "check time",
+    "rub two hands",
+    "nod head",
+    "shake head",
+    "wipe face",
+    "salute",
+    "put palms together",
+    "cross hands in front",
+    "sneeze or cough",
+    "staggering",
+    "falling down",
+    "headache",
+    "chest pain",
+    "back pain",
+    "neck pain",
+    "nausea",
+    "fan self",
+    "punch",
+    "kick other",
+    "push other",
+    "pat on back",
+    "point finger",
+    "hugging",
+    "give object",
+    "touch pocket",
+    "shaking hands",
+    "walk toward",
+    "walk apart",
+)
 NAME = re.compile(r"S(\d{3})C(\d{3})P(\d{3})R(\d{3})A(\d{3})")
 FRAME = re.compile(r"MDepth-(\d{8})\.png", re.IGNORECASE)
 WIDTH, HEIGHT, FPS = 512, 424, 30.0
@@ -70,9 +121,15 @@ def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
     ]
     _, camera, subject, _, action = numbers
     return Item(
-        name, path, split_of(protocol, subject, camera), label=action - 1, subject=subject, camera=camera, extra=extra,
+        name,
+        path,
+        split_of(protocol, subject, camera),
+        label=action - 1,
+        subject=subject,
+        camera=camera,
+        extra=extra,
         problem=f"{path}: {wrong[0]}" if wrong else "",
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -89,7 +146,7 @@ class NTU60:
         if self.protocol not in PUBLISHED:
             raise UsageError(f"--protocol {self.protocol}: expected {' or '.join(PUBLISHED)}")
         if not self.scale > 0:
-            raise UsageError(f"--scale {self.scale:g}: expected millimetres per unit of length, more than 0")
+            raise UsageError(f"--scale {self.scale:g}: expected millimeters per unit of length, more than 0")
 
     @property
     def class_names(self) -> list[str]:
@@ -220,8 +277,10 @@ class NTU60:
         good = [item for item in items if not item.problem]
         setups, splits = Counter(item.name[:4] for item in good), Counter(item.split for item in good)
         lines = [f"{len(good)} of the {VIDEOS} published videos found, {len(items) - len(good)} entries unusable"]
-        lines.append(f"{self.protocol}: " + ", ".join(
-            f"{split} {splits[split]}/{count}" for split, count in PUBLISHED[self.protocol].items()))  # fmt: skip
+        lines.append(
+            f"{self.protocol}: "
+            + ", ".join(f"{split} {splits[split]}/{count}" for split, count in PUBLISHED[self.protocol].items())
+        )
         if len(good) < VIDEOS:
             lines.append("by setup " + ", ".join(f"{setup}: {count}" for setup, count in sorted(setups.items())))
         return lines

@@ -90,7 +90,7 @@ class NvGesture:
     raw: Path
     foreground: str = "otsu"  # otsu | none
     erode: int = 1  # passes of 3x3 erosion
-    coordinates: str = "image"  # image: row, column, grey level | camera: pinhole with depth 255 - grey level
+    coordinates: str = "image"  # image: row, column, gray level | camera: pinhole with depth 255 - gray level
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
@@ -105,8 +105,8 @@ class NvGesture:
     @property
     def length_unit(self) -> str:
         if self.coordinates == "image":
-            return "pixel (row, column), grey level (depth; nearer = larger)"
-        return "255 - grey level"
+            return "pixel (row, column), gray level (depth; nearer = larger)"
+        return "255 - gray level"
 
     @property
     def config(self) -> dict[str, Any]:
@@ -149,9 +149,14 @@ class NvGesture:
         if relative.is_absolute() or ".." in relative.parts:
             problem = f"{where}: the path {entry.path} leaves the data folder"
         return Item(
-            name, path, split, label=entry.label - 1, subject=int(subject[1]) if subject else -1, problem=problem,
+            name,
+            path,
+            split,
+            label=entry.label - 1,
+            subject=int(subject[1]) if subject else -1,
+            problem=problem,
             extra={"start": entry.start, "stop": entry.stop},
-        )  # fmt: skip
+        )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         start, stop = item.extra["start"], item.extra["stop"]
@@ -164,11 +169,7 @@ class NvGesture:
         if len(frames) < stop - start:
             notes["frames listed beyond the end of a video"] = stop - start - len(frames)
         sequence = CloudSequence(
-            item.name,
-            np.concatenate(clouds),
-            offsets(counts[kept]),
-            time=kept / (rate or 30.0),
-            **describe(item),
+            item.name, np.concatenate(clouds), offsets(counts[kept]), time=kept / (rate or 30.0), **describe(item)
         )
         return Sample(sequence, notes)
 
@@ -180,7 +181,7 @@ class NvGesture:
         pixels = np.flatnonzero(seen)
         depth = frame.reshape(-1).take(pixels).astype(np.float32)
         if self.coordinates == "camera":
-            z = 255 - depth  # a grey level of 255 would be the camera itself
+            z = 255 - depth  # a gray level of 255 would be the camera itself
             return (pixel_rays(*frame.shape, INTRINSICS)[pixels] * z[:, None])[z > 0]
         points = pixel_places(*frame.shape).take(pixels, axis=0)
         points[:, 2] = depth

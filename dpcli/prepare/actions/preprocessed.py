@@ -27,9 +27,13 @@ _FORMS = ("auto", "msraction3d", "ntu60", "pts_label")
 
 
 def open_preprocessed(
-    raw: Path, form: str = "auto", labels: int = 28, lists: Path | None = None, protocol: str = "xsub",
+    raw: Path,
+    form: str = "auto",
+    labels: int = 28,
+    lists: Path | None = None,
+    protocol: str = "xsub",
     scale: float | None = None,
-) -> Reader:  # fmt: skip
+) -> Reader:
     """The reader for what is in a folder. form: which of the forms, or ``auto`` to tell it by the first file found.
 
     UsageError when an option is given that the form doesn't have; DataError when the folder holds none of them.

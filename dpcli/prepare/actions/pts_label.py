@@ -68,7 +68,7 @@ class PtsLabel:
     @property
     def length_unit(self) -> str:
         if self._is_nvgesture():
-            return "pixel (row, column), grey level (depth; nearer = larger)"
+            return "pixel (row, column), gray level (depth; nearer = larger)"
         return "pixel (row, column), mm (depth)"
 
     @property

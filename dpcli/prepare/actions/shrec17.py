@@ -82,9 +82,11 @@ class Shrec17:
 
     def __post_init__(self) -> None:
         for option, allowed in (
-            ("labels", (14, 28)), ("foreground", ("component", "none")), ("median", (0, 3, 5)),
+            ("labels", (14, 28)),
+            ("foreground", ("component", "none")),
+            ("median", (0, 3, 5)),
             ("coordinates", ("image", "camera")),
-        ):  # fmt: skip
+        ):
             if getattr(self, option) not in allowed:
                 words = " or ".join(str(v) for v in allowed)
                 raise UsageError(f"--{option} {getattr(self, option)}: expected {words}")

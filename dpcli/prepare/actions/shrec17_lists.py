@@ -10,9 +10,21 @@ from dpcli.errors import DataError
 from dpcli.prepare.reader import Item, require_folder
 
 GESTURES = (
-    "grab", "tap", "expand", "pinch", "rotation clockwise", "rotation counter-clockwise", "swipe right", "swipe left",
-    "swipe up", "swipe down", "swipe X", "swipe +", "swipe V", "shake",
-)  # fmt: skip
+    "grab",
+    "tap",
+    "expand",
+    "pinch",
+    "rotation clockwise",
+    "rotation counter-clockwise",
+    "swipe right",
+    "swipe left",
+    "swipe up",
+    "swipe down",
+    "swipe X",
+    "swipe +",
+    "swipe V",
+    "shake",
+)
 FINGERS = ("one finger", "whole hand")
 PUBLISHED = {"train": 1960, "test": 840}
 _COLUMNS = {"gesture": 14, "finger": 2, "subject": 28, "trial": 0, "label14": 14, "label28": 28, "frames": 0}
@@ -134,8 +146,14 @@ def listed_items(lists: Sequence[ListFile], labels: int) -> list[Item]:
         if isinstance(entry, str):
             items.append(Item(where, root, split, problem=entry))
         else:
-            items.append(Item(
-                entry.folder, root / entry.folder, split, label=entry.label(labels), subject=entry.subject,
-                extra={"root": root, "frames": entry.frames, "line": where},
-            ))  # fmt: skip
+            items.append(
+                Item(
+                    entry.folder,
+                    root / entry.folder,
+                    split,
+                    label=entry.label(labels),
+                    subject=entry.subject,
+                    extra={"root": root, "frames": entry.frames, "line": where},
+                )
+            )
     return items

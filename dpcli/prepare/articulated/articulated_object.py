@@ -86,11 +86,11 @@ class ArticulatedObject:
         return values
 
     def extent(self, poses: np.ndarray) -> tuple[np.ndarray, float]:
-        """Centre (3) of the bounding box and radius of the sphere about it that holds the object. poses (bodies,4,4)."""
+        """Center (3) of the bounding box and radius of the sphere about it that holds the object. poses (bodies,4,4)."""
         points, body = self.vertices
         placed = transform(poses[body], points)
-        centre = (placed.min(0) + placed.max(0)) / 2
-        return centre, float(np.linalg.norm(placed - centre, axis=1).max())
+        center = (placed.min(0) + placed.max(0)) / 2
+        return center, float(np.linalg.norm(placed - center, axis=1).max())
 
 
 def joint_motion(joint: Joint, values: np.ndarray) -> np.ndarray:

@@ -117,7 +117,7 @@ def draw_sequence(
     values = sample_values(obj, options.frames, options.joint_step, rng)
     still = sorted(locked)
     values[:, still] = values[:1, still]
-    scale, poses = _normalised(obj, obj.poses(values))
+    scale, poses = _normalized(obj, obj.poses(values))
     poses = global_motions(options, rng)[:, None] @ poses
     clouds, ids = zip(*_frames(obj, scale, poses, part, options, rng), strict=True)
     poses_of_parts = np.tile(np.eye(4), (options.frames, max(pad_parts, part.max() + 1), 1, 1))
@@ -128,12 +128,12 @@ def draw_sequence(
     return Sample(sequence, _notes(studied, clouds, ids, options))
 
 
-def _normalised(obj: ArticulatedObject, poses: np.ndarray) -> tuple[float, np.ndarray]:
-    """Scale of the bodies, and body poses f64 (F,bodies,4,4) of the scaled bodies: still rigid, frame 0 centred."""
-    centre, radius = obj.extent(poses[0])
+def _normalized(obj: ArticulatedObject, poses: np.ndarray) -> tuple[float, np.ndarray]:
+    """Scale of the bodies, and body poses f64 (F,bodies,4,4) of the scaled bodies: still rigid, frame 0 centered."""
+    center, radius = obj.extent(poses[0])
     scale = 0.5 / radius
     poses = poses.copy()
-    poses[..., :3, 3] = (poses[..., :3, 3] - centre) * scale
+    poses[..., :3, 3] = (poses[..., :3, 3] - center) * scale
     return scale, poses
 
 
@@ -154,17 +154,23 @@ def global_motions(options: Articulation, rng: np.random.Generator) -> np.ndarra
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
     """A rotation f64 (3,3), uniform over SO(3): a unit quaternion from a normal distribution."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _frames(
-    obj: ArticulatedObject, scale: float, poses: np.ndarray, part: np.ndarray, options: Articulation,
+    obj: ArticulatedObject,
+    scale: float,
+    poses: np.ndarray,
+    part: np.ndarray,
+    options: Articulation,
     rng: np.random.Generator,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Points f32 (N,3) and part ids i16 (N) of every frame. poses f64 (F,bodies,4,4), part i64 (bodies)."""
     count = options.points_per_frame * (1 if options.sampling == "random" else _DENSER)
     camera = _camera(obj, scale, poses, options, rng) if options.view == "single" else None

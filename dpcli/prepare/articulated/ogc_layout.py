@@ -9,7 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.articulated_object import axis_rotation
 
-GROUND = -0.49  # y of the floor; x and z are centred; the room is 1 wide
+GROUND = -0.49  # y of the floor; x and z are centered; the room is 1 wide
 _TRIES = 40  # places or motions drawn for one object before the room is begun anew
 _ROOMS = 400  # rooms begun before it is given up
 _SHRINK_AFTER, _SHRINK = 20, 0.99  # objects too bulky for the floor: from this room on, each has smaller ones
@@ -43,7 +43,7 @@ def scale_range(objects: int) -> tuple[float, float]:
 def draw_layout(hulls: list[np.ndarray], frames: int, motion: RoomMotion, rng: np.random.Generator) -> Layout:
     """Stand objects on the floor and move them so that their axis-parallel boxes never overlap.
 
-    hulls: for each object, points f64 (V,3) that span it, centred, longest side 1, y up. In frame 0 all boxes are on
+    hulls: for each object, points f64 (V,3) that span it, centered, longest side 1, y up. In frame 0 all boxes are on
     the floor of 1 x U(0.6, 1). An object turns about its own middle. DataError when there is no room for them.
     """
     low, high = scale_range(len(hulls))

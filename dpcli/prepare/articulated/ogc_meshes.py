@@ -1,4 +1,4 @@
-"""Any folder of meshes as shapes for generated rooms: centred, longest side 1, y up."""
+"""Any folder of meshes as shapes for generated rooms: centered, longest side 1, y up."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from dpcli.prepare.reader import natural_key, require_folder
 
 @dataclass(frozen=True)
 class Shape:
-    """triangles f64 (T,3,3), centred at the middle of their box, whose longest side is 1; hull f64 (V,3) spans them."""
+    """triangles f64 (T,3,3), centered at the middle of their box, whose longest side is 1; hull f64 (V,3) spans them."""
 
     triangles: np.ndarray
     hull: np.ndarray

@@ -154,7 +154,7 @@ def seen_by_camera(triangles: np.ndarray) -> SurfacePoints:
 
 def _first_hits(triangles: np.ndarray, rays: np.ndarray) -> SurfacePoints:
     open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelizm
     corners = open3d.core.Tensor(triangles.reshape(-1, 3).astype(np.float32))
     scene.add_triangles(corners, open3d.core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)))
     hits = scene.cast_rays(open3d.core.Tensor(rays))

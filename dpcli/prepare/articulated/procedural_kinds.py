@@ -28,7 +28,7 @@ Rng = np.random.Generator
 def _leaf(
     b: Builder, rng: Rng, size: tuple[float, float], at: tuple[float, float, float], side: str, opening: float
 ) -> int:
-    """A door leaf of (width, height) in front of ``at`` (its centre), hinged on ``side``: left, right, bottom or top."""
+    """A door leaf of (width, height) in front of ``at`` (its center), hinged on ``side``: left, right, bottom or top."""
     w, h = size
     x, y, z = at
     t = rng.uniform(0.02, 0.05)
@@ -53,7 +53,7 @@ def _handle(rng: Rng, at: np.ndarray, upright: bool) -> np.ndarray:
 
 
 def _drawer(b: Builder, rng: Rng, size: tuple[float, float, float], at: tuple[float, float, float]) -> int:
-    """A drawer of (width, depth, height) whose front stands at ``at``; it slides towards -y."""
+    """A drawer of (width, depth, height) whose front stands at ``at``; it slides toward -y."""
     w, d, h = size
     front = box((w * 0.98, 0.03, h * 0.95), (0, -0.015, 0))
     tray = open_box((w * 0.9, d * 0.9, h * 0.7), 0.012, (0, d * 0.45, 0))
@@ -154,9 +154,9 @@ def laptop(b: Builder, rng: Rng) -> None:
     b.hinge((0, d / 2, t / 2), X, -rng.uniform(110, 180), 0, screen)
 
 
-def _blade(rng: Rng, length: float, width: float, thick: float, towards: int) -> np.ndarray:
+def _blade(rng: Rng, length: float, width: float, thick: float, toward: int) -> np.ndarray:
     back, tip = rng.uniform(0.3, 0.5) * width, rng.uniform(0.7, 1.0)
-    outline = [(0, -back), (length * tip, -back), (length, -back * towards), (length * 0.6, back), (0, back)]
+    outline = [(0, -back), (length * tip, -back), (length, -back * toward), (length * 0.6, back), (0, back)]
     return plate(outline, thick)
 
 
@@ -204,8 +204,15 @@ def lamp(b: Builder, rng: Rng) -> None:
     for _ in range(int(rng.integers(1, 4))):
         length = rng.uniform(0.2, 0.45)
         lean = turned(length * Z[None], X, rng.uniform(-45, 45))[0]
-        on = b.hinge(at, X, -rng.uniform(20, 70), rng.uniform(20, 70), rod(np.zeros(3), lean, rng.uniform(0.01, 0.03)),
-                     ball(0.03), on=on)  # fmt: skip
+        on = b.hinge(
+            at,
+            X,
+            -rng.uniform(20, 70),
+            rng.uniform(20, 70),
+            rod(np.zeros(3), lean, rng.uniform(0.01, 0.03)),
+            ball(0.03),
+            on=on,
+        )
         at = lean
     wide, tall = rng.uniform(0.06, 0.16), rng.uniform(0.1, 0.2)
     shade = lathe([(0, 0), (0.03, 0), (wide, -tall)], axis=np.array([0, -rng.uniform(0, 1.5), 1]))
@@ -302,14 +309,7 @@ def chair(b: Builder, rng: Rng) -> None:
     w, d, h = rng.uniform((0.35, 0.35, 0.3), (0.55, 0.55, 0.7))
     column = b.slide((0, 0, 0.3), Z, 0, rng.uniform(0.1, 0.25), cylinder(0.025, 0.3, (0, 0, -0.05)))
     seat = b.hinge((0, 0, 0.1), Z, -150, 150, box((w, d, 0.06)), on=column)
-    b.hinge(
-        (0, d / 2, 0.03),
-        X,
-        -rng.uniform(20, 40),
-        15,
-        box((w, 0.05, h), (0, 0, h / 2)),
-        on=seat,
-    )
+    b.hinge((0, d / 2, 0.03), X, -rng.uniform(20, 40), 15, box((w, 0.05, h), (0, 0, h / 2)), on=seat)
     if rng.random() < 0.5:
         for x in (-1, 1):
             rest = box((0.06, d * 0.7, 0.03), (0, -d * 0.3, 0))
@@ -402,25 +402,25 @@ def stapler(b: Builder, rng: Rng) -> None:
 
 def assembly(b: Builder, rng: Rng) -> None:
     """Nothing in particular: two to seven random solids joined anyhow in a tree."""
-    centres, sizes = [], []
+    centers, sizes = [], []
     for k in range(int(rng.integers(2, 8))):
         size = rng.uniform(0.08, 0.6, 3)
         solid = _any_solid(rng, size)
         if k == 0:
             b.add(0, solid)
-            centres.append(np.zeros(3))
+            centers.append(np.zeros(3))
             sizes.append(size)
             continue
         on = int(rng.integers(k))
         side, sign = rng.integers(3), rng.choice([-1, 1])
         away = np.where(np.arange(3) == side, sign, rng.uniform(-0.4, 0.4, 3))  # leaves the parent through this side
         outwards, shift = away * sizes[on] / 2, away * size / 2
-        at, axis = centres[on] + outwards, np.eye(3)[rng.integers(3)] if rng.random() < 0.7 else rng.normal(size=3)
+        at, axis = centers[on] + outwards, np.eye(3)[rng.integers(3)] if rng.random() < 0.7 else rng.normal(size=3)
         if rng.random() < 0.65:
             b.hinge(at, axis, -rng.uniform(20, 120), rng.uniform(20, 120), solid + shift, on=on)
         else:
             b.slide(at, axis, 0, rng.uniform(0.1, 0.5), solid + shift, on=on)
-        centres.append(shift)
+        centers.append(shift)
         sizes.append(size)
 
 
@@ -434,16 +434,41 @@ def _any_solid(rng: Rng, size: np.ndarray) -> np.ndarray:
         lambda: open_box((1, 1, 1), 0.05),
         lambda: ring(0.35, 0.15, axis=np.eye(3)[rng.integers(3)]),
         lambda: lathe(list(zip(rng.uniform(0.1, 0.5, 5), np.linspace(-0.5, 0.5, 5)))),
-        lambda: plate([(rng.uniform(0.2, 0.5) * np.cos(a), rng.uniform(0.2, 0.5) * np.sin(a))
-                       for a in np.linspace(0, 2 * np.pi, 7)[:-1]], 1),
-    ]  # fmt: skip
+        lambda: plate(
+            [
+                (rng.uniform(0.2, 0.5) * np.cos(a), rng.uniform(0.2, 0.5) * np.sin(a))
+                for a in np.linspace(0, 2 * np.pi, 7)[:-1]
+            ],
+            1,
+        ),
+    ]
     return unit[rng.integers(len(unit))]() * size
 
 
 KINDS: dict[str, Callable[[Builder, Rng], None]] = {
     function.__name__.strip("_"): function
     for function in (
-        appliance, arm, assembly, bin_, bottle, cabinet, carton, cart, chair, chest, clock, desk, door, fan, glasses,
-        knife, lamp, laptop, scissors, stapler, tap, window,
+        appliance,
+        arm,
+        assembly,
+        bin_,
+        bottle,
+        cabinet,
+        carton,
+        cart,
+        chair,
+        chest,
+        clock,
+        desk,
+        door,
+        fan,
+        glasses,
+        knife,
+        lamp,
+        laptop,
+        scissors,
+        stapler,
+        tap,
+        window,
     )
-}  # fmt: skip
+}

@@ -111,12 +111,16 @@ class Sapien:
         names = self.class_names
         return [
             Item(
-                f"{f.name}_{number:03}" if not problem else f.name, f.path, split=split,
-                label=names.index(f.category) if f.category else -1, extra={"parts": pad}, problem=problem,
+                f"{f.name}_{number:03}" if not problem else f.name,
+                f.path,
+                split=split,
+                label=names.index(f.category) if f.category else -1,
+                extra={"parts": pad},
+                problem=problem,
             )
             for f, split, problem in zip(found, splits, problems)
             for number in range(1 if problem else self.pairs_per_object)
-        ]  # fmt: skip
+        ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         studied = _studied(item.path, self.articulation)

@@ -13,7 +13,7 @@ X, Y, Z = np.eye(3)
 
 
 def box(size: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """A box of edges ``size`` (3) centred at ``at`` (3): triangles f64 (12,3,3)."""
+    """A box of edges ``size`` (3) centered at ``at`` (3): triangles f64 (12,3,3)."""
     corners = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * size + at
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return corners[[t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]]
@@ -35,7 +35,7 @@ def lathe(
 
 
 def cylinder(radius: float, length: float, at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z) -> np.ndarray:
-    """A closed cylinder centred at ``at``."""
+    """A closed cylinder centered at ``at``."""
     half = length / 2
     return lathe([(0, -half), (radius, -half), (radius, half), (0, half)], at, axis)
 
@@ -53,13 +53,13 @@ def ball(radius: float, at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
 
 
 def ring(radius: float, tube: float, at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z) -> np.ndarray:
-    """A torus: wheels' tyres, finger holes, handles."""
+    """A torus: wheels' tires, finger holes, handles."""
     angle = np.linspace(0, 2 * np.pi, 11)
     return lathe(list(zip(radius + tube * np.cos(angle), tube * np.sin(angle), strict=True)), at, axis)
 
 
 def plate(outline: Sequence[tuple[float, float]], thickness: float, at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """An outline (x,y), star-shaped about its mean, extruded along z by ``thickness``, centred in z."""
+    """An outline (x,y), star-shaped about its mean, extruded along z by ``thickness``, centered in z."""
     xy = np.array(outline, np.float64)
     after, middle, half = np.roll(xy, -1, axis=0), xy.mean(0), thickness / 2
 
@@ -68,19 +68,26 @@ def plate(outline: Sequence[tuple[float, float]], thickness: float, at: Sequence
         return np.concatenate([points, np.full((len(xy), 1), z)], axis=1)
 
     low, high, next_low, next_high = lift(xy, -half), lift(xy, half), lift(after, -half), lift(after, half)
-    faces = [(low, next_low, next_high), (low, next_high, high), (low, next_low, lift(middle, -half)),
-             (high, next_high, lift(middle, half))]  # fmt: skip
+    faces = [
+        (low, next_low, next_high),
+        (low, next_high, high),
+        (low, next_low, lift(middle, -half)),
+        (high, next_high, lift(middle, half)),
+    ]
     return np.concatenate([np.stack(face, axis=1) for face in faces]) + at
 
 
 def open_box(size: Sequence[float], wall: float, at: Sequence[float] = (0, 0, 0), without: str = "top") -> np.ndarray:
-    """A box of five thin walls; ``without``: the side left open, one of top, front (towards -y)."""
+    """A box of five thin walls; ``without``: the side left open, one of top, front (toward -y)."""
     w, d, h = size
     sides = {
-        "top": box((w, d, wall), (0, 0, h / 2)), "bottom": box((w, d, wall), (0, 0, -h / 2)),
-        "front": box((w, wall, h), (0, -d / 2, 0)), "back": box((w, wall, h), (0, d / 2, 0)),
-        "left": box((wall, d, h), (-w / 2, 0, 0)), "right": box((wall, d, h), (w / 2, 0, 0)),
-    }  # fmt: skip
+        "top": box((w, d, wall), (0, 0, h / 2)),
+        "bottom": box((w, d, wall), (0, 0, -h / 2)),
+        "front": box((w, wall, h), (0, -d / 2, 0)),
+        "back": box((w, wall, h), (0, d / 2, 0)),
+        "left": box((wall, d, h), (-w / 2, 0, 0)),
+        "right": box((wall, d, h), (w / 2, 0, 0)),
+    }
     return np.concatenate([side for name, side in sides.items() if name != without]) + at
 
 

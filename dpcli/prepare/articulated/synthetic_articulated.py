@@ -74,12 +74,15 @@ class SyntheticArticulated:
         extra = {"parts": min(self.articulation.max_parts, 1 + joints)}
         return [
             Item(
-                f"{kind}_{number:05}_{k:03}", Path(kind), split=split, label=names.index(kind),
+                f"{kind}_{number:05}_{k:03}",
+                Path(kind),
+                split=split,
+                label=names.index(kind),
                 extra={**extra, "object": number},
             )
             for number, (kind, split) in enumerate(zip(kinds, splits))
             for k in range(self.sequences_per_object)
-        ]  # fmt: skip
+        ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         studied = _studied(self.seed, item.extra["object"], tuple(self.class_names), self.articulation)

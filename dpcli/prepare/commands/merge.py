@@ -56,10 +56,19 @@ def read_source(path: Path) -> Source:
         root = reader.attributes
         found = shard_of(reader.provenance[-1]) if reader.provenance else None
         return Source(
-            path, reader.class_names, reader.length_unit, int(root.get("seed", 0)), str(root.get("source", "")),
-            list(reader.names), reader.labels.tolist(), reader.fields, reader.provenance, reader.skipped,
-            read_positions(reader.file), found[0] if found else None,
-        )  # fmt: skip
+            path,
+            reader.class_names,
+            reader.length_unit,
+            int(root.get("seed", 0)),
+            str(root.get("source", "")),
+            list(reader.names),
+            reader.labels.tolist(),
+            reader.fields,
+            reader.provenance,
+            reader.skipped,
+            read_positions(reader.file),
+            found[0] if found else None,
+        )
 
 
 class OpenFiles:
@@ -83,9 +92,15 @@ class OpenFiles:
 
 
 def merge(
-    inputs: Sequence[Path], output: Path, *, labels: LabelMap | None = None, prefix: bool = False,
-    compression: str = "none", force: bool = False, resume: bool = True,
-) -> Report:  # fmt: skip
+    inputs: Sequence[Path],
+    output: Path,
+    *,
+    labels: LabelMap | None = None,
+    prefix: bool = False,
+    compression: str = "none",
+    force: bool = False,
+    resume: bool = True,
+) -> Report:
     """Join clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
 
     All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
@@ -186,9 +201,13 @@ def _merge_unlike(
                 skipped.append((source.sample_name(index), why))
             else:
                 chosen.append((source, index, table[label] if label >= 0 else -1))
-    config = {"merge": [source.path.name for source in sources], "labels": labels.config,
-              "prefix": any(source.prefix for source in sources),
-              "compression": compression, "sources": [source.provenance for source in sources]}  # fmt: skip
+    config = {
+        "merge": [source.path.name for source in sources],
+        "labels": labels.config,
+        "prefix": any(source.prefix for source in sources),
+        "compression": compression,
+        "sources": [source.provenance for source in sources],
+    }
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
     pattern = Source(output, class_names, sources[0].length_unit, 0, "merge", [], [], fields, [], [], None)
     return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
@@ -208,9 +227,16 @@ def _refuse_equal_names(sources: list[Source]) -> None:
 
 
 def _write(
-    output: Path, entry: dict[str, Any], pattern: Source, samples: list[tuple[Source, int, int | None]],
-    skipped: list[tuple[str, str]], *, compression: str, force: bool, resume: bool,
-) -> Report:  # fmt: skip
+    output: Path,
+    entry: dict[str, Any],
+    pattern: Source,
+    samples: list[tuple[Source, int, int | None]],
+    skipped: list[tuple[str, str]],
+    *,
+    compression: str,
+    force: bool,
+    resume: bool,
+) -> Report:
     """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
     report = Report(skipped=skipped)
     if not force and already_complete(output, entry):
@@ -220,14 +246,26 @@ def _write(
         return count_samples(report, output)
     files = OpenFiles()
     try:
-        with stop_requested() as stop, CloudsWriter(
-            output, class_names=pattern.class_names, length_unit=pattern.length_unit, source=pattern.made_by,
-            seed=pattern.seed, fields=pattern.fields, compression=compression, provenance=entry, force=force, resume=resume,
-        ) as writer, Progress("prepare merge", total=len(samples), unit="video") as bar:  # fmt: skip
+        with (
+            stop_requested() as stop,
+            CloudsWriter(
+                output,
+                class_names=pattern.class_names,
+                length_unit=pattern.length_unit,
+                source=pattern.made_by,
+                seed=pattern.seed,
+                fields=pattern.fields,
+                compression=compression,
+                provenance=entry,
+                force=force,
+                resume=resume,
+            ) as writer,
+            Progress("prepare merge", total=len(samples), unit="video") as bar,
+        ):
             done = copied_before(writer, [source.sample_name(index) for source, index, _ in samples])
             bar.skip(done)
             for source, index, label in samples[done:]:
-                sequence = _relabelled(files.read(source.path, index), source, pattern, label)
+                sequence = _relabeled(files.read(source.path, index), source, pattern, label)
                 writer.write(sequence)
                 bar.advance(1, frames=sequence.num_frames)
                 stop.check(f"{len(writer)} of {len(samples)} samples are kept")
@@ -242,14 +280,16 @@ def copied_before(writer: CloudsWriter, names: list[str]) -> int:
     done = len(writer.written_names)
     if writer.written_names != names[:done]:
         writer.keep = True
-        raise UsageError(f"{writer.path}: a stopped run left {done} other samples for it; go on with that run, write to "
-                         "another file, or --force to start over")  # fmt: skip
+        raise UsageError(
+            f"{writer.path}: a stopped run left {done} other samples for it; go on with that run, write to "
+            "another file, or --force to start over"
+        )
     if done:
         log.info(f"continuing: {done} of {len(names)} were copied before")
     return done
 
 
-def _relabelled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
+def _relabeled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
     """The sample as the joined file has it: its label, its name, and no field that others lack."""
     if label is not None:
         sequence.label = label

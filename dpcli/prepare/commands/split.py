@@ -161,9 +161,15 @@ def _file_name(split_name: str) -> str:
 
 
 def _copy(
-    reader: CloudsReader, source: Source, splits: list[str], output: Path, wanted: list[str], entry: dict, compression: str,
+    reader: CloudsReader,
+    source: Source,
+    splits: list[str],
+    output: Path,
+    wanted: list[str],
+    entry: dict,
+    compression: str,
     force: bool,
-) -> None:  # fmt: skip
+) -> None:
     check_output(output, "-o", [source.path])
     history = [*source.provenance, entry]
     if not force and already_complete(output, entry):
@@ -171,10 +177,22 @@ def _copy(
         log.info(f"{output}: already complete (--force makes it again)")
         return
     chosen = [index for index, name in enumerate(splits) if name in wanted]
-    with stop_requested() as stop, CloudsWriter(
-        output, class_names=source.class_names, length_unit=source.length_unit, source=source.made_by, seed=source.seed,
-        fields=source.fields, compression=compression, provenance=history, force=force, resume=True,
-    ) as writer, Progress(f"prepare split {output.stem}", total=len(chosen), unit="video") as bar:  # fmt: skip
+    with (
+        stop_requested() as stop,
+        CloudsWriter(
+            output,
+            class_names=source.class_names,
+            length_unit=source.length_unit,
+            source=source.made_by,
+            seed=source.seed,
+            fields=source.fields,
+            compression=compression,
+            provenance=history,
+            force=force,
+            resume=True,
+        ) as writer,
+        Progress(f"prepare split {output.stem}", total=len(chosen), unit="video") as bar,
+    ):
         done = copied_before(writer, [reader.names[index] for index in chosen])
         bar.skip(done)
         for index in chosen[done:]:

@@ -27,9 +27,15 @@ class Cloud:
 def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
     """One cloud; DataError says what is wrong. ``bin_columns``: float32 values per point of a ``.bin``."""
     readers = {
-        ".ply": _read_open3d, ".pcd": _read_open3d, ".npy": _read_npy, ".npz": _read_npz, ".las": _read_las,
-        ".csv": _read_text, ".xyz": _read_text, ".txt": _read_text,
-    }  # fmt: skip
+        ".ply": _read_open3d,
+        ".pcd": _read_open3d,
+        ".npy": _read_npy,
+        ".npz": _read_npz,
+        ".las": _read_las,
+        ".csv": _read_text,
+        ".xyz": _read_text,
+        ".txt": _read_text,
+    }
     suffix = path.suffix.lower()
     if path.stat().st_size == 0:
         raise DataError(f"{path}: the file is empty")
@@ -64,9 +70,23 @@ def _declared_points(path: Path) -> int:
 
 
 _PLY_BYTES = {
-    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2, "int": 4, "uint": 4,
-    "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8,
-}  # fmt: skip
+    "char": 1,
+    "uchar": 1,
+    "int8": 1,
+    "uint8": 1,
+    "short": 2,
+    "ushort": 2,
+    "int16": 2,
+    "uint16": 2,
+    "int": 4,
+    "uint": 4,
+    "int32": 4,
+    "uint32": 4,
+    "float": 4,
+    "float32": 4,
+    "double": 8,
+    "float64": 8,
+}
 
 
 def _check_ply_is_whole(path: Path, declared: int) -> None:
@@ -109,7 +129,7 @@ def _read_npz(path: Path) -> Cloud:
     color = next((arrays[k] for k in _COLOR_KEYS if k in arrays), None)
     points = _xyz(path, arrays[key])
     if color is not None and (color.shape != points.shape or color.dtype != np.uint8):
-        raise DataError(f"{path}: colours {color.dtype} {color.shape}; expected uint8 {points.shape}")
+        raise DataError(f"{path}: colors {color.dtype} {color.shape}; expected uint8 {points.shape}")
     return Cloud(points, color)
 
 
@@ -132,7 +152,7 @@ def _read_las(path: Path) -> Cloud:
     if len(las.points) != las.header.point_count:
         raise DataError(f"{path}: truncated: its header says {las.header.point_count} points, found {len(las.points)}")
     names = set(las.point_format.dimension_names)
-    # LAS colours have 16 bits
+    # LAS colors have 16 bits
     color = np.stack([las[c] for c in _RGB[0]], axis=1) >> 8 if set(_RGB[0]) <= names else None
     return Cloud(np.asarray(las.xyz, np.float64), None if color is None else color.astype(np.uint8))
 
@@ -157,7 +177,7 @@ def _read_text(path: Path) -> Cloud:
     rgb = next((names for names in _RGB if set(names) <= set(words)), None)
     color = table[:, [words.index(n) for n in rgb]] if rgb else None
     if color is not None and not ((color >= 0) & (color <= 255)).all():
-        raise DataError(f"{path}: colours from {color.min():g} to {color.max():g}; expected 0 to 255")
+        raise DataError(f"{path}: colors from {color.min():g} to {color.max():g}; expected 0 to 255")
     return Cloud(table[:, [words.index(n) for n in "xyz"]], None if color is None else color.astype(np.uint8))
 
 

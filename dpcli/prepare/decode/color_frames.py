@@ -1,4 +1,4 @@
-"""Colour frames of a clip, decoded one at a time: a folder of images in any peer's naming, a video file or a GIF."""
+"""Color frames of a clip, decoded one at a time: a folder of images in any peer's naming, a video file or a GIF."""
 
 from __future__ import annotations
 
@@ -179,7 +179,9 @@ def _open_video(path: Path) -> Frames:
             f"{path}: only {count} of its {declared} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
-    return Frames(path, _numbered(count), tuple(range(count)), (path,), None if times is None else tuple(times.tolist()))
+    return Frames(
+        path, _numbered(count), tuple(range(count)), (path,), None if times is None else tuple(times.tolist())
+    )
 
 
 def _frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
@@ -215,7 +217,7 @@ def _video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
             if not ok:
                 raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
             if frame.dtype != np.uint8 or frame.ndim != 3:
-                raise DataError(f"{path}: frame {index} is {frame.dtype} {frame.shape}; expected 8-bit colour")
+                raise DataError(f"{path}: frame {index} is {frame.dtype} {frame.shape}; expected 8-bit color")
             yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGBA)
     finally:
         capture.release()

@@ -16,7 +16,10 @@ from dpcli.prepare.reader import natural_key
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm")
-_GRAY_NOISE, _COLOURED_SHARE = 24, 0.02  # levels between channels, and share of pixels beyond: a colour map has most of them
+_GRAY_NOISE, _COLORED_SHARE = (
+    24,
+    0.02,
+)  # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 
 
@@ -34,7 +37,7 @@ def load_cv2():  # -> module
     import cv2
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    cv2.setNumThreads(1)  # one process per core is the parallelism
+    cv2.setNumThreads(1)  # one process per core is the parallelizm
     return cv2
 
 
@@ -89,20 +92,22 @@ def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> 
             ok, frame = capture.retrieve()
             if not ok:
                 raise DataError(f"{path}: frame {index} cannot be decoded")
-            if frame.ndim == 3 and _coloured(frame):
-                raise DataError(f"{path}: frame {index} is coloured; expected a depth video whose gray is the depth, not a picture of it")
+            if frame.ndim == 3 and _colored(frame):
+                raise DataError(
+                    f"{path}: frame {index} is colored; expected a depth video whose gray is the depth, not a picture of it"
+                )
             yield np.ascontiguousarray(frame[..., 0]) if frame.ndim == 3 else frame  # strided, all after is slower
         index += 1
 
 
-def _coloured(frame: np.ndarray) -> bool:
-    """Whether a decoded frame (H,W,3) u8 has colours, beyond what lossy codecs make of gray; looks at some of its pixels."""
+def _colored(frame: np.ndarray) -> bool:
+    """Whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of its pixels."""
     some = frame[::8, ::8].astype(np.int16)
-    return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLOURED_SHARE)
+    return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLORED_SHARE)
 
 
 def read_image(path: Path) -> np.ndarray:
-    """One gray depth image (H,W) u8, u16 or f32; DataError when unreadable or coloured."""
+    """One gray depth image (H,W) u8, u16 or f32; DataError when unreadable or colored."""
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is not None:
@@ -112,11 +117,13 @@ def read_image(path: Path) -> np.ndarray:
     if not pages:
         raise DataError(f"{path}: not a readable image (empty, truncated, or not an image)")
     if len(pages) > 1:  # which of them is the frame?
-        raise DataError(f"{path}: holds {len(pages)} pages; expected one depth image a file: save each page as its own file")
+        raise DataError(
+            f"{path}: holds {len(pages)} pages; expected one depth image a file: save each page as its own file"
+        )
     image = pages[0]
     if image.ndim == 3:
         if image.shape[2] != 3 or (image != image[..., :1]).any():
-            raise DataError(f"{path}: a colour image of shape {image.shape}; expected one gray channel of depth")
+            raise DataError(f"{path}: a color image of shape {image.shape}; expected one gray channel of depth")
         image = image[..., 0]
     return image
 

@@ -15,7 +15,7 @@ from dpcli.prepare.decode.depth_files import load_cv2
 from dpcli.prepare.decode.gray_png import decode_gray_png
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_COLOUR = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with alpha"}
+_COLOR = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with alpha"}
 
 
 def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple[int, ...] = (16,)) -> np.ndarray:
@@ -24,12 +24,12 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
     Everything is checked before libpng sees it, because it fills in what a damaged file lacks, or complains on
     stderr without a name. DataError says what was found at ``where``.
     """
-    width, height, depth, colour = _header(data, where)
+    width, height, depth, color = _header(data, where)
     if (width, height) != size:
         raise DataError(f"{where}: {width}x{height} pixels; expected {size[0]}x{size[1]}")
-    if colour != 0 or depth not in bits:
+    if color != 0 or depth not in bits:
         allowed = " or ".join(str(b) for b in bits)
-        raise DataError(f"{where}: {depth}-bit {_COLOUR.get(colour, 'unknown')} PNG; expected {allowed}-bit gray depth")
+        raise DataError(f"{where}: {depth}-bit {_COLOR.get(color, 'unknown')} PNG; expected {allowed}-bit gray depth")
     image = decode_gray_png(data)
     if image is None:
         _check_chunks(data, where)
@@ -41,7 +41,7 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
 
 
 def _header(data: bytes, where: str) -> tuple[int, int, int, int]:
-    """Width, height, bits and colour type."""
+    """Width, height, bits and color type."""
     if not data:
         raise DataError(f"{where}: the file is empty; expected a PNG")
     if not data.startswith(_SIGNATURE) or data[12:16] != b"IHDR" or len(data) < 33:

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-_SIGNATURE_AND_HEADER = struct.Struct(">8s 4x 4s II B B 3x I")  # type, width, height, bits, colour, checksum
+_SIGNATURE_AND_HEADER = struct.Struct(">8s 4x 4s II B B 3x I")  # type, width, height, bits, color, checksum
 _START, _END = (b"\x89PNG\r\n\x1a\n", b"IHDR"), b"\0\0\0\0IEND\xaeB`\x82"
 _MOST_DEFLATED = 1032  # bytes that one byte of a deflate stream can stand for
 
@@ -30,9 +30,9 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
     kornia-rs): OpenCV decodes that, or the caller says what is wrong with it."""
     if len(data) < _SIGNATURE_AND_HEADER.size or not data.endswith(_END):
         return None
-    *start, width, height, bits, colour, checksum = _SIGNATURE_AND_HEADER.unpack_from(data)
+    *start, width, height, bits, color, checksum = _SIGNATURE_AND_HEADER.unpack_from(data)
     decode = _decoders().get(bits)
-    if tuple(start) != _START or colour != 0 or decode is None:
+    if tuple(start) != _START or color != 0 or decode is None:
         return None
     # memory is taken before anything is decoded: a size that can't be true would ask for gigabytes
     if checksum != zlib.crc32(data[12:29]) or width * height * bits // 8 > _MOST_DEFLATED * len(data):

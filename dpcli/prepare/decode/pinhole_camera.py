@@ -16,7 +16,7 @@ from dpcli.errors import DataError, UsageError
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Focal lengths and principal point, in pixels; pixel (0, 0) is the centre of the top-left one."""
+    """Focal lengths and principal point, in pixels; pixel (0, 0) is the center of the top-left one."""
 
     fx: float
     fy: float
@@ -29,7 +29,7 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
-        """Square pixels, centre in the middle; ``degrees`` is the HORIZONTAL field of view."""
+        """Square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view."""
         if not 0 < degrees < 180:
             raise UsageError(f"a field of view lies between 0 and 180 degrees, found {degrees:g}")
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
@@ -73,9 +73,14 @@ def _complex_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray
 
 
 def back_project(
-    depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf,
+    depth: np.ndarray,
+    intrinsics: Intrinsics,
+    *,
+    unit: float = 1.0,
+    near: float = 0.0,
+    far: float = np.inf,
     choose: Callable[[int], np.ndarray | slice] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in near..far.
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
@@ -113,7 +118,7 @@ def _seen(
 
 
 def _lengths(frame: np.ndarray, pixels: np.ndarray, unit: np.float32) -> np.ndarray:
-    # float64 would double the traffic for nothing: raw depths are integers below 2**24 or metres
+    # float64 would double the traffic for nothing: raw depths are integers below 2**24 or meters
     z = frame.take(pixels).astype(np.float32)
     if unit != 1:
         z *= unit

@@ -14,10 +14,13 @@ import numpy as np
 from dpcli.errors import DataError
 
 # what pickling an array of numbers, or an object array of plain containers of such arrays, refers to; both spellings
-_ALLOWED = {
-    (f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")
-} | {("numpy", "ndarray"), ("numpy", "dtype"), ("numpy._core.numeric", "_frombuffer"),
-     ("numpy.core.numeric", "_frombuffer"), ("_codecs", "encode")}  # fmt: skip
+_ALLOWED = {(f"numpy.{core}.multiarray", name) for core in ("core", "_core") for name in ("_reconstruct", "scalar")} | {
+    ("numpy", "ndarray"),
+    ("numpy", "dtype"),
+    ("numpy._core.numeric", "_frombuffer"),
+    ("numpy.core.numeric", "_frombuffer"),
+    ("_codecs", "encode"),
+}
 _MOST_BYTES = 1 << 28
 
 

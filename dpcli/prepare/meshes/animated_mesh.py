@@ -76,21 +76,21 @@ class AnimatedMesh:
 
 
 def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, float]:
-    """A small ball that holds points (N,3): centre f64 (3) and radius.
+    """A small ball that holds points (N,3): center f64 (3) and radius.
 
-    Badoiu and Clarkson (2003): step i moves the centre by 1/(i+1) towards the farthest point; within 1/sqrt(steps)
+    Badoiu and Clarkson (2003): step i moves the center by 1/(i+1) toward the farthest point; within 1/sqrt(steps)
     of the smallest ball. Started at the middle of the box, it ends far closer than that.
     """
     points = np.asarray(points, np.float64)
     outer = _extreme(points)
-    centre = (outer.min(0) + outer.max(0)) / 2
+    center = (outer.min(0) + outer.max(0)) / 2
     for step in range(steps):
-        farthest = outer[((outer - centre) ** 2).sum(1).argmax()]
-        centre = centre + (farthest - centre) / (step + 5)
-    return centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
+        farthest = outer[((outer - center) ** 2).sum(1).argmax()]
+        center = center + (farthest - center) / (step + 5)
+    return center, float(np.sqrt(((points - center) ** 2).sum(1).max()))
 
 
-def normalised(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool = True) -> AnimatedMesh:
+def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool = True) -> AnimatedMesh:
     """The mesh in a ball of this radius around the origin, over all frames together.
 
     yaw: radians about the upright, y. travel=False: takes out the level (x, z) motion of the middle, as on a treadmill.
@@ -99,11 +99,11 @@ def normalised(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool
         middle = mesh.positions.mean(axis=1, dtype=np.float64) * [1, 0, 1]
         mesh = mesh.moved(np.eye(3), middle[0] - middle, 1.0)
     corners = np.unique(mesh.triangles)
-    centre, size = bounding_sphere(mesh.positions[:, corners].reshape(-1, 3))
+    center, size = bounding_sphere(mesh.positions[:, corners].reshape(-1, 3))
     cosine, sine = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     scale = radius / max(size, 1e-12)
-    return mesh.moved(rotation, -scale * rotation @ centre, scale)
+    return mesh.moved(rotation, -scale * rotation @ center, scale)
 
 
 def _extreme(points: np.ndarray, directions: int = 512) -> np.ndarray:

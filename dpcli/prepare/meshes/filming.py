@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
-from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalised
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
 from dpcli.prepare.meshes.bone_parts import carry, choose_points, heaviest_bones, rigid_parts
 from dpcli.prepare.meshes.raycast import FrameCaster
 from dpcli.prepare.views.views_pipeline import Clip
@@ -74,7 +74,7 @@ class Filming:
 
 
 def film(mesh: AnimatedMesh, filming: Filming, jobs: int = 1) -> Clip:
-    """A Clip of the mesh, normalised to a ball of radius 0.75 at the origin; its pictures are drawn as they are asked for.
+    """A Clip of the mesh, normalized to a ball of radius 0.75 at the origin; its pictures are drawn as they are asked for.
 
     The pictures don't depend on jobs. DataError when the mesh has no extent; a warning when it doesn't move.
     """
@@ -84,7 +84,7 @@ def film(mesh: AnimatedMesh, filming: Filming, jobs: int = 1) -> Clip:
     corners = mesh.positions[:, np.unique(mesh.triangles)]
     if not np.ptp(corners.reshape(-1, 3), axis=0).any():
         raise DataError(f"{mesh.name}: all vertices are one point; expected a mesh with an extent")
-    mesh = normalised(mesh, OBJECT_RADIUS, np.radians(filming.yaw), filming.travel)
+    mesh = normalized(mesh, OBJECT_RADIUS, np.radians(filming.yaw), filming.travel)
     if np.ptp(mesh.positions, axis=0).max() < _STILL * OBJECT_RADIUS:
         log.warn(f"{mesh.name}: nothing moves in this clip")
     track, part = ground_truth(mesh, filming)

@@ -23,7 +23,13 @@ COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 51
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MOST = 1 << 27  # entries: a damaged count must not fill the memory
-_UNDERSTOOD = ("KHR_materials_", "KHR_texture_transform", "KHR_mesh_quantization", "KHR_lights_punctual", "EXT_texture_webp")  # fmt: skip
+_UNDERSTOOD = (
+    "KHR_materials_",
+    "KHR_texture_transform",
+    "KHR_mesh_quantization",
+    "KHR_lights_punctual",
+    "EXT_texture_webp",
+)
 
 
 @dataclass
@@ -58,7 +64,7 @@ class Gltf:
         return entries[index]
 
     def accessor(self, index: Any, what: str, width: int | None = None, finite: bool = True) -> np.ndarray:
-        """Numbers of an accessor: (count,) or (count, components), normalised integers as float32 in -1..1.
+        """Numbers of an accessor: (count,) or (count, components), normalized integers as float32 in -1..1.
 
         what: named in errors. width: components expected, such as 3. finite: refuse NaN and infinite floats.
         """
@@ -195,8 +201,10 @@ def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """JSON and binary chunk of a .glb (section 4)."""
     version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
     if version != 2 or length > len(data):
-        raise DataError(f"{path}: a .glb of version {version} and {length} bytes, of which {len(data)} are left; "
-                        "truncated, or not glTF 2: copy or export it again")  # fmt: skip
+        raise DataError(
+            f"{path}: a .glb of version {version} and {length} bytes, of which {len(data)} are left; "
+            "truncated, or not glTF 2: copy or export it again"
+        )
     chunks, start = {}, 12
     while start + 8 <= length:
         size, kind = struct.unpack_from("<II", data, start)

@@ -1,4 +1,4 @@
-"""Materials of a glTF file: base colour, its texture and transparency; reflections are left out."""
+"""Materials of a glTF file: base color, its texture and transparency; reflections are left out."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def read_material(file: Gltf, index: int, header_only: bool = False) -> Any:
     extensions = entry.get("extensions", {})
     metal = entry.get("pbrMetallicRoughness", {})
     color, texture = metal.get("baseColorFactor"), metal.get("baseColorTexture")
-    if "KHR_materials_pbrSpecularGlossiness" in extensions:  # older exports keep their colours there
+    if "KHR_materials_pbrSpecularGlossiness" in extensions:  # older exports keep their colors there
         old = extensions["KHR_materials_pbrSpecularGlossiness"]
         color, texture = old.get("diffuseFactor", color), old.get("diffuseTexture", texture)
     change = (texture or {}).get("extensions", {}).get("KHR_texture_transform", {})
@@ -39,7 +39,7 @@ def read_material(file: Gltf, index: int, header_only: bool = False) -> Any:
         factor = tuple(float(np.clip(value, 0, 1)) for value in (color or (1, 1, 1, 1)))
         assert len(factor) == 4 and np.isfinite(factor).all()
     except (TypeError, ValueError, AssertionError):
-        raise file.fail(f"material {index}: its colour is not four numbers; export the file again") from None
+        raise file.fail(f"material {index}: its color is not four numbers; export the file again") from None
     blend = str(entry.get("alphaMode", "OPAQUE")).lower()
     material = Material(factor, None, blend, float(entry.get("alphaCutoff", 0.5)), "KHR_materials_unlit" in extensions)
     return replace(material, texture=_texture(file, texture["index"], change)) if texture else material

@@ -139,13 +139,19 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
     bones, weights, inverse_bind = _binding(file, node, attributes, positions, skins, where)
     targets = entry.get("targets") or None
     return _Piece(
-        node, positions,
+        node,
+        positions,
         read("NORMAL", 3, vertex_normals(positions, triangles)),
-        triangles, read(f"TEXCOORD_{uv_set}", 2, np.zeros((count, 2), np.float32)), color,
-        bones, weights, inverse_bind, material,
+        triangles,
+        read(f"TEXCOORD_{uv_set}", 2, np.zeros((count, 2), np.float32)),
+        color,
+        bones,
+        weights,
+        inverse_bind,
+        material,
         targets and _deltas(file, targets, "POSITION", count, where),
         targets and _deltas(file, targets, "NORMAL", count, where),
-    )  # fmt: skip
+    )
 
 
 def _floats(file: Gltf, attributes: dict, key: str, where: str, width: int | None, finite: bool = True) -> np.ndarray:
@@ -203,7 +209,7 @@ def _binding(
 def _repaired(
     file: Gltf, local: np.ndarray, weights: np.ndarray, positions: np.ndarray, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joints and weights (V,J), weights normalised, joints of no weight 0.
+    """Joints and weights (V,J), weights normalized, joints of no weight 0.
 
     Exporters leave a few vertices without weights, or with 0/0 = NaN: they follow the nearest vertex that has some.
     """
@@ -214,7 +220,7 @@ def _repaired(
     if lost.any():
         from scipy.spatial import cKDTree
 
-        log.warn(f"{file.path}: {where}: {lost.sum()} vertices without finite weights follow their nearest neighbours")
+        log.warn(f"{file.path}: {where}: {lost.sum()} vertices without finite weights follow their nearest neighbors")
         near = np.flatnonzero(~lost)[cKDTree(positions[~lost]).query(positions[lost])[1]]
         local, weights = local.copy(), weights.copy()
         local[lost], weights[lost] = local[near], weights[near]

@@ -66,10 +66,7 @@ def read_clip(file: Gltf, index: int) -> Clip:
     if not curves:
         raise file.fail(f"clip {name!r} moves nothing; choose another with --clip (see --list)")
     return Clip(
-        name,
-        float(min(c.times[0] for c in curves.values())),
-        float(max(c.times[-1] for c in curves.values())),
-        curves,
+        name, float(min(c.times[0] for c in curves.values())), float(max(c.times[-1] for c in curves.values())), curves
     )
 
 

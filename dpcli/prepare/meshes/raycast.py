@@ -1,4 +1,4 @@
-"""Pictures of a mesh by ray casting: textures, vertex colours, soft light that stays with the world, straight alpha."""
+"""Pictures of a mesh by ray casting: textures, vertex colors, soft light that stays with the world, straight alpha."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUDGE = 1e-4  # a ray goes on this far behind a transparent surface
 class FrameCaster:
     """One frame of an AnimatedMesh, ready to be looked at from any camera.
 
-    shading: 0 shows plain colours, 1 full light and shade. All surfaces are seen from both sides.
+    shading: 0 shows plain colors, 1 full light and shade. All surfaces are seen from both sides.
     """
 
     def __init__(self, mesh: AnimatedMesh, frame: int, shading: float = 0.5) -> None:
@@ -27,7 +27,7 @@ class FrameCaster:
         self.positions, self.normals = mesh.positions[frame], mesh.normals[frame]
         open3d = load_open3d()
         self._tensor = open3d.core.Tensor
-        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelizm
         self._scene.add_triangles(
             self._tensor(np.ascontiguousarray(self.positions, np.float32)),
             self._tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
@@ -40,7 +40,7 @@ class FrameCaster:
         size: tuple[int, int],  # width, height
         samples: int = 2,
     ) -> np.ndarray:
-        """RGBA u8 (H,W,4), straight alpha, sRGB; samples x samples rays per pixel, colours averaged as they are shown
+        """RGBA u8 (H,W,4), straight alpha, sRGB; samples x samples rays per pixel, colors averaged as they are shown
         (splats are blended in sRGB, too). What is empty is 0 0 0 0."""
         width, height = size
         image = np.zeros((height, width, 4), np.uint8)
@@ -116,7 +116,7 @@ class FrameCaster:
 
 
 def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: slice, samples: int) -> np.ndarray:
-    """Rays f32 (rows, samples, columns, samples, 6): origin and unit direction, pixel centres at +0.5."""
+    """Rays f32 (rows, samples, columns, samples, 6): origin and unit direction, pixel centers at +0.5."""
     y = np.arange(rows.start * samples, rows.stop * samples).reshape(-1, samples)
     x = np.arange(columns.start * samples, columns.stop * samples).reshape(-1, samples)
     y, x = (y + 0.5) / samples, (x + 0.5) / samples
@@ -131,7 +131,7 @@ def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: s
 def surface_color(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Linear RGBA f32 (N,4), unlit, of points by the vertices i64 (N,3) around them and their weights (N,3).
 
-    Base colour factor x vertex colour x texture; alpha is 1 where the material is opaque, 0 or 1 where it is masked.
+    Base color factor x vertex color x texture; alpha is 1 where the material is opaque, 0 or 1 where it is masked.
     """
     color = np.array([m.color for m in mesh.materials], np.float32)[material]
     if mesh.color.min() < 1:

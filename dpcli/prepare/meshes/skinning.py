@@ -23,17 +23,17 @@ class Curve:
         time = np.clip(np.asarray(time, np.float64), self.times[0], self.times[-1])
         if len(self.times) == 1:
             found = np.repeat(self.values[:, 1] if cubic else self.values, len(time), axis=0)
-            return normalise(found) if self.rotation else found
+            return normalize(found) if self.rotation else found
         k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
         step = self.times[k + 1] - self.times[k]
         s = ((time - self.times[k]) / step)[:, None]
         if cubic:
             found = _hermite(self.values[k], self.values[k + 1], step[:, None], s)
-            return normalise(found) if self.rotation else found
+            return normalize(found) if self.rotation else found
         first, last = self.values[k], self.values[k + 1]
         if self.interpolation == "STEP":
             found = np.where(s < 1, first, last)
-            return normalise(found) if self.rotation else found
+            return normalize(found) if self.rotation else found
         return slerp(first, last, s) if self.rotation else first + s * (last - first)
 
 
@@ -42,12 +42,14 @@ def _hermite(first: np.ndarray, last: np.ndarray, step: np.ndarray, s: np.ndarra
     s2, s3 = s * s, s * s * s
     leaving, arriving = step * first[:, 2], step * last[:, 0]
     return (
-        (2 * s3 - 3 * s2 + 1) * first[:, 1] + (s3 - 2 * s2 + s) * leaving
-        + (3 * s2 - 2 * s3) * last[:, 1] + (s3 - s2) * arriving
-    )  # fmt: skip
+        (2 * s3 - 3 * s2 + 1) * first[:, 1]
+        + (s3 - 2 * s2 + s) * leaving
+        + (3 * s2 - 2 * s3) * last[:, 1]
+        + (s3 - s2) * arriving
+    )
 
 
-def normalise(quaternions: np.ndarray) -> np.ndarray:
+def normalize(quaternions: np.ndarray) -> np.ndarray:
     """Unit quaternions; a zero one becomes zero rotation (x y z w)."""
     length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     return np.where(length > 1e-12, quaternions / np.maximum(length, 1e-12), [0.0, 0.0, 0.0, 1.0])
@@ -55,7 +57,7 @@ def normalise(quaternions: np.ndarray) -> np.ndarray:
 
 def slerp(first: np.ndarray, last: np.ndarray, s: np.ndarray) -> np.ndarray:
     """Spherical interpolation of quaternions (...,4) the short way round, at s (...,1) in 0..1."""
-    first, last = normalise(first), normalise(last)
+    first, last = normalize(first), normalize(last)
     cosine = (first * last).sum(-1, keepdims=True)
     last, cosine = np.where(cosine < 0, -last, last), np.abs(cosine)
     angle = np.arccos(np.minimum(cosine, 1))
@@ -64,17 +66,26 @@ def slerp(first: np.ndarray, last: np.ndarray, s: np.ndarray) -> np.ndarray:
     safe = np.where(near, 1, sine)
     a = np.where(near, 1 - s, np.sin((1 - s) * angle) / safe)
     b = np.where(near, s, np.sin(s * angle) / safe)
-    return normalise(a * first + b * last)
+    return normalize(a * first + b * last)
 
 
 def matrices(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Transforms f64 (T,4,4) = translation (T,3) x rotation (T,4, x y z w) x scale (T,3)."""
-    x, y, z, w = np.moveaxis(normalise(rotation), -1, 0)
-    turned = np.stack([
-        1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-        2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-        2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
-    ], axis=-1).reshape(-1, 3, 3)  # fmt: skip
+    x, y, z, w = np.moveaxis(normalize(rotation), -1, 0)
+    turned = np.stack(
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - z * w),
+            2 * (x * z + y * w),
+            2 * (x * y + z * w),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - x * w),
+            2 * (x * z - y * w),
+            2 * (y * z + x * w),
+            1 - 2 * (x * x + y * y),
+        ],
+        axis=-1,
+    ).reshape(-1, 3, 3)
     result = np.tile(np.eye(4), (len(turned), 1, 1))
     result[:, :3, :3], result[:, :3, 3] = turned * scale[:, None, :], translation
     return result

@@ -17,7 +17,7 @@ from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
 from dpcli.store import CloudSequence
 
-_FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimetre: map coordinates must be shifted first
+_FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class CloudFolders:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """``color`` when the very first frame has colours; then every frame must."""
+        """``color`` when the very first frame has colors; then every frame must."""
         return (("time",) if self.fps else ()) + (("color",) if self._has_color else ())
 
     @property
@@ -113,14 +113,17 @@ class CloudFolders:
         color = self._colors(item, paths, clouds) if item.extra["color"] else None
         time = kept * self.stride / self.fps if self.fps else None
         return Sample(
-            CloudSequence(item.name, points.astype(np.float32), offsets(counts[kept]), time=time, color=color, **describe(item)), notes
+            CloudSequence(
+                item.name, points.astype(np.float32), offsets(counts[kept]), time=time, color=color, **describe(item)
+            ),
+            notes,
         )
 
     def _colors(self, item: Item, paths: list[Path], clouds: list[Cloud]) -> np.ndarray:
         plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None]
         if plain:
             raise DataError(
-                f"{plain[0]}: no colours, though the first frame of all has them; expected the same fields throughout"
+                f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"
             )
         return np.concatenate([cloud.color for cloud in clouds if cloud.color is not None])
 
@@ -140,7 +143,7 @@ def frame_paths(folder: Path) -> list[Path]:
 
 
 def drop_invalid(cloud: Cloud) -> int:
-    """Remove points with NaN or infinity (organised clouds mark "no return" so) in place; how many there were."""
+    """Remove points with NaN or infinity (organized clouds mark "no return" so) in place; how many there were."""
     valid = np.isfinite(cloud.points).all(1)
     if not valid.all():
         cloud.points = cloud.points[valid]

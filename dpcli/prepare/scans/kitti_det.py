@@ -1,4 +1,4 @@
-"""KITTI 3D object detection (Geiger et al. 2012): single Velodyne scans, objects are what labelled boxes hold."""
+"""KITTI 3D object detection (Geiger et al. 2012): single Velodyne scans, objects are what labeled boxes hold."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from dpcli.prepare.scans.kitti_files import (
 from dpcli.store import CloudSequence
 
 TYPES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc")
-MARGIN = 0.01  # metres by which a box is larger than its label says
+MARGIN = 0.01  # meters by which a box is larger than its label says
 SCANS, LISTED = 7481, {"train": 3712, "val": 3769}
 _SPLITS = {"train": "train", "val": "validation"}
 
 
 @dataclass(frozen=True)
 class Box:
-    """A labelled box in camera axes: ``foot`` f64 (3), the middle of its lower face; size in metres; turned about y."""
+    """A labeled box in camera axes: ``foot`` f64 (3), the middle of its lower face; size in meters; turned about y."""
 
     kind: str
     foot: np.ndarray
@@ -130,12 +130,15 @@ class KittiDetection:
         present = set(names)
         return [
             Item(
-                name, folder, split=split.get(name, ""),
+                name,
+                folder,
+                split=split.get(name, ""),
                 problem=require_files([folder / key / f"{name}{end}" for key, end in _FILES.items()])
-                if name in present else f"{folder / 'velodyne' / name}.bin: listed ({split[name]}), but not there",
+                if name in present
+                else f"{folder / 'velodyne' / name}.bin: listed ({split[name]}), but not there",
             )
             for name in sorted(present | set(split))
-        ]  # fmt: skip
+        ]
 
     def _split(self) -> dict[str, str]:
         if self.lists is None:
@@ -156,8 +159,10 @@ class KittiDetection:
         size = png_size(image) if image.is_file() else IMAGE_SIZE
         points, _ = self.view.crop(scan, rectify @ to_camera, projection, size)
         if not len(points):
-            raise DataError(f"{item.path / 'velodyne' / item.name}.bin: no point in the camera's view within "
-                            f"{self.view.far} m; do scan and calibration belong together?")  # fmt: skip
+            raise DataError(
+                f"{item.path / 'velodyne' / item.name}.bin: no point in the camera's view within "
+                f"{self.view.far} m; do scan and calibration belong together?"
+            )
         boxes = [b for b in read_boxes(item.path / "label_2" / f"{item.name}.txt") if b.kind in self.objects]
         part = parts_of_boxes(points, boxes)
         notes = {

@@ -75,7 +75,7 @@ def calibration_matrix(found: dict[str, np.ndarray], path: Path, key: str) -> np
 
 
 def read_velodyne(path: Path) -> np.ndarray:
-    """A scan f32 (N,3): x forward, y left, z up, metres. The file: float32 x y z reflectance, little-endian."""
+    """A scan f32 (N,3): x forward, y left, z up, meters. The file: float32 x y z reflectance, little-endian."""
     data = path.read_bytes()
     if not data or len(data) % 16:
         raise DataError(
@@ -117,15 +117,15 @@ def png_size(path: Path) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class View:
-    """What of a scan is kept: in the left colour camera's picture, farther than ``near`` ahead of the scanner, nearer
-    than ``far`` from the camera (metres; x of the scanner, z of the camera)."""
+    """What of a scan is kept: in the left color camera's picture, farther than ``near`` ahead of the scanner, nearer
+    than ``far`` from the camera (meters; x of the scanner, z of the camera)."""
 
     near: float = 2.0
     far: float = 35.0
 
     def __post_init__(self) -> None:
         if not 0 < self.near < self.far:
-            raise UsageError(f"--near {self.near} --far {self.far}: expected 0 < near < far, metres")
+            raise UsageError(f"--near {self.near} --far {self.far}: expected 0 < near < far, meters")
 
     def crop(
         self,

@@ -23,16 +23,26 @@ from dpcli.prepare.scans.kitti_files import (
 from dpcli.store import CloudSequence
 
 # Cityscapes numbers, which KITTI's instance images use
-CLASSES = {"person": 24, "rider": 25, "car": 26, "truck": 27, "bus": 28, "caravan": 29, "trailer": 30, "train": 31,
-           "motorcycle": 32, "bicycle": 33}  # fmt: skip
+CLASSES = {
+    "person": 24,
+    "rider": 25,
+    "car": 26,
+    "truck": 27,
+    "bus": 28,
+    "caravan": 29,
+    "trailer": 30,
+    "train": 31,
+    "motorcycle": 32,
+    "bicycle": 33,
+}
 LABELS = ("instance", "obj_map")
-BASELINE = 0.54  # metres between the colour cameras
+BASELINE = 0.54  # meters between the color cameras
 SCENES, TRAIN_SCENES = 200, 100
 
 
 @dataclass
 class FlowPair:
-    """The same points in two frames, camera axes: first, second f64 (N,3) metres; pixel i64 (N,2) row, column."""
+    """The same points in two frames, camera axes: first, second f64 (N,3) meters; pixel i64 (N,2) row, column."""
 
     first: np.ndarray
     second: np.ndarray
@@ -70,8 +80,10 @@ def class_numbers(names: tuple[str, ...]) -> tuple[int, ...]:
     """Cityscapes numbers of class names; UsageError names one that is unknown."""
     unknown = [name for name in names if name not in CLASSES]
     if unknown or not names:
-        raise UsageError(f"--objects {','.join(names)}: {', '.join(unknown) or 'nothing'} is no class of the instance "
-                         f"images; expected some of {', '.join(CLASSES)}")  # fmt: skip
+        raise UsageError(
+            f"--objects {','.join(names)}: {', '.join(unknown) or 'nothing'} is no class of the instance "
+            f"images; expected some of {', '.join(CLASSES)}"
+        )
     return tuple(CLASSES[name] for name in names)
 
 
@@ -97,7 +109,7 @@ class KittiSceneFlow:
         if self.labels not in LABELS:
             raise UsageError(f"--labels {self.labels}: expected {' or '.join(LABELS)}")
         if not self.far > 0:
-            raise UsageError(f"--far {self.far}: expected a distance above 0, metres")
+            raise UsageError(f"--far {self.far}: expected a distance above 0, meters")
 
     @property
     def config(self) -> dict[str, Any]:
@@ -116,11 +128,13 @@ class KittiSceneFlow:
             raise DataError(f"{folder / 'flow_occ' / unknown[0]}_10.png: expected a name of six digits and _10.png")
         return [
             Item(
-                name, folder, split="train" if int(name) < TRAIN_SCENES else "test",
+                name,
+                folder,
+                split="train" if int(name) < TRAIN_SCENES else "test",
                 problem=require_files(list(self._files(folder, name).values())),
             )
             for name in names
-        ]  # fmt: skip
+        ]
 
     def _files(self, folder: Path, name: str) -> dict[str, Path]:
         images = ("disp_occ_0", "disp_occ_1", "flow_occ", self.labels)

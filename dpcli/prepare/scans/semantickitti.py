@@ -1,4 +1,4 @@
-"""SemanticKITTI (Behley et al. 2019): Velodyne scans of sequences 00 to 10, objects are labelled instances."""
+"""SemanticKITTI (Behley et al. 2019): Velodyne scans of sequences 00 to 10, objects are labeled instances."""
 
 from __future__ import annotations
 
@@ -24,11 +24,20 @@ from dpcli.prepare.scans.kitti_files import (
 from dpcli.store import CloudSequence
 
 # the lower 16 bits of a label; moving ones have numbers of their own
-CLASSES = {"car": (10, 252), "bicycle": (11,), "bus": (13, 257), "motorcycle": (15,), "on-rails": (16, 256),
-           "truck": (18, 258), "other-vehicle": (20, 259), "person": (30, 254), "bicyclist": (31, 253),
-           "motorcyclist": (32, 255)}  # fmt: skip
-LABELLED = tuple(f"{number:02}" for number in range(11))
-GROUPS = {"all": LABELLED, "without-08": tuple(s for s in LABELLED if s != "08"), "only-08": ("08",)}
+CLASSES = {
+    "car": (10, 252),
+    "bicycle": (11,),
+    "bus": (13, 257),
+    "motorcycle": (15,),
+    "on-rails": (16, 256),
+    "truck": (18, 258),
+    "other-vehicle": (20, 259),
+    "person": (30, 254),
+    "bicyclist": (31, 253),
+    "motorcyclist": (32, 255),
+}
+LABELED = tuple(f"{number:02}" for number in range(11))
+GROUPS = {"all": LABELED, "without-08": tuple(s for s in LABELED if s != "08"), "only-08": ("08",)}
 VALIDATION = "08"
 
 

@@ -37,12 +37,21 @@ def make_animal(motion: str, frames: int, cycles: float = 0.0, seed: int = 0, ce
     normals = vertex_normals(body.vertices, body.triangles)
     positions, normals = skin(body.vertices, normals, body.bones, body.weights, turned)
     return AnimatedMesh(
-        name=f"{kind.kind} {seed} {motion}", time=phase * kind.period, positions=positions, normals=normals,
-        triangles=body.triangles, material=np.zeros(len(body.triangles), np.int64), materials=(Material(),),
-        color=body.color, uv=np.zeros((len(body.vertices), 2), np.float32), bones=body.bones, weights=body.weights,
-        bone_pose=turned, bone_parent=np.array([bone.parent for bone in animal.bones]),
+        name=f"{kind.kind} {seed} {motion}",
+        time=phase * kind.period,
+        positions=positions,
+        normals=normals,
+        triangles=body.triangles,
+        material=np.zeros(len(body.triangles), np.int64),
+        materials=(Material(),),
+        color=body.color,
+        uv=np.zeros((len(body.vertices), 2), np.float32),
+        bones=body.bones,
+        weights=body.weights,
+        bone_pose=turned,
+        bone_parent=np.array([bone.parent for bone in animal.bones]),
         bone_name=tuple(bone.name for bone in animal.bones),
-    )  # fmt: skip
+    )
 
 
 def animal_clip(motion: str, frames: int, cycles: float, filming: Filming, jobs: int = 1) -> Clip:

@@ -20,7 +20,7 @@ class Bone:
 class Shape:
     """A cone with round ends on a bone, from a (radius ra) to b (radius rb); flat < 1 squeezes it along ``normal``.
 
-    paint: which of the animal's colours it has: coat, dark, fin, horn.
+    paint: which of the animal's colors it has: coat, dark, fin, horn.
     """
 
     bone: int
@@ -35,7 +35,7 @@ class Shape:
 
 @dataclass
 class Creature:
-    """bones: parents before children. eyes: (bone, centre of the head, direction, radius): they sit on the surface."""
+    """bones: parents before children. eyes: (bone, center of the head, direction, radius): they sit on the surface."""
 
     kind: str
     bones: list[Bone] = field(default_factory=list)
@@ -61,9 +61,9 @@ class Creature:
             index = self.bone(f"{name}_{k}", parent if k == 0 else f"{name}_{k - 1}", points[k])
             self.shape(index, points[k], points[k + 1], radii[k], radii[k + 1], paint, **more)
 
-    def add_eyes(self, bone: str, centre: np.ndarray, direction: tuple[float, float, float], radius: float) -> None:
+    def add_eyes(self, bone: str, center: np.ndarray, direction: tuple[float, float, float], radius: float) -> None:
         for side in (-1, 1):
-            self.eyes.append((self.index(bone), centre, np.array(direction) * [side, 1, 1], radius))
+            self.eyes.append((self.index(bone), center, np.array(direction) * [side, 1, 1], radius))
 
 
 def quadruped(rng: np.random.Generator) -> Creature:

@@ -96,7 +96,7 @@ def _bind(animal: Creature, distance: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _paint(animal: Creature, vertices: np.ndarray, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Linear RGBA f32 (V,4): a coat with a pale belly and spots, stripes or patches; dark feet, coloured fins, horn."""
+    """Linear RGBA f32 (V,4): a coat with a pale belly and spots, stripes or patches; dark feet, colored fins, horn."""
     hue = rng.uniform(0.03, 0.12) if animal.kind == "quadruped" else rng.uniform(0, 1)
     coat = np.array(colorsys.hsv_to_rgb(hue, rng.uniform(0.45, 0.75), rng.uniform(0.6, 0.85)))
     mark = coat * rng.uniform(0.25, 0.45) if rng.random() < 0.6 else 0.3 * coat + 0.68
@@ -115,7 +115,7 @@ def _paint(animal: Creature, vertices: np.ndarray, distance: np.ndarray, rng: np
 
 
 def _pattern(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """How much of the marking's colour each vertex has, 0..1."""
+    """How much of the marking's color each vertex has, 0..1."""
     kind, scale = rng.choice(["spots", "stripes", "patches"]), rng.uniform(0.8, 1.25)
     waves, phases = rng.normal(size=(24, 3)), rng.uniform(0, 2 * np.pi, 24)
     noise = np.sin((22 if kind == "spots" else 8) * scale * vertices @ waves.T + phases).sum(1) / np.sqrt(12)
@@ -124,12 +124,12 @@ def _pattern(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.clip(6 * (noise - 0.7) + 0.5, 0, 1)
 
 
-def _eye(animal: Creature, bone: int, centre: np.ndarray, direction: np.ndarray, radius: float) -> Skin:
+def _eye(animal: Creature, bone: int, center: np.ndarray, direction: np.ndarray, radius: float) -> Skin:
     """A dark ball with a glint, half sunk into the head where the direction leaves it."""
     direction = direction / np.linalg.norm(direction)
     along = np.linspace(0, 0.3, 301)
-    inside = field(centre + along[:, None] * direction, animal.shapes) < 0
-    place = centre + (along[int(np.argmin(inside))] - 0.3 * radius) * direction
+    inside = field(center + along[:, None] * direction, animal.shapes) < 0
+    place = center + (along[int(np.argmin(inside))] - 0.3 * radius) * direction
     side = np.stack(np.meshgrid(*[np.linspace(-1.3, 1.3, 14)] * 3, indexing="ij"), axis=-1)
     unit, triangles = surface_nets(np.linalg.norm(side, axis=-1) - 1)
     unit = unit * (2.6 / 13) - 1.3

@@ -21,9 +21,17 @@ from dpcli.runtime.seeds import generator
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
-    "raise arm", "lower arm", "swipe to left", "swipe to right", "push", "pull", "circle clockwise",
-    "circle counter-clockwise", "open arms", "close arms",
-)  # fmt: skip
+    "raise arm",
+    "lower arm",
+    "swipe to left",
+    "swipe to right",
+    "push",
+    "pull",
+    "circle clockwise",
+    "circle counter-clockwise",
+    "open arms",
+    "close arms",
+)
 FRAME_RATE = 15.0  # frames per second
 _FIELD_OF_VIEW = 57.0  # degrees, horizontal: Kinect v1
 _SUBJECT_KEY = 1 << 30  # keeps the generators of subjects apart from those of items
@@ -45,15 +53,15 @@ def wrist_path(movement: int, s: np.ndarray, rng: np.random.Generator) -> tuple[
         return _direction(rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.3) + 0 * s) * ahead[:, None], None
     if movement == 3:  # clockwise as the figure itself sees it
         angle, radius = rng.uniform(0, 2 * np.pi) + 2 * np.pi * s, rng.uniform(0.3, 0.45)
-        centre = np.array([tilt, rng.uniform(-0.1, 0.2), 0.65])
-        return centre + radius * np.stack([np.sin(angle), np.cos(angle), 0 * s], axis=1), None
+        center = np.array([tilt, rng.uniform(-0.1, 0.2), 0.65])
+        return center + radius * np.stack([np.sin(angle), np.cos(angle), 0 * s], axis=1), None
     azimuth = np.interp(s, [0, 1], [-0.1 + tilt / 2, 1.4 + tilt / 2])
     right = _direction(azimuth, rng.uniform(-0.3, 0.3)) * reach
     return right, right * [-1, 1, 1]
 
 
 def _direction(azimuth: np.ndarray | float, elevation: np.ndarray | float) -> np.ndarray:
-    """Unit vectors (T,3); azimuth from straight ahead towards the right, elevation from the horizon, radians."""
+    """Unit vectors (T,3); azimuth from straight ahead toward the right, elevation from the horizon, radians."""
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     return np.stack(
         [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)], axis=-1
@@ -67,8 +75,8 @@ class _Subject:
     figure: Figure
     pause: float  # longest rest before and after the movement, as a fraction of the video
     yaw: float  # how far the figure turns from the camera, radians
-    distance: float  # metres
-    camera_height: float  # metres
+    distance: float  # meters
+    camera_height: float  # meters
 
 
 def draw_subject(seed: int, subject: int) -> _Subject:
@@ -179,7 +187,7 @@ class SyntheticGestures:
 def to_camera(points: np.ndarray, yaw: float, place: np.ndarray) -> np.ndarray:
     """Body axes (...,3) -> camera axes (OpenCV): the figure faces the camera, turned by ``yaw`` about the upright.
 
-    place: (sideways shift, height of the camera above the floor, distance), metres.
+    place: (sideways shift, height of the camera above the floor, distance), meters.
     """
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     sideways, ahead = np.cos(yaw) * x + np.sin(yaw) * z, np.cos(yaw) * z - np.sin(yaw) * x

@@ -1,6 +1,6 @@
 """A human figure of capsules: its proportions, and its limbs' positions from where the hands are.
 
-Body axes: x towards the figure's right hand, y up, z forward; the origin lies on the floor between the feet. Metres.
+Body axes: x toward the figure's right hand, y up, z forward; the origin lies on the floor between the feet. Meters.
 """
 
 from __future__ import annotations
@@ -10,14 +10,25 @@ from dataclasses import dataclass
 import numpy as np
 
 PARTS = (
-    "torso", "hips", "neck and head", "right upper arm", "right forearm", "right hand", "left upper arm",
-    "left forearm", "left hand", "right thigh", "right shin", "left thigh", "left shin",
-)  # fmt: skip
+    "torso",
+    "hips",
+    "neck and head",
+    "right upper arm",
+    "right forearm",
+    "right hand",
+    "left upper arm",
+    "left forearm",
+    "left hand",
+    "right thigh",
+    "right shin",
+    "left thigh",
+    "left shin",
+)
 
 
 @dataclass(frozen=True)
 class Figure:
-    """Lengths in metres; ``girth`` scales all radii."""
+    """Lengths in meters; ``girth`` scales all radii."""
 
     height: float = 1.75
     girth: float = 1.0
@@ -26,17 +37,17 @@ class Figure:
 
     @property
     def reach(self) -> float:
-        """Shoulder to wrist, metres."""
+        """Shoulder to wrist, meters."""
         return self.arm * self.height
 
     def shoulders(self) -> tuple[np.ndarray, np.ndarray]:
-        """Right and left shoulder (3), metres."""
+        """Right and left shoulder (3), meters."""
         x, y = self.shoulder * self.height, 0.81 * self.height
         return np.array([x, y, 0.0]), np.array([-x, y, 0.0])
 
     @property
     def radii(self) -> np.ndarray:
-        """Capsule radius of every part, f64 (parts), metres."""
+        """Capsule radius of every part, f64 (parts), meters."""
         relative = [0.075, 0.07, 0.055, 0.028, 0.024, 0.026, 0.028, 0.024, 0.026, 0.045, 0.034, 0.045, 0.034]
         return self.girth * self.height * np.array(relative)
 
@@ -46,7 +57,7 @@ def bend_elbow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two-bone inverse kinematics: shoulder (3), wanted wrist (T,3), bone lengths, pole (3) -> elbow, wrist (T,3).
 
-    The elbow bends towards ``pole``. A wrist out of reach is moved onto the nearest reachable sphere.
+    The elbow bends toward ``pole``. A wrist out of reach is moved onto the nearest reachable sphere.
     """
     offset = wrist - shoulder
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
@@ -81,8 +92,14 @@ def capsules(figure: Figure, right_wrist: np.ndarray, left_wrist: np.ndarray) ->
 
 
 _TRUNK = {  # in body heights
-    "chest": (0, 0.75, 0), "waist": (0, 0.60, 0), "neck": (0, 0.87, 0.01), "crown": (0, 0.94, 0.01),
-    "hip right": (0.05, 0.53, 0), "hip left": (-0.05, 0.53, 0),
-    "knee right": (0.055, 0.285, 0.02), "knee left": (-0.055, 0.285, 0.02),
-    "ankle right": (0.06, 0.04, 0), "ankle left": (-0.06, 0.04, 0),
-}  # fmt: skip
+    "chest": (0, 0.75, 0),
+    "waist": (0, 0.60, 0),
+    "neck": (0, 0.87, 0.01),
+    "crown": (0, 0.94, 0.01),
+    "hip right": (0.05, 0.53, 0),
+    "hip left": (-0.05, 0.53, 0),
+    "knee right": (0.055, 0.285, 0.02),
+    "knee left": (-0.055, 0.285, 0.02),
+    "ankle right": (0.06, 0.04, 0),
+    "ankle left": (-0.06, 0.04, 0),
+}

@@ -10,7 +10,7 @@ from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
 def render(
     starts: np.ndarray, ends: np.ndarray, radii: np.ndarray, intrinsics: Intrinsics, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One frame: capsules with axes starts-ends f64 (K,3) and radii (K), in camera axes, metres.
+    """One frame: capsules with axes starts-ends f64 (K,3) and radii (K), in camera axes, meters.
 
     -> depth f32 (H,W), inf where nothing is seen; part i16 (H,W), -1 there.
     """
@@ -65,15 +65,15 @@ def bounding_box(
     if low[2] <= 1e-3:
         return slice(0, height), slice(0, width)
     edges = []
-    for axis, focal, centre, size in ((1, k.fy, k.cy, height), (0, k.fx, k.cx, width)):
-        first = focal * min(low[axis] / low[2], low[axis] / high[2]) + centre
-        last = focal * max(high[axis] / low[2], high[axis] / high[2]) + centre
+    for axis, focal, center, size in ((1, k.fy, k.cy, height), (0, k.fx, k.cx, width)):
+        first = focal * min(low[axis] / low[2], low[axis] / high[2]) + center
+        last = focal * max(high[axis] / low[2], high[axis] / high[2]) + center
         edges.append(slice(int(np.clip(np.floor(first), 0, size)), int(np.clip(np.ceil(last) + 1, 0, size))))
     return edges[0], edges[1]
 
 
 def add_noise(depth: np.ndarray, rng: np.random.Generator, strength: float, missing: float) -> np.ndarray:
-    """Sensor noise on depth f32 (P) in metres; non-positive values mean a lost pixel.
+    """Sensor noise on depth f32 (P) in meters; non-positive values mean a lost pixel.
 
     Axial noise grows with distance as measured on a Kinect (Nguyen et al. 2012: 1.2 mm + 1.9 mm (z - 0.4 m)^2),
     times ``strength``; a fraction ``missing`` of the pixels is lost.

@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
 from dpcli.prepare.decode.color_frames import read_rgba
-from dpcli.prepare.views.artemis_files import (  # fmt: skip
+from dpcli.prepare.views.artemis_files import (
     Motion,
     Skin,
     declared_frames,
@@ -117,9 +117,15 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
         _check_tracks(motion, frames[0], views[0], rig, track[0])
     header = ViewsHeader(
         f"{animal.resolve().name}-{options.motion}",
-        np.stack([crop.intrinsics(rig.intrinsics[view], options.size) for crop, view in zip(crops, views, strict=True)]),
-        poses[views], (np.array(frames) - frames[0]) / options.fps, roles, 0, (options.size, options.size),
-    )  # fmt: skip
+        np.stack(
+            [crop.intrinsics(rig.intrinsics[view], options.size) for crop, view in zip(crops, views, strict=True)]
+        ),
+        poses[views],
+        (np.array(frames) - frames[0]) / options.fps,
+        roles,
+        0,
+        (options.size, options.size),
+    )
 
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
         for number, view in enumerate(views):
@@ -217,7 +223,7 @@ def _tracks(animal: Path, motion: Motion, frames: list[int], skin: Skin) -> np.n
 
 
 def _sphere(motion: Motion, frame: int, rig: _Rig) -> tuple[np.ndarray, float]:
-    """Centre and radius of the object from the silhouettes of all cameras at one frame."""
+    """Center and radius of the object from the silhouettes of all cameras at one frame."""
     cameras, boxes = [], []
     for camera in _present(motion, frame, len(rig.poses)):
         box = visible_box(_alpha(motion, frame, camera))
@@ -236,11 +242,11 @@ def _alpha(motion: Motion, frame: int, camera: int) -> np.ndarray:
 
 
 def _picture(motion: Motion, frame: int, camera: int) -> np.ndarray:
-    colour, alpha = read_rgba(motion.image(frame, camera)), read_mask(motion.alpha(frame, camera))
-    if colour.shape[:2] != alpha.shape:
-        here, there = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, colour.shape))
+    color, alpha = read_rgba(motion.image(frame, camera)), read_mask(motion.alpha(frame, camera))
+    if color.shape[:2] != alpha.shape:
+        here, there = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, color.shape))
         raise DataError(f"{motion.alpha(frame, camera)}: {here}, its picture is {there}; expected the same size")
-    return clean(np.dstack([colour[..., :3], alpha]))
+    return clean(np.dstack([color[..., :3], alpha]))
 
 
 def _survey(motion: Motion, frames: list[int], views: list[int], on_error: str) -> tuple[list[int], list[Box]]:

@@ -23,7 +23,7 @@ class Motion:
     folders: dict[int, Path]
 
     def image(self, frame: int, camera: int) -> Path:
-        """The colour picture; DataError when it is missing."""
+        """The color picture; DataError when it is missing."""
         for pattern in _IMAGE:
             path = self.folders[frame] / pattern.format(camera)
             if path.is_file():
@@ -189,7 +189,7 @@ def _tensor(path: Path) -> np.ndarray:
 
 
 def outer_shell(points: np.ndarray) -> np.ndarray:
-    """Rows i64 of the voxels (N,3) that lack one of their six neighbours; all when they are on no regular grid."""
+    """Rows i64 of the voxels (N,3) that lack one of their six neighbors; all when they are on no regular grid."""
     step = np.inf
     for axis in range(3):
         gaps = np.diff(np.unique(np.round(points[:, axis], 6)))

@@ -12,12 +12,12 @@ from dpcli.prepare.decode.depth_files import load_cv2
 
 TOLERANCE = 0.06  # of the value range: compression noise of a video stays below
 FAINT = 8  # alpha below is a leftover of compression or of a network, not the object
-_COLOURS = {"white": (255.0, 255.0, 255.0), "black": (0.0, 0.0, 0.0)}
-_PLAIN = 0.5  # of the border has to be one colour: an object may touch it, a scene fills it
+_COLORS = {"white": (255.0, 255.0, 255.0), "black": (0.0, 0.0, 0.0)}
+_PLAIN = 0.5  # of the border has to be one color: an object may touch it, a scene fills it
 _RIM = 2  # pixels on each side of an outline where object and background mix
 HOLES = ("auto", "keep", "cut")
 _GAP = 0.005  # of the object: what may be a gap between limbs
-_FLAT = 4.0  # grey levels that a gap may be off the background more than the background itself: noise of compression
+_FLAT = 4.0  # gray levels that a gap may be off the background more than the background itself: noise of compression
 _SPECK = 1e-4  # of the picture: smaller islands are noise
 
 
@@ -29,46 +29,46 @@ def border_pixels(rgb: np.ndarray) -> np.ndarray:
     return pixels[:: max(1, len(pixels) // 4000)]
 
 
-def plain_share(pixels: np.ndarray, colour: np.ndarray, tolerance: float) -> float:
-    """Share of pixels u8 (B,3) that are `colour` (3), 0..255, within `tolerance` of the value range in every channel."""
-    off = np.abs(pixels.astype(np.float32) - colour).max(axis=1)
+def plain_share(pixels: np.ndarray, color: np.ndarray, tolerance: float) -> float:
+    """Share of pixels u8 (B,3) that are `color` (3), 0..255, within `tolerance` of the value range in every channel."""
+    off = np.abs(pixels.astype(np.float32) - color).max(axis=1)
     return float((off <= 255 * tolerance).mean())
 
 
 def plain_background(borders: list[np.ndarray], names: list[str], tolerance: float) -> np.ndarray:
-    """The one colour f32 (3) around the object in all frames; DataError that says what to do when there is none.
+    """The one color f32 (3) around the object in all frames; DataError that says what to do when there is none.
 
-    borders: `border_pixels` of each frame. The colour is the mean around the fullest cell of the colour cube, which an
+    borders: `border_pixels` of each frame. The color is the mean around the fullest cell of the color cube, which an
     object that covers part of the border doesn't move.
     """
     pixels = np.concatenate(borders).astype(np.float32)
-    colour = _densest(pixels, 255 * tolerance)
-    shares = [plain_share(border, colour, tolerance) for border in borders]
+    color = _densest(pixels, 255 * tolerance)
+    shares = [plain_share(border, color, tolerance) for border in borders]
     worst = int(np.argmin(shares))
     if shares[worst] < _PLAIN:
         raise DataError(
             f"{names[worst]}: the background is not plain: {shares[worst]:.0%} of the border is "
-            f"{_hex(colour)}, expected {_PLAIN:.0%}\n"
+            f"{_hex(color)}, expected {_PLAIN:.0%}\n"
             "Give a mask per frame (--mask FOLDER; SAM 2 or rembg make them), RGBA frames, or --background keep"
         )
-    return colour
+    return color
 
 
 def named_background(text: str) -> np.ndarray | None:
-    """The colour f32 (3), 0..255, of white, black or r,g,b; None for auto and keep. UsageError on anything else."""
+    """The color f32 (3), 0..255, of white, black or r,g,b; None for auto and keep. UsageError on anything else."""
     if text in ("auto", "keep"):
         return None
     try:
-        colour = np.array(_COLOURS.get(text) or [float(word) for word in text.split(",")], np.float32)
+        color = np.array(_COLORS.get(text) or [float(word) for word in text.split(",")], np.float32)
     except ValueError:
-        colour = np.zeros(0)
-    if colour.shape != (3,) or not ((0 <= colour) & (colour <= 255)).all():
+        color = np.zeros(0)
+    if color.shape != (3,) or not ((0 <= color) & (color <= 255)).all():
         raise UsageError(f"--background {text}: expected auto, keep, white, black or r,g,b with values 0 to 255")
-    return colour
+    return color
 
 
-def background_colour(borders: list[np.ndarray], names: list[str], background: str, tolerance: float) -> np.ndarray:
-    """The colour f32 (3) that --background names, or the plain one that auto finds; DataError when it isn't there."""
+def background_color(borders: list[np.ndarray], names: list[str], background: str, tolerance: float) -> np.ndarray:
+    """The color f32 (3) that --background names, or the plain one that auto finds; DataError when it isn't there."""
     named = named_background(background)
     if named is None:
         return plain_background(borders, names, tolerance)
@@ -85,14 +85,14 @@ def background_colour(borders: list[np.ndarray], names: list[str], background: s
 def _densest(pixels: np.ndarray, reach: float) -> np.ndarray:
     cells = (pixels // 16).astype(np.int64) @ np.array([256, 16, 1])
     fullest = np.bincount(cells).argmax()
-    colour = pixels[cells == fullest].mean(axis=0, dtype=np.float64)
-    for _ in range(2):  # the cell may cut through the colour's noise
-        colour = pixels[np.abs(pixels - colour).max(axis=1) <= reach].mean(axis=0, dtype=np.float64)
-    return colour
+    color = pixels[cells == fullest].mean(axis=0, dtype=np.float64)
+    for _ in range(2):  # the cell may cut through the color's noise
+        color = pixels[np.abs(pixels - color).max(axis=1) <= reach].mean(axis=0, dtype=np.float64)
+    return color
 
 
-def _hex(colour: np.ndarray) -> str:
-    return "#" + "".join(f"{round(float(value)):02x}" for value in colour)
+def _hex(color: np.ndarray) -> str:
+    return "#" + "".join(f"{round(float(value)):02x}" for value in color)
 
 
 def key_out(
@@ -101,11 +101,11 @@ def key_out(
     """u8 (H,W,3) on a plain background (3) -> u8 (H,W,4), straight alpha that is soft along the outline, and how many
     pixels were taken for holes.
 
-    Background is what has its colour and is connected to the border. Enclosed regions of that colour are eyes, teeth,
+    Background is what has its color and is connected to the border. Enclosed regions of that color are eyes, teeth,
     a shirt, or gaps between arms and legs. holes: keep (part of the object), cut (see-through), auto (see-through when
     as flat as the background itself and larger than 1/200 of the object).
-    Along the outline alpha is the share of the object's colour in the mixture (the projection of C - B on F - B, with
-    F the nearest colour safely inside), and the colour is unmixed with it, so that putting the result back on the
+    Along the outline alpha is the share of the object's color in the mixture (the projection of C - B on F - B, with
+    F the nearest color safely inside), and the color is unmixed with it, so that putting the result back on the
     background gives the picture again.
     """
     cv2 = load_cv2()
@@ -116,10 +116,10 @@ def key_out(
     inside = _without_specks(~(outside | gaps))
     core = cv2.erode(inside.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=_RIM, borderValue=1)
     rim = cv2.dilate(inside.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool) & ~core.astype(bool)
-    alpha, colour = inside.astype(np.float32), rgb.copy()
+    alpha, color = inside.astype(np.float32), rgb.copy()
     if core.any() and rim.any():
-        _soften(alpha, colour, core, rim, np.asarray(background, np.float32), 255 * tolerance)
-    return clean(np.dstack([colour, np.round(255 * alpha).astype(np.uint8)])), int(gaps.sum())
+        _soften(alpha, color, core, rim, np.asarray(background, np.float32), 255 * tolerance)
+    return clean(np.dstack([color, np.round(255 * alpha).astype(np.uint8)])), int(gaps.sum())
 
 
 def _difference(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def _difference(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 
 def _gaps(enclosed: np.ndarray, off: np.ndarray, outside: np.ndarray, holes: str) -> np.ndarray:
-    """bool (H,W): those of the enclosed regions of the background's colour that are taken for see-through."""
+    """bool (H,W): those of the enclosed regions of the background's color that are taken for see-through."""
     if holes == "keep" or not enclosed.any():
         return np.zeros_like(enclosed)
     cv2 = load_cv2()
@@ -145,28 +145,28 @@ def _gaps(enclosed: np.ndarray, off: np.ndarray, outside: np.ndarray, holes: str
 
 
 def _soften(
-    alpha: np.ndarray, colour: np.ndarray, core: np.ndarray, rim: np.ndarray, background: np.ndarray, noise: float
+    alpha: np.ndarray, color: np.ndarray, core: np.ndarray, rim: np.ndarray, background: np.ndarray, noise: float
 ) -> None:
-    """Share f32 (H,W) and colour u8 (H,W,3) of the object in the pixels of the rim, in place."""
+    """Share f32 (H,W) and color u8 (H,W,3) of the object in the pixels of the rim, in place."""
     cv2 = load_cv2()
     distance, label = cv2.distanceTransformWithLabels(1 - core, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     rows, columns = np.nonzero(core)
     where = np.zeros(label.max() + 1, np.int64)
     where[label[rows, columns]] = rows * core.shape[1] + columns
     mixed = rim & (distance <= 3 * _RIM)  # farther from any core: something thin, taken as it is
-    pure = colour.reshape(-1, 3)[where[label[mixed]]]
-    axis, seen = pure - background, colour[mixed] - background
+    pure = color.reshape(-1, 3)[where[label[mixed]]]
+    axis, seen = pure - background, color[mixed] - background
     length = (axis * axis).sum(axis=1)
-    clear = length > (2 * noise) ** 2  # else the object has the background's colour here
+    clear = length > (2 * noise) ** 2  # else the object has the background's color here
     share = np.where(clear, np.clip((axis * seen).sum(axis=1) / np.maximum(length, 1e-6), 0, 1), alpha[mixed])
     share[share < FAINT / 255] = 0
     alpha[mixed] = share
     unmixed = background + seen / np.maximum(share, FAINT / 255)[:, None]
-    colour[mixed] = np.clip(np.round(unmixed), 0, 255)
+    color[mixed] = np.clip(np.round(unmixed), 0, 255)
 
 
 def _reaches_border(empty: np.ndarray) -> np.ndarray:
-    """bool (H,W): pixels of `empty` u8 connected to the border of the picture (4 neighbours)."""
+    """bool (H,W): pixels of `empty` u8 connected to the border of the picture (4 neighbors)."""
     cv2 = load_cv2()
     framed = np.pad(empty, 1, constant_values=1)
     _, label = cv2.connectedComponents(framed, connectivity=4)
@@ -192,12 +192,12 @@ def cut_alone(rgba: np.ndarray, name: str, background: str, tolerance: float, ho
         return opaque(rgba)
     if (rgba[..., 3] < 255).any():
         return clean(rgba)
-    colour = background_colour([border_pixels(rgba[..., :3])], [name], background, tolerance)
-    return key_out(rgba[..., :3], colour, tolerance, holes)[0]
+    color = background_color([border_pixels(rgba[..., :3])], [name], background, tolerance)
+    return key_out(rgba[..., :3], color, tolerance, holes)[0]
 
 
 def clean(rgba: np.ndarray) -> np.ndarray:
-    """Faint alpha becomes 0, and the colour nobody sees becomes black: equal objects give equal bytes."""
+    """Faint alpha becomes 0, and the color nobody sees becomes black: equal objects give equal bytes."""
     return rgba * (rgba[..., 3:] >= FAINT)
 
 

@@ -11,25 +11,25 @@ OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: it fits
 
 @dataclass(frozen=True)
 class Similarity:
-    """x' = scale * rotation (x - centre); rotation f64 (3,3), centre f64 (3)."""
+    """x' = scale * rotation (x - center); rotation f64 (3,3), center f64 (3)."""
 
     scale: float
     rotation: np.ndarray
-    centre: np.ndarray
+    center: np.ndarray
 
     def points(self, points: np.ndarray) -> np.ndarray:
         """(...,3) -> f64 (...,3)."""
-        return self.scale * (np.asarray(points, np.float64) - self.centre) @ self.rotation.T
+        return self.scale * (np.asarray(points, np.float64) - self.center) @ self.rotation.T
 
     def pose(self, world_to_camera: np.ndarray) -> np.ndarray:
         """f64 (4,4) of the same camera in the new world: every point keeps its pixel, depths are scaled."""
         pose = np.eye(4)
         pose[:3, :3] = world_to_camera[:3, :3] @ self.rotation.T
-        pose[:3, 3] = self.scale * (world_to_camera[:3, :3] @ self.centre + world_to_camera[:3, 3])
+        pose[:3, 3] = self.scale * (world_to_camera[:3, :3] @ self.center + world_to_camera[:3, 3])
         return pose
 
 
-def camera_centres(poses: np.ndarray) -> np.ndarray:
+def camera_centers(poses: np.ndarray) -> np.ndarray:
     """world_to_camera (V,4,4) -> positions f64 (V,3)."""
     return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
 
@@ -41,67 +41,67 @@ def up_direction(poses: np.ndarray) -> np.ndarray:
     pictures' up directions.
     """
     mean = -poses[:, 1, :3].mean(axis=0)
-    centres = camera_centres(poses)
+    centers = camera_centers(poses)
     if len(poses) >= 3:
-        _, spread, axes = np.linalg.svd(centres - centres.mean(axis=0), full_matrices=False)
+        _, spread, axes = np.linalg.svd(centers - centers.mean(axis=0), full_matrices=False)
         normal = axes[2] * np.sign(axes[2] @ mean)
         if spread[2] < 0.1 * spread[1] and normal @ mean > 0.5 * np.linalg.norm(mean):
             return normal / np.linalg.norm(normal)
     return mean / np.linalg.norm(mean)
 
 
-def into_orbit(up: np.ndarray, reference: np.ndarray, centre: np.ndarray, radius: float) -> Similarity:
-    """The similarity that puts `centre` at the origin, `up` on +y, the camera `reference` (4,4) at azimuth 0.
+def into_orbit(up: np.ndarray, reference: np.ndarray, center: np.ndarray, radius: float) -> Similarity:
+    """The similarity that puts `center` at the origin, `up` on +y, the camera `reference` (4,4) at azimuth 0.
 
     radius: of the object in its own world; becomes OBJECT_RADIUS. A camera straight above keeps its picture's up as
     the direction away from azimuth 0.
     """
     up = up / np.linalg.norm(up)
     position = -reference[:3, :3].T @ reference[:3, 3]
-    front = position - centre - ((position - centre) @ up) * up
-    if np.linalg.norm(front) < 1e-6 * np.linalg.norm(position - centre):
+    front = position - center - ((position - center) @ up) * up
+    if np.linalg.norm(front) < 1e-6 * np.linalg.norm(position - center):
         front = reference[1, :3] - (reference[1, :3] @ up) * up
     front = front / np.linalg.norm(front)
     return Similarity(
-        OBJECT_RADIUS / radius, np.stack([np.cross(up, front), up, front]), np.asarray(centre, np.float64)
+        OBJECT_RADIUS / radius, np.stack([np.cross(up, front), up, front]), np.asarray(center, np.float64)
     )
 
 
 def bounding_sphere(points: np.ndarray, steps: int = 200) -> tuple[np.ndarray, float]:
-    """Centre f64 (3) and radius of a sphere that holds all points (...,3), nearly the smallest one.
+    """Center f64 (3) and radius of a sphere that holds all points (...,3), nearly the smallest one.
 
-    Steps of 1/(i+1) towards the farthest point (Badoiu and Clarkson 2003): within a percent of the smallest radius,
-    and turned points give the turned sphere. The radius is exact for the centre.
+    Steps of 1/(i+1) toward the farthest point (Badoiu and Clarkson 2003): within a percent of the smallest radius,
+    and turned points give the turned sphere. The radius is exact for the center.
     """
     flat = np.asarray(points, np.float64).reshape(-1, 3)
-    centre = flat.mean(axis=0)
+    center = flat.mean(axis=0)
     for step in range(1, steps + 1):
-        farthest = flat[((flat - centre) ** 2).sum(axis=1).argmax()]
-        centre = centre + (farthest - centre) / (step + 1)
-    return centre, float(np.sqrt(((flat - centre) ** 2).sum(axis=1).max()))
+        farthest = flat[((flat - center) ** 2).sum(axis=1).argmax()]
+        center = center + (farthest - center) / (step + 1)
+    return center, float(np.sqrt(((flat - center) ** 2).sum(axis=1).max()))
 
 
 def sphere_of_silhouettes(
     intrinsics: np.ndarray, poses: np.ndarray, boxes: list[tuple[int, int, int, int]]
 ) -> tuple[np.ndarray, float]:
-    """Centre f64 (3) and radius of an object known by its boxes (left, top, right, bottom) in V pictures.
+    """Center f64 (3) and radius of an object known by its boxes (left, top, right, bottom) in V pictures.
 
-    The centre is the point nearest to the rays through the boxes' middles (for parallel rays: nearest to the world's
+    The center is the point nearest to the rays through the boxes' middles (for parallel rays: nearest to the world's
     origin besides); the radius is the largest extent of a box around it, at its depth.
     """
-    centres = camera_centres(poses)
+    centers = camera_centers(poses)
     middles = np.array([((left + right) / 2, (top + bottom) / 2, 1) for left, top, right, bottom in boxes])
     rays = np.einsum("vji,vj->vi", poses[:, :3, :3], np.einsum("vij,vj->vi", np.linalg.inv(intrinsics), middles))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     system = across.sum(axis=0) + 1e-6 * np.eye(3)
-    centre = np.linalg.solve(system, np.einsum("vij,vj->i", across, centres))
+    center = np.linalg.solve(system, np.einsum("vij,vj->i", across, centers))
     radius = 0.0
     for camera, pose, (left, top, right, bottom) in zip(intrinsics, poses, boxes, strict=True):
-        seen = pose[:3, :3] @ centre + pose[:3, 3]
+        seen = pose[:3, :3] @ center + pose[:3, 3]
         u, v = (camera @ seen)[:2] / seen[2]
         reach = max(
             (right - u) / camera[0, 0], (u - left) / camera[0, 0], (bottom - v) / camera[1, 1], (v - top) / camera[1, 1]
         )
         radius = max(radius, float(reach * seen[2]))
-    return centre, radius
+    return center, radius

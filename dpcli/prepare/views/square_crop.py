@@ -31,24 +31,24 @@ class Crop:
         return resize(square, size)
 
     def intrinsics(self, camera: np.ndarray, size: int) -> np.ndarray:
-        """f64 (3,3) of the cropped and resized picture: u' = (u - left) size / side; pixel centres at +0.5."""
+        """f64 (3,3) of the cropped and resized picture: u' = (u - left) size / side; pixel centers at +0.5."""
         scale = size / self.side
         move = np.array([[scale, 0, -scale * self.left], [0, scale, -scale * self.top], [0, 0, 1]])
         return move @ camera
 
 
 def resize(rgba: np.ndarray, size: int) -> np.ndarray:
-    """u8 (S,S,4) -> u8 (size,size,4), on premultiplied colours: transparent pixels don't bleed into the outline."""
+    """u8 (S,S,4) -> u8 (size,size,4), on premultiplied colors: transparent pixels don't bleed into the outline."""
     if rgba.shape[:2] == (size, size):
         return rgba
     cv2 = load_cv2()
     alpha = rgba[..., 3:].astype(np.float32) / 255
-    colours = np.dstack([rgba[..., :3] * alpha, alpha])
+    colors = np.dstack([rgba[..., :3] * alpha, alpha])
     method = cv2.INTER_AREA if size < len(rgba) else cv2.INTER_LINEAR
-    colours = cv2.resize(colours, (size, size), interpolation=method)
-    colours[..., :3] /= np.maximum(colours[..., 3:], 1e-6)
-    colours[..., 3] *= 255
-    result = np.clip(np.round(colours), 0, 255).astype(np.uint8)
+    colors = cv2.resize(colors, (size, size), interpolation=method)
+    colors[..., :3] /= np.maximum(colors[..., 3:], 1e-6)
+    colors[..., 3] *= 255
+    result = np.clip(np.round(colors), 0, 255).astype(np.uint8)
     result[result[..., 3] == 0] = 0
     return result
 
@@ -91,6 +91,6 @@ def crop_around(box: Box, border: float) -> Crop:
 
 
 def whole_picture(width: int, height: int) -> Crop:
-    """The square that holds the whole picture, centred."""
+    """The square that holds the whole picture, centered."""
     side = max(width, height)
     return Crop(-((side - width) // 2), -((side - height) // 2), side)

@@ -78,9 +78,12 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     header = ViewsHeader(
         options.name or path.resolve().name,
         np.stack([crop.intrinsics(camera, options.size) for crop, camera in zip(crops, intrinsics, strict=True)]),
-        poses, seconds[chosen] - seconds[chosen[0]], ["reference", *(view.role for view in views[1:])], 0,
+        poses,
+        seconds[chosen] - seconds[chosen[0]],
+        ["reference", *(view.role for view in views[1:])],
+        0,
         (options.size, options.size),
-    )  # fmt: skip
+    )
     azimuths = ", ".join(f"{np.rad2deg(orbit_of(pose)[0]):.0f}" for pose in poses[:12])
     log.info(f"{path}: {len(views)} still cameras at azimuths {azimuths}{' ...' if len(poses) > 12 else ''} degrees")
 

@@ -31,7 +31,7 @@ class VideoOptions:
 
     frames: int = 32
     size: int = 512
-    recentre: bool = True
+    recenter: bool = True
     border: float = 0.2
     background: str = "auto"
     tolerance: float = matting.TOLERANCE
@@ -84,9 +84,11 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
         options.name or clip_name(path),
         np.stack([pinhole(camera.fovy, options.size, options.size) for camera in all_cameras]),
         np.stack([orbit_pose(camera.azimuth, camera.elevation, camera.radius) for camera in all_cameras]),
-        _times(frames, wanted, options.fps), ["reference", *(camera.role for camera in cameras)], 0,
+        _times(frames, wanted, options.fps),
+        ["reference", *(camera.role for camera in cameras)],
+        0,
         (options.size, options.size),
-    )  # fmt: skip
+    )
 
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
         for row, rgba in enumerate(cutter.cut(wanted)):
@@ -124,7 +126,7 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
 
 @dataclass
 class Cutter:
-    """Frames with the object cut out: by its own alpha, a mask, a plain background's colour, or not at all (keep)."""
+    """Frames with the object cut out: by its own alpha, a mask, a plain background's color, or not at all (keep)."""
 
     frames: Frames
     options: VideoOptions
@@ -171,7 +173,7 @@ def _survey(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], C
         log.info(f"{frames.path}: gaps in the object are see-through in {count} frames (--holes keep fills them)")
     if len(good) == 1:
         log.warn(f"{frames.path}: one frame only; this makes a still object, motion needs two or more")
-    crop = crop_around(union(boxes), options.border) if options.recentre else whole_picture(width, height)
+    crop = crop_around(union(boxes), options.border) if options.recenter else whole_picture(width, height)
     if crop.side < options.size / 1.5:
         log.warn(f"{frames.path}: the object covers few pixels: {crop.side} are enlarged to --size {options.size}")
     log.info(
@@ -248,7 +250,7 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
         return Cutter(frames, options, "alpha"), size
     names = [f"{frames.path}, {frames.names[index]}" for index in wanted]
     return Cutter(
-        frames, options, "plain", matting.background_colour(borders, names, options.background, options.tolerance)
+        frames, options, "plain", matting.background_color(borders, names, options.background, options.tolerance)
     ), size
 
 
@@ -266,7 +268,7 @@ def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
 def _report_empty(frames: Frames, empty: list[int], good: list[int], mode: str, on_error: str) -> None:
     if not empty:
         return
-    why = {"plain": "one colour only", "mask": "an empty mask", "alpha": "fully transparent"}.get(mode, "empty")
+    why = {"plain": "one color only", "mask": "an empty mask", "alpha": "fully transparent"}.get(mode, "empty")
     if not good:
         raise DataError(f"{frames.path}: no object in any frame: each is {why}; is --tolerance too large?")
     text = f"{frames.path}: no object in {_named(frames, empty)} ({why})"

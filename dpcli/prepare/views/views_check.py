@@ -33,8 +33,9 @@ class ArtemisIndex:
         images, declared = require_folder(self.animal / "img", "MOTION/FRAME/"), declared_frames(self.animal)
         there = {path.name for path in images.iterdir() if path.is_dir()}
         names = [self.motion] if self.motion else sorted(there | declared.keys())
-        return [Item(name, images / name, problem=self._problem(name, declared.get(name, 0), len(poses)))
-                for name in names]  # fmt: skip
+        return [
+            Item(name, images / name, problem=self._problem(name, declared.get(name, 0), len(poses))) for name in names
+        ]
 
     def summary(self, items: list[Item]) -> list[str]:
         return []

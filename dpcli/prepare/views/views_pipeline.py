@@ -32,9 +32,15 @@ class Clip:
 
 
 def convert_clip(
-    make_clip: Callable[[], Clip], output: Path, *, config: dict[str, Any], source: str, task: str,
-    seed: int = 0, force: bool = False,
-) -> ViewsHeader:  # fmt: skip
+    make_clip: Callable[[], Clip],
+    output: Path,
+    *,
+    config: dict[str, Any],
+    source: str,
+    task: str,
+    seed: int = 0,
+    force: bool = False,
+) -> ViewsHeader:
     """Write a clip to `output` and return its header; a finished file of the same configuration is left as it is.
 
     config: everything that decides the content, digests of the inputs among them. UsageError when `output` was made
@@ -47,9 +53,20 @@ def convert_clip(
             return reader.header
     clip = make_clip()
     header = clip.header
-    with stop_requested() as stop, ViewsWriter(
-        output, header, seed=seed, source=source, provenance=provenance, track=clip.track, part=clip.part, force=force
-    ) as writer, Progress(task, total=header.num_views * header.num_frames, unit="picture") as bar:  # fmt: skip
+    with (
+        stop_requested() as stop,
+        ViewsWriter(
+            output,
+            header,
+            seed=seed,
+            source=source,
+            provenance=provenance,
+            track=clip.track,
+            part=clip.part,
+            force=force,
+        ) as writer,
+        Progress(task, total=header.num_views * header.num_frames, unit="picture") as bar,
+    ):
         for view, frame, rgba in clip.pictures():
             writer.add(view, frame, rgba)
             bar.advance()

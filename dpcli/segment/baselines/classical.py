@@ -25,7 +25,7 @@ class ClassicalOptions:
 
     motion: what stands beside the coordinates: none, the flow, or the residual, which is the flow less the dominant
     rigid motion of the frame. max_parts: the most parts when their number is estimated. smallest: parts of a smaller
-    share of the frame's points join their neighbour. max_points: larger frames are cut in a sample of so many.
+    share of the frame's points join their neighbor. max_points: larger frames are cut in a sample of so many.
     """
 
     motion: str = "none"
@@ -121,7 +121,9 @@ def _converted(where: str, value: Any, default: Any) -> Any:
     name = where.split()[1]
     least = {"max_points": 2, "smallest": 0, "still": 0, "motion_weight": 0}.get(name)
     if not (whole and np.isfinite(converted) and (converted > 0 if least is None else converted >= least)):
-        expected = f"a positive {type(default).__name__}" if least is None else f"{type(default).__name__}, {least} or more"
+        expected = (
+            f"a positive {type(default).__name__}" if least is None else f"{type(default).__name__}, {least} or more"
+        )
         raise UsageError(f"{where} is {value!r}; expected {expected}")
     return converted
 
@@ -197,11 +199,7 @@ def _frame_labels(
 
 
 def _cut(
-    points: np.ndarray,
-    motion: np.ndarray,
-    num_parts: int | None,
-    options: ClassicalOptions,
-    rng: np.random.Generator,
+    points: np.ndarray, motion: np.ndarray, num_parts: int | None, options: ClassicalOptions, rng: np.random.Generator
 ) -> np.ndarray:
     """Raw clusters i64 (N); -1 for DBSCAN's outliers."""
     if isinstance(options, DbscanOptions):
@@ -235,7 +233,7 @@ def _ward(space: np.ndarray, num_parts: int | None, threshold: float) -> np.ndar
 
 
 def _tidy(parts: np.ndarray, points: np.ndarray, smallest: float, most: int) -> np.ndarray:
-    """Parts 0..K-1, K <= most: outliers (-1) go to the nearest point's part, then the smallest to their neighbours."""
+    """Parts 0..K-1, K <= most: outliers (-1) go to the nearest point's part, then the smallest to their neighbors."""
     if (parts < 0).all():
         return np.zeros(len(parts), np.int64)
     inside = np.flatnonzero(parts >= 0)

@@ -88,7 +88,7 @@ def spectral_parts(
     most: int,
     rng: np.random.Generator,
 ) -> np.ndarray:  # [N]
-    """Clusters i64 (N) of a graph, by its normalised Laplacian's lowest eigenvectors (Ng, Jordan & Weiss 2001).
+    """Clusters i64 (N) of a graph, by its normalized Laplacian's lowest eigenvectors (Ng, Jordan & Weiss 2001).
 
     num_parts None: estimated by the eigengap, between fewest and most.
     """

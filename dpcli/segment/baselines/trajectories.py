@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-Flows = Mapping[tuple[int, int], np.ndarray]  # (t, u) -> displacement (N_t,3) of frame t's points towards frame u
+Flows = Mapping[tuple[int, int], np.ndarray]  # (t, u) -> displacement (N_t,3) of frame t's points toward frame u
 _ROUNDS = 10  # of the robust fit of the dominant motion
 
 

@@ -66,16 +66,24 @@ def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) 
     taken = {name: getattr(sequence, name)[rows] for name in POINT_FIELDS if getattr(sequence, name) is not None}
     offsets = np.concatenate([[0], np.cumsum([len(own) for own in keep])]).astype(np.int64)
     return CloudSequence(
-        sequence.name, sequence.points[rows], offsets, sequence.split, sequence.label, sequence.subject,
-        sequence.camera, time=sequence.time, pose=sequence.pose, **taken,
-    )  # fmt: skip
+        sequence.name,
+        sequence.points[rows],
+        offsets,
+        sequence.split,
+        sequence.label,
+        sequence.subject,
+        sequence.camera,
+        time=sequence.time,
+        pose=sequence.pose,
+        **taken,
+    )
 
 
 def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, device: str = "cpu") -> np.ndarray:
     """Flow f32 (P,3) of the points drawn from the frames `whole`: to the next frame, in the last frame to the one before.
 
     icp and nearest look for the points in the whole next frame (icp in 1,024 of its points at most), a trained
-    estimator in the points drawn from it, as it was trained. Zero in a single frame and towards a frame without points.
+    estimator in the points drawn from it, as it was trained. Zero in a single frame and toward a frame without points.
     """
     frames = [drawn.frame(t) for t in range(drawn.num_frames)]
     targets = whole if flow in METHODS else frames
@@ -110,9 +118,18 @@ def flow_as_points(sequence: CloudSequence) -> np.ndarray:
 
 
 def run_flow_estimate(
-    data: str, output: str, *, flow: str, points: int, as_points: bool, split: str, seed: int, device: str,
-    jobs: int | None, force: bool,
-) -> None:  # fmt: skip
+    data: str,
+    output: str,
+    *,
+    flow: str,
+    points: int,
+    as_points: bool,
+    split: str,
+    seed: int,
+    device: str,
+    jobs: int | None,
+    force: bool,
+) -> None:
     """`dpc segment estimate-flow`; running again continues where a stopped or killed run ended."""
     weights = flow_weights(flow)
     with input_file(data) as path, output_file(output) as target:
@@ -127,9 +144,17 @@ def run_flow_estimate(
         work = FlowOfSequence(flow, points, as_points, seed, device)
         if force or not _already_there(target, history[-1]):
             keep_freed_memory()
-            with CloudsWriter(target, class_names=reader.class_names, length_unit=reader.length_unit, seed=seed,
-                              source=reader.path.name if data != "-" else "stdin", provenance=history, fields=work.fields(reader.fields),
-                              force=force, resume=output != "-") as writer:  # fmt: skip
+            with CloudsWriter(
+                target,
+                class_names=reader.class_names,
+                length_unit=reader.length_unit,
+                seed=seed,
+                source=reader.path.name if data != "-" else "stdin",
+                provenance=history,
+                fields=work.fields(reader.fields),
+                force=force,
+                resume=output != "-",
+            ) as writer:
                 frames = int(reader.frame_counts[chosen].sum())
                 _estimate_all(reader, chosen, work, writer, _processes(jobs, work, frames))
     if output != "-":

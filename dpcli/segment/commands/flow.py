@@ -25,9 +25,17 @@ def run_flow_training(
     shape = find_flow_config(config)
     with input_file(data) as path:
         reader = CloudsReader(path)
-        record = {"network": asdict(shape), "steps": steps, "batch": batch, "seed": seed, "data": provenance.file_digest(path)}
+        record = {
+            "network": asdict(shape),
+            "steps": steps,
+            "batch": batch,
+            "seed": seed,
+            "data": provenance.file_digest(path),
+        }
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_flow_curves)
-        log.info(f"training a flow estimator ({config}) on {chosen}: {len(reader)} sequences, {steps} steps of {batch} pairs")
+        log.info(
+            f"training a flow estimator ({config}) on {chosen}: {len(reader)} sequences, {steps} steps of {batch} pairs"
+        )
         keep_freed_memory()
         with stop_requested() as stop:
             train_flow(reader, folder, steps=steps, batch=batch, seed=seed, device=chosen, stop=stop, config=config)

@@ -41,10 +41,23 @@ CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
 
 
 def run_training(
-    data: str, output: str, *, config: str, network: dict[str, Any], schedule: dict[str, Any], objective: dict[str, Any],
-    flow: str, points: int | None, validation: str | None, start_from: str | None, flows_of: Path | None, seed: int,
-    device: str, force: bool, amp: bool | None = None,
-) -> None:  # fmt: skip
+    data: str,
+    output: str,
+    *,
+    config: str,
+    network: dict[str, Any],
+    schedule: dict[str, Any],
+    objective: dict[str, Any],
+    flow: str,
+    points: int | None,
+    validation: str | None,
+    start_from: str | None,
+    flows_of: Path | None,
+    seed: int,
+    device: str,
+    force: bool,
+    amp: bool | None = None,
+) -> None:
     """`dpc segment train`."""
     chosen = choose_device(device)
     plan, aims = Schedule(**_given(schedule)), Objective(**_given(objective))
@@ -53,11 +66,23 @@ def run_training(
         reader = CloudsReader(path)
         train_part, held = split_sequences(reader, validation, seed)
         _check_supervision(reader, aims)
-        record = {"network": json.loads(shape.to_json()), "schedule": asdict(plan), "objective": asdict(aims), "flow": flow,
-                  "validation": validation, "start_from": start_from, "seed": seed, "data": provenance.file_digest(path)}  # fmt: skip
-        used = {"flow_weights": None if aims.supervised else flow_weights(flow),
-                "start_weights": find_model(start_from, "--start-from") if start_from else None}  # fmt: skip
-        record |= {role: provenance.file_digest(file) for role, file in used.items() if file}  # what a path leads to may change
+        record = {
+            "network": json.loads(shape.to_json()),
+            "schedule": asdict(plan),
+            "objective": asdict(aims),
+            "flow": flow,
+            "validation": validation,
+            "start_from": start_from,
+            "seed": seed,
+            "data": provenance.file_digest(path),
+        }
+        used = {
+            "flow_weights": None if aims.supervised else flow_weights(flow),
+            "start_weights": find_model(start_from, "--start-from") if start_from else None,
+        }
+        record |= {
+            role: provenance.file_digest(file) for role, file in used.items() if file
+        }  # what a path leads to may change
         mixed = wanted(amp, chosen)
         record |= {"amp": True} if mixed else {}
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
@@ -67,8 +92,14 @@ def run_training(
         torch.manual_seed(seed)
         model = _new_model(shape, start_from, folder).to(chosen)
         model.mixed = mixed
-        notes = {"command": provenance.command_line(), "data": record["data"], "seed": seed, "supervised": aims.supervised,
-                 "flow": flow, "trained_on": f"{len(train_part)} sequences, {len(training.pairs)} pairs"}  # fmt: skip
+        notes = {
+            "command": provenance.command_line(),
+            "data": record["data"],
+            "seed": seed,
+            "supervised": aims.supervised,
+            "flow": flow,
+            "trained_on": f"{len(train_part)} sequences, {len(training.pairs)} pairs",
+        }
         log.info(
             f"training on {chosen}: {notes['trained_on']}, {len(held)} sequences for validation; {plan.epochs} epochs"
         )
@@ -98,7 +129,9 @@ def _check_flows(
     mine = json.loads(json.dumps(record))
     for key in ("data", "seed", "validation", "flow", "flow_weights"):
         if other.get(key) != mine.get(key):
-            raise UsageError(f"--flows-of {folder}: its {key} is {other.get(key)!r}, here {mine.get(key)!r}; flows don't fit")
+            raise UsageError(
+                f"--flows-of {folder}: its {key} is {other.get(key)!r}, here {mine.get(key)!r}; flows don't fit"
+            )
     first_flows(folder, len(training.pairs), training.points)
 
 
@@ -124,8 +157,10 @@ def _check_supervision(reader: CloudsReader, aims: Objective) -> None:
     if not any(name in reader.fields for name in MOTION_FIELDS):
         missing.append(" or ".join(MOTION_FIELDS))
     if aims.supervised and missing:
-        raise DataError(f"{reader.path}: --supervised needs part ids and poses or scene flow, but the file has no "
-                        f"{' and no '.join(missing)}")  # fmt: skip
+        raise DataError(
+            f"{reader.path}: --supervised needs part ids and poses or scene flow, but the file has no "
+            f"{' and no '.join(missing)}"
+        )
 
 
 def split_sequences(reader: CloudsReader, validation: str | None, seed: int) -> tuple[list[int], list[int]]:
@@ -152,7 +187,9 @@ def split_sequences(reader: CloudsReader, validation: str | None, seed: int) -> 
         count = max(1, round(share * len(train)))
         left, held = [train[i] for i in sorted(order[count:])], [train[i] for i in sorted(order[:count])]
     if not left:
-        raise UsageError(f"--validation {validation}: holds out all of the {len(train)} training sequences; none is left to train on")
+        raise UsageError(
+            f"--validation {validation}: holds out all of the {len(train)} training sequences; none is left to train on"
+        )
     return left, held
 
 
@@ -168,10 +205,24 @@ def _hold_out_classes(reader: CloudsReader, train: list[int], names: str) -> tup
 
 
 def run_prediction(
-    data: str, model: str, output: str, *, method: str | None, method_options: dict[str, Any], num_parts: int | None,
-    flow: str, refinement: dict[str, Any], split: str, seed: int, device: str, force: bool,
-    picture: Path | None, ply: Path | None, turntable: Path | None, amp: bool | None = None,
-) -> None:  # fmt: skip
+    data: str,
+    model: str,
+    output: str,
+    *,
+    method: str | None,
+    method_options: dict[str, Any],
+    num_parts: int | None,
+    flow: str,
+    refinement: dict[str, Any],
+    split: str,
+    seed: int,
+    device: str,
+    force: bool,
+    picture: Path | None,
+    ply: Path | None,
+    turntable: Path | None,
+    amp: bool | None = None,
+) -> None:
     """`dpc segment predict`."""
     for path, option, kinds in ((picture, "--picture", PICTURES), (turntable, "--turntable", (".gif",))):
         if path is not None:
@@ -191,19 +242,36 @@ def run_prediction(
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
         fields = [name for name in reader.fields if name not in ("part", "pose")]
         if force or not _already_there(target, history[-1]):
-            with PartsWriter(target, num_parts=slots, class_names=reader.class_names, length_unit=reader.length_unit, seed=seed,
-                             source=reader.path.name if data != "-" else "stdin", provenance=history, fields=[*fields, "part"],
-                             force=force, resume=True) as writer:  # fmt: skip
-                _predict_all(reader, sequences, segmenter, partial(pair_flow, method=flow), options, seed, writer, fields)
+            with PartsWriter(
+                target,
+                num_parts=slots,
+                class_names=reader.class_names,
+                length_unit=reader.length_unit,
+                seed=seed,
+                source=reader.path.name if data != "-" else "stdin",
+                provenance=history,
+                fields=[*fields, "part"],
+                force=force,
+                resume=True,
+            ) as writer:
+                _predict_all(
+                    reader, sequences, segmenter, partial(pair_flow, method=flow), options, seed, writer, fields
+                )
         _show(target, picture, ply, turntable)
     if output != "-":
         print(f"{output}: parts of {len(sequences)} sequences")
 
 
 def _segmenter(
-    method: str | None, method_options: dict[str, Any], num_parts: int | None, model_name: str, device: torch.device, seed: int,
-    mixed: bool = False, points: int = Refinement.points,
-) -> tuple[Segmenter, int, dict[str, Any]]:  # fmt: skip
+    method: str | None,
+    method_options: dict[str, Any],
+    num_parts: int | None,
+    model_name: str,
+    device: torch.device,
+    seed: int,
+    mixed: bool = False,
+    points: int = Refinement.points,
+) -> tuple[Segmenter, int, dict[str, Any]]:
     if method is None:
         model, notes = load_model(model_name)
         model.mixed = mixed
@@ -259,9 +327,15 @@ def _already_there(target: Path, entry: dict) -> bool:
 
 
 def _predict_all(
-    reader: CloudsReader, sequences: list[int], segmenter: Segmenter, estimate: Estimate, options: Refinement, seed: int,
-    writer: PartsWriter, fields: list[str],
-) -> None:  # fmt: skip
+    reader: CloudsReader,
+    sequences: list[int],
+    segmenter: Segmenter,
+    estimate: Estimate,
+    options: Refinement,
+    seed: int,
+    writer: PartsWriter,
+    fields: list[str],
+) -> None:
     done = set(writer.written_names)
     with Progress("segment predict", len(sequences), "sequence") as bar, stop_requested() as stop:
         bar.skip(len(done))

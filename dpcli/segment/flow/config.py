@@ -11,13 +11,13 @@ from dpcli.errors import UsageError
 
 @dataclass(frozen=True)
 class FlowConfig:
-    """Widths and neighbourhoods. Defaults are `compact`, ours, for training on a CPU. Lengths: diameters of the object."""
+    """Widths and neighborhoods. Defaults are `compact`, ours, for training on a CPU. Lengths: diameters of the object."""
 
     local: tuple[int, int] = (24, 48)  # channels at N/2 and N/4 points
     deep: tuple[int, int] = (64, 96)  # at N/8 and N/16: what the global correlation compares
     hidden: int = 64  # of the gated recurrent unit
     head: int = 48  # of the flow regressor
-    neighbours: int = 16
+    neighbors: int = 16
     correlated: int = 8  # nearest points of the other frame, compared with each warped point
     radius: float = 0.1  # farther ones are replaced by the nearest
     iterations: int = 4

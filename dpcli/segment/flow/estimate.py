@@ -41,7 +41,7 @@ def estimate_flow(points1: Tensor, points2: Tensor, method: str = "icp", *, devi
 
 
 def body_flow(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> np.ndarray:
-    """Flow f32 (N,3) of the rigid bodies of points1 (N,3), found towards points2 (M,3); any unit of length.
+    """Flow f32 (N,3) of the rigid bodies of points1 (N,3), found toward points2 (M,3); any unit of length.
 
     Clouds of more than 1,024 points are thinned by farthest points for the search; every point then takes the body of
     the nearest one kept. Below 16 points, or without extent, all points shift by the difference of the means.
@@ -54,16 +54,16 @@ def body_flow(points1: np.ndarray, points2: np.ndarray, search: BodySearch | Non
 
 def rigid_bodies(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> Bodies:
     """As `find_bodies`, for clouds of any size and unit: label i64 (N) of every point, motion f64 (K,3,4)."""
-    centre = points1.mean(0, dtype=np.float64)
-    size = 2 * np.sqrt(((points1 - centre) ** 2).sum(1).max())
+    center = points1.mean(0, dtype=np.float64)
+    size = 2 * np.sqrt(((points1 - center) ** 2).sum(1).max())
     if min(len(points1), len(points2)) < _FEWEST or not size > 0:
-        shift = points2.mean(0, dtype=np.float64) - centre
+        shift = points2.mean(0, dtype=np.float64) - center
         motion = np.concatenate([np.eye(3), shift[:, None]], 1)[None]
         return Bodies(np.zeros(len(points1), np.int64), motion)
     kept1, kept2 = _thinned(points1), _thinned(points2)
-    found = find_bodies((points1[kept1] - centre) / size, (points2[kept2] - centre) / size, search)
+    found = find_bodies((points1[kept1] - center) / size, (points2[kept2] - center) / size, search)
     rotation = found.motion[:, :, :3]
-    offset = size * found.motion[:, :, 3] + centre - rotation @ centre
+    offset = size * found.motion[:, :, 3] + center - rotation @ center
     label = found.label
     if len(kept1) < len(points1):
         from scipy.spatial import cKDTree

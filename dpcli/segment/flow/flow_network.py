@@ -1,8 +1,8 @@
 """A scene-flow network: a coarse global match, then a recurrent unit that corrects it (after FlowStep3D, 2021).
 
-Kittenplon, Eldar, Raviv: FlowStep3D, CVPR 2021. Features of both frames are set abstractions of nearest neighbours;
+Kittenplon, Eldar, Raviv: FlowStep3D, CVPR 2021. Features of both frames are set abstractions of nearest neighbors;
 the first flow is a soft assignment by cosine similarity of deep features (as in FLOT); every further iteration warps
-the first frame, compares it with its new neighbours, and lets a gated unit say by how much to go on.
+the first frame, compares it with its new neighbors, and lets a gated unit say by how much to go on.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dpcli.segment.flow.config import FlowConfig
 
 
 class _Norm(nn.Module):
-    """Batch or layer normalisation of the last axis, whatever stands before it."""
+    """Batch or layer normalization of the last axis, whatever stands before it."""
 
     def __init__(self, kind: str, channels: int) -> None:
         super().__init__()
@@ -35,10 +35,10 @@ def _mlp(channels: list[int], norm: str) -> nn.Sequential:
 
 
 class SetConv(nn.Module):
-    """Maximum over neighbours of an MLP of [offset, feature]: (B,N,3), (B,N,C), idx (B,M,k), (B,M,3) -> (B,M,C').
+    """Maximum over neighbors of an MLP of [offset, feature]: (B,N,3), (B,N,C), idx (B,M,k), (B,M,3) -> (B,M,C').
 
-    The first layer is linear, so it runs before the gathering, on N points rather than M k neighbours. `own` (B,M,C'),
-    if given, is added to it at every centre.
+    The first layer is linear, so it runs before the gathering, on N points rather than M k neighbors. `own` (B,M,C'),
+    if given, is added to it at every center.
     """
 
     def __init__(self, before: int, after: int, norm: str, depth: int = 3) -> None:
@@ -49,9 +49,9 @@ class SetConv(nn.Module):
         self.rest = _mlp([after] * depth, norm)
 
     def forward(
-        self, points: Tensor, features: Tensor, idx: Tensor, centres: Tensor, own: Tensor | None = None
+        self, points: Tensor, features: Tensor, idx: Tensor, centers: Tensor, own: Tensor | None = None
     ) -> Tensor:
-        shift = -self.place(centres) if own is None else own - self.place(centres)
+        shift = -self.place(centers) if own is None else own - self.place(centers)
         gathered = gather_points(self.feature(features) + self.place(points), idx)
         return self.rest(self.first(gathered + shift[:, :, None])).amax(2)
 
@@ -98,7 +98,9 @@ class FlowNetwork(nn.Module):
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)
 
-    def forward(self, points1: Tensor, points2: Tensor, iterations: int | None = None, decay: float = 1.0) -> list[Tensor]:  # fmt: skip
+    def forward(
+        self, points1: Tensor, points2: Tensor, iterations: int | None = None, decay: float = 1.0
+    ) -> list[Tensor]:
         """Flows f32 (B,N,3): the global match's, then iterations - 1 corrected ones. decay: factor of the correction from
         one iteration to the next (the release is said to test with 0.5)."""
         first, second = self._encode(points1), self._encode(points2)
@@ -106,7 +108,7 @@ class FlowNetwork(nn.Module):
         near, other = first[1], second[1]
         flow = three_nn_interpolate(near.points, first[-1].points, coarse)
         flows = [three_nn_interpolate(points1, near.points, flow)]
-        _, idx = knn(near.points, near.points, self.config.neighbours)
+        _, idx = knn(near.points, near.points, self.config.neighbors)
         hidden = torch.tanh(self.start(near.features))
         for i in range((iterations or self.config.iterations) - 1):
             flow = flow.detach()  # each iteration learns to correct what it is given
@@ -122,15 +124,15 @@ class FlowNetwork(nn.Module):
         levels, features = [], points - points.mean(1, keepdim=True)
         for layer in self.encoder:
             chosen = fps(points, max(points.shape[1] // 2, 1))
-            centres = gather_points(points, chosen)
-            _, idx = knn(centres, points, self.config.neighbours)
-            features = layer(points, features, idx, centres)
-            points = centres
+            centers = gather_points(points, chosen)
+            _, idx = knn(centers, points, self.config.neighbors)
+            features = layer(points, features, idx, centers)
+            points = centers
             levels.append(_Level(points, features))
         return levels
 
     def _global_match(self, first: _Level, second: _Level) -> Tensor:
-        """Soft correspondences of the coarsest points: weights exp(-(1 - cosine) / (exp(s) + 0.03)), normalised."""
+        """Soft correspondences of the coarsest points: weights exp(-(1 - cosine) / (exp(s) + 0.03)), normalized."""
         cosine = nn.functional.normalize(first.features, dim=-1) @ nn.functional.normalize(second.features, dim=-1).mT
         logits = (cosine - 1) / (self.sharpness.exp() + 0.03)
         distance = torch.cdist(first.points, second.points)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.ops.cpu.jit import kernel
 
-_BLOCK = 128  # distances whose least is found at once; the compiler vectorises that for 128, not for 64
+_BLOCK = 128  # distances whose least is found at once; the compiler vectorizes that for 128, not for 64
 _WORST = np.int32(0x7FFFFFFF)
 _FAR = np.float32(1e30)
 
@@ -18,9 +18,9 @@ def nearest_point(x, y, z, cloud, squared, bits):
     """Index of and squared distance to the nearest column of cloud (3,M); the first of equals.
 
     Scratch: squared f32 (M) and its bits, the same memory as i32. The bits of numbers that are not negative sort as
-    they do, and the least of integers vectorises: 4.5 times as fast as the least of floats.
+    they do, and the least of integers vectorizes: 4.5 times as fast as the least of floats.
     """
-    count = np.uintp(cloud.shape[1])  # unsigned: numba then drops the negative-index case and the loop vectorises
+    count = np.uintp(cloud.shape[1])  # unsigned: numba then drops the negative-index case and the loop vectorizes
     for j in range(count):
         a, b, c = cloud[0, j] - x, cloud[1, j] - y, cloud[2, j] - z
         squared[j] = a * a + b * b + c * c
@@ -44,10 +44,10 @@ def nearest_point(x, y, z, cloud, squared, bits):
 
 @kernel
 def _look_up(points, cloud, around, near, grid, origin, cells_per_unit, work, bits, at, far):
-    """As nearest_point for points f32 (3,n), but only among the neighbours of the point nearest to the centre of each
+    """As nearest_point for points f32 (3,n), but only among the neighbors of the point nearest to the center of each
     one's cell of the grid: column i64 (n) and squared distance f32 (n) into `at` and `far`.
 
-    near f32 (M,3,16): the places of the neighbours `around` (M,k), far away beyond the k. Scratch: work f32, of at least
+    near f32 (M,3,16): the places of the neighbors `around` (M,k), far away beyond the k. Scratch: work f32, of at least
     M and 16 n, and its bits. In three passes, because a search point by point waits for memory each time.
     """
     count, lanes, top = np.uintp(points.shape[1]), np.uintp(near.shape[2]), np.int32(0)
@@ -97,15 +97,15 @@ def _solve(matrix, vector):
 
 
 @kernel
-def _compose(motion, v, centre):
-    """motion (3,4) in place: afterwards turn by the rotation vector v[:3] about centre and shift by v[3:]."""
+def _compose(motion, v, center):
+    """motion (3,4) in place: afterwards turn by the rotation vector v[:3] about center and shift by v[3:]."""
     angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     a = math.sin(angle) / angle if angle > 1e-9 else 1.0
     b = (1 - math.cos(angle)) / (angle * angle) if angle > 1e-4 else 0.5
     for j in range(4):
         x, y, z = motion[0, j], motion[1, j], motion[2, j]
         if j == 3:
-            x, y, z = x - centre[0], y - centre[1], z - centre[2]
+            x, y, z = x - center[0], y - center[1], z - center[2]
         dot = v[0] * x + v[1] * y + v[2] * z
         c = math.cos(angle)
         motion[0, j] = c * x + a * (v[1] * z - v[2] * y) + b * dot * v[0]
@@ -113,7 +113,7 @@ def _compose(motion, v, centre):
         motion[2, j] = c * z + a * (v[0] * y - v[1] * x) + b * dot * v[2]
         if j == 3:
             for i in range(3):
-                motion[i, 3] += centre[i] + v[3 + i]
+                motion[i, 3] += center[i] + v[3 + i]
 
 
 @kernel
@@ -124,7 +124,7 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
     itself (both squared), weighted by Geman and McClure's 1 / (1 + d^2/s^2)^2 with s falling from wide to narrow.
     """
     count = source.shape[1]
-    matrix, vector, centre = np.empty((6, 6)), np.empty(6), np.empty(3)
+    matrix, vector, center = np.empty((6, 6)), np.empty(6), np.empty(3)
     moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
     at, far = np.empty(count, np.int64), np.empty(count, np.float32)
     work = np.empty(max(cloud.shape[1], near.shape[2] * count), np.float32)
@@ -138,7 +138,7 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
                 moved[k, i] = s + motion[k, 3]
                 rounded[k, i] = moved[k, i]
                 total += moved[k, i]
-            centre[k] = total / count
+            center[k] = total / count
         _look_up(rounded, cloud, around, near, grid, origin, cells_per_unit, work, bits, at, far)
         # the normal equations' sums as plain numbers: kept in arrays, they were stored again for every point
         total = 1e-6
@@ -153,7 +153,7 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
             total += w
             rx, ry, rz = cloud[0, j] - x, cloud[1, j] - y, cloud[2, j] - z
             nx, ny, nz = np.float64(normals[0, j]), np.float64(normals[1, j]), np.float64(normals[2, j])
-            x, y, z = x - centre[0], y - centre[1], z - centre[2]
+            x, y, z = x - center[0], y - center[1], z - center[2]
             a, b, c = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
             gap = w * (nx * rx + ny * ry + nz * rz)
             u = w * share
@@ -215,7 +215,7 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
         for a in range(6):  # keeps a line or a single point from turning freely
             matrix[a, a] += 1e-6 * total * (0.05 if a < 3 else 1.0)
         _solve(matrix, vector)
-        _compose(motion, vector, centre)
+        _compose(motion, vector, center)
 
 
 @kernel
@@ -239,8 +239,23 @@ def residual_kernel(source, cloud, normals, around, near, grid, origin, cells_pe
 
 @kernel
 def hypotheses_kernel(
-    source, cloud, normals, around, near, grid, origin, cells_per_unit, motions, steps, wide, narrow, share, share_out, scale, out
-):  # fmt: skip
+    source,
+    cloud,
+    normals,
+    around,
+    near,
+    grid,
+    origin,
+    cells_per_unit,
+    motions,
+    steps,
+    wide,
+    narrow,
+    share,
+    share_out,
+    scale,
+    out,
+):
     """ICP from every one of motions (H,3,4), in place; out (H): mean of d^2 / (d^2 + scale^2) afterwards."""
     squared = np.empty(source.shape[1])
     for h in range(len(motions)):
@@ -278,14 +293,14 @@ def _gap(m, px, py, pz, x, y, z):
 
 
 @kernel
-def energy_kernel(points, normals, label, motion, cost, neighbours, target, share, scale, tear, border, distance):
+def energy_kernel(points, normals, label, motion, cost, neighbors, target, share, scale, tear, border, distance):
     """What bodies cost (see `bodies`): both clouds' mean saturated residuals, the borders, and the way from body 0.
 
-    points (N,3), their normals (N,3), label (N), motion (K,3,4), cost (K,N) saturated residuals, neighbours (N,k),
+    points (N,3), their normals (N,3), label (N), motion (K,3,4), cost (K,N) saturated residuals, neighbors (N,k),
     target f32 (3,M). A border point costs more, from 1 - tear to 1, the farther apart (0.15 is far) its two motions
     take it.
     """
-    count, near = neighbours.shape
+    count, near = neighbors.shape
     moved, turned = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
     own, torn, away = 0.0, 0.0, 0.0
     for i in range(count):
@@ -302,7 +317,7 @@ def energy_kernel(points, normals, label, motion, cost, neighbours, target, shar
         if body > 0:
             away += _gap(motion[0], px, py, pz, x, y, z)
         for j in range(near):
-            other = label[neighbours[i, j]]
+            other = label[neighbors[i, j]]
             if other != body:
                 torn += 1 - tear + tear * min(_gap(motion[other], px, py, pz, x, y, z) / 0.15, 1.0)
     squared, seen = np.empty(target.shape[1]), 0.0
@@ -313,17 +328,17 @@ def energy_kernel(points, normals, label, motion, cost, neighbours, target, shar
 
 
 @kernel
-def assign_kernel(cost, neighbours, label, extra, border, rounds):
-    """Labels (N) in place, all at once per round: the least of own and neighbours' mean cost (K,N), halved, plus `extra`
-    for all bodies but the first, less twice the border's cost for every share of neighbours that agrees."""
+def assign_kernel(cost, neighbors, label, extra, border, rounds):
+    """Labels (N) in place, all at once per round: the least of own and neighbors' mean cost (K,N), halved, plus `extra`
+    for all bodies but the first, less twice the border's cost for every share of neighbors that agrees."""
     bodies, count = cost.shape
-    near = neighbours.shape[1]
+    near = neighbors.shape[1]
     unary = np.empty((count, bodies))
     for i in range(count):
         for k in range(bodies):
             total = 0.0
             for j in range(near):
-                total += cost[k, neighbours[i, j]]
+                total += cost[k, neighbors[i, j]]
             unary[i, k] = 0.5 * cost[k, i] + 0.5 * total / near + (extra if k > 0 else 0.0)
     new, votes = np.empty_like(label), np.empty(bodies)
     for _ in range(rounds):
@@ -331,7 +346,7 @@ def assign_kernel(cost, neighbours, label, extra, border, rounds):
         for i in range(count):
             votes[:] = 0.0
             for j in range(near):
-                votes[label[neighbours[i, j]]] += 1.0
+                votes[label[neighbors[i, j]]] += 1.0
             best = 0
             for k in range(1, bodies):
                 if unary[i, k] - 2 * border * votes[k] / near < unary[i, best] - 2 * border * votes[best] / near:
@@ -344,31 +359,31 @@ def assign_kernel(cost, neighbours, label, extra, border, rounds):
 
 
 @kernel
-def lloyd_kernel(points, centre, rounds, patch):
-    """k-means in place: centre f64 (K,D), patch i64 (N) of points f32 (N,D); a centre without points stays.
+def lloyd_kernel(points, center, rounds, patch):
+    """k-means in place: center f64 (K,D), patch i64 (N) of points f32 (N,D); a center without points stays.
 
     Distances in float64, ties to the lowest patch; means in float32 in the points' order, as numpy takes them.
     """
-    total, own = np.empty(centre.shape, np.float32), np.empty(len(centre), np.int64)
+    total, own = np.empty(center.shape, np.float32), np.empty(len(center), np.int64)
     for _ in range(rounds):
         total[:] = 0
         own[:] = 0
         for i in range(len(points)):
             best, at = math.inf, 0
-            for k in range(len(centre)):
+            for k in range(len(center)):
                 apart = 0.0
                 for c in range(points.shape[1]):
-                    apart += (points[i, c] - centre[k, c]) ** 2
+                    apart += (points[i, c] - center[k, c]) ** 2
                 if apart < best:
                     best, at = apart, k
             patch[i] = at
             own[at] += 1
             for c in range(points.shape[1]):
                 total[at, c] += points[i, c]
-        for k in range(len(centre)):
+        for k in range(len(center)):
             if own[k]:
                 for c in range(points.shape[1]):
-                    centre[k, c] = total[k, c] / np.float32(own[k])
+                    center[k, c] = total[k, c] / np.float32(own[k])
 
 
 @kernel

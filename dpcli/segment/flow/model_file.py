@@ -51,12 +51,12 @@ def trained_flow(points1: Tensor, points2: Tensor, name: str, device: str = "cpu
 
 
 def _one(model: FlowNetwork, points1: Tensor, points2: Tensor) -> Tensor:
-    centre = points1.mean(1, keepdim=True)
-    size = 2 * (points1 - centre).square().sum(-1).max().sqrt()
-    shift = points2.mean(1, keepdim=True) - centre
+    center = points1.mean(1, keepdim=True)
+    size = 2 * (points1 - center).square().sum(-1).max().sqrt()
+    shift = points2.mean(1, keepdim=True) - center
     if min(points1.shape[1], points2.shape[1]) < _FEWEST or not size > 0:
         return shift.expand_as(points1).clone()
-    first, second = ((p - centre) / size for p in (points1, points2))
+    first, second = ((p - center) / size for p in (points1, points2))
     thin1, thin2 = _thinned(first), _thinned(second)
     flow = model(thin1, thin2)[-1]
     if thin1.shape[1] < first.shape[1]:

@@ -11,15 +11,15 @@ ANGLES = (-0.6, -0.3, 0.3, 0.6)  # radians
 SHIFTS = (-0.18, -0.08, 0.08, 0.18)  # diameters
 
 
-def turn(axes: np.ndarray, angles: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Motions (H,3,4): by angles (H) radians about unit axes (H,3) through centres (H,3) or (3) (Rodrigues)."""
+def turn(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Motions (H,3,4): by angles (H) radians about unit axes (H,3) through centers (H,3) or (3) (Rodrigues)."""
     x, y, z = axes.T
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     sine, versine = np.sin(angles)[:, None, None], 1 - np.cos(angles)[:, None, None]
     rotation = np.eye(3) + sine * cross + versine * cross @ cross
-    offset = np.broadcast_to(centres, axes.shape) - np.einsum(
-        "hij,hj->hi", rotation, np.broadcast_to(centres, axes.shape)
+    offset = np.broadcast_to(centers, axes.shape) - np.einsum(
+        "hij,hj->hi", rotation, np.broadcast_to(centers, axes.shape)
     )
     return np.concatenate([rotation, offset[:, :, None]], 2)
 
@@ -39,19 +39,19 @@ def articulated(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
     """Motions (H,3,4) for a part (n,3): none; about its edges (doors, lids), about its normal (blades); along its axes
     (drawers); and onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
     """
-    centre = points.mean(0)
+    center = points.mean(0)
     axes = np.linalg.eigh(np.cov(points.T))[1].T[::-1]  # longest first, the normal last
-    extent = np.abs((points - centre) @ axes.T).max(0)
+    extent = np.abs((points - center) @ axes.T).max(0)
     hinge, across = np.array([0, 1, 0, 1]), np.array([1, 0, 2, 2])
-    edges = centre + np.array([-1, 1])[:, None, None] * (extent[across, None] * axes[across])  # [side, hinge, 3]
+    edges = center + np.array([-1, 1])[:, None, None] * (extent[across, None] * axes[across])  # [side, hinge, 3]
     angles = len(ANGLES)
     turns = turn(
         np.tile(np.repeat(axes[hinge], angles, 0), (2, 1)),
         np.tile(ANGLES, 8),
         np.repeat(edges.reshape(-1, 3), angles, 0),
     )
-    spins = turn(axes[[2, 2]], np.array([-0.4, 0.4]), centre)
-    offsets = np.concatenate([np.zeros((1, 3)), *(axes * by for by in SHIFTS), lonely - centre])
+    spins = turn(axes[[2, 2]], np.array([-0.4, 0.4]), center)
+    offsets = np.concatenate([np.zeros((1, 3)), *(axes * by for by in SHIFTS), lonely - center])
     return np.concatenate([turns, spins, shift(offsets)])
 
 
@@ -66,29 +66,29 @@ def distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: 
 
 def voronoi(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
     """Patch i64 (N) of each point (N,3 or more): k-means (Lloyd) from farthest points; the same every time."""
-    centre = points[fps_numpy(points[:, :3], min(count, len(points)))].astype(np.float64)
+    center = points[fps_numpy(points[:, :3], min(count, len(points)))].astype(np.float64)
     patch = np.zeros(len(points), np.int64)
-    lloyd_kernel(np.ascontiguousarray(points, np.float32), centre, rounds, patch)
+    lloyd_kernel(np.ascontiguousarray(points, np.float32), center, rounds, patch)
     return patch
 
 
-def centres(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
-    """Up to `most` centres (Q,3) of patches of about `each` points; none for fewer than 6 points."""
+def centers(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
+    """Up to `most` centers (Q,3) of patches of about `each` points; none for fewer than 6 points."""
     if len(points) < 6:
         return np.zeros((0, 3))
     patch = voronoi(points, min(most, max(1, len(points) // each)))
     return np.stack([points[patch == k].mean(0) for k in np.unique(patch)]).astype(np.float64)
 
 
-def components(chosen: np.ndarray, neighbours: np.ndarray) -> list[np.ndarray]:
-    """Connected sets of the chosen points (mask (N)) in the graph of neighbours (N,k), as index arrays."""
+def components(chosen: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
+    """Connected sets of the chosen points (mask (N)) in the graph of neighbors (N,k), as index arrays."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     index = np.flatnonzero(chosen)
     place = np.full(len(chosen), -1)
     place[index] = np.arange(len(index))
-    ends = place[neighbours[index]]
+    ends = place[neighbors[index]]
     row, column = np.nonzero(ends >= 0)
     graph = coo_matrix((np.ones(len(row)), (row, ends[row, column])), (len(index), len(index)))
     count, part = connected_components(graph, directed=False)

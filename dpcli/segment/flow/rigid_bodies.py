@@ -27,7 +27,7 @@ class BodySearch:
     most: int = 6  # bodies
     scale: float = 1.25  # spacings: a residual of this counts one half
     share: float = 0.15  # of point-to-point distance in a residual, besides point to plane
-    border: float = 0.3  # cost of a point whose neighbours are all in other bodies
+    border: float = 0.3  # cost of a point whose neighbors are all in other bodies
     tear: float = 0.5  # share of it that grows with the gap between the two motions
     far: float = 0.1  # cost of a point's distance from where the first body would take it
     normal: float = 0.3  # how much patches care about the normal
@@ -150,15 +150,25 @@ class _Search:
         """With its energy: both clouds' mean saturated residuals, the borders, and the way from the first body."""
         options = self.options
         energy = energy_kernel(
-            self.points, self.source.normals, label, motion, cost, self.source.neighbours, self.target.columns,
-            options.share, self.scale, options.tear, options.border, options.far,
-        )  # fmt: skip
+            self.points,
+            self.source.normals,
+            label,
+            motion,
+            cost,
+            self.source.neighbors,
+            self.target.columns,
+            options.share,
+            self.scale,
+            options.tear,
+            options.border,
+            options.far,
+        )
         return Bodies(label, motion, energy, cost)
 
     def _assign(self, label: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        """Each point to the body that explains it and its neighbours best, neighbours preferring the same (ICM)."""
+        """Each point to the body that explains it and its neighbors best, neighbors preferring the same (ICM)."""
         label = label.copy()
-        assign_kernel(cost, self.source.neighbours, label, self.options.extra, self.options.border, 6)
+        assign_kernel(cost, self.source.neighbors, label, self.options.extra, self.options.border, 6)
         return label
 
     def _one_more(self, now: Bodies) -> Bodies | None:
@@ -197,7 +207,7 @@ class _Search:
         moved = np.einsum("nij,nj->ni", own[:, :, :3], self.points) + own[:, :, 3]
         normals = np.einsum("nij,nj->ni", own[:, :, :3], self.source.normals)
         seen = self._saturated(self.target.covered_by(moved, normals, self.options.share))
-        lonely = starts.centres(self.target.points[seen > 0.5])
+        lonely = starts.centers(self.target.points[seen > 0.5])
         current = now.cost[now.label, np.arange(len(now.label))]
         proposals = []
         for region in self._regions(current):
@@ -213,8 +223,8 @@ class _Search:
 
     def _regions(self, current: np.ndarray) -> list[np.ndarray]:
         """Where the cost is high: connected badly explained points, and patches of two sizes; the worst first."""
-        around = 0.5 * current + 0.5 * current[self.source.neighbours].mean(1)
-        regions = [r for level in (0.35, 0.55) for r in starts.components(around > level, self.source.neighbours)]
+        around = 0.5 * current + 0.5 * current[self.source.neighbors].mean(1)
+        regions = [r for level in (0.35, 0.55) for r in starts.components(around > level, self.source.neighbors)]
         regions += [np.flatnonzero(patch == k) for patch in self.patches for k in range(patch.max() + 1)]
         regions = [region for region in regions if len(region) >= 8 and around[region].mean() > around.mean()]
         excess = [(around[region] - around.mean()).sum() / np.sqrt(len(region)) for region in regions]

@@ -25,10 +25,10 @@ def rigid_groups(
 ) -> Tensor:  # [B, N]
     """Labels i64 (B,N), 0 = the largest body; -1 = no motion found explains the point.
 
-    Hypotheses are the motions of neighbourhoods of `seeds` far-apart points, of two sizes, and of the whole. The one that
+    Hypotheses are the motions of neighborhoods of `seeds` far-apart points, of two sizes, and of the whole. The one that
     explains most is taken and fitted again to what it explains, then the one that explains most of the rest, until a
     motion would gain less than the share `gain` of the points or there are `most`. A point counts as explained within a
-    tolerance: three times the median residual of the small neighbourhoods' own fits, kept within the bounds (diameters).
+    tolerance: three times the median residual of the small neighborhoods' own fits, kept within the bounds (diameters).
     """
     moved = points + flow
     hypotheses, noise = _hypotheses(points, moved, min(seeds, points.shape[1]))
@@ -47,15 +47,19 @@ def rigid_groups(
         own = torch.where(open_[:, None], own, torch.inf)
         cost = torch.minimum(cost, own)
         chosen.append(own)
-    return _labels(points, torch.stack(chosen, 1), bound, smallest) if chosen else torch.zeros(points.shape[:2], dtype=torch.int64)
+    return (
+        _labels(points, torch.stack(chosen, 1), bound, smallest)
+        if chosen
+        else torch.zeros(points.shape[:2], dtype=torch.int64)
+    )
 
 
 def _hypotheses(points: Tensor, moved: Tensor, seeds: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
     """Motions (B,H,3,3), (B,H,3) and the flow's noise (B)."""
-    centres = gather_points(points, fps(points, seeds))
+    centers = gather_points(points, fps(points, seeds))
     rotations, shifts, noise = [], [], None
     for count in (16, 48):
-        _, index = knn(centres, points, min(count, points.shape[1]))
+        _, index = knn(centers, points, min(count, points.shape[1]))
         weights = torch.zeros(len(points), points.shape[1], seeds, device=points.device)
         weights.scatter_(1, index.transpose(1, 2), 1.0)
         rotation, shift = weighted_kabsch(points, moved, weights)
@@ -84,7 +88,7 @@ def _refined(points: Tensor, moved: Tensor, cost: Tensor, residual: Tensor, boun
 
 
 def _labels(points: Tensor, residual: Tensor, bound: Tensor, smallest: float) -> Tensor:
-    """The motion with the least residual over each point's neighbours; crumbs and unexplained points are -1."""
+    """The motion with the least residual over each point's neighbors; crumbs and unexplained points are -1."""
     _, index = knn(points, points, min(8, points.shape[1]))
     capped = residual.clamp(max=2 * float(bound.max())).transpose(1, 2)  # [B, N, M]
     smooth = gather_points(capped, index).mean(2)

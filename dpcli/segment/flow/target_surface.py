@@ -1,4 +1,4 @@
-"""A cloud prepared for many searches: normals, neighbours, a grid of nearest points; and the ICP onto it."""
+"""A cloud prepared for many searches: normals, neighbors, a grid of nearest points; and the ICP onto it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dpcli.segment.flow.kernels_icp import cover_kernel, hypotheses_kernel, icp_
 
 _CELL, _MARGIN = 0.03, 0.12  # of the grid, in diameters of the cloud: callers scale their clouds to about 1
 _CELLS = 96  # at most, along an axis
-_AROUND = 9  # points tried per look-up: the nearest to the cell's centre and its neighbours
+_AROUND = 9  # points tried per look-up: the nearest to the cell's center and its neighbors
 _OF_EIGHTH = 0.31  # nearest over 8th nearest distance in random samples of a surface; duplicates make the former small
 SHARE = 0.3  # of the distance to the point itself in an ICP step, besides the distance to its plane
 
@@ -16,7 +16,7 @@ SHARE = 0.3  # of the distance to the point itself in an ICP step, besides the d
 class Surface:
     """points (N,3), f32, of diameter about 1 and N >= 9.
 
-    `neighbours` i64 (N,8) without the point itself; `normals` f32 (N,3) by the plane through 8 points, of either sign.
+    `neighbors` i64 (N,8) without the point itself; `normals` f32 (N,3) by the plane through 8 points, of either sign.
     """
 
     def __init__(self, points: np.ndarray) -> None:
@@ -25,7 +25,7 @@ class Surface:
         self.points = np.ascontiguousarray(points, np.float32)
         distance, found = cKDTree(self.points).query(self.points, _AROUND)
         self.spacing = float(max(distance[:, 1].mean(), _OF_EIGHTH * distance[:, -1].mean()))
-        self.neighbours = found[:, 1:]
+        self.neighbors = found[:, 1:]
         patch = self.points[found[:, :8]].astype(np.float64)
         patch -= patch.mean(1, keepdims=True)
         self.normals = np.linalg.eigh(patch.transpose(0, 2, 1) @ patch)[1][:, :, 0].astype(np.float32)
@@ -38,8 +38,14 @@ class Surface:
         near = np.full((len(self.points), 3, 16), 1e9, np.float32)
         near[:, :, :_AROUND] = self.points[found].transpose(0, 2, 1)
         self._search = (
-            self.columns, columns(self.normals), found.astype(np.int32), near, grid, origin, np.float32(1 / cell),
-        )  # fmt: skip
+            self.columns,
+            columns(self.normals),
+            found.astype(np.int32),
+            near,
+            grid,
+            origin,
+            np.float32(1 / cell),
+        )
 
     def icp(self, source: np.ndarray, motion: np.ndarray, steps: int, wide: float, narrow: float) -> np.ndarray:
         """Motion (3,4) that brings source (3,n) f32 onto the cloud, from a first one; robust, point to plane."""
@@ -48,8 +54,15 @@ class Surface:
         return motion
 
     def icp_many(
-        self, source: np.ndarray, motions: np.ndarray, steps: int, wide: float, narrow: float, share: float, scale: float
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        self,
+        source: np.ndarray,
+        motions: np.ndarray,
+        steps: int,
+        wide: float,
+        narrow: float,
+        share: float,
+        scale: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The same from motions (H,3,4): where they end (h,3,4), and their mean saturated residuals (h).
 
         After a third of the steps the worse half is given up.

@@ -1,7 +1,7 @@
 """Training the flow network without labels: Chamfer distance of the warped frame, and smoothness of the flow.
 
 A run can be stopped at any step and continued to the same result: a step's randomness comes from (seed, step), and the
-state holds weights, optimiser and the step.
+state holds weights, optimizer and the step.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from dpcli.segment.flow.config import find_flow_config
 from dpcli.segment.flow.flow_network import FlowNetwork
 from dpcli.segment.flow.model_file import augmented, save_flow_model
 from dpcli.segment.frame_pairs import PairSource
-from dpcli.segment.training.losses import smoothness_loss, smoothness_neighbours
+from dpcli.segment.training.losses import smoothness_loss, smoothness_neighbors
 from dpcli.store import CloudsReader
 
 COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "learning_rate", "seconds")
@@ -46,18 +46,27 @@ def chamfer(moved: Tensor, points: Tensor) -> Tensor:
 def flow_loss(points1: Tensor, points2: Tensor, flows: list[Tensor]) -> tuple[Tensor, Tensor]:
     """Weighted sum over iterations of 0.75 Chamfer + 0.25 smoothness (4 nearest within 0.05, 8 of a ball of 0.1), as
     FlowStep3D on SAPIEN; weights 0.5, then 0.3. And the last iteration's Chamfer distance alone."""
-    neighbours = smoothness_neighbours(points1, k=4, radius=0.05, ball_k=8, ball_radius=0.1)
+    neighbors = smoothness_neighbors(points1, k=4, radius=0.05, ball_k=8, ball_radius=0.1)
     total, distance = points1.new_zeros(()), points1.new_zeros(())
     for i, flow in enumerate(flows):
         distance = chamfer(points1 + flow, points2)
-        total = total + (_LATER if i else _FIRST) * (0.75 * distance + 0.25 * smoothness_loss(flow, neighbours))
+        total = total + (_LATER if i else _FIRST) * (0.75 * distance + 0.25 * smoothness_loss(flow, neighbors))
     return total, distance.detach()
 
 
 def train_flow(
-    reader: CloudsReader, folder: RunFolder, *, steps: int, batch: int, seed: int, device: torch.device | str,
-    stop: StopRequest, config: str = "compact", points: int = 512, log_every: int | None = None,
-) -> FlowNetwork:  # fmt: skip
+    reader: CloudsReader,
+    folder: RunFolder,
+    *,
+    steps: int,
+    batch: int,
+    seed: int,
+    device: torch.device | str,
+    stop: StopRequest,
+    config: str = "compact",
+    points: int = 512,
+    log_every: int | None = None,
+) -> FlowNetwork:
     """Train on the adjacent pairs, both ways, of split `train` (of all sequences if there is none); the best network.
 
     Adam at 1e-3, halved every 400,000 pairs, not below 1e-5. Pairs are scaled to diameter 1 and changed as `augmented`
@@ -72,9 +81,18 @@ def train_flow(
 
 class _Trainer:
     def __init__(
-        self, reader: CloudsReader, folder: RunFolder, steps: int, batch: int, seed: int, device: torch.device,
-        stop: StopRequest, config: str, points: int, log_every: int | None,
-    ) -> None:  # fmt: skip
+        self,
+        reader: CloudsReader,
+        folder: RunFolder,
+        steps: int,
+        batch: int,
+        seed: int,
+        device: torch.device,
+        stop: StopRequest,
+        config: str,
+        points: int,
+        log_every: int | None,
+    ) -> None:
         self.folder, self.steps, self.batch, self.seed, self.device, self.stop = (
             folder,
             steps,
@@ -141,8 +159,15 @@ class _Trainer:
         loss, chamfer_sum, count = self.sums
         value, error = self._validate()
         seconds = self.spent + time.monotonic() - started
-        row = {"step": self.step, "loss": loss / count, "chamfer": chamfer_sum / count, "validation_loss": value,
-               "validation_epe": error, "learning_rate": self._rate(), "seconds": round(seconds, 2)}  # fmt: skip
+        row = {
+            "step": self.step,
+            "loss": loss / count,
+            "chamfer": chamfer_sum / count,
+            "validation_loss": value,
+            "validation_epe": error,
+            "learning_rate": self._rate(),
+            "seconds": round(seconds, 2),
+        }
         log.detail(f"{row}")
         self.folder.log(row)
         self.sums, self.spent = [0.0, 0.0, 0], 0.0
@@ -173,10 +198,16 @@ class _Trainer:
         return float(np.mean(losses)), float(np.mean(errors)) if errors else None
 
     def _save(self) -> None:
-        self.folder.save_state({
-            "step": self.step, "best": self.best, "sums": self.sums, "spent": self.spent,
-            "model": self.model.state_dict(), "optimizer": self.optimizer.state_dict(),
-        })  # fmt: skip
+        self.folder.save_state(
+            {
+                "step": self.step,
+                "best": self.best,
+                "sums": self.sums,
+                "spent": self.spent,
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+            }
+        )
 
     def _restore(self, state: dict) -> None:
         for key in ("step", "best", "sums", "spent"):

@@ -17,7 +17,7 @@ class Layer:
     stride: int
     radius: float
     sigma: float  # a kernel point's reach, squared
-    neighbours: int
+    neighbors: int
     kernel_radius: float
 
 
@@ -46,7 +46,10 @@ class PartConfig:
     points: int = 512  # per frame in training
 
     def __post_init__(self) -> None:
-        for option, value, known in (("--group", self.group, ("icosahedral", "trivial")), ("--pooling", self.pooling, ("point", "global"))):
+        for option, value, known in (
+            ("--group", self.group, ("icosahedral", "trivial")),
+            ("--pooling", self.pooling, ("point", "global")),
+        ):
             if value not in known:
                 raise UsageError(f"{option} {value}: expected {' or '.join(known)}")
 
@@ -78,14 +81,26 @@ def compact() -> PartConfig:
 def release() -> PartConfig:
     """The released SAPIEN network: 1,432,365 parameters."""
     rows = (
-        (32, 2, 0.2, 0.02, 96), (32, 1, 0.08**0.5, 0.04, 48), (64, 1, 0.08**0.5, 0.04, 48),
-        (64, 2, 0.4, 0.08, 96), (64, 1, 0.4, 0.08, 48), (128, 1, 0.4, 0.08, 48),
-    )  # fmt: skip
+        (32, 2, 0.2, 0.02, 96),
+        (32, 1, 0.08**0.5, 0.04, 48),
+        (64, 1, 0.08**0.5, 0.04, 48),
+        (64, 2, 0.4, 0.08, 96),
+        (64, 1, 0.4, 0.08, 48),
+        (128, 1, 0.4, 0.08, 48),
+    )
     layers = [Layer(c, stride, radius, sigma, count, 0.7 * radius) for c, stride, radius, sigma, count in rows]
     return PartConfig(
-        (tuple(layers[:3]), tuple(layers[3:])), kernel="uniform", rule="first", pool_heads=1, canonical_heads=0,
-        decoder=((256, 128), (128, 128, 64)), slot_width=128, slot_heads=8, motion_width=128, motion_layers=(128, 64, 32),
-    )  # fmt: skip
+        (tuple(layers[:3]), tuple(layers[3:])),
+        kernel="uniform",
+        rule="first",
+        pool_heads=1,
+        canonical_heads=0,
+        decoder=((256, 128), (128, 128, 64)),
+        slot_width=128,
+        slot_heads=8,
+        motion_width=128,
+        motion_layers=(128, 64, 32),
+    )
 
 
 CONFIGS = {"compact": compact, "release": release}

@@ -12,7 +12,7 @@ from dpcli.ops.gather import gather_points
 from dpcli.runtime.mixed_precision import full_precision
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS
-from dpcli.segment.network.neighborhood import RULES, Neighbourhood
+from dpcli.segment.network.neighborhood import RULES, Neighborhood
 from dpcli.segment.network.se3_conv import SeparableConv
 
 
@@ -29,7 +29,7 @@ class InvariantPooling(nn.Module):
     """u(p) = sum_a softmax_a(logit(p,a)) f(p,a), the weighted sum over the group (eq. 4.2), with one or several weightings.
 
     logit = 1x1 convolution of [f(p,a), R_a^T (x_p - m)]. m is the cloud's mean in the release, which lets a part's weights
-    depend on the other parts' poses; else the mean of the point's own neighbours. ``global``: one weighting for all points.
+    depend on the other parts' poses; else the mean of the point's own neighbors. ``global``: one weighting for all points.
     """
 
     def __init__(self, channels: int, config: PartConfig) -> None:
@@ -37,15 +37,15 @@ class InvariantPooling(nn.Module):
         self.config = config
         self.logit = nn.Linear(channels + 3, config.pool_heads)
 
-    def forward(self, features: Tensor, points: Tensor, near: Neighbourhood) -> Tensor:
+    def forward(self, features: Tensor, points: Tensor, near: Neighborhood) -> Tensor:
         """features (B,P,G,C), points (B,P,3) -> (B,P,H*C)."""
         rotations = GROUPS[self.config.group]().rotations_like(points)
         if self.config.canonical_heads:  # scaled by the radius, each cloud's own: of order 1, like the features
             radius = near.offsets.square().sum(-1).mean((1, 2)).sqrt().clamp(min=1e-6)
-            centred = -near.offsets.mean(2) / radius[:, None, None]
+            centered = -near.offsets.mean(2) / radius[:, None, None]
         else:
-            centred = points - points.mean(1, keepdim=True)
-        local = _turned_back(rotations, centred).to(features.dtype)
+            centered = points - points.mean(1, keepdim=True)
+        local = _turned_back(rotations, centered).to(features.dtype)
         logits = self.logit(torch.cat([features, local], -1))
         if self.config.pooling == "global":
             logits = logits.mean(1, keepdim=True).expand_as(logits)
@@ -60,7 +60,7 @@ def _turned_back(rotations: Tensor, offsets: Tensor) -> Tensor:
 
 
 class Encoder(nn.Module):
-    """Blocks of separable SE(3) convolutions; centres are farthest points of the first layer, later strides keep the first ones."""
+    """Blocks of separable SE(3) convolutions; centers are farthest points of the first layer, later strides keep the first ones."""
 
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
@@ -82,18 +82,18 @@ class Encoder(nn.Module):
             near, used = None, None
             for conv in block:
                 layer = conv.spatial.layer
-                key = (layer.radius, layer.neighbours, points.shape[1], layer.stride)
+                key = (layer.radius, layer.neighbors, points.shape[1], layer.stride)
                 if near is None or key != used:
-                    near, used = self._neighbourhood(points, layer, features is None), key
+                    near, used = self._neighborhood(points, layer, features is None), key
                 features = conv(features, near)
-                points = near.centres
+                points = near.centers
             levels.append(Level(points, features, pool(features, points, near)))
         return levels
 
-    def _neighbourhood(self, points: Tensor, layer, first: bool) -> Neighbourhood:
+    def _neighborhood(self, points: Tensor, layer, first: bool) -> Neighborhood:
         count = -(-points.shape[1] // layer.stride)
-        centres = gather_points(points, fps(points, count)) if first else points[:, :count]
-        return RULES[self.config.rule](points, centres, layer.radius, layer.neighbours)
+        centers = gather_points(points, fps(points, count)) if first else points[:, :count]
+        return RULES[self.config.rule](points, centers, layer.radius, layer.neighbors)
 
 
 class CanonicalFrames(nn.Module):
@@ -110,7 +110,7 @@ class CanonicalFrames(nn.Module):
         nn.init.normal_(self.logit.weight, std=4 / channels**0.5)  # an even weighting of all rotations would give zero
 
     def forward(self, level: Level) -> Tensor:
-        """Maps (B,H,3,3) that take centred coordinates into the canonical frames."""
+        """Maps (B,H,3,3) that take centered coordinates into the canonical frames."""
         return self._maps(level.equivariant)
 
     @full_precision

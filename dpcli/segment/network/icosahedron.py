@@ -60,14 +60,16 @@ def rotation_about(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def _faces() -> np.ndarray:
-    """Centres of the 20 faces, unit vectors: every three vertices that touch one another."""
+    """Centers of the 20 faces, unit vectors: every three vertices that touch one another."""
     points = vertices()
     touch = np.isclose(points @ points.T, 1 / 5**0.5)
     found = [
         points[[i, j, k]].sum(0)
-        for i in range(12) for j in range(i) for k in range(j)
+        for i in range(12)
+        for j in range(i)
+        for k in range(j)
         if touch[i, j] and touch[j, k] and touch[i, k]
-    ]  # fmt: skip
+    ]
     return np.array([f / np.linalg.norm(f) for f in found])
 
 
@@ -76,7 +78,7 @@ def icosahedral_group() -> RotationGroup:
     """The 60 rotations that map an icosahedron to itself: 1 identity, 24 fifth-turns, 20 third-turns, 15 half-turns.
 
     Closes the turns by 72 degrees about a vertex and by 120 degrees about one of its faces under products. ``nearby``
-    are the 12 elements that map a face to itself or to one of its three neighbours (EPN, Chen et al. 2021).
+    are the 12 elements that map a face to itself or to one of its three neighbors (EPN, Chen et al. 2021).
     """
     faces, points = _faces(), vertices()
     face = faces[np.argmax(faces @ points[0])]

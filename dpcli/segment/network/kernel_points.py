@@ -15,7 +15,7 @@ class KernelPoints:
     """Kernel points (K,3) of radius 1 seen from every rotation of a group.
 
     orbit f64 (D,3): the distinct positions among all R_a k; slot i64 (G,K): where R_a k is in the orbit.
-    A kernel that the group maps to itself has D = K: then neighbours are weighed once for all rotations.
+    A kernel that the group maps to itself has D = K: then neighbors are weighed once for all rotations.
     """
 
     points: np.ndarray
@@ -29,7 +29,7 @@ class KernelPoints:
 
 @lru_cache
 def kernel_points(name: str, group: str) -> KernelPoints:
-    """`vertices`: the centre and an icosahedron's 12 vertices, closed under its rotations. `uniform`: the centre and 23
+    """`vertices`: the center and an icosahedron's 12 vertices, closed under its rotations. `uniform`: the center and 23
     points spread over the sphere, as EPN and the release use them."""
     points = np.concatenate([np.zeros((1, 3)), vertices() if name == "vertices" else _spread(23)])
     rotated = np.einsum("gij,kj->gki", GROUPS[group]().rotations, points)

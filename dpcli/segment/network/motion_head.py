@@ -25,9 +25,17 @@ def relative_labels(rotation: Tensor, group: RotationGroup) -> tuple[Tensor, Ten
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     """(w,x,y,z) of any length (...,4) -> rotation (...,3,3)."""
     w, x, y, z = nn.functional.normalize(quaternion, dim=-1, eps=1e-8).unbind(-1)
-    rows = (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))  # fmt: skip
+    rows = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
     return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
@@ -60,13 +68,13 @@ class MotionHead(nn.Module):
     def part_features(self, features: Tensor, points: Tensor, mask: Tensor) -> Tensor:
         """Eq. 4.3 and max over points: features (B,P,G,C), points (B,P,3), mask (B,P,S) -> (B,S,G,D).
 
-        Coordinates are centred on the part, weighted by the mask, so that they depend on nothing but the part.
+        Coordinates are centered on the part, weighted by the mask, so that they depend on nothing but the part.
         """
         anchors = self.group.rotations_like(points)
         share = mask / mask.sum(1, keepdim=True).clamp(min=1e-6)
-        centre = torch.einsum("bps,bpi->bsi", share, points)
-        centred = points[:, :, None] - torch.einsum("bps,bsi->bpi", mask, centre)[:, :, None]
-        local = torch.einsum("gij,bpi->bpgj", anchors, centred[:, :, 0])
+        center = torch.einsum("bps,bpi->bsi", share, points)
+        centered = points[:, :, None] - torch.einsum("bps,bsi->bpi", mask, center)[:, :, None]
+        local = torch.einsum("gij,bpi->bpgj", anchors, centered[:, :, 0])
         hidden = torch.relu(self.embed(torch.cat([features, local.to(features.dtype)], -1)))
         slots = [(hidden * mask[:, :, s, None, None]).amax(1) for s in range(mask.shape[-1])]
         return torch.stack(slots, 1)
@@ -93,8 +101,10 @@ class MotionHead(nn.Module):
         return torch.cat([means, rotation.gather(2, top)[:, :, 0]], 2)
 
 
-def rotation_loss(confidence: Tensor, residual: Tensor, rotation: Tensor, weight: Tensor, group: RotationGroup) -> Tensor:
-    """Squared error of the residual at the labelled pair (as the release has it) plus 0.1 of the confidences' cross-entropy.
+def rotation_loss(
+    confidence: Tensor, residual: Tensor, rotation: Tensor, weight: Tensor, group: RotationGroup
+) -> Tensor:
+    """Squared error of the residual at the labeled pair (as the release has it) plus 0.1 of the confidences' cross-entropy.
 
     rotation (B,S,3,3): each part's from frame 1 to 2. weight (B,S): how much each counts, e.g. its share of the points.
     """
@@ -105,15 +115,17 @@ def rotation_loss(confidence: Tensor, residual: Tensor, rotation: Tensor, weight
     return (weight[..., None] * (error - 0.1 * chosen)).sum() / (weight.sum() * label.shape[-1]).clamp(min=1e-6)
 
 
-def choose_motion(rotations: Tensor, first: Tensor, mask1: Tensor, second: Tensor, mask2: Tensor) -> tuple[Tensor, Tensor]:
+def choose_motion(
+    rotations: Tensor, first: Tensor, mask1: Tensor, second: Tensor, mask2: Tensor
+) -> tuple[Tensor, Tensor]:
     """Of candidate rotations (B,S,M,3,3) the one with the least mask-weighted two-way Chamfer distance (B.6, B.7).
 
     first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S) matched to mask1. The translation joins the parts'
-    weighted centres. -> rotation (B,S,3,3), translation (B,S,3).
+    weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
     """
     share1, share2 = (m / m.sum(1, keepdim=True).clamp(min=1e-6) for m in (mask1, mask2))
-    centre1, centre2 = torch.einsum("bps,bpi->bsi", share1, first), torch.einsum("bps,bpi->bsi", share2, second)
-    translation = centre2[:, :, None] - (rotations @ centre1[:, :, None, :, None]).squeeze(-1)
+    center1, center2 = torch.einsum("bps,bpi->bsi", share1, first), torch.einsum("bps,bpi->bsi", share2, second)
+    translation = center2[:, :, None] - (rotations @ center1[:, :, None, :, None]).squeeze(-1)
     costs = []
     for m in range(rotations.shape[2]):  # one candidate at a time: (B,S,P,Q) is the largest array
         moved = torch.einsum("bsij,bpj->bspi", rotations[:, :, m], first) + translation[:, :, m, None]

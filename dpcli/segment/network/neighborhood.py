@@ -1,4 +1,4 @@
-"""Which points a spherical convolution looks at: centres, neighbours, and how much each counts at each kernel point.
+"""Which points a spherical convolution looks at: centers, neighbors, and how much each counts at each kernel point.
 
 Depends on coordinates alone, so one pass serves all layers of a frame and nothing here carries a gradient.
 """
@@ -16,38 +16,38 @@ from dpcli.runtime.mixed_precision import full_precision
 
 
 @dataclass
-class Neighbourhood:
-    """centres (B,P,3), the neighbours' index (B,P,n) into the layer's input points, offsets (B,P,n,3) = x_n - x_p, and
-    window (B,P,n): how much a neighbour counts at all."""
+class Neighborhood:
+    """centers (B,P,3), the neighbors' index (B,P,n) into the layer's input points, offsets (B,P,n,3) = x_n - x_p, and
+    window (B,P,n): how much a neighbor counts at all."""
 
-    centres: Tensor
+    centers: Tensor
     index: Tensor
     offsets: Tensor
     window: Tensor
 
 
-def nearest_neighbourhood(points: Tensor, centres: Tensor, radius: float, count: int) -> Neighbourhood:
+def nearest_neighborhood(points: Tensor, centers: Tensor, radius: float, count: int) -> Neighborhood:
     """At most `count` nearest points within `radius`, with a window that falls to zero where the ball or the count ends.
 
     window = 1 - d^2 / min(radius, distance to the next point)^2: nothing jumps when rounding lets a point in or out, so
-    features move as little as the coordinates do. points (B,N,3), centres (B,P,3).
+    features move as little as the coordinates do. points (B,N,3), centers (B,P,3).
     """
     count = min(count, points.shape[1])
-    squared, index = knn(centres, points, count + 1)
+    squared, index = knn(centers, points, count + 1)
     beyond = squared[..., -1:] if points.shape[1] > count else torch.full_like(squared[..., -1:], radius**2)
     limit = beyond.clamp(max=radius**2).clamp(min=1e-12)
     index = index[..., :count]
-    offsets = gather_points(points, index) - centres[..., None, :]
+    offsets = gather_points(points, index) - centers[..., None, :]
     window = (1 - offsets.square().sum(-1) / limit).clamp(min=0)
-    return Neighbourhood(centres, index, offsets, window)
+    return Neighborhood(centers, index, offsets, window)
 
 
-def first_neighbourhood(points: Tensor, centres: Tensor, radius: float, count: int) -> Neighbourhood:
+def first_neighborhood(points: Tensor, centers: Tensor, radius: float, count: int) -> Neighborhood:
     """The release's rule: the first `count` points in index order with d < radius, repeated in turn when there are fewer.
 
     Its quirk is kept: with exactly count - 1 hits, the last slot is point 0. window is 1.
     """
-    squared = (centres[:, :, None] - points[:, None]).square().sum(-1)
+    squared = (centers[:, :, None] - points[:, None]).square().sum(-1)
     hit = squared < radius**2
     found = hit.sum(-1, keepdim=True).clamp(min=1)
     order = torch.argsort((~hit).to(torch.uint8), dim=-1, stable=True)
@@ -55,11 +55,11 @@ def first_neighbourhood(points: Tensor, centres: Tensor, radius: float, count: i
     index = order.gather(2, torch.minimum(slot % found, torch.tensor(points.shape[1] - 1)))
     quirk = (found == count - 1) & (slot == count - 1)
     index = torch.where(quirk, 0, index)
-    offsets = gather_points(points, index) - centres[..., None, :]
-    return Neighbourhood(centres, index, offsets, torch.ones_like(offsets[..., 0]))
+    offsets = gather_points(points, index) - centers[..., None, :]
+    return Neighborhood(centers, index, offsets, torch.ones_like(offsets[..., 0]))
 
 
-RULES = {"nearest": nearest_neighbourhood, "first": first_neighbourhood}
+RULES = {"nearest": nearest_neighborhood, "first": first_neighborhood}
 
 
 @full_precision

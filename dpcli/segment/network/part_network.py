@@ -35,8 +35,8 @@ class PartNetwork(nn.Module):
         self.motion = MotionHead(config) if config.motion_width else None
 
     def forward(self, points: Tensor) -> FrameParts:
-        """points (B,N,3) f32, N >= 2 -> mask (B,N,S) and features. The cloud's place doesn't matter: it is centred first."""
-        if self.config.canonical_heads:  # far from the origin, float32 would blur the neighbours' distances
+        """points (B,N,3) f32, N >= 2 -> mask (B,N,S) and features. The cloud's place doesn't matter: it is centered first."""
+        if self.config.canonical_heads:  # far from the origin, float32 would blur the neighbors' distances
             points = points - points.mean(1, keepdim=True)
         with reduced_products(points.device, self.mixed):
             levels = self.encoder(points)
@@ -62,6 +62,6 @@ class PartNetwork(nn.Module):
 
     def _coarse_mask(self, points: Tensor, frames: FrameParts, mask: Tensor) -> Tensor:
         """The masks at the coarsest level's points, which are some of the frame's own."""
-        centred = points - points.mean(1, keepdim=True) if self.config.canonical_heads else points
-        _, own = knn(frames.level.points, centred, 1)
+        centered = points - points.mean(1, keepdim=True) if self.config.canonical_heads else points
+        _, own = knn(frames.level.points, centered, 1)
         return gather_points(mask, own[..., 0])

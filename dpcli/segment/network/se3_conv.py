@@ -14,7 +14,7 @@ from dpcli.runtime.mixed_precision import REDUCED, is_reduced
 from dpcli.segment.network.config import Layer, PartConfig
 from dpcli.segment.network.icosahedron import GROUPS
 from dpcli.segment.network.kernel_points import kernel_points
-from dpcli.segment.network.neighborhood import Neighbourhood, kernel_weights
+from dpcli.segment.network.neighborhood import Neighborhood, kernel_weights
 
 
 class SpatialConv(nn.Module):
@@ -34,27 +34,29 @@ class SpatialConv(nn.Module):
         self.weight = nn.Parameter(torch.empty(count * channels, layer.channels))  # rows: kernel point, channel
         nn.init.normal_(self.weight, std=(2 / ((channels + layer.channels) * count)) ** 0.5 * 2**0.5)
 
-    def forward(self, features: Tensor | None, near: Neighbourhood) -> Tensor:
+    def forward(self, features: Tensor | None, near: Neighborhood) -> Tensor:
         if features is None:
             return self._of_constant(near) @ self.weight
         if self.closed:
             weight = self._weights(near, self.orbit)
             return kernel_convolution(features, near.index, weight, self.slot, self.weight)
-        grouped = [checkpoint(self._one_rotation, features[:, :, a], near, a, use_reentrant=False)
-                   for a in range(len(self.slot))]  # fmt: skip
+        grouped = [
+            checkpoint(self._one_rotation, features[:, :, a], near, a, use_reentrant=False)
+            for a in range(len(self.slot))
+        ]
         return torch.stack(grouped, 2)
 
-    def _weights(self, near: Neighbourhood, positions: Tensor) -> Tensor:
-        """(B,P,n,D): what every neighbour counts at every kernel position (D,3) of radius 1."""
+    def _weights(self, near: Neighborhood, positions: Tensor) -> Tensor:
+        """(B,P,n,D): what every neighbor counts at every kernel position (D,3) of radius 1."""
         weight = kernel_weights(near.offsets, positions * self.layer.kernel_radius, self.layer.sigma)
         return weight * near.window[..., None]
 
-    def _of_constant(self, near: Neighbourhood) -> Tensor:
+    def _of_constant(self, near: Neighborhood) -> Tensor:
         """(B,P,G,K): the sums of the constant 1, in pieces of the orbit."""
         total = torch.cat([self._weights(near, part).sum(2) for part in self.orbit.split(128)], -1)
         return total[..., self.slot]
 
-    def _one_rotation(self, features: Tensor, near: Neighbourhood, rotation: int) -> Tensor:
+    def _one_rotation(self, features: Tensor, near: Neighborhood, rotation: int) -> Tensor:
         """One a: the correlations of (P,K,n) live only here and are made again for the gradient."""
         weight = self._weights(near, self.orbit[self.slot[rotation]])
         rows = torch.arange(len(features), device=features.device)[:, None, None]
@@ -154,12 +156,12 @@ class SeparableConv(nn.Module):
         self.across = GroupConv(layer.channels, layer.channels, config)
         self.shortcut = nn.Linear(channels, layer.channels)
 
-    def forward(self, features: Tensor | None, near: Neighbourhood) -> Tensor:
-        """features (B,N,G,C), or None for the constant 1, at points whose first P are the centres -> (B,P,G,C')."""
+    def forward(self, features: Tensor | None, near: Neighborhood) -> Tensor:
+        """features (B,N,G,C), or None for the constant 1, at points whose first P are the centers -> (B,P,G,C')."""
         out = _activate(self.across(_activate(self.spatial(features, near))))
         if features is None:  # the norm of a constant is zero: so is the shortcut
             return out
-        return out + _activate(self.shortcut(features[:, : near.centres.shape[1]]))
+        return out + _activate(self.shortcut(features[:, : near.centers.shape[1]]))
 
 
 def _activate(features: Tensor) -> Tensor:

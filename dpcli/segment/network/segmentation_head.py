@@ -93,8 +93,8 @@ class SegmentationHead(nn.Module):
         if self.frames is None:
             return lambda positions: positions
         maps = self.frames(coarse)
-        centre = points.mean(1, keepdim=True)
-        return lambda positions: _read_in(maps, positions - centre)
+        center = points.mean(1, keepdim=True)
+        return lambda positions: _read_in(maps, positions - center)
 
     def _slots(self, memory: Tensor) -> Tensor:
         memory = self.memory(memory)

@@ -12,7 +12,7 @@ from dpcli.ops import gather_points, knn
 
 
 def assign(score: Tensor) -> Tensor:
-    """Row-by-row optimal assignment of score (B,S,G), maximised (Kuhn 1955): columns (B,S) i64.
+    """Row-by-row optimal assignment of score (B,S,G), maximized (Kuhn 1955): columns (B,S) i64.
 
     With fewer columns than rows, rows left over get -1. Not finite counts as worst. Ties as scipy decides.
     """
@@ -52,7 +52,7 @@ def match_slots(
     """The order of frame 2's slots (B,S) i64 that agrees with frame 1's: compare mask2[b][:, order[b]] with mask1[b].
 
     Frame 1's mask is carried along the flow, both are made hard (ties to the lowest slot), and the assignment
-    maximises the sum of IoU (Hungarian method), as OGC (Song and Yang 2022) does. Carries no gradient.
+    maximizes the sum of IoU (Hungarian method), as OGC (Song and Yang 2022) does. Carries no gradient.
     """
     carried = carry_mask(points1, flow, mask1.detach(), points2)
     return assign(soft_iou(one_hot(carried), one_hot(mask2)))

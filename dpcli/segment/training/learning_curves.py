@@ -4,8 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-COLUMNS = ("epoch", "pairs", "loss", "cold_start", "dynamic", "smooth", "motion", "mask", "invariance", "consensus", "flow_error",
-           "validation_loss", "validation_rand_index", "learning_rate", "seconds")  # fmt: skip
+COLUMNS = (
+    "epoch",
+    "pairs",
+    "loss",
+    "cold_start",
+    "dynamic",
+    "smooth",
+    "motion",
+    "mask",
+    "invariance",
+    "consensus",
+    "flow_error",
+    "validation_loss",
+    "validation_rand_index",
+    "learning_rate",
+    "seconds",
+)
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:

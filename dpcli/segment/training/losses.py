@@ -71,17 +71,17 @@ def consensus_weights(
     return torch.where(trusted, torch.exp(-tau * square), 1.0)
 
 
-class Neighbours(NamedTuple):
+class Neighbors(NamedTuple):
     """Indices (B,N,k) i64 into the cloud: the nearest within a radius, and any within a larger one."""
 
     nearest: Tensor
     ball: Tensor
 
 
-def smoothness_neighbours(
+def smoothness_neighbors(
     points: Tensor, *, k: int = 8, radius: float = 0.1, ball_k: int = 16, ball_radius: float = 0.2
-) -> Neighbours:
-    """Neighbours of every point of (B,N,3) for `smoothness_loss`; the defaults are SAPIEN's.
+) -> Neighbors:
+    """Neighbors of every point of (B,N,3) for `smoothness_loss`; the defaults are SAPIEN's.
 
     The k nearest, those farther than `radius` replaced by the point itself; and the first ball_k in index order with
     distance below ball_radius, unused places repeating the first. Other data sets: OGC-DR 8, 0.02, 16, 0.04; KITTI 32,
@@ -91,14 +91,12 @@ def smoothness_neighbours(
     nearest = torch.where(squared > radius**2, nearest[..., :1], nearest)
     still = torch.zeros(points.shape[:2], device=points.device)
     ball, _ = space_time_ball_query(points, still, points, still, [ball_radius], ball_k)
-    return Neighbours(nearest, ball)
+    return Neighbors(nearest, ball)
 
 
-def smoothness_loss(values: Tensor, neighbours: Neighbours, weights: tuple[float, float] = (3.0, 1.0)) -> Tensor:
-    """Mean over points and neighbours of |v_i - v_j|_1 summed over the channels of (B,N,S): 3 nearest + 1 ball."""
-    near, far = (
-        (values[:, :, None] - gather_points(values, index)).abs().sum(-1).mean() for index in neighbours
-    )  # fmt: skip
+def smoothness_loss(values: Tensor, neighbors: Neighbors, weights: tuple[float, float] = (3.0, 1.0)) -> Tensor:
+    """Mean over points and neighbors of |v_i - v_j|_1 summed over the channels of (B,N,S): 3 nearest + 1 ball."""
+    near, far = ((values[:, :, None] - gather_points(values, index)).abs().sum(-1).mean() for index in neighbors)
     return weights[0] * near + weights[1] * far
 
 

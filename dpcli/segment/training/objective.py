@@ -20,7 +20,7 @@ from dpcli.segment.training.losses import (
     invariance_loss,
     rigid_loss,
     smoothness_loss,
-    smoothness_neighbours,
+    smoothness_neighbors,
     supervised_loss,
 )
 
@@ -53,11 +53,21 @@ class Objective:
             f"--flow-decay {self.flow_decay}: expected 0 to 1": not 0 <= self.flow_decay <= 1,
             f"--tau {self.tau}: expected a number above 0": not self.tau > 0,
         }
-        for option, weight in (("--smooth", self.smooth), ("--invariance", self.invariance), ("--cold-start", self.cold_start)):
+        for option, weight in (
+            ("--smooth", self.smooth),
+            ("--invariance", self.invariance),
+            ("--cold-start", self.cold_start),
+        ):
             problems[f"{option} {weight}: expected a weight, 0 or more"] = not weight >= 0
-        for option, share in (("--cold-until", self.cold_until), ("--motion-after", self.motion_after),
-                              ("--update-after", self.update_after), ("--consensus-after", self.consensus_after)):  # fmt: skip
-            problems[f"{option} {share}: expected a fraction of the training, 0 or more"] = not share >= 0  # above 1: never
+        for option, share in (
+            ("--cold-until", self.cold_until),
+            ("--motion-after", self.motion_after),
+            ("--update-after", self.update_after),
+            ("--consensus-after", self.consensus_after),
+        ):
+            problems[f"{option} {share}: expected a fraction of the training, 0 or more"] = (
+                not share >= 0
+            )  # above 1: never
         for message, wrong in problems.items():
             if wrong:
                 raise UsageError(message)
@@ -84,21 +94,25 @@ def swap(values: Tensor) -> Tensor:
 
 @dataclass
 class Outcome:
-    """The loss to minimise, its terms for the log, and the corrected flow if it was asked for."""
+    """The loss to minimize, its terms for the log, and the corrected flow if it was asked for."""
 
     loss: Tensor
     terms: dict[str, float]
     flow: Tensor | None = None
 
 
-def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: float, training: bool = True) -> Outcome:
+def pair_loss(
+    model: PartNetwork, batch: Batch, objective: Objective, progress: float, training: bool = True
+) -> Outcome:
     """Every term that is on at `progress` (0 to 1)."""
     frames = model(batch.points)
     if objective.supervised:
         return _supervised(model, batch, frames, objective)
     mask = frames.mask
     rotation, translation = weighted_kabsch(batch.points, batch.points + batch.flow, mask.detach())
-    needs_match = model.motion is not None and training and progress >= min(objective.motion_after, objective.update_after)
+    needs_match = (
+        model.motion is not None and training and progress >= min(objective.motion_after, objective.update_after)
+    )
     order = _match(batch, mask) if needs_match else None
     beta = None
     terms: dict[str, Tensor] = {}
@@ -111,7 +125,7 @@ def pair_loss(model: PartNetwork, batch: Batch, objective: Objective, progress: 
         terms["cold_start"] = objective.cold_start * _cold_start(batch, mask)
     terms["dynamic"] = objective.dynamic * _rigidity(batch, mask, rotation, translation, beta, objective)
     if progress >= objective.smooth_after or not training:
-        terms["smooth"] = objective.smooth * smoothness_loss(mask, smoothness_neighbours(batch.points))
+        terms["smooth"] = objective.smooth * smoothness_loss(mask, smoothness_neighbors(batch.points))
     if objective.invariance and training:
         terms["invariance"] = objective.invariance * invariance_loss(mask, model(turn_randomly(batch.points)[0]).mask)
     loss = torch.stack(list(terms.values())).sum()

@@ -65,10 +65,20 @@ class Trainer:
     """Trains one network. `estimate` gives the first flow, forth and back, of two frames (N,3)."""
 
     def __init__(
-        self, model: PartNetwork, folder: RunFolder, schedule: Schedule, objective: Objective, training: PairSource,
-        validation: PairSource | None, estimate: Estimate | None, notes: dict, device: torch.device, stop: StopRequest, seed: int,
+        self,
+        model: PartNetwork,
+        folder: RunFolder,
+        schedule: Schedule,
+        objective: Objective,
+        training: PairSource,
+        validation: PairSource | None,
+        estimate: Estimate | None,
+        notes: dict,
+        device: torch.device,
+        stop: StopRequest,
+        seed: int,
         flows_of: Path | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.model, self.folder, self.schedule, self.objective = model.to(device), folder, schedule, objective
         self.training, self.validation, self.estimate = training, validation, estimate
         self.notes, self.device, self.stop, self.seed, self.flows_of = notes, device, stop, seed, flows_of
@@ -148,13 +158,13 @@ class Trainer:
             batch.flow = batch.flow @ rotation.mT
         rate = self.schedule.rate(step, steps)
         outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1))
-        self._optimise(outcome.loss, rate)
+        self._optimize(outcome.loss, rate)
         if outcome.flow is not None:
             self._keep_flow(pairs, outcome.flow if rotation is None else outcome.flow @ rotation)
         self._count({"loss": float(outcome.loss.detach()), **outcome.terms})
         return rate
 
-    def _optimise(self, loss: torch.Tensor, rate: float) -> None:
+    def _optimize(self, loss: torch.Tensor, rate: float) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
@@ -169,7 +179,9 @@ class Trainer:
         self._compare(flow, loaded)
         return batch
 
-    def _assemble(self, loaded: list[LoadedPair], estimate: Callable[[int, torch.Tensor], torch.Tensor]) -> tuple[Batch, torch.Tensor]:
+    def _assemble(
+        self, loaded: list[LoadedPair], estimate: Callable[[int, torch.Tensor], torch.Tensor]
+    ) -> tuple[Batch, torch.Tensor]:
         """A batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames of pair i)."""
         points = torch.from_numpy(np.stack([pair.points for pair in loaded]))  # [B, 2, N, 3]
         if self.objective.supervised:
@@ -255,10 +267,18 @@ class Trainer:
         return batches
 
     def _save(self) -> None:
-        self.folder.save_state({
-            "epoch": self.epoch, "step": self.step, "best": self.best, "sums": self.sums, "spent": self.spent,
-            "model": self.model.state_dict(), "optimizer": self.optimizer.state_dict(), "flows": self.flows.pending(),
-        })  # fmt: skip
+        self.folder.save_state(
+            {
+                "epoch": self.epoch,
+                "step": self.step,
+                "best": self.best,
+                "sums": self.sums,
+                "spent": self.spent,
+                "model": self.model.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "flows": self.flows.pending(),
+            }
+        )
         self.flows.flush()
 
     def _restore(self, state: dict) -> None:
@@ -272,6 +292,6 @@ class Trainer:
 
 
 def rand_index(labels: torch.Tensor, truth: torch.Tensor) -> float:
-    """Share of ordered point pairs (itself included) on which two labellings (N) agree about same or different."""
+    """Share of ordered point pairs (itself included) on which two labelings (N) agree about same or different."""
     same = labels[:, None] == labels
     return float((same == (truth[:, None] == truth)).float().mean())

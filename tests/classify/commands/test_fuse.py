@@ -76,10 +76,16 @@ def test_weights(two, tmp_path):
     np.testing.assert_allclose(parse_weights("0.7,0.3", ["a", "b"]), [0.7, 0.3])
     np.testing.assert_allclose(parse_weights("b=0.3,a=0.7", ["a", "b"]), [0.7, 0.3])
     for text, message in (
-        ("0.5", "1 weights for 2"), ("a,b", "expected numbers"), ("-1,2", "from 0 up"), ("0,0", "not all"),
-        ("nan,1", "from 0 up"), ("inf,1", "from 0 up"), ("a=1,c=1", "expected a=NUMBER,b=NUMBER"), ("a=1,a=1", "expected a="),
+        ("0.5", "1 weights for 2"),
+        ("a,b", "expected numbers"),
+        ("-1,2", "from 0 up"),
+        ("0,0", "not all"),
+        ("nan,1", "from 0 up"),
+        ("inf,1", "from 0 up"),
+        ("a=1,c=1", "expected a=NUMBER,b=NUMBER"),
+        ("a=1,a=1", "expected a="),
         ("a=1,b", "expected numbers"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(UsageError, match=message):
             parse_weights(text, ["a", "b"])
     with pytest.raises(UsageError, match="expected a=NUMBER,b=NUMBER"):
@@ -157,8 +163,10 @@ def test_a_pipe_and_the_evaluation(dpc, two, tmp_path):
     said = CliRunner().invoke(app, ["evaluate", "classification", str(tmp_path / "piped.h5"), "--json"])
     streams = json.loads(said.stdout)["metrics"]["streams"]
     assert {name: round(values["accuracy"], 3) for name, values in streams.items()} == {
-        "flow": 0.667, "stdin": 0.667, "fused": 1.0,
-    }  # fmt: skip
+        "flow": 0.667,
+        "stdin": 0.667,
+        "fused": 1.0,
+    }
     refused = CliRunner().invoke(app, ["classify", "fuse", str(two[0]), "-o", str(tmp_path / "x.h5")])
     assert refused.exit_code != 0 and "two or more" in str(refused.exception)
 
@@ -181,7 +189,9 @@ def test_the_streams_of_one_file_get_another_mean(dpc, tmp_path):
     np.testing.assert_allclose(fuse([one], tmp_path / "same.h5").scores, ScoresReader(one).scores, atol=1e-7)
     with pytest.raises(UsageError, match="expected dynamic=NUMBER,static=NUMBER"):
         fuse([one], tmp_path / "x.h5", "1,3")
-    done = dpc("classify", "fuse", "-", "-o", tmp_path / "piped.h5", "--weights", "dynamic=3,static=1", stdin=one.read_bytes())
+    done = dpc(
+        "classify", "fuse", "-", "-o", tmp_path / "piped.h5", "--weights", "dynamic=3,static=1", stdin=one.read_bytes()
+    )
     assert done.returncode == 0, done.stderr.decode()
     assert "weights dynamic 0.75, static 0.25" in done.stdout.decode()
     np.testing.assert_array_equal(ScoresReader(tmp_path / "piped.h5").scores, found.scores)
@@ -258,8 +268,11 @@ def test_geometric_weights_are_the_best_there_are(models):
 def test_weights_are_chosen_on_other_videos(tmp_path):
     rows = {"v0": (0, [0.6, 0.3, 0.1], [0.2, 0.3, 0.5]), "v1": (1, [1, 0, 0], [0, 1, 0])}
     one = with_streams(tmp_path / "one.h5", rows)
-    held = {"w0": (0, [0.1, 0.9, 0], [0.4, 0.3, 0.3]), "w1": (1, [0.5, 0.5, 0], [0.4, 0.4, 0.2]),
-            "w2": (-1, [1, 0, 0], [0, 0, 1])}  # fmt: skip
+    held = {
+        "w0": (0, [0.1, 0.9, 0], [0.4, 0.3, 0.3]),
+        "w1": (1, [0.5, 0.5, 0], [0.4, 0.4, 0.2]),
+        "w2": (-1, [1, 0, 0], [0, 0, 1]),
+    }
     judge = with_streams(tmp_path / "held.h5", held, "validation")
 
     def chosen(inputs, by, output="out.h5"):
@@ -271,21 +284,33 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
     assert entry["fuse"] == ["dynamic", "static"] and len(entry["weights_from"]) == 1
     best = likelihood_weights(np.array([[0.4, 0.4], [0.1, 0.5]]))
     np.testing.assert_allclose(entry["weights"], best, atol=1e-6)
-    np.testing.assert_allclose(found.scores[0], best[0] * np.array([0.2, 0.3, 0.5]) + best[1] * np.array([0.6, 0.3, 0.1]), atol=1e-6)
+    np.testing.assert_allclose(
+        found.scores[0], best[0] * np.array([0.2, 0.3, 0.5]) + best[1] * np.array([0.6, 0.3, 0.1]), atol=1e-6
+    )
 
     two = [write(tmp_path / "points.h5", POINTS), write(tmp_path / "flow.h5", FLOW)]
     run_fusion([str(one)], str(tmp_path / "g.h5"), weights=None, force=False, weights_from=str(judge), mean="geometric")
     static, dynamic = np.array([held[name][1:] for name in ("w0", "w1")]).swapaxes(0, 1)
-    np.testing.assert_allclose(ScoresReader(tmp_path / "g.h5").provenance[-1]["config"]["weights"],
-                               geometric_weights(np.stack([dynamic, static]), np.array([0, 1])), atol=1e-5)  # fmt: skip
+    np.testing.assert_allclose(
+        ScoresReader(tmp_path / "g.h5").provenance[-1]["config"]["weights"],
+        geometric_weights(np.stack([dynamic, static]), np.array([0, 1])),
+        atol=1e-5,
+    )
     judges = [write(tmp_path / "a.h5", {"w": (0, [0.9, 0.1, 0])}), write(tmp_path / "b.h5", {"w": (0, [0.1, 0.9, 0])})]
     by = ",".join(map(str, judges))
     np.testing.assert_allclose(chosen(two, by).provenance[-1]["config"]["weights"], [1, 0], atol=1e-3)
     for inputs, judged, error, message in (
-        ([one], str(one), DataError, "'v0' is among the fused videos"), (two, str(judge), UsageError, "1 files for 2"),
-        ([one], str(two[0]), UsageError, "without streams"), (two, f"{two[0]},{two[1]}", DataError, r"\(3 such videos\)"),
-        ([one], str(with_streams(tmp_path / "unknown.h5", {"w": (-1, [1, 0, 0], [1, 0, 0])})), DataError, "no video has a label"),
-    ):  # fmt: skip
+        ([one], str(one), DataError, "'v0' is among the fused videos"),
+        (two, str(judge), UsageError, "1 files for 2"),
+        ([one], str(two[0]), UsageError, "without streams"),
+        (two, f"{two[0]},{two[1]}", DataError, r"\(3 such videos\)"),
+        (
+            [one],
+            str(with_streams(tmp_path / "unknown.h5", {"w": (-1, [1, 0, 0], [1, 0, 0])})),
+            DataError,
+            "no video has a label",
+        ),
+    ):
         with pytest.raises(error, match=message):
             chosen(inputs, judged, "x.h5")
     assert not (tmp_path / "x.h5").exists()
@@ -294,7 +319,9 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
         chosen([one], str(judge), "held.h5")  # the output would have taken its place
     assert judge.read_bytes() == kept
     with pytest.raises(UsageError, match="one of the two"):
-        run_fusion([str(one)], str(tmp_path / "x.h5"), weights="static=1,dynamic=1", force=False, weights_from=str(judge))
+        run_fusion(
+            [str(one)], str(tmp_path / "x.h5"), weights="static=1,dynamic=1", force=False, weights_from=str(judge)
+        )
 
 
 @pytest.mark.parametrize("row", [[-1.0, 1.0, 1.0], [30.0, 15.0, 5.0], [0.3, 0.3, 0.3], [0.0, 0.0, 0.0]])

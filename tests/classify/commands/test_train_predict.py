@@ -137,7 +137,9 @@ def test_a_stopped_and_a_killed_prediction_go_on(data, run_folder, dpc_here, tmp
 
     def started(output: Path, signal_number: int, after: int) -> subprocess.CompletedProcess:
         command = [sys.executable, "-c", ENDS_EARLY, signal_number, after, *words, output]
-        return subprocess.run([str(word) for word in command], capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+        return subprocess.run(
+            [str(word) for word in command], capture_output=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+        )
 
     first = started(tmp_path / "s.h5", number, 3)
     assert first.returncode == {signal.SIGTERM: 75, signal.SIGKILL: -9}.get(number, 1), first.stderr.decode()
@@ -165,7 +167,9 @@ def test_another_prediction_leaves_what_is_kept(data, run_folder, dpc_here, tmp_
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
     forced = dpc_here(*words, "--split", "test", "--force")
     assert forced.returncode == 0 and b"continuing" not in forced.stderr
-    assert set(ScoresReader(tmp_path / "s.h5").splits) == {"test"} and [path.name for path in tmp_path.iterdir()] == ["s.h5"]
+    assert set(ScoresReader(tmp_path / "s.h5").splits) == {"test"} and [path.name for path in tmp_path.iterdir()] == [
+        "s.h5"
+    ]
 
 
 def test_the_videos_held_out_of_training_choose_the_streams_weights(data, run_folder, dpc_here, tmp_path):
@@ -179,12 +183,16 @@ def test_the_videos_held_out_of_training_choose_the_streams_weights(data, run_fo
     assert dpc_here(*looked, "--split", "validation").returncode == 0
     assert set(CloudsReader(tmp_path / "pac.h5").names) == held
     dpc_here(*words, tmp_path / "test.h5")
-    fused = dpc_here("classify", "fuse", tmp_path / "test.h5", "-o", tmp_path / "w.h5", "--weights-from", tmp_path / "held.h5")
+    fused = dpc_here(
+        "classify", "fuse", tmp_path / "test.h5", "-o", tmp_path / "w.h5", "--weights-from", tmp_path / "held.h5"
+    )
     assert fused.returncode == 0, fused.stderr.decode()
     done = dpc_here("evaluate", "classification", tmp_path / "w.h5", "--json")
     assert set(json.loads(done.stdout)["metrics"]["streams"]) == {"static", "dynamic", "fused"}
     other = gestures(tmp_path / "other.h5", videos=15)
-    refused = dpc_here("classify", "predict", other, "--model", run_folder, "-o", tmp_path / "x.h5", "--split", "validation")
+    refused = dpc_here(
+        "classify", "predict", other, "--model", run_folder, "-o", tmp_path / "x.h5", "--split", "validation"
+    )
     assert refused.returncode == 3 and b"not the file that" in refused.stderr
     assert not (tmp_path / "x.h5").exists()
 
@@ -197,7 +205,11 @@ def test_held_out_videos(data):
     subjects = [3, 3, 7, 7]
     with CloudsWriter(data.parent / "subjects.h5", class_names=["left", "right"]) as writer:
         for i, subject in enumerate(subjects):
-            writer.write(CloudSequence.from_frames(f"s{i}", [np.zeros((4, 3), np.float32)], label=i % 2, split="train", subject=subject))
+            writer.write(
+                CloudSequence.from_frames(
+                    f"s{i}", [np.zeros((4, 3), np.float32)], label=i % 2, split="train", subject=subject
+                )
+            )
     info.notes["validation"] = "subject"  # needs no digest: whoever has the highest number
     assert held_out(CloudsReader(data.parent / "subjects.h5"), info, "a model") == [2, 3]
     info.notes["validation"] = "subjects:3"
@@ -227,7 +239,9 @@ def test_a_stopped_step_drops_what_it_would_have_dropped(data, tmp_path, monkeyp
             with monkeypatch.context() as patch:
                 patch.setattr(Trainer, "_take", stopping)
                 words = (*TRAIN, "--epochs", "2", "--epochs-dynamic", "2", "--dropout", "0.5", "--validation", "none")
-                assert exit_code("classify", "train", data, "-o", tmp_path / name, *words) == (0 if stop is None else 75)
+                assert exit_code("classify", "train", data, "-o", tmp_path / name, *words) == (
+                    0 if stop is None else 75
+                )
         return last_weights(tmp_path / name)
 
     whole, parts = run("whole"), run("parts", 1, 0, 3)
@@ -241,9 +255,22 @@ def test_weights_of_another_model_are_told(data, run_folder, dpc_here, tmp_path)
     words = (*TRAIN, "--epochs", 1, "--epochs-dynamic", 1, "--seed", 4, "--validation", "none")
     assert dpc_here("classify", "train", data, "-o", other, *words).returncode == 0
     for name, model, split in (("s", run_folder, "test"), ("own", run_folder, "train"), ("theirs", other, "train")):
-        assert dpc_here("classify", "predict", data, "--model", model, "--split", split, "-o", tmp_path / f"{name}.h5").returncode == 0
+        assert (
+            dpc_here(
+                "classify", "predict", data, "--model", model, "--split", split, "-o", tmp_path / f"{name}.h5"
+            ).returncode
+            == 0
+        )
     for judge, told in (("own", False), ("theirs", True)):
-        done = dpc_here("classify", "fuse", tmp_path / "s.h5", "-o", tmp_path / f"f-{judge}.h5", "--weights-from", tmp_path / f"{judge}.h5")
+        done = dpc_here(
+            "classify",
+            "fuse",
+            tmp_path / "s.h5",
+            "-o",
+            tmp_path / f"f-{judge}.h5",
+            "--weights-from",
+            tmp_path / f"{judge}.h5",
+        )
         assert done.returncode == 0 and (b"another model" in done.stderr) == told, done.stderr
 
 
@@ -280,7 +307,7 @@ def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folde
     assert third.returncode == 0, third.stderr.decode()
     ours, whole = last_weights(folder), last_weights(run_folder)
     # The same steps in the same order, to rounding: after a first compilation weights were 5e-7 of their norm apart (cause unknown), and
-    # Adam amplifies the last bit where a gradient is nearly zero. A lost step or optimiser state moves weights by far more.
+    # Adam amplifies the last bit where a gradient is nearly zero. A lost step or optimizer state moves weights by far more.
     learned = [key for key in whole if whole[key].dim() > 1]
     apart = sum(float((ours[key] - whole[key]).square().sum()) for key in learned) ** 0.5
     size = sum(float(whole[key].square().sum()) for key in learned) ** 0.5
@@ -296,7 +323,9 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
 
 
 def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc_here):
-    other = dpc_here("classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5)
+    other = dpc_here(
+        "classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5
+    )
     assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
     assert b"(schedule.learning_rate 0.002, now 0.5)" in other.stderr
 
@@ -325,8 +354,12 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
     ):
         with pytest.raises(UsageError, match="expected"):
             Schedule(**wrong)
-    for option, wrong in (("--lr -1.0:", {"learning_rate": -1.0}), ("--lr-dynamic 0:", {"learning_rate_dynamic": 0}),
-                          ("--epochs -1:", {"epochs": (-1, 1)}), ("--epochs-dynamic -2:", {"epochs": (1, -2)})):  # fmt: skip
+    for option, wrong in (
+        ("--lr -1.0:", {"learning_rate": -1.0}),
+        ("--lr-dynamic 0:", {"learning_rate_dynamic": 0}),
+        ("--epochs -1:", {"epochs": (-1, 1)}),
+        ("--epochs-dynamic -2:", {"epochs": (1, -2)}),
+    ):
         with pytest.raises(UsageError, match=option):
             Schedule(**wrong)
     (tmp_path / "file").write_text("")
@@ -354,12 +387,16 @@ def test_truncated_and_foreign_weights_are_refused(data, run_folder, dpc_here, t
     (tmp_path / "half.safetensors").write_bytes(weights[: len(weights) // 2])
     (tmp_path / "pickle.safetensors").write_bytes(b"\x80\x04K\x01.")
     for name in ("half", "pickle"):
-        run = dpc_here("classify", "predict", data, "--model", tmp_path / f"{name}.safetensors", "-o", tmp_path / "s.h5")
+        run = dpc_here(
+            "classify", "predict", data, "--model", tmp_path / f"{name}.safetensors", "-o", tmp_path / "s.h5"
+        )
         assert run.returncode == 3 and b"safetensors" in run.stderr, name
 
 
 def test_profile_prints_true_and_paper_counts(dpc_here):
-    run = dpc_here("classify", "profile", "--variant", "release", "--classes", 20, "--frames", 4, "--points", 256, "--json")
+    run = dpc_here(
+        "classify", "profile", "--variant", "release", "--classes", 20, "--frames", 4, "--points", 256, "--json"
+    )
     assert run.returncode == 0, run.stderr.decode()
     report = json.loads(run.stdout)
     assert report["parameters"]["static"] == 741_652 and report["parameters"]["total"] == 1_586_906

@@ -109,7 +109,7 @@ def test_points_are_drawn_without_replacement_or_in_whole_copies():
     assert sample_points(frame[:0], 4, rng).tolist() == [[0, 0, 0]] * 4
 
 
-def test_normalisations():
+def test_normalizations():
     points = np.random.default_rng(0).normal(3, 2, (4, 50, 3)).astype(np.float32)
     assert np.allclose(normalize(points, "center").mean((0, 1)), 0, atol=1e-5)
     unit = normalize(points, "unit")
@@ -123,7 +123,7 @@ def test_normalisations():
 
 
 def _body(tall: float, frames: int = 6) -> np.ndarray:
-    """A clip (T,200,3) of one shape, `tall` times its size, that crouches in its last frame and stands off centre."""
+    """A clip (T,200,3) of one shape, `tall` times its size, that crouches in its last frame and stands off center."""
     shape = np.random.default_rng(0).normal(0, (0.1, 0.3, 0.1), (200, 3))
     clip = np.tile(shape, (frames, 1, 1))
     clip[-1, :, 1] *= 0.5
@@ -131,8 +131,8 @@ def _body(tall: float, frames: int = 6) -> np.ndarray:
 
 
 def test_equal_height_makes_bodies_of_any_size_and_unit_the_same_clip():
-    child, adult, millimetres = (normalize(_body(tall), "height") for tall in (0.8, 1.2, 1200))
-    assert np.allclose(child, adult, atol=1e-5) and np.allclose(millimetres, adult, atol=1e-4)
+    child, adult, millimeters = (normalize(_body(tall), "height") for tall in (0.8, 1.2, 1200))
+    assert np.allclose(child, adult, atol=1e-5) and np.allclose(millimeters, adult, atol=1e-4)
     assert not np.allclose(normalize(_body(0.8), "center"), normalize(_body(1.2), "center"), atol=1e-2)
     deviations = adult[..., 1].std(1)
     assert np.allclose(deviations[:-1], 0.27, atol=1e-5)
@@ -143,7 +143,9 @@ def test_equal_height_makes_bodies_of_any_size_and_unit_the_same_clip():
 def test_equal_height_of_clips_with_empty_frames_or_without_height():
     clip = _body(1.2)
     clip[:4] = 0  # what `sample_points` makes of empty frames: most of the clip
-    assert np.isclose(normalize(clip, "height")[4:, :, 1].std(1).max(), 0.27 * 4 / 3, atol=1e-4)  # median of whole and half
+    assert np.isclose(
+        normalize(clip, "height")[4:, :, 1].std(1).max(), 0.27 * 4 / 3, atol=1e-4
+    )  # median of whole and half
     flat = _body(1.2)
     flat[..., 1] = 5
     for points in (flat, np.zeros_like(flat)):
@@ -163,7 +165,9 @@ def test_augmentation_is_one_rigid_draw_a_clip():
         ratio = (scaled - where) / (points - where)
         assert np.allclose(ratio, ratio[0, 0], rtol=1e-2) and len(np.unique(ratio[0, 0].round(4))) == 3
         assert np.all((ratio[0, 0] > 0.89) & (ratio[0, 0] < 1.11))
-    far = points + np.float32([0, 0, 3.5])  # a body before the camera comes nearer and goes, as in the published loaders
+    far = points + np.float32(
+        [0, 0, 3.5]
+    )  # a body before the camera comes nearer and goes, as in the published loaders
     depths = [PEERS(far, np.random.default_rng(seed))[..., 2].mean() for seed in range(50)]
     assert 0.15 < np.std(depths) < 0.25
     thinned = Augmentation(0, False, 0, 0, 0, 0, 0.9, 0)(points, np.random.default_rng(3))
@@ -180,7 +184,7 @@ def test_validation_comes_from_training_subjects_only(reader):
     train, held = carve_validation(reader, "0.4", 0)
     assert sorted(train + held) == [0, 1, 2, 3, 4] and 5 not in train + held and len(held) == 2
     assert carve_validation(reader, "none", 0) == ([0, 1, 2, 3, 4], [])
-    with pytest.raises(DataError, match="no labelled sample of split 'validation'; the file has 'test', 'train'"):
+    with pytest.raises(DataError, match="no labeled sample of split 'validation'; the file has 'test', 'train'"):
         carve_validation(reader, "split", 0)
     for bad in ("subjects:9", "subjects:0,1,2,3,4", "1.5", "some", "subjects:x"):
         with pytest.raises(UsageError):
@@ -189,7 +193,9 @@ def test_validation_comes_from_training_subjects_only(reader):
 
 def test_the_files_own_validation_videos_validate(tmp_path, make_sequence):
     with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b"]) as writer:
-        for k, (split, label) in enumerate([("train", 0), ("validation", 1), ("test", 0), ("validation", -1), ("train", 1)]):
+        for k, (split, label) in enumerate(
+            [("train", 0), ("validation", 1), ("test", 0), ("validation", -1), ("train", 1)]
+        ):
             writer.write(make_sequence(f"v{k}", label=label, split=split, subject=k))
     reader = CloudsReader(tmp_path / "own.h5")
     assert default_rule(reader) == "split" and carve_validation(reader, "split", 0) == ([0, 4], [1])
@@ -200,7 +206,11 @@ def test_the_files_own_validation_videos_validate(tmp_path, make_sequence):
     ("labels", "splits", "message"),
     [
         ((-1, -1), ("train", "train"), "none has a label: prepare them with --labels TABLE or, .* --label-from-folder"),
-        ((0, 1), ("", ""), "none has a split: `dpc prepare split .*own.h5 -o own-split.h5 --fractions 0.8,0,0.2` divides them"),
+        (
+            (0, 1),
+            ("", ""),
+            "none has a split: `dpc prepare split .*own.h5 -o own-split.h5 --fractions 0.8,0,0.2` divides them",
+        ),
         ((0, 1), ("val", "test"), "the file has 'test', 'val'$"),
     ],
 )
@@ -208,7 +218,7 @@ def test_a_file_without_training_videos_says_how_to_make_them(tmp_path, make_seq
     with CloudsWriter(tmp_path / "own.h5", class_names=["a", "b"]) as writer:
         for k in (0, 1):
             writer.write(make_sequence(f"v{k}", label=labels[k], split=splits[k]))
-    with pytest.raises(DataError, match=rf"own.h5: no labelled sample of split 'train'; {message}"):
+    with pytest.raises(DataError, match=rf"own.h5: no labeled sample of split 'train'; {message}"):
         carve_validation(CloudsReader(tmp_path / "own.h5"), "none", 0)
 
 
@@ -266,7 +276,9 @@ def test_a_clip_at_another_speed_leaves_out_or_repeats_frames(reader):
     assert all(step.max() - step.min() <= 1 for step in steps)  # a speed is one for the clip
     spans = np.array([f[-1] - f[0] for f in seen])
     assert set(spans) == {1, 2, 3, 4, 5, 6}  # 3 frames at 1/1.8 to 1.8 of the speed
-    assert abs(spans.mean() - 3 * (1.8 - 1 / 1.8) / (2 * np.log(1.8))) < 0.25  # 3 times the mean of a log-uniform factor
+    assert (
+        abs(spans.mean() - 3 * (1.8 - 1 / 1.8) / (2 * np.log(1.8))) < 0.25
+    )  # 3 times the mean of a log-uniform factor
     assert {int(f[-1]) for f in seen} >= {8, 9} and {int(f[0]) for f in seen} >= {0, 1, 6}
 
 
@@ -275,7 +287,9 @@ def test_without_a_speed_clips_are_drawn_as_ever(reader):
     assert still.epoch(3, 2) == ClipSource(reader, [2, 3], CONFIG, seed=5).epoch(3, 2)
     rng, lengths = generator(5, 1, 3), reader.frame_counts
     starts = [(s, int(rng.integers(max(int(lengths[s]) - 4, 0) + 1))) for s in (2, 3) for _ in range(2)]
-    drawn = [Clip(s, clip_frames(int(lengths[s]), 4, start)) for s, start in starts]  # one number a clip, then the order
+    drawn = [
+        Clip(s, clip_frames(int(lengths[s]), 4, start)) for s, start in starts
+    ]  # one number a clip, then the order
     assert still.epoch(3, 2) == [drawn[i] for i in rng.permutation(4)]
     assert all((np.diff(clip.frames) == 1).all() for clip in still.epoch(3, 2) if clip.sequence == 3)
 

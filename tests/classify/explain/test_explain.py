@@ -31,7 +31,7 @@ from dpcli.classify.explain.point_activation_cloud import (
     raw_points,
     rescaled,
 )
-from dpcli.classify.explain.tsne import chosen_perplexity, neighbour_accuracy, plane, silhouette, video_features
+from dpcli.classify.explain.tsne import chosen_perplexity, neighbor_accuracy, plane, silhouette, video_features
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, save_model
@@ -41,8 +41,14 @@ from dpcli.store.embedding import EmbeddingReader
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CPU = torch.device("cpu")
-TINY = {"num_classes": 3, "num_frames": 4, "points_per_frame": 32, "centroids": (24, 12), "neighbors": 6,
-        "widths": ((8, 16), (16, 24), (24, 32))}  # fmt: skip
+TINY = {
+    "num_classes": 3,
+    "num_frames": 4,
+    "points_per_frame": 32,
+    "centroids": (24, 12),
+    "neighbors": 6,
+    "widths": ((8, 16), (16, 24), (24, 32)),
+}
 NAMES = ["wave", "kick", "bend"]
 
 
@@ -65,13 +71,13 @@ def model() -> Kinet:
     return network()
 
 
-def blobs(path: Path, videos: int = 6, labelled: bool = True) -> Path:
+def blobs(path: Path, videos: int = 6, labeled: bool = True) -> Path:
     rng = np.random.default_rng(0)
-    with CloudsWriter(path, class_names=NAMES if labelled else (), fields=["part"]) as writer:
+    with CloudsWriter(path, class_names=NAMES if labeled else (), fields=["part"]) as writer:
         for i in range(videos):
             frames = [rng.normal(size=(40, 3)) * 0.3 + [0.1 * t * (i % 3), 0, 2] for t in range(5)]
             parts = [np.arange(40) % 3 for _ in frames]
-            label = i % 3 if labelled else -1
+            label = i % 3 if labeled else -1
             writer.write(CloudSequence.from_frames(f"v{i}", frames, label=label, part=parts))
     return path
 
@@ -93,8 +99,8 @@ def weights(data, model) -> Path:
 
 @pytest.mark.parametrize("within_frames", [False, True])
 def test_equation_a2_in_loops(model, within_frames):
-    """max over channels and neighbours of relu(bn2(W2 relu(bn1(W1 (x_j - x_i))))), centroid by centroid in float64; also of a
-    static stream whose neighbourhoods are its own."""
+    """max over channels and neighbors of relu(bn2(W2 relu(bn1(W1 (x_j - x_i))))), centroid by centroid in float64; also of a
+    static stream whose neighborhoods are its own."""
     if within_frames:
         plain, model = model, Kinet(model.config.changed(static_temporal_radius=0)).eval()
         model.load_state_dict(plain.state_dict())
@@ -104,10 +110,10 @@ def test_equation_a2_in_loops(model, within_frames):
     group, stage = model.group(points)[0], copy.deepcopy(model.static.stage1).double()
     by_hand = []
     stage.requires_grad_(False)
-    for centre, neighbours in zip(group.centers[0], group.idx[0]):
+    for center, neighbors in zip(group.centers[0], group.idx[0]):
         values = []
-        for j in neighbours:
-            hidden = torch.relu(stage.norm1(stage.linear1((group.points[0, j] - centre).double()[None])))
+        for j in neighbors:
+            hidden = torch.relu(stage.norm1(stage.linear1((group.points[0, j] - center).double()[None])))
             values.append(float(torch.relu(stage.norm2(stage.linear2(hidden))).max()))
         by_hand.append(max(values))
     np.testing.assert_allclose(centroid_activation(layer).numpy(), by_hand, rtol=1e-5)
@@ -271,7 +277,7 @@ def test_the_dynamic_stream_lights_up_what_moves_and_time_gone_it_does_not(tmp_p
             cloud = activation_cloud(model, source, source.clips(1)[0], ("dynamic",), Question(), CPU)
             own = cloud.sequence.part == 0
             assert cloud.activation["dynamic"][own].mean() > 10 * cloud.activation["dynamic"][~own].mean()
-    # n_x of an exact fit: 1 / sqrt(1 + speed^2). The ridge spreads the mean time of one-sided neighbourhoods, at the clip's ends,
+    # n_x of an exact fit: 1 / sqrt(1 + speed^2). The ridge spreads the mean time of one-sided neighborhoods, at the clip's ends,
     # over a blob's nearly constant features: 0.08 is what float64 has for a still one.
     assert found[0.15][0] > 0.7 and found[0.15][1] < 0.1
     assert found[0.0][0] < 0.1  # the same blob, standing still
@@ -302,7 +308,7 @@ def test_values_are_carried_from_the_three_nearest_centroids_in_space_and_time()
 
 
 @pytest.mark.parametrize("rule", ["none", "center", "height", "unit", "image"])
-def test_all_points_go_where_normalisation_took_the_drawn_ones(data, rule):
+def test_all_points_go_where_normalization_took_the_drawn_ones(data, rule):
     config = KinetConfig(**{**TINY, "points_per_frame": 40}, normalize=rule)  # all points are drawn
     source = ClipSource(CloudsReader(data), [0], config)
     clip = source.clips(1)[0]
@@ -440,26 +446,28 @@ def test_video_features_are_means_of_what_the_last_layers_read(model, data):
             groups = model.group(points)
             features = model.static.stage2(groups[1], model.static.stage1(groups[0], None))
             embedded = model.static.head.embed(groups[1].centers, features).mean(0).numpy()
-            read = [stream.head.classify(torch.from_numpy(found[key][row])).numpy()
-                    for key, stream in (("static", model.static), ("dynamic", model.dynamic))]  # fmt: skip
+            read = [
+                stream.head.classify(torch.from_numpy(found[key][row])).numpy()
+                for key, stream in (("static", model.static), ("dynamic", model.dynamic))
+            ]
         np.testing.assert_allclose(found["static"][row], embedded, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(read[0], static, rtol=1e-4, atol=1e-4)  # the last layer is linear: it takes the mean
         np.testing.assert_allclose(read[1], dynamic, rtol=1e-4, atol=1e-4)
 
 
-def test_neighbour_accuracy_and_silhouette_against_other_programs():
+def test_neighbor_accuracy_and_silhouette_against_other_programs():
     from sklearn.neighbors import KNeighborsClassifier
 
     rng = np.random.default_rng(3)
-    labels = rng.integers(0, 2, 40)  # two classes and five neighbours: no tied votes
+    labels = rng.integers(0, 2, 40)  # two classes and five neighbors: no tied votes
     features = (rng.normal(size=(40, 7)) + 0.9 * labels[:, None]).astype(np.float32)
     others = ~np.eye(40, dtype=bool)
     voted = [KNeighborsClassifier(5).fit(features[o], labels[o]).predict(f[None])[0] for o, f in zip(others, features)]
     other = (voted == labels).mean()
-    assert neighbour_accuracy(features, labels) == pytest.approx(other) and 0.6 < other < 1
+    assert neighbor_accuracy(features, labels) == pytest.approx(other) and 0.6 < other < 1
     unknown = np.concatenate([labels, [-1, -1]])
     more = np.concatenate([features, features[:2] + 0.01])
-    assert neighbour_accuracy(more, unknown) == pytest.approx(other)  # what has no label neither votes nor counts
+    assert neighbor_accuracy(more, unknown) == pytest.approx(other)  # what has no label neither votes nor counts
     distance = np.linalg.norm(features[:, None].astype(float) - features[None], axis=-1)
     by_hand = []
     for i, label in enumerate(labels):
@@ -467,16 +475,16 @@ def test_neighbour_accuracy_and_silhouette_against_other_programs():
         a, b = distance[i, own].mean(), distance[i, labels != label].mean()
         by_hand.append((b - a) / max(a, b))
     assert silhouette(more, unknown) == pytest.approx(np.mean(by_hand))
-    assert neighbour_accuracy(features, rng.permutation(labels)) < other - 0.1  # shuffled labels are told
+    assert neighbor_accuracy(features, rng.permutation(labels)) < other - 0.1  # shuffled labels are told
     line = np.array(
         [[0], [1], [2.1], [3.3]], np.float32
     )  # each video has one of its own class and two of the other beside it
     assert (
-        neighbour_accuracy(line, np.array([0, 1, 0, 1]), k=2) == 0.0
+        neighbor_accuracy(line, np.array([0, 1, 0, 1]), k=2) == 0.0
     )  # tied votes go to the nearest, which is the other
-    assert neighbour_accuracy(line, np.array([0, 0, 1, 1]), k=1) == 0.75
+    assert neighbor_accuracy(line, np.array([0, 0, 1, 1]), k=1) == 0.75
     for one_class in (np.zeros(4, int), np.full(4, -1)):
-        assert neighbour_accuracy(line, one_class) is None and silhouette(line, one_class) is None
+        assert neighbor_accuracy(line, one_class) is None and silhouette(line, one_class) is None
 
 
 def test_the_map_keeps_clusters_and_repeats_by_seed():
@@ -485,7 +493,7 @@ def test_the_map_keeps_clusters_and_repeats_by_seed():
     features = (rng.normal(size=(18, 20)) + 6 * np.eye(20)[labels]).astype(np.float32)
     first, again, other = (plane(features, 5, seed) for seed in (2**40, 2**40, 1))  # more than scikit-learn takes
     assert first.shape == (18, 2) and first.dtype == np.float32 and np.array_equal(first, again)
-    assert neighbour_accuracy(first, labels, 3) == neighbour_accuracy(other, labels, 3) == 1.0
+    assert neighbor_accuracy(first, labels, 3) == neighbor_accuracy(other, labels, 3) == 1.0
     with pytest.raises(DataError, match="same feature vector"):
         plane(np.ones((9, 4), np.float32), 3, 0)
 
@@ -571,8 +579,8 @@ def test_tsne_writes_an_embedding_that_info_understands(data, weights, tmp_path,
     assert reader.names == [f"v{i}" for i in range(6)] and set(reader.streams) == {"static", "fused"}
     assert reader.streams["static"].features.shape == (6, 32) and reader.streams["fused"].features.shape == (6, 64)
     for stream, one in reader.streams.items():
-        expected = neighbour_accuracy(one.features, reader.labels)
-        assert said["metrics"][f"{stream}_neighbour_accuracy"] == expected == one.values["neighbour_accuracy"]
+        expected = neighbor_accuracy(one.features, reader.labels)
+        assert said["metrics"][f"{stream}_neighbor_accuracy"] == expected == one.values["neighbor_accuracy"]
         assert said["metrics"][f"{stream}_silhouette"] == pytest.approx(silhouette(one.features, reader.labels))
     assert png.read_bytes().startswith(b"\x89PNG") and not list(tmp_path.glob(".*"))
     assert dpc("info", out, "--json") == 0
@@ -584,12 +592,12 @@ def test_tsne_writes_an_embedding_that_info_understands(data, weights, tmp_path,
         EmbeddingReader(out)
 
 
-def test_unlabelled_videos_get_a_map_and_a_sentence(weights, tmp_path, capsys):
-    data = blobs(tmp_path / "u.h5", videos=5, labelled=False)
+def test_unlabeled_videos_get_a_map_and_a_sentence(weights, tmp_path, capsys):
+    data = blobs(tmp_path / "u.h5", videos=5, labeled=False)
     words = (data, "--model", weights, "-o", tmp_path / "t.h5", "--clips-per-video", 1)
     assert dpc("classify", "explain", "tsne", *words, "--picture", tmp_path / "t.png") == 0
     said = capsys.readouterr()
-    assert "no labels" in said.err and "nearest neighbours -" in said.out
+    assert "no labels" in said.err and "nearest neighbors -" in said.out
     words = (data, "--model", weights, "-o", tmp_path / "p.h5", "--rule", "gradient", "--class", "label")
     assert dpc("classify", "explain", "pac", *words) == 3 and not (tmp_path / "p.h5").exists()
     assert "has no label" in capsys.readouterr().err

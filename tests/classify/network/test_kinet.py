@@ -17,8 +17,14 @@ from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
 from dpcli.ops import fps
 
-TINY = {"num_classes": 5, "num_frames": 4, "points_per_frame": 64, "centroids": (32, 16), "neighbors": 8,
-        "widths": ((16, 16), (16, 32), (32, 64))}  # fmt: skip
+TINY = {
+    "num_classes": 5,
+    "num_frames": 4,
+    "points_per_frame": 64,
+    "centroids": (32, 16),
+    "neighbors": 8,
+    "widths": ((16, 16), (16, 32), (32, 64)),
+}
 
 
 @pytest.mark.parametrize(
@@ -69,7 +75,9 @@ CONFIGS = [
 
 
 @pytest.mark.parametrize(
-    "config", CONFIGS, ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}-s{c.static_radius}"
+    "config",
+    CONFIGS,
+    ids=lambda c: f"{c.variant}-{c.weighting}-{c.normals}-d{c.group_size}-t{c.temporal_radius}-s{c.static_radius}",
 )
 def test_every_switch_trains_the_dynamic_branch_alone(config):
     torch.manual_seed(0)
@@ -102,7 +110,7 @@ def test_a_shift_of_the_body_only_reaches_the_absolute_inputs(config):
     assert torch.allclose(features[0][0], features[1][0], atol=1e-4)
 
 
-def test_order_of_points_within_a_frame_doesn_t_matter_with_nearest_neighbours():
+def test_order_of_points_within_a_frame_doesn_t_matter_with_nearest_neighbors():
     """FPS starts at point 0, so that one stays first; all others may be shuffled."""
     torch.manual_seed(0)
     model = Kinet(KinetConfig(**TINY, grouping="nearest", solver="ridge")).eval()
@@ -136,7 +144,10 @@ def test_surfaces_don_t_depend_on_when_a_clip_begins(variant, solver):
     unit = KinematicUnit(config, 16, 0).double()
     activation, relative = 4 * torch.rand(1, 6, 40, 16).double(), torch.randn(1, 6, 40, 3).double()
     times = torch.randint(-1, 2, (1, 6, 40)).double()
-    normals = [unit(activation, relative, times + start, torch.full((1, 6), start).double(), None).normals for start in (1.0, 20.0)]
+    normals = [
+        unit(activation, relative, times + start, torch.full((1, 6), start).double(), None).normals
+        for start in (1.0, 20.0)
+    ]
     torch.testing.assert_close(normals[0], normals[1], rtol=1e-6, atol=1e-6)
 
 
@@ -199,9 +210,15 @@ def test_config_survives_json_and_refuses_nonsense():
         ({"group_size": 0}, "--group-size 0: expected at least 1"),
         ({"temporal_radius": -1}, "--temporal-radius -1: expected at least 0"),
         ({"static_temporal_radius": -1}, "--static-temporal-radius -1: expected at least 0"),
-        ({"static_temporal_radius": 0, "points_per_frame": 63, "num_frames": 32}, "--static-temporal-radius 0 hold 63 points"),
-        ({"static_temporal_radius": 0, "backbone": "dgcnn"}, "--static-temporal-radius 0: dgcnn's one graph serves both"),
-        ({"temporal_radius": 32}, "--temporal-radius 32: balanced grouping shares 64 neighbours among 65 frames"),
+        (
+            {"static_temporal_radius": 0, "points_per_frame": 63, "num_frames": 32},
+            "--static-temporal-radius 0 hold 63 points",
+        ),
+        (
+            {"static_temporal_radius": 0, "backbone": "dgcnn"},
+            "--static-temporal-radius 0: dgcnn's one graph serves both",
+        ),
+        ({"temporal_radius": 32}, "--temporal-radius 32: balanced grouping shares 64 neighbors among 65 frames"),
         ({"dropout": 1.0}, "--dropout 1.0: expected a probability"),
         ({"dropout": float("nan")}, "--dropout nan: expected a probability"),
         ({"radii": (-0.5, -1.0)}, "--radius -0.5: expected a number above 0"),
@@ -239,7 +256,7 @@ def test_shipped_models_load_and_have_a_card():
         model, info = load_model(name)
         assert model.config.num_classes == len(info.class_names) and not model.training
         card = (SHIPPED / f"{name}.md").read_text()
-        assert "Trained on" in card and "Result" in card and "licence" in card
+        assert "Trained on" in card and "Result" in card and "license" in card
         assert (SHIPPED / f"{name}.safetensors").stat().st_size < 8e6
         with torch.no_grad():
             static, dynamic = model(body_like_clip(model.config.num_frames, model.config.points_per_frame))
@@ -248,7 +265,7 @@ def test_shipped_models_load_and_have_a_card():
         load_model("nonesuch")
 
 
-def test_the_shipped_model_recognises_real_depth_videos(shared_data, tmp_path, dpc):
+def test_the_shipped_model_recognizes_real_depth_videos(shared_data, tmp_path, dpc):
     """Five test videos of five actions, from raw file to score: at least four right (93.5 % expected)."""
     for name in ("a01_s06_e01", "a10_s06_e01", "a13_s07_e01", "a16_s08_e01", "a19_s09_e01"):
         (tmp_path / f"{name}_sdepth.mat").symlink_to(shared_data / "msraction3d" / f"{name}_sdepth.mat")
@@ -293,7 +310,7 @@ def test_profile_splits_steps_into_their_parts():
     for name in ("static_step", "dynamic_step", "inference"):
         step = result[name]
         assert 0 < step["matrix_products_share"] <= 1
-        assert set(step["ms_per_clip"]) == {"matrix_products", "sparse_products", "neighbours", "other"}
+        assert set(step["ms_per_clip"]) == {"matrix_products", "sparse_products", "neighbors", "other"}
         assert step["sparse_products_share"] == 0 or name == "static_step"
         total = sum(step["ms_per_clip"].values())
         assert total == pytest.approx(1000 * step["seconds_on_one_thread"] / step["batch"], rel=0.1, abs=0.05)
@@ -302,7 +319,7 @@ def test_profile_splits_steps_into_their_parts():
 
 
 def test_a_static_stream_within_frames_knows_nothing_of_their_order():
-    """With every point a centroid, sampling has no say: any order of the frames gives the same logits. Neighbourhoods that
+    """With every point a centroid, sampling has no say: any order of the frames gives the same logits. Neighborhoods that
     reach into the next frame don't, nor does the dynamic stream, which reads the same layers across frames."""
     clip, order = body_like_clip(4, 32), torch.tensor([2, 0, 3, 1])
     sizes = {**TINY, "centroids": (128, 128), "points_per_frame": 32, "grouping": "nearest", "solver": "ridge"}
@@ -335,12 +352,14 @@ def test_a_static_stream_of_its_own_is_that_of_a_network_of_its_reach_and_the_dy
         expected = model.static.stage2.taps(across[1], pooled)[0]
         assert all(map(torch.equal, stages[1].activations, expected))
         theirs = shared.static.taps(across)[0]
-        assert torch.equal(stages[0].activations[1], theirs[0].activations[1])  # the first stage reads coordinates alone
+        assert torch.equal(
+            stages[0].activations[1], theirs[0].activations[1]
+        )  # the first stage reads coordinates alone
         assert not torch.equal(stages[1].activations[1], theirs[1].activations[1])
     assert len(model.train().group(clip)) == 2  # training asks for its own alone
 
 
-def test_models_made_before_the_static_stream_had_neighbourhoods_of_its_own_stay_as_they_are():
+def test_models_made_before_the_static_stream_had_neighborhoods_of_its_own_stay_as_they_are():
     values = json.loads(KinetConfig(temporal_radius=2).to_json())
     del values["static_temporal_radius"]
     config = KinetConfig.from_json(json.dumps(values))
@@ -350,7 +369,13 @@ def test_models_made_before_the_static_stream_had_neighbourhoods_of_its_own_stay
 
 def test_the_preset_thesis_keeps_its_static_stream_within_a_frame_where_it_can():
     """Also with the default backbone named; a graph that serves both streams, a user's own network and the release share."""
-    for backbone, variant, radius in ((None, None, 0), ("pointnet2", None, 0), ("dgcnn", None, 1), ("spidercnn", None, 1),
-                                      ("tests.support.tiny_backbone:TinyBackbone", None, 1), (None, "release", 1)):  # fmt: skip
+    for backbone, variant, radius in (
+        (None, None, 0),
+        ("pointnet2", None, 0),
+        ("dgcnn", None, 1),
+        ("spidercnn", None, 1),
+        ("tests.support.tiny_backbone:TinyBackbone", None, 1),
+        (None, "release", 1),
+    ):
         assert network_config("thesis", variant, {}, 20, backbone).static_radius == radius
     assert network_config("quick", None, {}, 20).static_radius == 1

@@ -62,7 +62,7 @@ def test_fit_equals_a_least_squares_solver(size):
             np.testing.assert_allclose(ours[b, k], best, atol=1e-7)
 
 
-def test_ridge_and_guard_are_finite_where_neighbours_repeat():
+def test_ridge_and_guard_are_finite_where_neighbors_repeat():
     features = torch.randn(1, 1, 2, 4).expand(7, 64, 2, 4).clone().requires_grad_()
     times = torch.zeros(7, 64)
     for options in ({"solver": "ridge"}, {"guard": "signed"}, {"guard": "release"}):

@@ -58,9 +58,15 @@ def compare(size, learned, coordinates, weighted, fit):
 
 
 CASES = [
-    (4, 8, False, False, "ridge"), (3, 10, True, True, "ridge"), (4, 5, True, True, "ridge"), (1, 9, False, True, "ridge"),
-    (4, 16, False, True, "inverse"), (2, 9, False, True, "inverse"), (3, 7, True, False, "inverse"), (6, 3, True, True, "ridge"),
-]  # fmt: skip
+    (4, 8, False, False, "ridge"),
+    (3, 10, True, True, "ridge"),
+    (4, 5, True, True, "ridge"),
+    (1, 9, False, True, "ridge"),
+    (4, 16, False, True, "inverse"),
+    (2, 9, False, True, "inverse"),
+    (3, 7, True, False, "inverse"),
+    (6, 3, True, True, "ridge"),
+]
 
 
 @pytest.mark.parametrize("deviations", [True, False])
@@ -71,7 +77,7 @@ def test_pieces_give_the_reference(size, learned, coordinates, weighted, solver,
 
 
 def repeated(size, distinct, dtype, twin):
-    """Normals and a weight's gradient of fits whose 32 neighbours are `distinct` points again and again."""
+    """Normals and a weight's gradient of fits whose 32 neighbors are `distinct` points again and again."""
     g = torch.Generator().manual_seed(10 * size + distinct)
     pick = torch.arange(32) % distinct
     activation = torch.rand(1, 500, distinct, size, generator=g)[:, :, pick].to(dtype)
@@ -100,13 +106,15 @@ def check_repeated(size, distinct, twin):
 @pytest.mark.parametrize("twin", [fit_reduced, fit_reduced_reference])
 @pytest.mark.parametrize("distinct", [1, 2, 3])
 @pytest.mark.parametrize("size", [1, 3, 4, 7])
-def test_a_ridge_is_right_where_neighbours_repeat(size, distinct, twin):
+def test_a_ridge_is_right_where_neighbors_repeat(size, distinct, twin):
     """Rank-deficient fits, as sparse clouds have them: the ridge alone holds the determinant, at 1e-3 to the power of the rank missing."""
     check_repeated(size, distinct, twin)
 
 
 def test_an_inverse_by_the_determinant_is_not(monkeypatch):
-    monkeypatch.setattr(st_surface, "small_solve", lambda m, r: (small_inverse(m, guard="none") * r[..., None, :]).sum(-1))
+    monkeypatch.setattr(
+        st_surface, "small_solve", lambda m, r: (small_inverse(m, guard="none") * r[..., None, :]).sum(-1)
+    )
     with pytest.raises(AssertionError):
         check_repeated(4, 1, fit_reduced_reference)
 
@@ -182,13 +190,18 @@ def test_guarded_solutions_and_gradients_against_autograd(size, least, guard):
     solve_planes(flat, *rule, planes.reshape(-1))
     leaves = matrix.double().requires_grad_(), right.double().requires_grad_()
     expected = (small_inverse_reference(leaves[0], min_det=least, guard=guard) * leaves[1][..., None, :]).sum(-1)
-    torch.testing.assert_close(torch.from_numpy(planes).transpose(1, 2).double(), expected.detach(), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        torch.from_numpy(planes).transpose(1, 2).double(), expected.detach(), rtol=1e-4, atol=1e-5
+    )
     to_matrix, to_right = np.empty((count, n, n, groups), np.float32), np.empty((count, n, groups), np.float32)
     given = grad.transpose(1, 2).contiguous().numpy().reshape(-1)
     solve_planes_back(flat, *rule, given, to_matrix.reshape(-1), to_right.reshape(-1))
     wanted = torch.autograd.grad((expected * grad).sum(), leaves)
     wanted = wanted[0] + wanted[0].transpose(-1, -2), wanted[1]
-    found = torch.from_numpy(to_matrix).permute(0, 3, 1, 2).double(), torch.from_numpy(to_right).transpose(1, 2).double()
+    found = (
+        torch.from_numpy(to_matrix).permute(0, 3, 1, 2).double(),
+        torch.from_numpy(to_right).transpose(1, 2).double(),
+    )
     for a, b in zip(found, wanted):
         assert (a - b).abs().max() < 2e-4 * b.abs().max() + 1e-12
 
@@ -204,8 +217,15 @@ def test_an_activation_that_wants_a_gradient_gets_it(monkeypatch):
 @pytest.mark.parametrize("variant", ["thesis", "release"])
 def test_a_whole_network_is_the_same_without_the_kernels(variant, monkeypatch):
     """To the rounding of the plain network, which is more in `release`: it counts time from the clip's start."""
-    sizes = {"num_classes": 4, "num_frames": 4, "points_per_frame": 64, "centroids": (48, 24), "neighbors": 12,
-             "widths": ((16, 24), (24, 32), (32, 64)), "solver": "ridge"}  # fmt: skip
+    sizes = {
+        "num_classes": 4,
+        "num_frames": 4,
+        "points_per_frame": 64,
+        "centroids": (48, 24),
+        "neighbors": 12,
+        "widths": ((16, 24), (24, 32), (32, 64)),
+        "solver": "ridge",
+    }
     config = KinetConfig.release(**sizes) if variant == "release" else KinetConfig(**sizes)
     torch.manual_seed(0)
     model = Kinet(config).eval()
@@ -215,7 +235,10 @@ def test_a_whole_network_is_the_same_without_the_kernels(variant, monkeypatch):
     monkeypatch.setenv("DPC_BACKEND", "torch")
     with torch.no_grad():
         plain, stages = model(points), model.group(points)
-        stages = [Grouping(*(part if part.dtype == torch.long else part.double() for part in vars(g).values())) for g in stages]
+        stages = [
+            Grouping(*(part if part.dtype == torch.long else part.double() for part in vars(g).values()))
+            for g in stages
+        ]
         taps, static = model.double().static.taps(stages)
         exact = static, model.dynamic(taps)
     for a, b, c in zip(ours, plain, exact):

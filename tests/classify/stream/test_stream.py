@@ -39,8 +39,15 @@ from dpcli.runtime.signals import StopRequest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 
 ROOT = Path(__file__).resolve().parents[3]
-CONFIG = KinetConfig(num_classes=3, num_frames=4, points_per_frame=24, centroids=(16, 8), neighbors=9, normalize="center",
-                     widths=((8, 8), (8, 16), (16, 32)))  # fmt: skip
+CONFIG = KinetConfig(
+    num_classes=3,
+    num_frames=4,
+    points_per_frame=24,
+    centroids=(16, 8),
+    neighbors=9,
+    normalize="center",
+    widths=((8, 8), (8, 16), (16, 32)),
+)
 NAMES = ["left", "right", "still"]
 CPU = torch.device("cpu")
 
@@ -106,7 +113,7 @@ def uniform_file(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("rule", ["center", "height", "unit", "image"])
 def test_a_window_gives_the_points_that_the_whole_file_gives(tmp_path, rule):
-    """No rule of normalisation may need frames that have left the window."""
+    """No rule of normalization may need frames that have left the window."""
     frames, config, window = random_frames(9), CONFIG.changed(normalize=rule), Window(4)
     reader = batch_source(frames, tmp_path).reader
     for points in frames:
@@ -192,8 +199,18 @@ def through_a_pipe(content: bytes, pieces: int = 7) -> list[np.ndarray]:
         sender.join()
 
 
-@given(st.lists(st.tuples(st.integers(0, 40), st.sampled_from([3, 4, 6]), st.sampled_from("<f4 <f8 >f4 <f2 <i2 u1".split()),
-                          st.booleans()), max_size=4), st.integers(1, 9))  # fmt: skip
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 40),
+            st.sampled_from([3, 4, 6]),
+            st.sampled_from("<f4 <f8 >f4 <f2 <i2 u1".split()),
+            st.booleans(),
+        ),
+        max_size=4,
+    ),
+    st.integers(1, 9),
+)
 @settings(max_examples=25, deadline=None)
 def test_any_numbers_in_any_layout_arrive(kinds, pieces):
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Neighbourhoods kept between epochs: the same as searched anew, the same training, nothing left behind, no room told."""
+"""Neighborhoods kept between epochs: the same as searched anew, the same training, nothing left behind, no room told."""
 
 from __future__ import annotations
 
@@ -20,8 +20,24 @@ from dpcli.runtime.whole_file import DiskFull
 from tests.classify.commands.test_train_predict import gestures, last_weights
 from tests.support.commands import exit_code as dpc
 
-SMALL = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "none",
-         "--epochs", "1", "--lr", "0.001")  # fmt: skip
+SMALL = (
+    "--preset",
+    "tiny",
+    "--frames",
+    "4",
+    "--points",
+    "64",
+    "--batch",
+    "4",
+    "--seed",
+    "3",
+    "--validation",
+    "none",
+    "--epochs",
+    "1",
+    "--lr",
+    "0.001",
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,7 +52,7 @@ def fields(groups: list[Grouping]) -> list[torch.Tensor]:
 
 
 @pytest.mark.parametrize("backbone", ["pointnet2", "dgcnn", "spidercnn", "tests.support.tiny_backbone:TinyBackbone"])
-def test_kept_neighbourhoods_are_those_that_a_search_finds(backbone, tmp_path):
+def test_kept_neighborhoods_are_those_that_a_search_finds(backbone, tmp_path):
     torch.manual_seed(0)
     config = network_config("tiny", None, {"num_frames": 3, "points_per_frame": 64}, 3, backbone)
     model, searched = Kinet(config), []
@@ -78,7 +94,7 @@ def test_a_backbone_that_groups_points_of_its_own_is_refused(tmp_path):
         NeighborCache(search, tmp_path, 1)(torch.randn(1, 2, 8, 3), torch.tensor([0]))
 
 
-def test_a_training_with_kept_neighbours_is_the_one_that_searches_each_time(data, tmp_path, monkeypatch):
+def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data, tmp_path, monkeypatch):
     words = (*SMALL, "--epochs-dynamic", "5", "--draws", "2", "--accumulate", "2")
     searched: list[int] = []
 
@@ -96,10 +112,14 @@ def test_a_training_with_kept_neighbours_is_the_one_that_searches_each_time(data
     assert sum(searched) == 2 * 8  # eight training videos, two draws; five epochs
     kept, anew = last_weights(tmp_path / "kept"), last_weights(tmp_path / "searched")
     assert all(torch.equal(kept[key], anew[key]) for key in kept)
-    assert {path.name for path in (tmp_path / "kept").iterdir()} == {path.name for path in (tmp_path / "searched").iterdir()}
+    assert {path.name for path in (tmp_path / "kept").iterdir()} == {
+        path.name for path in (tmp_path / "searched").iterdir()
+    }
     assert json.loads((tmp_path / "kept" / "config.json").read_text())["schedule"]["draws"] == 2
     monkeypatch.setattr(training, "NeighborCache", NeighborCache)
-    assert dpc("classify", "train", data, "-o", tmp_path / "fresh", *SMALL, "--epochs-dynamic", 5, "--accumulate", 2) == 0
+    assert (
+        dpc("classify", "train", data, "-o", tmp_path / "fresh", *SMALL, "--epochs-dynamic", 5, "--accumulate", 2) == 0
+    )
     fresh = last_weights(tmp_path / "fresh")
     assert not all(torch.equal(kept[key], fresh[key]) for key in kept)  # draws that come back are another training
     assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] is None  # older runs go on
@@ -124,7 +144,7 @@ def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, mo
     assert all(torch.equal(whole[key], parts[key]) for key in whole)
 
 
-def test_no_room_for_neighbours_is_told_before_the_work(tmp_path):
+def test_no_room_for_neighbors_is_told_before_the_work(tmp_path):
     model = Kinet(network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, before[1]))

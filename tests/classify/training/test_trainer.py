@@ -28,7 +28,19 @@ from tests.support.commands import exit_code as dpc
 
 ROOT = Path(__file__).resolve().parents[3]
 SMALL = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "none")
-SHORT = (*SMALL, "--epochs", "3", "--epochs-dynamic", "2", "--lr", "0.0001", "--label-smoothing", "0.05", "--draws", "1")
+SHORT = (
+    *SMALL,
+    "--epochs",
+    "3",
+    "--epochs-dynamic",
+    "2",
+    "--lr",
+    "0.0001",
+    "--label-smoothing",
+    "0.05",
+    "--draws",
+    "1",
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -54,8 +66,17 @@ def together(data) -> Path:
     """Two processes by torchrun: first a batch norm shared by them, then the same run as `alone`."""
     folder = data.parent / "together"
     words = ["classify", "train", str(data), "-o", str(folder), *SHORT]
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-               str(ROOT / "tests" / "support" / "two_processes.py"), str(data.parent / "norm.pt"), *words]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        str(ROOT / "tests" / "support" / "two_processes.py"),
+        str(data.parent / "norm.pt"),
+        *words,
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
     assert done.returncode == 0, done.stderr
@@ -224,7 +245,7 @@ def test_a_killed_loader_ends_with_a_sentence_and_the_run_continues(data, tmp_pa
 
 
 def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
-    """`--init`: weights of 4 frames begin a run of 6, of other neighbourhoods; with no epochs they stay as they are."""
+    """`--init`: weights of 4 frames begin a run of 6, of other neighborhoods; with no epochs they stay as they are."""
     longer = [*SHORT]
     longer[longer.index("4")] = "6"
     assert (
@@ -331,7 +352,7 @@ def test_one_class_and_absent_classes_are_named(tmp_path, make_sequence, capfd):
     assert dpc(*words, tmp_path / "one.h5") == 3
     assert "class 'up'" in capfd.readouterr().err
     assert dpc(*words, tmp_path / "absent.h5") == 0
-    assert "can't be recognised: round" in capfd.readouterr().err
+    assert "can't be recognized: round" in capfd.readouterr().err
 
 
 def test_a_pipe_can_t_be_shared(monkeypatch, capfd):
@@ -360,8 +381,17 @@ def test_validation_is_shared_out_among_processes(data, alone):
     for count in (1, 2):
         collected: list[list[float]] = []
         for rank in range(count):
-            trainer = Trainer(model, info, folder, Schedule((0, 1), batch=4), source, source, torch.device("cpu"),
-                              StopRequest(), Counting(rank, count))  # fmt: skip
+            trainer = Trainer(
+                model,
+                info,
+                folder,
+                Schedule((0, 1), batch=4),
+                source,
+                source,
+                torch.device("cpu"),
+                StopRequest(),
+                Counting(rank, count),
+            )
             trainer.stage = 1
             trainer.validate()
         found.append(np.sum(collected, 0))

@@ -73,7 +73,7 @@ def test_undefined_numbers_are_null(scores: Path) -> None:
     assert found["metrics"]["accuracy"] == 1 and found["denominators"]["classes_that_occur"] == 1
 
 
-def test_split_all_takes_every_labelled_sample(scores: Path) -> None:
+def test_split_all_takes_every_labeled_sample(scores: Path) -> None:
     assert evaluate_classification(scores, split="all").main.samples == 5
 
 

@@ -112,9 +112,15 @@ def start(out: Path, videos: int = VIDEOS) -> subprocess.Popen:
     before, deadline = part.stat().st_size if part.exists() else 0, time.monotonic() + 60
     process = subprocess.Popen(
         [*DPC, *SYNTHETIC, str(videos), "-o", str(out), "--jobs", "2"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where a shell put us in the background
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(
+            signal.SIGINT, signal.SIG_DFL
+        ),  # ignored where a shell put us in the background
+    )
     while not (part.exists() and part.stat().st_size > before + 100_000):
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.01)

@@ -139,8 +139,10 @@ def test_numbers_are_those_of_the_single_commands(run, parts, scores):
 @pytest.mark.parametrize("protocol", ["dpc", "release"])
 def test_swapping_the_files_turns_the_signs(run, parts, protocol):
     options = ("--truth", parts["truth"], "--json", "--protocol", protocol, "--resamples", 200)
-    one, other = (json.loads(run("compare", parts[a], parts[b], *options))["metrics"]
-                  for a, b in (("good", "twin"), ("twin", "good")))  # fmt: skip
+    one, other = (
+        json.loads(run("compare", parts[a], parts[b], *options))["metrics"]
+        for a, b in (("good", "twin"), ("twin", "good"))
+    )
     for key, own in one.items():
         back = other[key]
         assert own["difference"] == pytest.approx(-back["difference"], abs=1e-12)
@@ -164,8 +166,7 @@ def test_pairing_takes_away_what_is_hard_for_both():
     """A constant gain under a large spread of samples: the paired interval sees it, separate ones overlap."""
     hard = np.random.default_rng(0).normal(20, 5, 30)
     tables = [{f"x{i}": {"psnr": v + shift} for i, v in enumerate(hard)} for shift in (0.2, 0)]
-    sides = [of_values(name, "video", "views", table, {"psnr": "dB"})
-             for name, table in zip("AB", tables, strict=True)]  # fmt: skip
+    sides = [of_values(name, "video", "views", table, {"psnr": "dB"}) for name, table in zip("AB", tables, strict=True)]
     found = pair(*sides, Resampling(500)).changes["psnr"]
     assert found.interval.low == pytest.approx(0.2) == found.interval.high and found.p < 0.01
     single = Resampling(500).intervals(sides[0].metric, 30)["psnr"]
@@ -176,11 +177,19 @@ def test_bootstrap_difference_of_means_equals_scipy():
     from scipy.stats import bootstrap
 
     a, b = np.random.default_rng(0).normal(size=(2, 25))
-    sides = [of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"})
-             for side in (a, b)]  # fmt: skip
+    sides = [
+        of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"}) for side in (a, b)
+    ]
     found = pair(*sides, Resampling(4000)).changes["m"]
-    expected = bootstrap((a, b), lambda x, y, axis=-1: (x - y).mean(axis=axis), paired=True, vectorized=True,
-                         method="percentile", n_resamples=4000, rng=np.random.default_rng(1))  # fmt: skip
+    expected = bootstrap(
+        (a, b),
+        lambda x, y, axis=-1: (x - y).mean(axis=axis),
+        paired=True,
+        vectorized=True,
+        method="percentile",
+        n_resamples=4000,
+        rng=np.random.default_rng(1),
+    )
     close = 4 * expected.standard_error / math.sqrt(4000) * 3  # Monte-Carlo error of a 2.5 % quantile
     assert [found.interval.low, found.interval.high] == pytest.approx(list(expected.confidence_interval), abs=close)
 
@@ -188,8 +197,10 @@ def test_bootstrap_difference_of_means_equals_scipy():
 def test_a_table_of_values_becomes_a_whole_report(tmp_path):
     """What a video's views or frames need: tables, notes, JSON and picture from {sample: {metric: value}}."""
     tables = [{f"view {i}": {"psnr": 20 + i + s, "lpips": 0.1 * i + s / 10} for i in range(4)} for s in (0, 1)]
-    sides = [of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
-             for n, table in zip("ab", tables, strict=True)]  # fmt: skip
+    sides = [
+        of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
+        for n, table in zip("ab", tables, strict=True)
+    ]
     report = compare_measured(*sides, Resampling(200))
     found = json.loads(json.dumps(compare_json(report), allow_nan=False))
     assert found["metrics"]["psnr"]["interval"] == pytest.approx([-1, -1])
@@ -227,8 +238,16 @@ def test_text_markdown_and_picture(run, scores, parts, tmp_path):
         and "McNemar's exact test: p 0.688" in text
         and "v10" in text
     )
-    text = run("compare", parts["good"], parts["twin"], "--truth", parts["truth"], "--picture", tmp_path / "b.png",
-               "--markdown")  # fmt: skip
+    text = run(
+        "compare",
+        parts["good"],
+        parts["twin"],
+        "--truth",
+        parts["truth"],
+        "--picture",
+        tmp_path / "b.png",
+        "--markdown",
+    )
     assert "| mIoU (%) |" in text and "EPE3D (m) ↓ |" in text and "< 0.001" in text
     assert all((tmp_path / name).read_bytes()[:4] == b"\x89PNG" for name in ("a.png", "b.png"))
 
@@ -323,12 +342,18 @@ def test_the_interval_of_a_share_ends_where_its_mean_does():
         assert spread(length, share=length[1] > 1).interval.high > 1.4
 
 
-
 def test_runs_of_parts_and_of_their_json_are_the_same(run, parts, tmp_path):
     names = ("good", "twin")
     direct = json.loads(run("runs", *(parts[name] for name in names), "--truth", parts["truth"], "--json"))
-    lines = [CliRunner().invoke(evaluate.app, ["segmentation", str(parts[name]), "--truth", str(parts["truth"]), "--json",
-                                               "--resamples", "0"]).stdout for name in names]  # fmt: skip
+    lines = [
+        CliRunner()
+        .invoke(
+            evaluate.app,
+            ["segmentation", str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
+        )
+        .stdout
+        for name in names
+    ]
     (tmp_path / "both.json").write_text("".join(lines))
     by_json = json.loads(run("runs", tmp_path / "both.json", "--json"))
     for key, own in by_json["metrics"].items():
@@ -350,8 +375,14 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
         run("runs", parts["good"], parts["fewer"], "--truth", parts["truth"])
     objects = {}
     for protocol in ("dpc", "release"):
-        objects[protocol] = CliRunner().invoke(evaluate.app, [
-            "segmentation", str(parts["good"]), "--truth", str(parts["truth"]), "--json", "--protocol", protocol]).stdout  # fmt: skip
+        objects[protocol] = (
+            CliRunner()
+            .invoke(
+                evaluate.app,
+                ["segmentation", str(parts["good"]), "--truth", str(parts["truth"]), "--json", "--protocol", protocol],
+            )
+            .stdout
+        )
     path = tmp_path / "mixed.json"
     path.write_text(objects["dpc"] + objects["release"])
     with pytest.raises(DataError, match="mixed.json:2: another protocol than .*name 'release', not 'dpc'"):
@@ -359,8 +390,13 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
     path.write_text(objects["dpc"])
     with pytest.raises(DataError, match="another task than"):
         run("runs", scores["good"], path)
-    for text, words in (("", "empty"), ("{}\n", "not an object of"), ("hello", "neither a file"), ("\x00\xff", "neither"),
-                        (objects["dpc"].replace('"miou": ', '"miou": NaN, "x": ', 1), "miou of 7 metrics not finite")):  # fmt: skip
+    for text, words in (
+        ("", "empty"),
+        ("{}\n", "not an object of"),
+        ("hello", "neither a file"),
+        ("\x00\xff", "neither"),
+        (objects["dpc"].replace('"miou": ', '"miou": NaN, "x": ', 1), "miou of 7 metrics not finite"),
+    ):
         path.write_text(text)
         with pytest.raises(DpcError, match=words):
             run("runs", path)
@@ -368,8 +404,14 @@ def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
 
 def test_runs_of_video_results_need_no_names(run, tmp_path):
     """Objects of `evaluate video` carry no sample names: their denominators are compared."""
-    own = {"task": "video", "input": "a.h5", "protocol": {"name": "dpc"}, "units": {"psnr": "dB", "ssim": "1"},
-           "metrics": {"psnr": 30.0, "ssim": None, "per_view": []}, "denominators": {"views": 2, "frames": 8}}  # fmt: skip
+    own = {
+        "task": "video",
+        "input": "a.h5",
+        "protocol": {"name": "dpc"},
+        "units": {"psnr": "dB", "ssim": "1"},
+        "metrics": {"psnr": 30.0, "ssim": None, "per_view": []},
+        "denominators": {"views": 2, "frames": 8},
+    }
     path = tmp_path / "v.json"
     path.write_text("\n".join(json.dumps(own | {"metrics": {"psnr": p, "ssim": 0.5}}) for p in (30.0, 32.0)))
     found = json.loads(run("runs", path, "--json"))
@@ -403,12 +445,14 @@ def test_intersect_of_scores_and_truth(scores, tmp_path):
 
 @pytest.mark.parametrize("task", ["segmentation", "motion"])
 def test_another_length_unit_is_an_error(task, parts, tmp_path):
-    truth = write_truth(tmp_path / "mm.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)],
-                        length_unit="mm")  # fmt: skip
+    truth = write_truth(
+        tmp_path / "mm.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit="mm"
+    )
     result = CliRunner().invoke(evaluate.app, [task, str(parts["good"]), "--truth", str(truth)])
     assert isinstance(result.exception, DataError) and "length_unit 'm', but 'mm' in" in str(result.exception)
-    unnamed = write_truth(tmp_path / "none.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)],
-                          length_unit="")  # fmt: skip
+    unnamed = write_truth(
+        tmp_path / "none.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit=""
+    )
     assert CliRunner().invoke(evaluate.app, [task, str(parts["good"]), "--truth", str(unnamed)]).exit_code == 0
 
 
@@ -439,18 +483,33 @@ def emptied(file) -> None:
         file.create_dataset(key, data=values, dtype=kind)
 
 
-@pytest.mark.parametrize(("what", "change", "words"), [
-    ("scores", put("scores", 3, math.nan), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
-    ("scores", put("scores", (slice(5, 9), 0), math.inf), "4 of .* samples with NaN or infinite scores, the first 'v5'"),
-    ("scores", put("scores", 3, -math.inf), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
-    ("scores", emptied, "no samples"),
-    ("parts", put("flow", 0, math.nan), "'s0': 1 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1"),
-    ("parts", put("flow", slice(0, 2), math.inf), "'s0': 2 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1"),
-    ("parts", put("part_probability", 0, math.nan), "'s0': 1 of .* NaN or infinite probability, the first is point 0"),
-    ("parts", put("part_motion", 0, math.nan), "'s0': motion of part 0"),
-    ("truth", put("pose", 0, math.nan), "pose"),
-    ("truth", put("points", 0, math.nan), "'s0' holds NaN or infinite coordinates"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("what", "change", "words"),
+    [
+        ("scores", put("scores", 3, math.nan), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
+        (
+            "scores",
+            put("scores", (slice(5, 9), 0), math.inf),
+            "4 of .* samples with NaN or infinite scores, the first 'v5'",
+        ),
+        ("scores", put("scores", 3, -math.inf), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
+        ("scores", emptied, "no samples"),
+        ("parts", put("flow", 0, math.nan), "'s0': 1 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1"),
+        (
+            "parts",
+            put("flow", slice(0, 2), math.inf),
+            "'s0': 2 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1",
+        ),
+        (
+            "parts",
+            put("part_probability", 0, math.nan),
+            "'s0': 1 of .* NaN or infinite probability, the first is point 0",
+        ),
+        ("parts", put("part_motion", 0, math.nan), "'s0': motion of part 0"),
+        ("truth", put("pose", 0, math.nan), "pose"),
+        ("truth", put("points", 0, math.nan), "'s0' holds NaN or infinite coordinates"),
+    ],
+)
 def test_bad_numbers_are_named(run, scores, parts, tmp_path, what, change, words):
     """In the single command, in a comparison and among runs: an error of one or two lines, never a number."""
     source = scores["good"] if what == "scores" else parts[{"parts": "good"}.get(what, what)]

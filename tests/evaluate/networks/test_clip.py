@@ -41,8 +41,14 @@ def pictures(count: int, height: int, width: int, seed: int = 0) -> np.ndarray:
 def tiny_model():
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(2)
-    vision = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2,
-              "image_size": SIDE, "patch_size": 16}  # fmt: skip
+    vision = {
+        "hidden_size": 16,
+        "intermediate_size": 32,
+        "num_hidden_layers": 2,
+        "num_attention_heads": 2,
+        "image_size": SIDE,
+        "patch_size": 16,
+    }
     return transformers.CLIPVisionModelWithProjection(
         transformers.CLIPVisionConfig(**vision, projection_dim=WIDTH)
     ).eval()
@@ -112,8 +118,12 @@ def test_bad_pictures():
     good = np.full((1, 8, 8, 3), 0.5, np.float32)
     nan = good.copy()
     nan[0, 1, 2] = np.nan
-    for bad, words in ((good * 255, "divide by 255"), (good - 1, "expected 0..1"), (nan, "3 values are NaN"),
-                       (good.astype(np.int64), "int64")):  # fmt: skip
+    for bad, words in (
+        (good * 255, "divide by 255"),
+        (good - 1, "expected 0..1"),
+        (nan, "3 values are NaN"),
+        (good.astype(np.int64), "int64"),
+    ):
         with pytest.raises(DataError, match=words):
             preprocess(bad)
     with pytest.raises(ValueError, match=r"\(B,H,W,3\)"):

@@ -156,8 +156,9 @@ def test_disco_and_videogpt_networks_differ_as_named(i3d, one_thread):
 
 
 def test_same_padding_is_tensorflows():
-    assert [same_padding(*case) for case in ((224, 7, 2), (10, 7, 2), (112, 3, 2), (5, 3, 2), (14, 2, 2), (3, 2, 2))] == [
-        (2, 3), (2, 3), (0, 1), (1, 1), (0, 0), (0, 1)]  # fmt: skip
+    assert [
+        same_padding(*case) for case in ((224, 7, 2), (10, 7, 2), (112, 3, 2), (5, 3, 2), (14, 2, 2), (3, 2, 2))
+    ] == [(2, 3), (2, 3), (0, 1), (1, 1), (0, 0), (0, 1)]
     assert same_padding(9, 1, 3) == (0, 0)  # a kernel under its stride needs none
 
 
@@ -190,7 +191,7 @@ def test_every_stage_of_the_3d_resnet_equals_an_independent_definition(one_threa
     np.testing.assert_allclose(ours.mean((2, 3, 4))[0, : len(MONAI)], MONAI, rtol=1e-4)
 
 
-class Colour(torch.nn.Module):
+class Color(torch.nn.Module):
     """A network whose features can be told by hand: mean and spread of each channel of a clip."""
 
     def __init__(self) -> None:
@@ -234,12 +235,12 @@ def test_pil_bicubic_is_of_eight_bits_in_floats(name: str, side: int):
 
 def test_a_whole_video_is_one_clip_and_windows_slide():
     for name, frames, clips, lengths in (("videogpt", 12, 1, [12]), ("disco", 20, 5, [16] * 5), ("r3d50", 16, 1, [16])):
-        network = FeatureNetwork(VARIANTS[name], Colour())
+        network = FeatureNetwork(VARIANTS[name], Color())
         video = ClipFeatures(network)
         for frame in flat(np.linspace(0, 1, frames)):
             video.add(frame)
         assert video.result().samples == clips and network.module.frames == lengths
-    network = FeatureNetwork(VARIANTS["disco"], Colour())
+    network = FeatureNetwork(VARIANTS["disco"], Color())
     video = ClipFeatures(network, every=4)
     levels = np.arange(24) / 255
     for frame in flat(levels):
@@ -249,12 +250,12 @@ def test_a_whole_video_is_one_clip_and_windows_slide():
 
 
 def test_memory_is_bounded_by_a_clip():
-    network = FeatureNetwork(VARIANTS["disco"], Colour())
+    network = FeatureNetwork(VARIANTS["disco"], Color())
     video = ClipFeatures(network, every=20)
     for frame in flat([0.5] * 60):
         video.add(frame)
         assert len(video._waiting) <= 16
-    long = ClipFeatures(FeatureNetwork(VARIANTS["videogpt"], Colour()))
+    long = ClipFeatures(FeatureNetwork(VARIANTS["videogpt"], Color()))
     long.frames = LONGEST
     with pytest.raises(DataError, match="256 frames at most.*disco"):
         long.add(flat([0.5])[0])
@@ -262,7 +263,7 @@ def test_memory_is_bounded_by_a_clip():
 
 def test_too_few_frames_say_how_many_are_needed():
     for name, least in (("styleganv", 10), ("videogpt", 10), ("disco", 16), ("r3d50", 16), ("consistent4d", 2)):
-        video = VideoFeatures(FeatureNetwork(VARIANTS[name], Colour()))
+        video = VideoFeatures(FeatureNetwork(VARIANTS[name], Color()))
         for frame in flat([0.5] * (least - 1)):
             video.add(frame, frame)
         with pytest.raises(DataError, match=rf"{least - 1} frames: .* at least {least}"):
@@ -279,7 +280,7 @@ def test_bad_pictures_are_refused():
     with pytest.raises(UsageError, match="expected styleganv"):
         feature_variant("tensorflow")
     with pytest.raises(UsageError, match="1 or more"):
-        ClipFeatures(FeatureNetwork(VARIANTS["disco"], Colour()), every=0)
+        ClipFeatures(FeatureNetwork(VARIANTS["disco"], Color()), every=0)
 
 
 def pair(network: FeatureNetwork, levels: list[float], others: list[float]):
@@ -290,7 +291,7 @@ def pair(network: FeatureNetwork, levels: list[float], others: list[float]):
 
 
 def test_consistent4d_is_the_closed_form_of_each_view_then_their_mean():
-    network = FeatureNetwork(VARIANTS["consistent4d"], Colour())
+    network = FeatureNetwork(VARIANTS["consistent4d"], Color())
     pairs = [pair(network, [0.0] * 3, [1.0] * 3), pair(network, [0.0] * 3, [0.0] * 3)]
     found = video_distance(VARIANTS["consistent4d"], pairs)
     # features of black: -1, -1, -1, 0, 0, 0, of white: 1, 1, 1, 0, 0, 0: equal spread, three apart by 2
@@ -300,10 +301,10 @@ def test_consistent4d_is_the_closed_form_of_each_view_then_their_mean():
 
 def test_one_video_gives_the_mean_term_or_an_error_as_published():
     for name in ("styleganv", "videogpt"):
-        network = FeatureNetwork(VARIANTS[name], Colour())
+        network = FeatureNetwork(VARIANTS[name], Color())
         found = video_distance(VARIANTS[name], [pair(network, [0.0] * 10, [1.0] * 10)])
         assert found.value == pytest.approx(12.0, rel=1e-5)
-    network = FeatureNetwork(VARIANTS["disco"], Colour())
+    network = FeatureNetwork(VARIANTS["disco"], Color())
     with pytest.raises(DataError, match="at least 2: .*closed form"):
         video_distance(VARIANTS["disco"], [pair(network, [0.0] * 16, [1.0] * 16)])
     with pytest.raises(DataError, match="no videos"):
@@ -311,7 +312,7 @@ def test_one_video_gives_the_mean_term_or_an_error_as_published():
 
 
 def test_windows_of_all_videos_are_pooled_and_equal_videos_are_no_distance_apart():
-    network, rng = FeatureNetwork(VARIANTS["disco"], Colour()), generator(0, 56)
+    network, rng = FeatureNetwork(VARIANTS["disco"], Color()), generator(0, 56)
     levels = rng.random((3, 2, 17)).round(2)
     pairs = [pair(network, *both) for both in levels]
     found = video_distance(VARIANTS["disco"], pairs)
@@ -357,7 +358,13 @@ def test_published_names_load_and_absent_weights_say_where_to_get_them(tmp_path:
     with pytest.raises(DataError, match=r"no tensor Mixed_4e\.b2b\.conv3d\.weight"):
         FeatureNetwork.load("disco", tmp_path)
     assert {name.split(".")[0] for name in ResNet3D50().state_dict()} == {
-        "conv1", "bn1", "layer1", "layer2", "layer3", "layer4"}  # fmt: skip
+        "conv1",
+        "bn1",
+        "layer1",
+        "layer2",
+        "layer3",
+        "layer4",
+    }
 
 
 @pytest.mark.parametrize("name", ["styleganv", "videogpt"])

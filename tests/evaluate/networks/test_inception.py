@@ -39,8 +39,10 @@ class Twin:
         self.state = state
 
     def conv(self, x, name, stride=1, pad=(0, 0)):
-        s = {key: self.state[f"{name}.{key}"].double() for key in
-             ("conv.weight", "bn.weight", "bn.bias", "bn.running_mean", "bn.running_var")}  # fmt: skip
+        s = {
+            key: self.state[f"{name}.{key}"].double()
+            for key in ("conv.weight", "bn.weight", "bn.bias", "bn.running_mean", "bn.running_var")
+        }
         scale = s["bn.weight"] / (s["bn.running_var"] + 0.001).sqrt()
         weight = (s["conv.weight"] * scale[:, None, None, None]).float()
         bias = (s["bn.bias"] - s["bn.running_mean"] * scale).float()
@@ -73,14 +75,27 @@ class Twin:
         row, column = (1, (0, 3)), (1, (3, 0))
         yield self.chain(x, block, ("branch1x1", 1, 0))
         yield self.chain(x, block, ("branch7x7_1", 1, 0), ("branch7x7_2", *row), ("branch7x7_3", *column))
-        yield self.chain(x, block, ("branch7x7dbl_1", 1, 0), ("branch7x7dbl_2", *column), ("branch7x7dbl_3", *row),
-                         ("branch7x7dbl_4", *column), ("branch7x7dbl_5", *row))  # fmt: skip
+        yield self.chain(
+            x,
+            block,
+            ("branch7x7dbl_1", 1, 0),
+            ("branch7x7dbl_2", *column),
+            ("branch7x7dbl_3", *row),
+            ("branch7x7dbl_4", *column),
+            ("branch7x7dbl_5", *row),
+        )
         yield self.chain(self.mean(x), block, ("branch_pool", 1, 0))
 
     def d(self, x, block):
         yield self.chain(x, block, ("branch3x3_1", 1, 0), ("branch3x3_2", 2, 0))
-        yield self.chain(x, block, ("branch7x7x3_1", 1, 0), ("branch7x7x3_2", 1, (0, 3)), ("branch7x7x3_3", 1, (3, 0)),
-                         ("branch7x7x3_4", 2, 0))  # fmt: skip
+        yield self.chain(
+            x,
+            block,
+            ("branch7x7x3_1", 1, 0),
+            ("branch7x7x3_2", 1, (0, 3)),
+            ("branch7x7x3_3", 1, (3, 0)),
+            ("branch7x7x3_4", 2, 0),
+        )
         yield F.max_pool2d(x, 3, 2)
 
     def e(self, x, block):

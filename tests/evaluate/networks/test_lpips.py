@@ -73,8 +73,9 @@ def twin_of(net: str) -> nn.Sequential:
 
 def twin_with(net: str, state: dict[str, torch.Tensor]) -> nn.Sequential:
     twin = twin_of(net).double()
-    named = {re.sub(r"^(\d+)\.(squeeze|expand)", r"\1.convs.\2", k.removeprefix("features.")): v
-             for k, v in state.items()}  # fmt: skip
+    named = {
+        re.sub(r"^(\d+)\.(squeeze|expand)", r"\1.convs.\2", k.removeprefix("features.")): v for k, v in state.items()
+    }
     twin.load_state_dict({k: v.double() for k, v in named.items()})
     return twin.requires_grad_(False)
 
@@ -107,7 +108,7 @@ def heads_of(net: str) -> list[np.ndarray]:
 
 
 def two_pictures(count: int = 2, side: int = 64, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Smooth colours, and the same shifted, dimmed and with noise; f32 (count,3,side,side) in 0..1."""
+    """Smooth colors, and the same shifted, dimmed and with noise; f32 (count,3,side,side) in 0..1."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:side, :side] / side
     waves = [np.sin(2 * np.pi * (f * x + g * y) + p) for f, g, p in rng.uniform(0.5, 4, (3 * count, 3))]
@@ -151,8 +152,9 @@ def test_torchmetrics_agrees(random_net, monkeypatch):
     """Its slices decide what a tap is; its epsilon stands under the root, which these features don't feel."""
     theirs_module = pytest.importorskip("torchmetrics.functional.image.lpips")
     net, ours, twin = random_net
-    monkeypatch.setattr(theirs_module, "_get_tv_model_features",
-                        lambda name, pretrained=False: {TORCHMETRICS[net]: twin}[name])  # fmt: skip
+    monkeypatch.setattr(
+        theirs_module, "_get_tv_model_features", lambda name, pretrained=False: {TORCHMETRICS[net]: twin}[name]
+    )
     theirs = theirs_module._LPIPS(pretrained=True, net=net, pnet_rand=True, use_dropout=True).double()
     a, b = two_pictures(1, 48)
     for mine, other in zip(ours.feature_maps(a), theirs.net(scaled(a)), strict=True):
@@ -198,7 +200,7 @@ def test_a_broken_twin_is_noticed(random_net):
 
 
 def test_spatial_map(random_net):
-    """Constant layers: the map's mean is the distance; in general each layer is resized by pixel-centre bilinear."""
+    """Constant layers: the map's mean is the distance; in general each layer is resized by pixel-center bilinear."""
     net, ours, _ = random_net
     a, b = two_pictures(1, 64)
     found = ours.distance(a, b, spatial=True)
@@ -233,8 +235,12 @@ def test_bad_pictures():
     a, b = two_pictures(1, 32)
     nan = b.clone()
     nan[0, 1, 2, 3] = torch.nan
-    for bad, words in ((b * 255, "divide by 255"), (b * 2 - 1, "add 1 and halve"), (nan, "1 values are NaN"),
-                       ((b * 255).to(torch.uint8), "uint8")):  # fmt: skip
+    for bad, words in (
+        (b * 255, "divide by 255"),
+        (b * 2 - 1, "add 1 and halve"),
+        (nan, "1 values are NaN"),
+        ((b * 255).to(torch.uint8), "uint8"),
+    ):
         with pytest.raises(DataError, match=words):
             net.distance(a, bad)
     with pytest.raises(ValueError, match="shapes"):
@@ -270,8 +276,15 @@ def test_loading_a_zoo_file(tmp_path, monkeypatch):
     state = OrderedDict(source.trunk.state_dict())
     state["classifier.1.weight"] = torch.zeros(10, 512, 1, 1)
     torch.save(state, tmp_path / "zoo.pth")
-    entry = Weights("squeezenet", "zoo.pth", "https://example.org/zoo.pth", (tmp_path / "zoo.pth").stat().st_size,
-                    "none", "", "lpips")  # fmt: skip
+    entry = Weights(
+        "squeezenet",
+        "zoo.pth",
+        "https://example.org/zoo.pth",
+        (tmp_path / "zoo.pth").stat().st_size,
+        "none",
+        "",
+        "lpips",
+    )
     monkeypatch.setattr(weights_module, "known", lambda: {"squeezenet": entry})
     a, b = two_pictures(1, 32)
     assert torch.equal(Lpips.load("squeeze", tmp_path).distance(a, b), source.distance(a, b))
@@ -345,8 +358,9 @@ class Graph:
             if layer.get("type") == "Const" and data.get("element_type") == "f16":
                 start, size = int(data.get("offset")), int(data.get("size"))
                 shape = [int(n) for n in data.get("shape").split(",") if n]
-                self.constants[key] = torch.from_numpy(np.frombuffer(raw, np.float16, size // 2, start).reshape(shape)
-                                                       .astype(np.float64))  # fmt: skip
+                self.constants[key] = torch.from_numpy(
+                    np.frombuffer(raw, np.float16, size // 2, start).reshape(shape).astype(np.float64)
+                )
 
     def run(self, bgr: torch.Tensor, until: str) -> dict[str, torch.Tensor]:
         """Outputs by layer name, up to `until`."""
@@ -435,8 +449,9 @@ def test_real_value(graph, keras_state, shared_data):
     """End to end: real trunk, real heads. The numbers come from the twin in float64 and the heads' other copy."""
     a, b = two_pictures(2, 64)
     twin = twin_with("squeeze", keras_state)
-    other = torch.load(shared_data / "weights" / "lpips_linear_heads" / "squeeze.pth", map_location="cpu",
-                       weights_only=True)  # fmt: skip
+    other = torch.load(
+        shared_data / "weights" / "lpips_linear_heads" / "squeeze.pth", map_location="cpu", weights_only=True
+    )
     heads = [other[f"lin{layer}.model.1.weight"].double().numpy().ravel() for layer in range(7)]
     expected = numpy_lpips(*(twin_maps("squeeze", twin, scaled(x)) for x in (a, b)), heads)
     assert np.abs(expected - GOLDEN).max() < 1e-9

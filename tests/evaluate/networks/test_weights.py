@@ -39,8 +39,9 @@ from dpcli.evaluate.networks.weights import (
 from dpcli.evaluate.networks.weights_fetch import fetch
 
 CONTENT = bytes(range(256)) * 40
-ENTRY = Weights("toy", "toy.bin", "https://example.org/toy.bin", len(CONTENT), "MIT",
-                hashlib.sha256(CONTENT).hexdigest(), "tests")  # fmt: skip
+ENTRY = Weights(
+    "toy", "toy.bin", "https://example.org/toy.bin", len(CONTENT), "MIT", hashlib.sha256(CONTENT).hexdigest(), "tests"
+)
 
 
 # The list
@@ -48,13 +49,22 @@ ENTRY = Weights("toy", "toy.bin", "https://example.org/toy.bin", len(CONTENT), "
 
 def test_the_list_is_whole():
     entries = known()
-    needed = {"alexnet", "vgg16", "squeezenet", "i3d-torchscript", "i3d-400", "resnet50-kinetics", "inception",
-              "clip-openai", "clip-laion"}  # fmt: skip
+    needed = {
+        "alexnet",
+        "vgg16",
+        "squeezenet",
+        "i3d-torchscript",
+        "i3d-400",
+        "resnet50-kinetics",
+        "inception",
+        "clip-openai",
+        "clip-laion",
+    }
     assert set(entries) == needed
     files = [each for entry in entries.values() for each in entry.files]
     assert len({each.file for each in files}) == len(files)
     for each in files:
-        assert each.url.startswith("https://") and each.size > 0 and each.licence and each.used_by
+        assert each.url.startswith("https://") and each.size > 0 and each.license and each.used_by
         assert re.fullmatch(r"[0-9a-f]{64}|[0-9a-f]{8}|", each.sha256)
         digits = re.search(r"-([0-9a-f]{8})\.pth$", each.file)
         assert not digits or each.sha256.startswith(digits[1])
@@ -103,8 +113,9 @@ def test_a_missing_file_is_one_line(tmp_path):
     assert find("clip-openai", tmp_path).name == "pytorch_model.bin"
 
 
-@pytest.mark.parametrize("count, words", [(4958839, "4.96 MB"), (605247071, "605 MB"), (4186, "4.19 kB"), (12, "12 B"),
-                                          (2.5e9, "2.5 GB")])  # fmt: skip
+@pytest.mark.parametrize(
+    "count, words", [(4958839, "4.96 MB"), (605247071, "605 MB"), (4186, "4.19 kB"), (12, "12 B"), (2.5e9, "2.5 GB")]
+)
 def test_sizes_as_text(count, words):
     assert bytes_text(count) == words and bytes_text(count, about=True) == f"about {words}"
 

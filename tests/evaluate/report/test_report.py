@@ -53,7 +53,7 @@ def scores(folder) -> Path:
 def truth(folder) -> Path:
     """Two rigid bodies; `bad` is a sequence whose parts the prediction has all wrong."""
     path = folder / "truth.h5"
-    with CloudsWriter(path, fields=("part", "pose"), length_unit="metre") as writer:
+    with CloudsWriter(path, fields=("part", "pose"), length_unit="meter") as writer:
         for name in ("bad", "good", "fine", "well"):
             writer.write(_sequence(name))
     return path
@@ -62,7 +62,7 @@ def truth(folder) -> Path:
 @pytest.fixture(scope="module")
 def parts(folder, truth) -> Path:
     path = folder / "parts.h5"
-    with PartsWriter(path, num_parts=2, length_unit="metre", provenance={"command": "dpc segment predict"}) as writer:
+    with PartsWriter(path, num_parts=2, length_unit="meter", provenance={"command": "dpc segment predict"}) as writer:
         for name in ("bad", "good", "fine", "well"):
             sequence = _sequence(name)
             sequence.pose = None
@@ -77,7 +77,7 @@ def _sequence(name: str) -> CloudSequence:
     points = np.random.default_rng(len(name)).normal(size=(40, 3)).astype(np.float32)
     part = np.repeat([0, 1], 20).astype(np.int16)
     pose = np.tile(np.eye(4), (2, 2, 1, 1))
-    pose[1, 1, 0, 3] = 0.5  # body 1 moves by half a metre
+    pose[1, 1, 0, 3] = 0.5  # body 1 moves by half a meter
     moved = points + np.where(part == 1, 0.5, 0.0)[:, None].astype(np.float32) * np.array([1, 0, 0], np.float32)
     return CloudSequence(name, np.concatenate([points, moved]), np.array([0, 40, 80]), part=np.tile(part, 2), pose=pose)
 
@@ -140,7 +140,7 @@ def test_the_page_has_the_numbers_of_the_command(scores, parts, truth, page):
     counts = sorted(report.main.confusion[report.main.confusion > 0].tolist())
     assert sorted(int(count) for _, count in cells) == counts
     assert "dpc prepare msraction3d RAW" in words and "dpc segment predict" in words
-    assert "worst: bad, frame" in words and "End-point error of the frame pairs (metre)" in words
+    assert "worst: bad, frame" in words and "End-point error of the frame pairs (meter)" in words
 
 
 def test_files_and_their_json_make_the_same_sections(scores, folder):
@@ -160,9 +160,13 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
 
 def test_motion_beside_the_thesis_is_at_its_threshold():
     """Ours at tau 0.05 must not stand beside the thesis's numbers at 0.01."""
-    found = {"task": "motion", "input": "m.h5", "provenance": [{"command": "dpc prepare sapien X"}],
-             "metrics": {"epe3d": 0.02, "accs": 0.9, "thresholds": [{"tau": 0.01, "accs": 0.4}, {"tau": 0.05, "accs": 0.9}]},
-             "units": {"epe3d": "metre", "accs": "fraction"}}  # fmt: skip
+    found = {
+        "task": "motion",
+        "input": "m.h5",
+        "provenance": [{"command": "dpc prepare sapien X"}],
+        "metrics": {"epe3d": 0.02, "accs": 0.9, "thresholds": [{"tau": 0.01, "accs": 0.4}, {"tau": 0.05, "accs": 0.9}]},
+        "units": {"epe3d": "meter", "accs": "fraction"},
+    }
     report = arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode())))
     row = report.beside[0].rows[0]
     assert report.beside[0].key == "table-B.3" and [own.text for own in row[3:5]] == ["2.00", "40.00"]
@@ -173,8 +177,12 @@ def test_motion_beside_the_thesis_is_at_its_threshold():
 
 def test_video_beside_the_thesis_is_of_the_reference_view():
     """The thesis's PSNR is of the reference view; our mean over all views must not stand beside it."""
-    found = {"task": "video", "input": "v.h5", "metrics": {"psnr": 20.0, "ssim": 0.9, "per_role": {"reference": {"psnr": 25.0}}},
-             "units": {"psnr": "dB", "ssim": "1"}}  # fmt: skip
+    found = {
+        "task": "video",
+        "input": "v.h5",
+        "metrics": {"psnr": 20.0, "ssim": 0.9, "per_role": {"reference": {"psnr": 25.0}}},
+        "units": {"psnr": "dB", "ssim": "1"},
+    }
     row = (
         arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode()), pictures=False), beside=["table-5.1"])
         .beside[0]
@@ -184,13 +192,23 @@ def test_video_beside_the_thesis_is_of_the_reference_view():
 
 
 def test_comparisons_and_runs_have_a_row_for_each_metric():
-    pair = {"task": "compare", "input": ["a.h5", "b.h5"], "units": {"accuracy": "fraction"},
-            "provenance": [[{"command": "A"}], [{"command": "B"}]],
-            "metrics": {"accuracy": {"a": 0.9, "b": 0.8, "difference": 0.1, "p": 0.03, "interval": [0.02, 0.2], "ties": 7}},
-            "intervals": {"resamples": 2000, "metrics": {"accuracy": [0.02, 0.2]}}, "mcnemar": {"only_a": 4, "only_b": 1, "p": 0.4},
-            "most_changed": {"accuracy": [{"name": "v7", "a": 1.0, "b": 0.0}]}}  # fmt: skip
-    runs = {"task": "runs", "input": ["a", "b"], "runs": ["seed 0", "seed 1"], "units": {"accuracy": "fraction"},
-            "metrics": {"accuracy": {"mean": 0.85, "sd": 0.05, "n": 2, "interval": [0.4, 1.0], "values": [0.8, 0.9]}}}  # fmt: skip
+    pair = {
+        "task": "compare",
+        "input": ["a.h5", "b.h5"],
+        "units": {"accuracy": "fraction"},
+        "provenance": [[{"command": "A"}], [{"command": "B"}]],
+        "metrics": {"accuracy": {"a": 0.9, "b": 0.8, "difference": 0.1, "p": 0.03, "interval": [0.02, 0.2], "ties": 7}},
+        "intervals": {"resamples": 2000, "metrics": {"accuracy": [0.02, 0.2]}},
+        "mcnemar": {"only_a": 4, "only_b": 1, "p": 0.4},
+        "most_changed": {"accuracy": [{"name": "v7", "a": 1.0, "b": 0.0}]},
+    }
+    runs = {
+        "task": "runs",
+        "input": ["a", "b"],
+        "runs": ["seed 0", "seed 1"],
+        "units": {"accuracy": "fraction"},
+        "metrics": {"accuracy": {"mean": 0.85, "sd": 0.05, "n": 2, "interval": [0.4, 1.0], "values": [0.8, 0.9]}},
+    }
     report = arrange(collect(["-"], stdin=BytesIO("\n".join(map(json.dumps, (pair, runs))).encode())))
     first, second = report.sections
     row = [own.text for own in first.blocks[0].rows[0]]
@@ -230,8 +248,14 @@ def test_the_rows_of_the_thesis_equal_its_text(shared_data):
 
 def test_tables_are_chosen_by_data_or_by_name(scores):
     found = {"task": "classification", "provenance": [{"command": "dpc prepare msraction3d RAW"}]}
-    named = {"task": "classification", "metrics": {"per_class": [{"name": name.upper()} for name in (
-        "high arm wave", "side boxing", "tennis serve", "golf swing")]}}  # fmt: skip
+    named = {
+        "task": "classification",
+        "metrics": {
+            "per_class": [
+                {"name": name.upper()} for name in ("high arm wave", "side boxing", "tennis serve", "golf swing")
+            ]
+        },
+    }
     other = {"task": "classification", "provenance": [{"command": "dpc prepare synthetic gestures"}]}
     assert (
         [own.id for own in chosen_tables([], [found])]
@@ -247,10 +271,21 @@ def test_tables_are_chosen_by_data_or_by_name(scores):
     assert all(own[1].text.startswith("thesis") for own in rows[3:])
 
 
-@pytest.mark.parametrize(("text", "value"), [
-    ("93.5 %", 93.5), ("1,024", 1024), ("-0.5 dB", -0.5), ("89.6 to 96.0 %", 89.6), ("-", None), ("", None),
-    ("wave", None), ("nan", None), ("inf", None), ("12\u00b0", 12),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("93.5 %", 93.5),
+        ("1,024", 1024),
+        ("-0.5 dB", -0.5),
+        ("89.6 to 96.0 %", 89.6),
+        ("-", None),
+        ("", None),
+        ("wave", None),
+        ("nan", None),
+        ("inf", None),
+        ("12\u00b0", 12),
+    ],
+)
 def test_sort_keys(text, value):
     assert sort_key(text) == value
 
@@ -261,14 +296,22 @@ def test_numbers_are_written_with_their_units():
     assert interval_text({"low": 1.0, "high": 2.5}) == "1 to 2.5" and interval_text([1]) == interval_text(None) == ""
 
 
-@pytest.mark.parametrize(("content", "words"), [
-    (b"", "empty"), (b"\x00\xff\x01", "neither text nor HDF5"), (b"hello there\n", "line 1 is not JSON"),
-    (b'{"task": "a"}\n{"task": ', "line 2 is not JSON"), (b"[1, 2]", "object 1: a int, no result"),
-    (b'{"metrics": {}}', "no text `task`"), (b'{"task": "a", "metrics": 3}', "metrics is a int"),
-    (b'{"task": "a", "metrics": {"x": NaN}}', "not JSON"), (b'{"task": "a", "provenance": ["x"]}', "provenance is not a list"),
-    (b'{"task": "classification", "metrics": {"confusion": [[1, 2]]}}', "confusion has shape (1, 2)"),
-    (b'{"task": "classification", "metrics": {"streams": {"a": 3}}}', "can't be shown"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b"\x00\xff\x01", "neither text nor HDF5"),
+        (b"hello there\n", "line 1 is not JSON"),
+        (b'{"task": "a"}\n{"task": ', "line 2 is not JSON"),
+        (b"[1, 2]", "object 1: a int, no result"),
+        (b'{"metrics": {}}', "no text `task`"),
+        (b'{"task": "a", "metrics": 3}', "metrics is a int"),
+        (b'{"task": "a", "metrics": {"x": NaN}}', "not JSON"),
+        (b'{"task": "a", "provenance": ["x"]}', "provenance is not a list"),
+        (b'{"task": "classification", "metrics": {"confusion": [[1, 2]]}}', "confusion has shape (1, 2)"),
+        (b'{"task": "classification", "metrics": {"streams": {"a": 3}}}', "can't be shown"),
+    ],
+)
 def test_what_is_no_result_is_said(tmp_path, content, words):
     path = tmp_path / "x.json"
     path.write_bytes(content)
@@ -291,8 +334,13 @@ def test_what_is_missing_is_said(parts, truth, tmp_path):
 
 
 def test_unknown_tasks_are_shown_and_duplicates_named(tmp_path):
-    found = {"task": "weather", "input": "w", "metrics": {"rain": 3.25, "days": [{"name": "Mon", "rain": 1.5}], "hours": [1, 2, 4]},
-             "units": {"rain": "mm"}, "intervals": {"rain": [3, 3.5]}}  # fmt: skip
+    found = {
+        "task": "weather",
+        "input": "w",
+        "metrics": {"rain": 3.25, "days": [{"name": "Mon", "rain": 1.5}], "hours": [1, 2, 4]},
+        "units": {"rain": "mm"},
+        "intervals": {"rain": [3, 3.5]},
+    }
     path = tmp_path / "w.jsonl"
     path.write_text("\n".join(json.dumps(own) for own in (found, found, found | {"input": "v"})))
     report = arrange(collect([str(path)]))
@@ -302,9 +350,12 @@ def test_unknown_tasks_are_shown_and_duplicates_named(tmp_path):
 
 
 _LEAVES = (
-    st.none() | st.booleans() | st.integers(-9, 99) | st.text(max_size=6)
+    st.none()
+    | st.booleans()
+    | st.integers(-9, 99)
+    | st.text(max_size=6)
     | st.floats(allow_nan=False, allow_infinity=False)
-)  # fmt: skip
+)
 _METRICS = st.recursive(
     _LEAVES,
     lambda own: st.lists(own, max_size=4) | st.dictionaries(st.text(max_size=5), own, max_size=4),
@@ -331,11 +382,18 @@ def test_any_object_is_shown_or_refused_with_a_sentence(metrics, task):
 @pytest.mark.parametrize(
     "metrics",
     [
-        {"": [{}]}, {"a": [{}, {}]}, {"": {"": {}}}, {"a": {"b": {}}}, {"a": [{"b": {}}]}, {"a": []},
-        {"m": {"mean": 1.0, "values": []}}, {"m": {"mean": {}}}, {"": {"mean": {}}},
+        {"": [{}]},
+        {"a": [{}, {}]},
+        {"": {"": {}}},
+        {"a": {"b": {}}},
+        {"a": [{"b": {}}]},
+        {"a": []},
+        {"m": {"mean": 1.0, "values": []}},
+        {"m": {"mean": {}}},
+        {"": {"mean": {}}},
     ],
     ids=str,
-)  # fmt: skip
+)
 @pytest.mark.parametrize("more", [{}, {"mcnemar": {}, "runs": [""]}, {"mcnemar": {"p": {}}, "runs": ["", ""]}], ids=str)
 def test_records_without_a_column_are_no_table(metrics, more):
     data = json.dumps({"task": "x", "metrics": metrics, **more}).encode()

@@ -53,8 +53,11 @@ def one_frame(truth, part, own, slots: int, protocol: str, ignore_below: int = 0
 
 
 A = ([0] * 5 + [1] * 3 + [2] * 2, [0, 0, 0, 0, 3, 1, 1, 3, 1, 3], [0.9, 0.9, 0.8, 0.8, 0.95, 0.7, 0.7, 0.9, 0.6, 0.85])
-B = ([0] * 5 + [1] * 4 + [2] * 2 + [3], [2, 2, 2, 3, 3, 0, 0, 0, 2, 1, 1, 0],
-     [0.8, 0.8, 0.8, 0.6, 0.6, 0.7, 0.7, 0.7, 0.8, 0.99, 0.99, 0.7])  # fmt: skip
+B = (
+    [0] * 5 + [1] * 4 + [2] * 2 + [3],
+    [2, 2, 2, 3, 3, 0, 0, 0, 2, 1, 1, 0],
+    [0.8, 0.8, 0.8, 0.6, 0.6, 0.7, 0.7, 0.7, 0.8, 0.99, 0.99, 0.7],
+)
 
 
 def test_golden_cases_of_the_published_code(golden):
@@ -306,9 +309,15 @@ def test_json_says_numbers_units_and_denominators(files):
     assert metrics["miou"] == pytest.approx((1 + np.mean(each[0]) + np.mean(each[1])) / 3)
     assert set(found["units"].values()) == {"fraction"} and set(found["units"]) <= set(metrics)
     assert found["denominators"] == {
-        "sequences": 3, "frames": 9, "true_parts": 27, "predictions": 15, "true_positives": 9,
-        "frames_without_truth": 0, "predictions_on_ignored_ground": 0, "points_without_truth": 0,
-    }  # fmt: skip
+        "sequences": 3,
+        "frames": 9,
+        "true_parts": 27,
+        "predictions": 15,
+        "true_positives": 9,
+        "frames_without_truth": 0,
+        "predictions_on_ignored_ground": 0,
+        "points_without_truth": 0,
+    }
     assert found["protocol"]["name"] == "dpc" and len(found["protocol"]["fixes"]) == 5
     assert [(row["name"], row["sequences"]) for row in metrics["per_class"]] == [("door", 2), ("lamp", 1)]
 

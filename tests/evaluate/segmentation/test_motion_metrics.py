@@ -148,9 +148,14 @@ def test_the_truth_has_no_error_and_a_broken_twin_has(tmp_path, truths) -> None:
     assert found["units"]["epe3d"] == "m" and set(found["units"]) - {"tau"} <= set(metrics)
     points = sum(len(flow) for *_, flows in samples for flow in flows)
     assert found["denominators"] == {
-        "sequences": 3, "pairs": 9, "points": points, "true_part_motions": 27, "unmatched_part_motions": 0,
-        "points_without_truth": 0, "pairs_without_truth": 0,
-    }  # fmt: skip
+        "sequences": 3,
+        "pairs": 9,
+        "points": points,
+        "true_part_motions": 27,
+        "unmatched_part_motions": 0,
+        "points_without_truth": 0,
+        "pairs_without_truth": 0,
+    }
     for *_, flows in samples:  # source and target exchanged
         flows[:] = [-flow for flow in flows]
     broken = json.loads(run(write_parts(tmp_path / "b.h5", samples), "--truth", truth, "--json").stdout)

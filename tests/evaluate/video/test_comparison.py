@@ -32,9 +32,9 @@ def clip(seed: int = 0, noise: float = 0, views: int = 4, frames: int = FRAMES, 
     rng = np.random.default_rng(seed)
     for v in range(views):
         for t in range(frames):
-            colour = 120 + 60 * np.sin(x[..., None] / 3 + y[..., None] / (2 + v) + np.arange(3))
-            colour = colour + rng.normal(0, noise * (1 + v), colour.shape)
-            made[v, t, ..., :3] = np.clip(colour, 0, 255)
+            color = 120 + 60 * np.sin(x[..., None] / 3 + y[..., None] / (2 + v) + np.arange(3))
+            color = color + rng.normal(0, noise * (1 + v), color.shape)
+            made[v, t, ..., :3] = np.clip(color, 0, 255)
             made[v, t, ..., 3] = 255 * np.clip(9 - np.hypot(x - 12 - 2 * t, y - 11 - v), 0, 1)
     return made
 
@@ -190,8 +190,11 @@ def test_a_folder_of_any_naming_is_the_same_video(tmp_path: Path, name: str) -> 
 
 def test_folders_of_views_match_by_name(tmp_path: Path, truth: Path, said: Path) -> None:
     noisy = clip(1, noise=6)
-    for folder, names in (("a", ("0", "1", "2", "3")), ("b", ("reference", "train_0", "eval_0", "eval_1")),
-                          ("c", ("view_00", "view_01", "view_02", "view_03"))):  # fmt: skip
+    for folder, names in (
+        ("a", ("0", "1", "2", "3")),
+        ("b", ("reference", "train_0", "eval_0", "eval_1")),
+        ("c", ("view_00", "view_01", "view_02", "view_03")),
+    ):
         for view, name in enumerate(names):
             write_folder(tmp_path / folder / name, noisy[view])
         found = evaluate_video(tmp_path / folder, truth)
@@ -272,10 +275,10 @@ def test_the_first_difference_is_named(tmp_path: Path, truth: Path) -> None:
         evaluate_video(tmp_path / "f", truth)
 
 
-def test_colours_saved_in_0_to_1_are_noticed(tmp_path: Path, truth: Path) -> None:
+def test_colors_saved_in_0_to_1_are_noticed(tmp_path: Path, truth: Path) -> None:
     dim = clip()
     dim[..., :3] = np.round(dim[..., :3] / 255)
-    with pytest.raises(DataError, match="no value above 1; colours in 0..1 were saved"):
+    with pytest.raises(DataError, match="no value above 1; colors in 0..1 were saved"):
         evaluate_video(write(tmp_path / "dim.h5", dim), truth)
     np.save(tmp_path / "loud.npy", clip().astype(np.float32))
     with pytest.raises(DataError, match="frame 0 has values up to 255; floats are taken as 0..1"):
@@ -293,8 +296,13 @@ def test_nan_predictions_are_counted_and_named(tmp_path: Path, truth: Path) -> N
         evaluate_video(tmp_path / "nan.npy", truth)
     result = run(tmp_path / "nan.npy", "--truth", truth, "--json", "--intersect")
     found = json.loads(result.stdout)  # NaN would be refused
-    assert found["left_out"] == [{"reason": "frames in which the prediction has NaN or infinite pixels", "count": 2,
-                                  "names": ["view 2 frame 1 (2 pixels)", "view 3 frame 0 (1 pixels)"]}]  # fmt: skip
+    assert found["left_out"] == [
+        {
+            "reason": "frames in which the prediction has NaN or infinite pixels",
+            "count": 2,
+            "names": ["view 2 frame 1 (2 pixels)", "view 3 frame 0 (1 pixels)"],
+        }
+    ]
     assert found["denominators"]["frames"] == 10
     assert (
         numbers(evaluate_video(tmp_path / "nan.npy", truth, intersect=True), "psnr")[:2]
@@ -354,8 +362,14 @@ def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:
     (tmp_path / "bad.mp4").write_bytes(b"not a film")
     (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
     np.save(tmp_path / "ints.npy", np.zeros((2, 8, 8, 3), np.int32))
-    for name, what in (("empty", "no images"), ("bad", "not a readable image"), ("bad.mp4", "not a readable video"),
-                       ("bad.npy", "not a readable .npy"), ("ints.npy", "int32"), ("absent.h5", "no such file")):  # fmt: skip
+    for name, what in (
+        ("empty", "no images"),
+        ("bad", "not a readable image"),
+        ("bad.mp4", "not a readable video"),
+        ("bad.npy", "not a readable .npy"),
+        ("ints.npy", "int32"),
+        ("absent.h5", "no such file"),
+    ):
         with pytest.raises(DataError, match=what):
             open_source(tmp_path / name)
     scene = tmp_path / "scene.h5"
@@ -406,11 +420,18 @@ def scene_views(folder: Path, size: int = 64) -> tuple[Path, Path]:
     head = ViewsHeader("toy", cameras[1], cameras[0], scene.time, ["reference", "test"], 0, (size, size))
     with ViewsWriter(folder / "views.h5", head, track=scene.frame_mean, part=scene.part) as writer:
         for v, t in np.ndindex(2, scene.num_frames):
-            given = (scene.frame_mean[t], scene.frame_quaternion[t], scene.scale, scene.opacity, scene.sh,
-                     cameras[0][v : v + 1], cameras[1][v : v + 1])  # fmt: skip
+            given = (
+                scene.frame_mean[t],
+                scene.frame_quaternion[t],
+                scene.scale,
+                scene.opacity,
+                scene.sh,
+                cameras[0][v : v + 1],
+                cameras[1][v : v + 1],
+            )
             tensors = [torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in given]
-            colour, alpha, _ = rasterization(*tensors, size, size, sh_degree=scene.sh_degree)
-            straight = torch.cat([colour / alpha.clamp_min(1e-6), alpha], -1)[0].clamp(0, 1)
+            color, alpha, _ = rasterization(*tensors, size, size, sh_degree=scene.sh_degree)
+            straight = torch.cat([color / alpha.clamp_min(1e-6), alpha], -1)[0].clamp(0, 1)
             writer.add(v, t, (straight * 255 + 0.5).to(torch.uint8).numpy())
     return folder / "scene.h5", folder / "views.h5"
 
@@ -418,8 +439,16 @@ def scene_views(folder: Path, size: int = 64) -> tuple[Path, Path]:
 def test_parts_and_tracks_need_no_pictures(tmp_path: Path) -> None:
     scene, path = toy_scene(size=24), tmp_path / "scene.h5"
     write_scene(path, scene)
-    head = ViewsHeader("toy", scene.camera_intrinsics, scene.camera_world_to_camera, scene.time, ["reference", "test"], 0,
-                       (24, 24), "m")  # fmt: skip
+    head = ViewsHeader(
+        "toy",
+        scene.camera_intrinsics,
+        scene.camera_world_to_camera,
+        scene.time,
+        ["reference", "test"],
+        0,
+        (24, 24),
+        "m",
+    )
     views = write(
         tmp_path / "v.h5", np.zeros((2, 5, 24, 24, 4), np.uint8), head, track=scene.frame_mean, part=scene.part
     )

@@ -20,10 +20,10 @@ from dpcli.evaluate.video.frechet import (
 from dpcli.runtime.seeds import generator
 
 
-def axes(lengths: np.ndarray, centre: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
-    """2 D samples centre +- length e_i: covariance diag(2 length^2 / (2 D - 1)), turned."""
+def axes(lengths: np.ndarray, center: np.ndarray, turn: np.ndarray | None = None) -> np.ndarray:
+    """2 D samples center +- length e_i: covariance diag(2 length^2 / (2 D - 1)), turned."""
     rows = np.concatenate([np.diag(lengths), -np.diag(lengths)])
-    return (rows if turn is None else rows @ turn) + centre
+    return (rows if turn is None else rows @ turn) + center
 
 
 @pytest.mark.parametrize("root", ROOTS)

@@ -88,9 +88,14 @@ def test_equal_pictures_score_exactly_one() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.integers(11, 40), st.integers(11, 40), st.sampled_from([1, 3]), st.integers(0, 2**31), st.sampled_from([1.0, 255.0]),
-    st.sampled_from(image_metrics.BORDERS), st.sampled_from(["noise", "flat", "binary", "faint"]),
-)  # fmt: skip
+    st.integers(11, 40),
+    st.integers(11, 40),
+    st.sampled_from([1, 3]),
+    st.integers(0, 2**31),
+    st.sampled_from([1.0, 255.0]),
+    st.sampled_from(image_metrics.BORDERS),
+    st.sampled_from(["noise", "flat", "binary", "faint"]),
+)
 def test_the_kernel_equals_the_reference(
     height: int, width: int, channels: int, seed: int, data_range: float, border: str, kind: str
 ) -> None:

@@ -30,8 +30,10 @@ ROLES = ("reference", "test", "test")
 @pytest.fixture(scope="module")
 def files(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("learned")
-    made = [write(folder / f"{name}.h5", clip(seed, noise=noise, views=3), header(ROLES))
-            for name, seed, noise in (("said", 1, 9), ("truth", 0, 0))]  # fmt: skip
+    made = [
+        write(folder / f"{name}.h5", clip(seed, noise=noise, views=3), header(ROLES))
+        for name, seed, noise in (("said", 1, 9), ("truth", 0, 0))
+    ]
     return made[0], made[1]
 
 
@@ -42,7 +44,7 @@ def pictures(which: int) -> np.ndarray:
 
 
 class FakeClip:
-    """Embeds a picture as its mean colours in four quarters; keeps the real class's interface."""
+    """Embeds a picture as its mean colors in four quarters; keeps the real class's interface."""
 
     def embed(self, batch: np.ndarray, *, bgr: bool = False) -> np.ndarray:
         batch = batch[..., ::-1] if bgr else batch
@@ -162,8 +164,8 @@ def with_gaps(folder: Path, frames: int, lost: dict[int, tuple[int, ...]]) -> tu
     return folder / "said.npy", folder / "truth.npy", *(np.moveaxis(one, -1, 2) for one in (ours, theirs))  # type: ignore
 
 
-def test_a_frame_left_out_leaves_no_neighbours(tmp_path: Path, fake_networks) -> None:
-    """Frames 3-5 of 8 are lost: 2 and 6 are no pair, 3 pairs of true neighbours remain."""
+def test_a_frame_left_out_leaves_no_neighbors(tmp_path: Path, fake_networks) -> None:
+    """Frames 3-5 of 8 are lost: 2 and 6 are no pair, 3 pairs of true neighbors remain."""
     said, truth, ours, theirs = with_gaps(tmp_path, 8, {0: (3, 4, 5)})
     found = evaluate_video(said, truth, metrics=("lpips", "warping", "clip_temporal"), intersect=True).learned
     assert found["lpips"].counts == {"views": 1, "frames": 5}
@@ -262,11 +264,11 @@ def test_options_replace_a_protocols_networks() -> None:
 def test_disco_takes_ssim_of_luminance(files) -> None:
     protocol = replace(PROTOCOLS["disco"], size=None)
     found = evaluate_video(*files, metrics=("psnr", "ssim"), protocol=protocol)
-    grey = [np.tensordot(np.rint(pictures(which) * 255), [0.2125, 0.7154, 0.0721], (2, 0)) for which in (0, 1)]
-    each = [np.mean([ssim_reference(o, t, data_range=255) for o, t in zip(*view)]) for view in zip(*grey)]
+    gray = [np.tensordot(np.rint(pictures(which) * 255), [0.2125, 0.7154, 0.0721], (2, 0)) for which in (0, 1)]
+    each = [np.mean([ssim_reference(o, t, data_range=255) for o, t in zip(*view)]) for view in zip(*gray)]
     assert [view.metrics.ssim for view in found.views] == pytest.approx(each, abs=1e-4)
-    colour = evaluate_video(*files, metrics=("psnr", "ssim"), protocol=replace(protocol, grey=False))
-    assert colour.mean()["psnr"] == found.mean()["psnr"] and colour.mean()["ssim"] != found.mean()["ssim"]
+    color = evaluate_video(*files, metrics=("psnr", "ssim"), protocol=replace(protocol, gray=False))
+    assert color.mean()["psnr"] == found.mean()["psnr"] and color.mean()["ssim"] != found.mean()["ssim"]
 
 
 def test_red_and_blue_swapped_are_noticed(tmp_path: Path, files) -> None:

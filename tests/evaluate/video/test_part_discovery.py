@@ -12,8 +12,8 @@ from sklearn.metrics import adjusted_rand_score
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.part_discovery import (
-    PART_NEIGHBOURS,
-    TRACK_NEIGHBOURS,
+    PART_NEIGHBORS,
+    TRACK_NEIGHBORS,
     _clusters,
     adjusted_rand_index,
     attach,
@@ -120,7 +120,7 @@ def test_a_point_among_gaussians_without_part_has_none() -> None:
     scene.part[:] = -1
     scene.part[0] = 1
     found = surface_parts(scene, scene.frame_mean[0].astype(np.float64), 0.0)
-    assert found[0] == 1 and set(found) == {-1, 1} and (found == 1).sum() <= 8 * PART_NEIGHBOURS
+    assert found[0] == 1 and set(found) == {-1, 1} and (found == 1).sum() <= 8 * PART_NEIGHBORS
 
 
 def rigid_scene(rng: np.random.Generator, frames: int = 4) -> tuple[GaussianScene, np.ndarray]:
@@ -147,7 +147,7 @@ def test_points_of_a_rigid_scene_are_carried_exactly() -> None:
     score = track_score(scene, truth, scene.time)
     assert score.epe < 2e-5 < score.static and (score.points, score.frames) == (50, 3)
     frozen = replace(scene, frame_quaternion=np.tile(scene.frame_quaternion[:1], (4, 1, 1)))
-    assert track_score(frozen, truth, scene.time).epe > 0.1  # without its turn a neighbour carries a point elsewhere
+    assert track_score(frozen, truth, scene.time).epe > 0.1  # without its turn a neighbor carries a point elsewhere
 
 
 def test_tracks_of_the_toy_and_the_baseline_by_hand() -> None:
@@ -158,8 +158,11 @@ def test_tracks_of_the_toy_and_the_baseline_by_hand() -> None:
     static = np.linalg.norm(truth[1:] - truth[0], axis=-1).mean()
     assert score.static == pytest.approx(static) and score.epe < 0.02 * static
     assert score.diameter == pytest.approx(np.linalg.norm(points.max(0) - points.min(0)))
-    still = replace(scene, frame_mean=np.tile(scene.frame_mean[:1], (5, 1, 1)),
-                    frame_quaternion=np.tile(scene.frame_quaternion[:1], (5, 1, 1)))  # fmt: skip
+    still = replace(
+        scene,
+        frame_mean=np.tile(scene.frame_mean[:1], (5, 1, 1)),
+        frame_quaternion=np.tile(scene.frame_quaternion[:1], (5, 1, 1)),
+    )
     assert track_score(still, truth, scene.time).epe == pytest.approx(static)
 
 
@@ -171,9 +174,9 @@ def test_one_frame_has_no_tracks_and_no_points_are_an_error() -> None:
         track_score(scene, np.zeros((5, 0, 3)), scene.time)
 
 
-def test_fewer_gaussians_than_neighbours() -> None:
+def test_fewer_gaussians_than_neighbors() -> None:
     scene = toy_scene(per_part=1)
-    assert scene.num_gaussians == 2 < TRACK_NEIGHBOURS
+    assert scene.num_gaussians == 2 < TRACK_NEIGHBORS
     points = scene.frame_mean[0].astype(np.float64)
     assert carry(scene, points, scene.time).shape == (5, 2, 3)
     assert list(surface_parts(scene, points, 0.0)) == [0, 1]

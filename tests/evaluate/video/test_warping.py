@@ -43,8 +43,8 @@ def test_a_constant_video_is_perfect():
 
 
 def test_flow_has_the_known_motion(moving):
-    grey = [(frame.mean(0) * 255).astype(np.uint8) for frame in moving[:2]]
-    flow = optical_flow(grey[1], grey[0])  # the window goes right and down, so what it shows goes left and up
+    gray = [(frame.mean(0) * 255).astype(np.uint8) for frame in moving[:2]]
+    flow = optical_flow(gray[1], gray[0])  # the window goes right and down, so what it shows goes left and up
     inner = flow[16:-16, 16:-16]
     np.testing.assert_allclose(inner.mean((0, 1)), STEP, atol=0.05)
 
@@ -79,8 +79,8 @@ def test_what_a_moving_square_uncovers_is_left_out():
         frame = behind.copy()
         frame[:, 32:80, 30 + 8 * t : 78 + 8 * t] = front
         frames.append(frame)
-    grey = [(frame.mean(0) * 255).astype(np.uint8) for frame in frames]
-    back, forth = optical_flow(grey[1], grey[0]), optical_flow(grey[0], grey[1])
+    gray = [(frame.mean(0) * 255).astype(np.uint8) for frame in frames]
+    back, forth = optical_flow(gray[1], gray[0]), optical_flow(gray[0], gray[1])
     seen = seen_in_both(back, forth)
     assert 0.5 < (~seen).sum() / (48 * 8) < 2  # about the area that nobody has seen before, and mostly there
     assert seen[36:76, 31:37].mean() < 0.5 and seen[40:72, 48:76].mean() > 0.95 and seen[:24].mean() > 0.99

@@ -60,8 +60,26 @@ def test_the_ply_header_is_what_players_expect(tmp_path):
     header = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0].decode("ascii").split("\n")
     assert header[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 300"]
     rest = [f"f_rest_{i}" for i in range(9)]
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *rest, "opacity", "scale_0", "scale_1",
-             "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        *rest,
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+        "rot_0",
+        "rot_1",
+        "rot_2",
+        "rot_3",
+    ]
     assert header[3:-1] == [f"property float {name}" for name in names]
 
 
@@ -80,13 +98,23 @@ def test_open3d_reads_the_splat(tmp_path):
 
 
 _TERMS = (  # the real spherical harmonics of 3DGS up to factors, in its order, at directions x y z
-    lambda x, y, z: 1 + 0 * x, lambda x, y, z: -y, lambda x, y, z: z, lambda x, y, z: -x,
-    lambda x, y, z: x * y, lambda x, y, z: y * z, lambda x, y, z: 2 * z * z - x * x - y * y, lambda x, y, z: x * z,
-    lambda x, y, z: x * x - y * y, lambda x, y, z: y * (3 * x * x - y * y), lambda x, y, z: x * y * z,
-    lambda x, y, z: y * (4 * z * z - x * x - y * y), lambda x, y, z: z * (2 * z * z - 3 * x * x - 3 * y * y),
-    lambda x, y, z: x * (4 * z * z - x * x - y * y), lambda x, y, z: z * (x * x - y * y),
+    lambda x, y, z: 1 + 0 * x,
+    lambda x, y, z: -y,
+    lambda x, y, z: z,
+    lambda x, y, z: -x,
+    lambda x, y, z: x * y,
+    lambda x, y, z: y * z,
+    lambda x, y, z: 2 * z * z - x * x - y * y,
+    lambda x, y, z: x * z,
+    lambda x, y, z: x * x - y * y,
+    lambda x, y, z: y * (3 * x * x - y * y),
+    lambda x, y, z: x * y * z,
+    lambda x, y, z: y * (4 * z * z - x * x - y * y),
+    lambda x, y, z: z * (2 * z * z - 3 * x * x - 3 * y * y),
+    lambda x, y, z: x * (4 * z * z - x * x - y * y),
+    lambda x, y, z: z * (x * x - y * y),
     lambda x, y, z: x * (x * x - 3 * y * y),
-)  # fmt: skip
+)
 
 
 def _seen(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -94,7 +122,7 @@ def _seen(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 def test_half_a_turn_for_players_turns_everything_together(scene):
-    """Covariances, positions and the colours seen from a direction all turn by the same rotation."""
+    """Covariances, positions and the colors seen from a direction all turn by the same rotation."""
     kept, turned = Splats.of(scene, 0.7, "keep"), Splats.of(scene, 0.7)
     np.testing.assert_allclose(turned.mean, kept.mean @ TO_PLAYER.T, atol=1e-7)
     for one, two in ((_matrices(kept.quaternion), _matrices(turned.quaternion)),):
@@ -188,7 +216,12 @@ def test_the_command_says_what_it_cannot_do(scene_file, tmp_path):
 
 def test_cameras_and_metrics_replace_nothing_unasked(scene_file, tmp_path, monkeypatch):
     usual = {"time": None, "axes": "player", "least": None, "points": None, "seed": 0}
-    for form, name in (("cameras", "notes.txt"), ("metrics", "scene.h5"), ("cameras", "mine.json"), ("metrics", "mine.json")):
+    for form, name in (
+        ("cameras", "notes.txt"),
+        ("metrics", "scene.h5"),
+        ("cameras", "mine.json"),
+        ("metrics", "mine.json"),
+    ):
         (tmp_path / name).write_bytes(b"mine")
         with pytest.raises(UsageError, match="--force replaces it" if name == "mine.json" else "ends in .json"):
             run_export(str(scene_file), str(tmp_path / name), form=form, force=False, **usual)
@@ -230,8 +263,22 @@ def test_an_export_flows_into_the_segmenter(dpc, scene_file, tmp_path):
     clouds = dpc("generate4d", "export", scene_file, "--as", "clouds", "--points", "200", "-o", "-")
     assert clouds.returncode == 0, clouds.stderr.decode()
     parts = tmp_path / "parts.h5"
-    said = dpc("segment", "predict", "-", "-o", parts, "--method", "ward", "--parts", "2", "--flow", "nearest",
-               "--icp", "0", stdin=clouds.stdout)  # fmt: skip
+    said = dpc(
+        "segment",
+        "predict",
+        "-",
+        "-o",
+        parts,
+        "--method",
+        "ward",
+        "--parts",
+        "2",
+        "--flow",
+        "nearest",
+        "--icp",
+        "0",
+        stdin=clouds.stdout,
+    )
     assert said.returncode == 0, said.stderr.decode()
     (tmp_path / "clouds.h5").write_bytes(clouds.stdout)
     with CloudsReader(tmp_path / "clouds.h5") as reader, PartsReader(parts) as predicted:

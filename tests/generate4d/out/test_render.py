@@ -1,4 +1,4 @@
-"""Pictures of a scene: camera paths, times, colours, trails, and the files they end in."""
+"""Pictures of a scene: camera paths, times, colors, trails, and the files they end in."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import typer
 
 from dpcli.cli.generate4d.output import render
 from dpcli.draw.animation import output_kind, write_pictures
-from dpcli.draw.palette import PALETTE, part_colours
+from dpcli.draw.palette import PALETTE, part_colors
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, plan
-from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colours
+from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colors
 from dpcli.generate4d.out.render import Look, Renderer, render_views, sheet
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
@@ -95,11 +95,13 @@ def test_a_still_instant_and_a_scene_of_one_frame(scene):
 
 def test_wrong_cameras_are_refused(scene):
     for wrong, says in (
-        (lambda: Lens(radius=0), "--radius 0"), (lambda: Lens(fovy=math.pi), "--fovy 180"),
-        (lambda: Lens(elevation=2), "--elevation 114"), (lambda: Lens(size=4), "--size 4"),
+        (lambda: Lens(radius=0), "--radius 0"),
+        (lambda: Lens(fovy=math.pi), "--fovy 180"),
+        (lambda: Lens(elevation=2), "--elevation 114"),
+        (lambda: Lens(size=4), "--size 4"),
         (lambda: plan(scene, "spiral"), "--path spiral: expected one of turntable"),
-        (lambda: Look("shape"), "--colour shape"),
-    ):  # fmt: skip
+        (lambda: Look("shape"), "--color shape"),
+    ):
         with pytest.raises(UsageError, match=says):
             wrong()
 
@@ -108,7 +110,7 @@ def test_wrong_cameras_are_refused(scene):
 
 
 def _blue(picture: np.ndarray) -> np.ndarray:
-    """Centre (x, y) of the blue part."""
+    """Center (x, y) of the blue part."""
     rows, columns = np.nonzero(picture[..., 2].astype(int) - picture[..., 0] > 120)
     return np.array([columns.mean(), rows.mean()]) + 0.5
 
@@ -132,7 +134,7 @@ def test_backgrounds_and_transparency_agree(scene, renderer):
     assert clear[0, 0].tolist() == [0, 0, 0, 0] and clear[..., 3].max() > 250
 
 
-def test_part_rigid_and_depth_colours(scene, renderer):
+def test_part_rigid_and_depth_colors(scene, renderer):
     shot = plan(scene, "fixed", time=0.0)[0]
     middles = [tuple(np.array([24, 24]) + [0, side]) for side in (-8, 8)]
     for part, place in enumerate(middles):
@@ -141,9 +143,9 @@ def test_part_rigid_and_depth_colours(scene, renderer):
     weightless = Renderer(replace(scene, rigid_weight=np.zeros_like(scene.rigid_weight)))
     assert np.abs(weightless.picture(shot, Look("rigid"))[middles[0]].astype(int) - WEIGHTS[0]).max() < 12
     aside = plan(scene, "fixed", Lens(azimuth=1.2), time=0.0)[0]  # from the blue box's side: blue is nearer
-    depth, colour = renderer.picture(aside, Look("depth")).astype(int), renderer.picture(aside)
-    near = colour[..., 2].astype(int) - colour[..., 0] > 150
-    far = colour[..., 0].astype(int) - colour[..., 2] > 150
+    depth, color = renderer.picture(aside, Look("depth")).astype(int), renderer.picture(aside)
+    near = color[..., 2].astype(int) - color[..., 0] > 150
+    far = color[..., 0].astype(int) - color[..., 2] > 150
     assert depth[near].sum(1).mean() > depth[far].sum(1).mean() + 60
 
 
@@ -157,12 +159,12 @@ def test_trails_follow_control_points_and_start_where_they_were(scene, renderer)
     assert renderer.picture(shot, Look(trajectories=True, background=None)).shape == (48, 48, 4)
 
 
-def test_colour_tables():
-    assert part_colours(np.array([-1, 0, 14])).tolist() == [[128] * 3, PALETTE[0].tolist(), PALETTE[0].tolist()]
-    np.testing.assert_array_equal(weight_colours(np.linspace(0, 1, 9)), WEIGHTS)
-    assert weight_colours(np.array([-1.0, 2.0])).tolist() == [WEIGHTS[0].tolist(), WEIGHTS[-1].tolist()]
+def test_color_tables():
+    assert part_colors(np.array([-1, 0, 14])).tolist() == [[128] * 3, PALETTE[0].tolist(), PALETTE[0].tolist()]
+    np.testing.assert_array_equal(weight_colors(np.linspace(0, 1, 9)), WEIGHTS)
+    assert weight_colors(np.array([-1.0, 2.0])).tolist() == [WEIGHTS[0].tolist(), WEIGHTS[-1].tolist()]
     assert [parse_background(text) for text in ("white", "1,2,3", "none")] == [(255, 255, 255), (1, 2, 3), None]
-    for text in ("grey", "1,2", "1,2,256"):
+    for text in ("gray", "1,2", "1,2,256"):
         with pytest.raises(UsageError, match="--background"):
             parse_background(text)
 
@@ -258,26 +260,48 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
     app = typer.Typer()
     app.command()(render)
     write_scene(tmp_path / "s.h5", scene)
-    header = ViewsHeader("toy", scene.camera_intrinsics, scene.camera_world_to_camera, np.array([1.0]), ["reference", "test"],
-                         0, (48, 48))  # fmt: skip
+    header = ViewsHeader(
+        "toy",
+        scene.camera_intrinsics,
+        scene.camera_world_to_camera,
+        np.array([1.0]),
+        ["reference", "test"],
+        0,
+        (48, 48),
+    )
     render_views(renderer, header, tmp_path / "v.h5")
     words = [str(tmp_path / "s.h5"), "--device", "cpu", "--cameras", str(tmp_path / "v.h5"), "-o"]
-    done = CliRunner().invoke(app, [*words, str(tmp_path / "p.h5"), "--colour", "part", "--trajectories"])
+    done = CliRunner().invoke(app, [*words, str(tmp_path / "p.h5"), "--color", "part", "--trajectories"])
     assert done.exit_code == 0, done.exception
     shot = plan(scene, "reference", time=1.0)[0]
     with ViewsReader(tmp_path / "p.h5") as reader:
         np.testing.assert_array_equal(reader.rgba(0, 0), renderer.picture(shot, Look("part", None, True)))
-        assert reader.provenance[-1]["config"] == {"cameras": True, "colour": "part", "trajectories": True}
+        assert reader.provenance[-1]["config"] == {"cameras": True, "color": "part", "trajectories": True}
     for more, says in (
-        (["--background", "black"], "--background: not with --cameras"), (["--path", "swing"], "--path: not with"),
-        (["--frames", "3", "--fps", "9"], "--frames, --fps: not with"), (["--azimuth", "0", "--time", "0"], "--azimuth, --time:"),
+        (["--background", "black"], "--background: not with --cameras"),
+        (["--path", "swing"], "--path: not with"),
+        (["--frames", "3", "--fps", "9"], "--frames, --fps: not with"),
+        (["--azimuth", "0", "--time", "0"], "--azimuth, --time:"),
         (["--size", "32"], "--size: not with"),
-    ):  # fmt: skip
+    ):
         refused = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *more])
         assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
     assert not (tmp_path / "q.h5").exists()
-    sheet_words = ["--picture", str(tmp_path / "sheet.png"), "--columns", "1", "--size", "16", "--time", "0", "--background", "black"]
-    done = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *sheet_words])  # what a sheet has use for is its own
+    sheet_words = [
+        "--picture",
+        str(tmp_path / "sheet.png"),
+        "--columns",
+        "1",
+        "--size",
+        "16",
+        "--time",
+        "0",
+        "--background",
+        "black",
+    ]
+    done = CliRunner().invoke(
+        app, [*words, str(tmp_path / "q.h5"), *sheet_words]
+    )  # what a sheet has use for is its own
     assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
 
 
@@ -298,9 +322,26 @@ def test_the_command_draws_and_refuses(scene, tmp_path):
     app.command()(render)
     write_scene(tmp_path / "s.h5", scene)
     words = [str(tmp_path / "s.h5"), "--device", "cpu", "-o"]
-    done = CliRunner().invoke(app, [
-        *words, str(tmp_path / "a.mp4"), "--path", "swing", "--size", "32", "--frames", "7", "--colour", "part",
-        "--trajectories", "--picture", str(tmp_path / "sheet.png"), "--columns", "3"])  # fmt: skip
+    done = CliRunner().invoke(
+        app,
+        [
+            *words,
+            str(tmp_path / "a.mp4"),
+            "--path",
+            "swing",
+            "--size",
+            "32",
+            "--frames",
+            "7",
+            "--color",
+            "part",
+            "--trajectories",
+            "--picture",
+            str(tmp_path / "sheet.png"),
+            "--columns",
+            "3",
+        ],
+    )
     assert done.exit_code == 0, done.exception
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 7
     assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (22 + 4 * (32 + 4), 96 + 3 * (32 + 4))

@@ -148,8 +148,8 @@ def clip_embedding(model: Zero123Model, image: np.ndarray) -> torch.Tensor:
         return np.where(x < 1, near, np.where(x < 2, far, 0))
 
     scale = SIZE / 12
-    centres = (np.arange(12) + 0.5) * scale - 0.5
-    rows = kernel((np.arange(SIZE) - centres[:, None]) / scale)
+    centers = (np.arange(12) + 0.5) * scale - 0.5
+    rows = kernel((np.arange(SIZE) - centers[:, None]) / scale)
     rows /= rows.sum(1, keepdims=True)
     small = np.einsum("ij,jkc,lk->ilc", rows, image.astype(np.float64), rows).clip(0, 1)
     pixels = (small - [0.48145466, 0.4578275, 0.40821073]) / [0.26862954, 0.26130258, 0.27577711]
@@ -196,12 +196,12 @@ def test_checker_rejects_broken_twins(model: Zero123Model, video: np.ndarray, mo
 
 
 def assert_zero123_scalars(function: Callable) -> None:
-    """From the camera centres, as Zero123's training data define them: Blender's z up, polar angle from +z."""
+    """From the camera centers, as Zero123's training data define them: Blender's z up, polar angle from +z."""
 
     def spherical(azimuth: float, elevation: float, radius: float) -> np.ndarray:
         pose = orbit_pose(azimuth, elevation, radius)
-        centre = -pose[:3, :3].T @ pose[:3, 3]
-        x, y, z = centre[[2, 0, 1]]  # our +z, +x, +y are their +x, +y, +z
+        center = -pose[:3, :3].T @ pose[:3, 3]
+        x, y, z = center[[2, 0, 1]]  # our +z, +x, +y are their +x, +y, +z
         distance = np.sqrt(x * x + y * y + z * z)
         return np.array([np.arccos(z / distance), np.arctan2(y, x), distance])
 
@@ -255,11 +255,11 @@ def test_descent_leads_to_what_the_model_expects(prior: Zero123, monkeypatch: py
 
     monkeypatch.setattr(prior.model, "unet", knowing)
     images, generator = renders(0), seeded()
-    optimiser, before = torch.optim.Adam([images], 0.02), (prior._latents(images) - goal).norm().item()
+    optimizer, before = torch.optim.Adam([images], 0.02), (prior._latents(images) - goal).norm().item()
     for step in range(60):
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         prior.loss(images, CAMERAS, FRAMES, step / 60, generator).backward()
-        optimiser.step()
+        optimizer.step()
     assert (prior._latents(images) - goal).norm().item() < 0.2 * before
 
 

@@ -35,14 +35,14 @@ def test_a_disc_becomes_a_ball_and_a_bar_a_rod():
     assert ball_thickness(joined)[30, 60] == pytest.approx(thickness[30, 60], abs=0.5)
 
 
-def test_inflated_points_project_into_the_silhouette_with_its_colours():
+def test_inflated_points_project_into_the_silhouette_with_its_colors():
     rgba, intrinsics = _disc(64, 20), pinhole(np.deg2rad(49.1), 64, 64)
     pose = orbit_pose(0.7, 0.3)
-    points, colours = inflated(rgba, intrinsics, pose, 500, RNG)
+    points, colors = inflated(rgba, intrinsics, pose, 500, RNG)
     camera = points @ pose[:3, :3].T + pose[:3, 3]
     pixel = (camera / camera[:, 2:]) @ intrinsics.T
     assert rgba[pixel[:, 1].astype(int), pixel[:, 0].astype(int), 3].all()
-    np.testing.assert_allclose(colours, np.tile([0.5, 0, 0], (500, 1)))
+    np.testing.assert_allclose(colors, np.tile([0.5, 0, 0], (500, 1)))
     radius = 20 / intrinsics[0, 0] * 2
     assert np.abs(camera[:, 2] - 2).max() == pytest.approx(radius, rel=0.15)  # as thick as wide
 
@@ -52,16 +52,14 @@ def test_an_empty_first_frame_is_explained():
         inflated(np.zeros((8, 8, 4), np.float32), pinhole(1.0, 8, 8), orbit_pose(0, 0), 10, RNG)
 
 
-def test_the_hull_is_inside_every_silhouette_and_takes_the_near_colour():
+def test_the_hull_is_inside_every_silhouette_and_takes_the_near_color():
     intrinsics = np.stack([pinhole(np.deg2rad(49.1), 64, 64)] * 2)
     poses = np.stack([orbit_pose(0, 0), orbit_pose(np.pi, 0)])
     front, back = _disc(64, 15), _disc(64, 15)
     back[..., :3] = [0, 0, 1]
-    points, colours = hull([front, back], intrinsics, poses, 800, RNG)
+    points, colors = hull([front, back], intrinsics, poses, 800, RNG)
     near, far = points[:, 2] > 0.3, points[:, 2] < -0.3
-    assert (
-        len(points) == 800 and (colours[near, 0] > colours[near, 2]).all() and (colours[far, 2] > colours[far, 0]).all()
-    )
+    assert len(points) == 800 and (colors[near, 0] > colors[near, 2]).all() and (colors[far, 2] > colors[far, 0]).all()
     side = np.stack([orbit_pose(0, 0), orbit_pose(np.pi / 2, 0)])
     off = np.roll(_disc(64, 4), 28, axis=0)
     with pytest.raises(DataError, match="no point in common"):
@@ -100,15 +98,15 @@ def test_growing_copies_the_busy_and_drops_the_transparent():
     gaussians.gradient[[5, 7]] = torch.tensor([3.0, 9.0])
     gaussians.seen += 1
     before = {name: getattr(gaussians, name).detach().clone() for name in NAMES}
-    memory = optimizer.state[gaussians.colour]["exp_avg"].clone()
+    memory = optimizer.state[gaussians.color]["exp_avg"].clone()
     config = preset("quick", grow_share=0.1)
     gaussians.grow_and_prune(optimizer, config, torch.Generator().manual_seed(0), grow=True)
     kept = [i for i in range(20) if i != 3]
     assert len(gaussians) == 21
-    torch.testing.assert_close(gaussians.colour.data, before["colour"][kept + [5, 7]])
+    torch.testing.assert_close(gaussians.color.data, before["color"][kept + [5, 7]])
     torch.testing.assert_close(gaussians.anchor[20], gaussians.anchor[kept.index(7)])
-    torch.testing.assert_close(optimizer.state[gaussians.colour]["exp_avg"][:19], memory[kept])
-    assert (optimizer.state[gaussians.colour]["exp_avg"][19:] == 0).all()
+    torch.testing.assert_close(optimizer.state[gaussians.color]["exp_avg"][:19], memory[kept])
+    assert (optimizer.state[gaussians.color]["exp_avg"][19:] == 0).all()
     assert not torch.equal(gaussians.mean[20], before["mean"][7])
     (gaussians.mean**2).sum().backward()
     optimizer.step()  # the optimizer's groups hold the new parameters
@@ -157,6 +155,8 @@ def test_wrong_settings_are_named():
 
 
 def test_a_limit_on_gaussians_holds_from_the_start():
-    assert preset("quick", most_gaussians=800).gaussians == 800 and preset("quick", most_gaussians=9000).gaussians == 6000
+    assert (
+        preset("quick", most_gaussians=800).gaussians == 800 and preset("quick", most_gaussians=9000).gaussians == 6000
+    )
     with pytest.raises(UsageError, match="--most-gaussians 800: expected at least the 900"):
         preset("quick", most_gaussians=800, gaussians=900)

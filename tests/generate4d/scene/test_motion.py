@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dpcli.generate4d.scene.control_points import ControlPoints
-from dpcli.generate4d.scene.identification import ball_neighbours, spatial_loss, temporal_loss
+from dpcli.generate4d.scene.identification import ball_neighbors, spatial_loss, temporal_loss
 from dpcli.generate4d.scene.losses import arap_loss
 from dpcli.generate4d.scene.motion import Motion, MotionField, encode
-from dpcli.generate4d.scene.quaternion import multiply, normalise, rotate, to_matrix
+from dpcli.generate4d.scene.quaternion import multiply, normalize, rotate, to_matrix
 
 TIMES = torch.tensor([0.0, 0.4, 1.0])
 
@@ -97,17 +97,17 @@ def test_parts_start_as_cells_and_turn_about_their_middle():
     part = field.part_of(points, TIMES)[1]
     assert (part.argmax(1) == torch.arange(3).repeat_interleave(50)).all()
     middle = torch.stack([points[i * 50 : i * 50 + 50].mean(0) for i in range(3)])
-    torch.testing.assert_close(field.centre, middle, atol=0.05, rtol=0)
+    torch.testing.assert_close(field.center, middle, atol=0.05, rtol=0)
     torch.nn.init.zeros_(field.movement_shift.weight)
     turn, shift = field.part_motion(TIMES)
-    torch.testing.assert_close(rotate(turn, field.centre) + shift, field.centre.expand(3, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(rotate(turn, field.center) + shift, field.center.expand(3, 3, 3), atol=1e-5, rtol=0)
 
 
 def test_the_temporal_loss_knows_the_true_partition():
     torch.manual_seed(0)
     points = torch.randn(40, 3)
     true = torch.nn.functional.one_hot(torch.arange(40) % 2, 2).float().expand(2, -1, -1)
-    turns = normalise(torch.randn(2, 4))
+    turns = normalize(torch.randn(2, 4))
     moved = torch.stack([_rigid_motion(points[i], turns[i % 2], torch.full((3,), float(i % 2))) for i in range(40)])
     displacement = (moved - points).expand(2, -1, -1).clone().requires_grad_()
     wrong = true[:, torch.randperm(40)].clone().requires_grad_()
@@ -119,10 +119,10 @@ def test_the_temporal_loss_knows_the_true_partition():
 
 @settings(deadline=None)
 @given(st.integers(1, 12), st.integers(1, 5), st.floats(0.2, 3.0))
-def test_neighbours_and_spatial_loss_by_brute_force(count, most, radius):
+def test_neighbors_and_spatial_loss_by_brute_force(count, most, radius):
     rng = torch.Generator().manual_seed(count * 7 + most)
     points, part = torch.randn(count, 3, generator=rng), torch.rand(1, count, 2, generator=rng)
-    index = ball_neighbours(points, radius, most)
+    index = ball_neighbors(points, radius, most)
     distance = (points[:, None] - points).norm(dim=-1)
     total = []
     for i in range(count):
@@ -143,7 +143,7 @@ def test_skinning_is_equation_5_8_in_loops():
     control = ControlPoints(torch.randn(12, 3), 4).double()
     control.log_radius.data += torch.randn(12, dtype=torch.float64) * 0.3
     points = torch.randn(7, 3, dtype=torch.float64)
-    turn = normalise(torch.cat([torch.ones(2, 12, 1), torch.randn(2, 12, 3)], -1).double())
+    turn = normalize(torch.cat([torch.ones(2, 12, 1), torch.randn(2, 12, 3)], -1).double())
     shift = torch.randn(2, 12, 3, dtype=torch.float64)
     nearest = torch.cdist(points, control.position).topk(4, largest=False).indices
     moved, quaternion = control.carry(points, nearest, _motion(turn, shift))
@@ -154,14 +154,14 @@ def test_skinning_is_equation_5_8_in_loops():
             weight = weight / weight.sum()
             there = [rotate(turn[b, j], points[i] - control.position[j]) + control.position[j] + shift[b, j] for j in k]
             torch.testing.assert_close(moved[b, i], (weight[:, None] * torch.stack(there)).sum(0))
-            torch.testing.assert_close(quaternion[b, i], normalise((weight[:, None] * turn[b, k]).sum(0)))
+            torch.testing.assert_close(quaternion[b, i], normalize((weight[:, None] * turn[b, k]).sum(0)))
 
 
 def test_one_rigid_motion_of_all_control_points_carries_everything_rigidly():
     torch.manual_seed(2)
     points = torch.randn(200, 3)
     control = ControlPoints.among(points, 20)
-    turn, shift = normalise(torch.tensor([1.0, 0.3, -0.2, 0.5])), torch.tensor([0.1, -0.4, 2.0])
+    turn, shift = normalize(torch.tensor([1.0, 0.3, -0.2, 0.5])), torch.tensor([0.1, -0.4, 2.0])
     displacement = _rigid_motion(control.position.detach(), turn, shift) - control.position.detach()
     motion = _motion(turn.expand(1, 20, 4), displacement[None])
     moved, quaternion = control.carry(points, control.nearest(points), motion)
@@ -179,7 +179,7 @@ def test_gradients_through_skinning_are_those_of_finite_differences():
 
     def outputs(points, turn, shift, position, radius):
         control.__dict__["_parameters"].update(position=position, log_radius=radius)
-        return control.carry(points, nearest, _motion(normalise(torch.cat([turn[..., :1] * 0 + 1, turn], -1)), shift))
+        return control.carry(points, nearest, _motion(normalize(torch.cat([turn[..., :1] * 0 + 1, turn], -1)), shift))
 
     position, radius = (
         control.position.detach().clone().requires_grad_(),
@@ -191,11 +191,9 @@ def test_gradients_through_skinning_are_those_of_finite_differences():
 def test_arap_is_zero_for_rigid_motions_and_sees_a_stretch():
     torch.manual_seed(4)
     points = torch.randn(30, 3)
-    neighbours = ball_neighbours(points, 2.0, 5)
-    turn = normalise(torch.randn(2, 4))
+    neighbors = ball_neighbors(points, 2.0, 5)
+    turn = normalize(torch.randn(2, 4))
     rigid = torch.stack([_rigid_motion(points, q, torch.ones(3)) for q in turn])
-    assert arap_loss(points, rigid, neighbours) < 1e-9
-    assert arap_loss(points, points[None] * torch.tensor([1.0, 1.5, 1.0]), neighbours) > 1e-2
-    assert (
-        arap_loss(points, points[None] * torch.tensor([-1.0, 1.0, 1.0]), neighbours) > 1e-2
-    )  # a mirror is no rotation
+    assert arap_loss(points, rigid, neighbors) < 1e-9
+    assert arap_loss(points, points[None] * torch.tensor([1.0, 1.5, 1.0]), neighbors) > 1e-2
+    assert arap_loss(points, points[None] * torch.tensor([-1.0, 1.0, 1.0]), neighbors) > 1e-2  # a mirror is no rotation

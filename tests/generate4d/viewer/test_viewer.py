@@ -80,12 +80,12 @@ def _ours(scene, time: float, azimuth: float, elevation: float, **look) -> np.nd
 
 
 @needs_browser
-def test_a_browser_draws_what_our_rasteriser_draws(scene, page, tmp_path):
+def test_a_browser_draws_what_our_rasterizer_draws(scene, page, tmp_path):
     """Another implementation (GLSL), the same splatting: pixels differ by rounding of the data and of blending only."""
     pictures = []
     for state, look in (
         ("time=0.4&azimuth=25&elevation=20", {}),
-        ("time=1&azimuth=25&elevation=20&colour=part&background=black", {"colour": "part", "background": (12, 14, 18)}),
+        ("time=1&azimuth=25&elevation=20&color=part&background=black", {"color": "part", "background": (12, 14, 18)}),
     ):
         shown = show(page, f"{state}&controls=0", tmp_path)
         assert (shown.state, shown.error) == ("ready", "")
@@ -95,16 +95,16 @@ def test_a_browser_draws_what_our_rasteriser_draws(scene, page, tmp_path):
         assert np.quantile(difference, 0.999) <= 12
         pictures.append(shown)
     start, end = pictures
-    assert np.abs(start.pixels.astype(int) - end.pixels).mean() > 20  # time, colour and background do something
+    assert np.abs(start.pixels.astype(int) - end.pixels).mean() > 20  # time, color and background do something
     assert "part 0" in end.page and "&lt;/script&gt;" in end.page and "31.5" in end.page
 
 
 @needs_browser
 def test_without_webgl_a_canvas_shows_the_same(scene, page, tmp_path):
-    shown = show(page, "time=0.5&azimuth=-20&elevation=10&colour=rigid&controls=0&renderer=2d", tmp_path)
+    shown = show(page, "time=0.5&azimuth=-20&elevation=10&color=rigid&controls=0&renderer=2d", tmp_path)
     assert shown.state == "ready" and 'data-renderer="2d"' in shown.page
-    difference = np.abs(_ours(scene, 0.5, -20, 10, colour="rigid") - shown.pixels)
-    assert difference.mean() < 2 and np.quantile(difference, 0.99) < 24  # colours of 5 bits, blobs of 32 pixels
+    difference = np.abs(_ours(scene, 0.5, -20, 10, color="rigid") - shown.pixels)
+    assert difference.mean() < 2 and np.quantile(difference, 0.99) < 24  # colors of 5 bits, blobs of 32 pixels
 
 
 @needs_browser
@@ -141,7 +141,9 @@ def test_the_last_frame_is_shown_as_long_as_the_others(rate, speed, tmp_path):
     clip = replace(toy_scene(per_part=5, frames=8), time=np.arange(8) / rate)
     for fps, expected in ((None, speed), (50, 50 / rate)):
         write_page(clip, tmp_path / "a.html", title="toy", fps=fps)
-        header = json.loads(re.search(r'id="header">(.*?)</script>', (tmp_path / "a.html").read_text(encoding="utf-8"), re.S)[1])
+        header = json.loads(
+            re.search(r'id="header">(.*?)</script>', (tmp_path / "a.html").read_text(encoding="utf-8"), re.S)[1]
+        )
         assert (header["rate"], header["tail"]) == pytest.approx((expected, 1 / rate))
 
 
@@ -171,9 +173,10 @@ def test_the_page_stays_small():
     scene = toy_scene(per_part=500, frames=8)
     turns = rng.normal(size=scene.frame_quaternion.shape)
     noise = replace(
-        scene, frame_mean=rng.normal(size=scene.frame_mean.shape).astype(np.float32),
+        scene,
+        frame_mean=rng.normal(size=scene.frame_mean.shape).astype(np.float32),
         frame_quaternion=(turns / np.linalg.norm(turns, axis=-1, keepdims=True)).astype(np.float32),
-    )  # fmt: skip
+    )
     moving = sum(packed(noise)[key].nbytes for key in ("position", "turn", "weight"))
     assert moving == 8 * 1000 * 11  # 20,000 Gaussians over 32 frames: 9.4 MB in base64, at worst
 

@@ -144,7 +144,11 @@ def test_a_gradient_goes_through_torch(monkeypatch) -> None:
 def test_rejects_shapes_that_do_not_fit() -> None:
     source, target, weights = moving(8, 9, 2)
     rotation, shift = weighted_kabsch(source, target, weights)
-    for wrong in ((source, weights[:, 1:], rotation, shift), (source, weights, rotation[:, 1:], shift[:, 1:]),
-                  (source, weights, rotation[:1], shift[:1]), (source, weights, rotation, shift[:, :1])):  # fmt: skip
+    for wrong in (
+        (source, weights[:, 1:], rotation, shift),
+        (source, weights, rotation[:, 1:], shift[:, 1:]),
+        (source, weights, rotation[:1], shift[:1]),
+        (source, weights, rotation, shift[:, :1]),
+    ):
         with pytest.raises(ValueError, match="do not fit"):
             rigid_flow(*wrong)

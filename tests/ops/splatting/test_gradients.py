@@ -1,4 +1,4 @@
-"""The rasteriser's gradients by finite differences, its determinism, and that the checker sees what is broken."""
+"""The rasterizer's gradients by finite differences, its determinism, and that the checker sees what is broken."""
 
 from __future__ import annotations
 
@@ -23,8 +23,20 @@ def test_reference_by_finite_differences(mode: str) -> None:
     background = torch.rand(1, 3, dtype=torch.float64)
 
     def function(means, quats, scales, opacities, colors, views, background):
-        out = rasterization_reference(means, quats, scales, opacities, colors, views, lenses, 4, 3, sh_degree=1,
-                                      backgrounds=background, render_mode=mode)  # fmt: skip
+        out = rasterization_reference(
+            means,
+            quats,
+            scales,
+            opacities,
+            colors,
+            views,
+            lenses,
+            4,
+            3,
+            sh_degree=1,
+            backgrounds=background,
+            render_mode=mode,
+        )
         return out[0], out[1]
 
     inputs = [t.requires_grad_() for t in (means, quats, scales, opacities, colors, views, background)]
@@ -92,7 +104,7 @@ def test_same_bits_on_any_number_of_threads() -> None:
 
 
 def shifted(*args, **kwargs):
-    """Integer pixel centres."""
+    """Integer pixel centers."""
     lenses = args[6].clone()
     lenses[:, :2, 2] += 0.5
     return rasterization(*args[:6], lenses, *args[7:], **kwargs)
@@ -144,8 +156,20 @@ def _table_powers(table, values, out):
 
 @arithmetic_kernel
 def _totals(values, out):
-    store(out, 0, totals(load(values, 0), load(values, 8), load(values, 16), load(values, 24), load(values, 32),
-                         load(values, 40), load(values, 48), load(values, 56)))  # fmt: skip
+    store(
+        out,
+        0,
+        totals(
+            load(values, 0),
+            load(values, 8),
+            load(values, 16),
+            load(values, 24),
+            load(values, 32),
+            load(values, 40),
+            load(values, 48),
+            load(values, 56),
+        ),
+    )
 
 
 @arithmetic_kernel
@@ -167,7 +191,7 @@ def _powers_from_table(values, out):
 
 @pytest.mark.parametrize("powers", [_powers, _powers_from_table])
 def test_lanes_power_of_two(powers) -> None:
-    """`power` where the compiler may reorder, as in the rasteriser: it could cancel what rounds."""
+    """`power` where the compiler may reorder, as in the rasterizer: it could cancel what rounds."""
     values = np.concatenate([np.linspace(-126, 1, 1 << 20), np.linspace(-9, 0, 1 << 20)]).astype(np.float32)
     out = np.empty_like(values)
     powers(values, out)
@@ -205,8 +229,20 @@ def test_tile_lists_hold_every_gaussian_by_depth(workers: int) -> None:
     depths = (rng.integers(-3, 4, (cameras, count)) / np.float32(3)).astype(np.float32)
     packed, box = np.empty((cameras, count, PACKED), np.float32), np.empty((cameras, count, 4), np.int32)
     pair_start = np.empty((cameras, count), np.int64)
-    tasks, start, gaussian = tile_lists(means, conics, opacities, radii, depths.view(np.int32), width, height, workers,
-                                        np.zeros(1, np.int64), packed, box, pair_start)  # fmt: skip
+    tasks, start, gaussian = tile_lists(
+        means,
+        conics,
+        opacities,
+        radii,
+        depths.view(np.int32),
+        width,
+        height,
+        workers,
+        np.zeros(1, np.int64),
+        packed,
+        box,
+        pair_start,
+    )
     assert not box[radii[..., 0] == 0].any()
     across, down, places = -(-width // WIDE), -(-height // TALL), []
     for c in range(cameras):

@@ -1,4 +1,4 @@
-"""The rasteriser: its definition, every kind of scene on both backends, modes, cameras, bad input."""
+"""The rasterizer: its definition, every kind of scene on both backends, modes, cameras, bad input."""
 
 from __future__ import annotations
 
@@ -23,8 +23,13 @@ FRONT = torch.eye(4)[None]
 
 def one(opacity: float = 0.6, scale: float = 0.1, depth: float = 2.0, color=(1.0, 0.5, 0.25)) -> list[torch.Tensor]:
     """One round Gaussian straight ahead."""
-    return [torch.tensor([[0, 0, depth]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), scale),
-            torch.tensor([opacity]), torch.tensor([color])]  # fmt: skip
+    return [
+        torch.tensor([[0, 0, depth]]),
+        torch.tensor([[1.0, 0, 0, 0]]),
+        torch.full((1, 3), scale),
+        torch.tensor([opacity]),
+        torch.tensor([color]),
+    ]
 
 
 def lens(size: int = 9, focal: float = 20.0) -> torch.Tensor:
@@ -49,9 +54,16 @@ def test_one_gaussian_by_hand(name: str) -> None:
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_opaque_is_capped_and_pixels_stop(name: str) -> None:
-    stack = [torch.cat([a, b, c, d]) for a, b, c, d in zip(
-        one(1.0, depth=2.0, color=(1.0, 0, 0)), one(0.5, depth=1.0, color=(0, 1.0, 0)),
-        one(1.0, depth=3.0, color=(0, 0, 1.0)), one(1.0, depth=4.0, color=(1.0, 1.0, 1.0)), strict=True)]  # fmt: skip
+    stack = [
+        torch.cat([a, b, c, d])
+        for a, b, c, d in zip(
+            one(1.0, depth=2.0, color=(1.0, 0, 0)),
+            one(0.5, depth=1.0, color=(0, 1.0, 0)),
+            one(1.0, depth=3.0, color=(0, 0, 1.0)),
+            one(1.0, depth=4.0, color=(1.0, 1.0, 1.0)),
+            strict=True,
+        )
+    ]
     with backend(name):
         colors, alphas, _ = rasterization(*stack, FRONT, lens(), 9, 9)
     # 0.5, then 0.999 of the rest leaves 5e-4; 0.999 of that would leave 5e-7: the pixel stops before it
@@ -82,7 +94,7 @@ def test_reference_matches_written_out_loops(seed: int) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("count", "size"), [(1, (7, 5)), (60, (33, 18)), (400, (48, 64))])
 def test_kernel_matches_reference(kind: str, count: int, size: tuple[int, int]) -> None:
-    """Pictures and gradients of means, quaternions, scales, opacities, colours and projected means."""
+    """Pictures and gradients of means, quaternions, scales, opacities, colors and projected means."""
     views = straight if kind == "ties" else cameras
     assert_renders(rasterization, scene(count, kind, seed=count), views(2, *size), size)
 
@@ -93,9 +105,10 @@ def test_channels_and_modes(channels: int, mode: str) -> None:
     views, size = cameras(2, 24, 20), (24, 20)
     background = torch.rand(2, channels)
     tensors = scene(80, channels=channels)
-    if mode in ("D", "ED"):  # colours play no part, so they have no gradient to compare
-        colors, alphas, _ = rasterization(*(t.float() for t in tensors), *(v.float() for v in views), *size,
-                                          backgrounds=background, render_mode=mode)  # fmt: skip
+    if mode in ("D", "ED"):  # colors play no part, so they have no gradient to compare
+        colors, alphas, _ = rasterization(
+            *(t.float() for t in tensors), *(v.float() for v in views), *size, backgrounds=background, render_mode=mode
+        )
         want = rasterization_reference(*tensors, *views, *size, render_mode="RGB+" + mode)[0][..., -1:]
         assert colors.shape == (2, 20, 24, 1)
         assert ((colors - want).abs() > 1e-4).double().mean() < 2e-3
@@ -141,8 +154,13 @@ def test_each_camera_may_see_its_own_gaussians() -> None:
         name = ("means", "quats", "scales", "opacities", "colors")[option]
         torch.testing.assert_close(again[2][name].sum(0), together[2][name], rtol=1e-4, atol=1e-4)
     for c in range(3):
-        alone = rasterization(*(t[c].float() for t in moved), *(t.float() for t in tensors[2:]),
-                              views[c : c + 1].float(), lenses[c : c + 1].float(), *size)  # fmt: skip
+        alone = rasterization(
+            *(t[c].float() for t in moved),
+            *(t.float() for t in tensors[2:]),
+            views[c : c + 1].float(),
+            lenses[c : c + 1].float(),
+            *size,
+        )
         assert torch.equal(alone[0][0], together[0][c]) and torch.equal(alone[1][0], together[1][c])
     assert_renders(rasterization, [*moved, *tensors[2:]], (views, lenses), size)
 
@@ -153,8 +171,10 @@ def test_world_may_turn_and_quaternions_may_scale() -> None:
     turn = torch.eye(4, dtype=torch.float64)
     turn[:3, :3], turn[:3, 3] = rotations(torch.tensor([0.3, -0.5, 0.7, 0.2]).double()), torch.tensor([3.0, -1.0, 2.0])
     w, u = torch.tensor([0.3]).double(), torch.tensor([-0.5, 0.7, 0.2]).double()
-    product = [quats[:, :1] * w - (quats[:, 1:] * u).sum(-1, keepdim=True),
-               w * quats[:, 1:] + quats[:, :1] * u + torch.linalg.cross(u.expand(100, 3), quats[:, 1:])]  # fmt: skip
+    product = [
+        quats[:, :1] * w - (quats[:, 1:] * u).sum(-1, keepdim=True),
+        w * quats[:, 1:] + quats[:, :1] * u + torch.linalg.cross(u.expand(100, 3), quats[:, 1:]),
+    ]
     turned = [means @ turn[:3, :3].T + turn[:3, 3], -3 * torch.cat(product, -1), *rest]
     there = views @ torch.linalg.inv(turn)
     a, b = (rasterization_reference(*t, v, lenses, *size)[0] for t, v in ((tensors, views), (turned, there)))

@@ -74,12 +74,12 @@ def test_geometry_near_far_and_scale(tmp_path):
     frames = depth16()
     np.save(tmp_path / "v.npy", frames)
     sequence = read(tmp_path / "v.npy", intrinsics=CAMERA, depth_scale=5000, near=2.0, far=9.0)
-    metres = frames / 5000
-    kept = (metres >= 2) & (metres <= 9)
+    meters = frames / 5000
+    kept = (meters >= 2) & (meters <= 9)
     assert len(sequence.points) == kept.sum()
     x, y, z = sequence.points.astype(float).T
     _, rows, columns = np.nonzero(kept)
-    np.testing.assert_allclose(z, metres[kept], rtol=1e-6)
+    np.testing.assert_allclose(z, meters[kept], rtol=1e-6)
     np.testing.assert_allclose(x / z * 20 + 15.5, columns, atol=1e-3)
     np.testing.assert_allclose(y / z * 21 + 11.5, rows, atol=1e-3)
 
@@ -91,7 +91,7 @@ def test_field_of_view_spans_the_image():
     assert camera.fx == camera.fy and camera.cy == 23.5
 
 
-def test_float_depths_are_metres_and_their_nan_is_nothing(tmp_path):
+def test_float_depths_are_meters_and_their_nan_is_nothing(tmp_path):
     frames = np.full((2, 3, 4), 1.5, np.float32)
     frames[0, 0, 0], frames[1, 2, 3] = np.nan, np.inf
     np.save(tmp_path / "v.npy", frames)
@@ -100,23 +100,27 @@ def test_float_depths_are_metres_and_their_nan_is_nothing(tmp_path):
     assert (sequence.points[:, 2] == 1.5).all()
 
 
-@pytest.mark.parametrize("kind, metres", [("<u2", 1.5), ("<i2", 1.5), ("<i4", 1.5), ("<u4", 1.5), ("<f4", 1500.0), ("<f8", 1500.0)])
-def test_whole_numbers_are_millimetres_whatever_their_width(tmp_path, kind, metres):
+@pytest.mark.parametrize(
+    "kind, meters", [("<u2", 1.5), ("<i2", 1.5), ("<i4", 1.5), ("<u4", 1.5), ("<f4", 1500.0), ("<f8", 1500.0)]
+)
+def test_whole_numbers_are_millimeters_whatever_their_width(tmp_path, kind, meters):
     np.save(tmp_path / "v.npy", np.full((2, 8, 8), 1500, kind))
-    np.testing.assert_allclose(read(tmp_path / "v.npy").points[:, 2], metres, rtol=1e-6)
+    np.testing.assert_allclose(read(tmp_path / "v.npy").points[:, 2], meters, rtol=1e-6)
 
 
-def test_a_video_of_a_colour_map_is_no_depth_and_gray_ones_are(tmp_path):
+def test_a_video_of_a_color_map_is_no_depth_and_gray_ones_are(tmp_path):
     rng = np.random.default_rng(0)
-    gray = cv2.GaussianBlur(rng.integers(0, 255, (6, 48, 64)).astype(np.uint8).transpose(1, 2, 0), (7, 7), 0).transpose(2, 0, 1)
+    gray = cv2.GaussianBlur(rng.integers(0, 255, (6, 48, 64)).astype(np.uint8).transpose(1, 2, 0), (7, 7), 0).transpose(
+        2, 0, 1
+    )
     for codec, name in (("mp4v", "lossy.mp4"), ("FFV1", "exact.avi"), ("MJPG", "jpeg.avi")):
-        for coloured in (False, True):
+        for colored in (False, True):
             writer = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter_fourcc(*codec), 10.0, (64, 48))
             for frame in gray:
-                writer.write(cv2.applyColorMap(frame, cv2.COLORMAP_JET) if coloured else np.dstack([frame] * 3))
+                writer.write(cv2.applyColorMap(frame, cv2.COLORMAP_JET) if colored else np.dstack([frame] * 3))
             writer.release()
-            if coloured:
-                with pytest.raises(DataError, match=f"{name}: frame 0 is coloured"):
+            if colored:
+                with pytest.raises(DataError, match=f"{name}: frame 0 is colored"):
                     list(video_frames(tmp_path / name))
             else:
                 assert len(list(video_frames(tmp_path / name))) == 6
@@ -182,7 +186,9 @@ def test_labels_from_folders(tmp_path):
     found = [(i.name, i.label, i.split) for i in reader.items()]
     assert found == [("a clap/deep/1.npy", 0, ""), ("wave/2.npy", 1, ""), ("wave/10.npy", 1, "")]
     assert reader.read(reader.items()[1], np.random.default_rng(0)).sequence.label == 1
-    with pytest.raises(DataError, match=r"'2.npy' lies in no folder of its class; --label-from-folder expects CLASS/VIDEO"):
+    with pytest.raises(
+        DataError, match=r"'2.npy' lies in no folder of its class; --label-from-folder expects CLASS/VIDEO"
+    ):
         DepthVideos((tmp_path / "own" / "wave",), label_from_folder=True).items()
     with pytest.raises(UsageError, match="use one"):
         DepthVideos((tmp_path,), label_from_folder=True, labels=tmp_path / "x.csv")
@@ -230,7 +236,7 @@ def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
         ("name,label\na,1\na,2\n", "labels.csv:3: 'a' appears twice"),
         ("name,label\na,1,2\n", "labels.csv:2: 'a,1,2'; expected name,label"),
         ("name,label\na\n", "labels.csv:2"),
-        ("name,colour\na,1\n", "labels.csv:1: columns name,colour"),
+        ("name,color\na,1\n", "labels.csv:1: columns name,color"),
         ("name,label\na,1\nb,two\n", "some labels are numbers and some are words"),
         ("name,label,subject\na,1,x\n", "labels.csv:2: subject 'x'"),
         ("", "no rows"),
@@ -259,7 +265,7 @@ def save_png(path, image):
     ("make", "message"),
     [
         (lambda d: save_png(d / "v" / "1.png", np.zeros((4, 5), np.uint16)), "none of its 1 frames has a valid depth"),
-        (lambda d: save_png(d / "v" / "1.png", np.arange(60, dtype=np.uint8).reshape(4, 5, 3)), "a colour image"),
+        (lambda d: save_png(d / "v" / "1.png", np.arange(60, dtype=np.uint8).reshape(4, 5, 3)), "a color image"),
         (lambda d: (np.save(d / "v.npy", np.zeros((0, 4, 5), np.uint16)), d / "v.npy")[1], "empty video"),
         (lambda d: (np.save(d / "v.npy", np.ones((4, 5, 6, 7))), d / "v.npy")[1], "expected numbers \\(frames, height"),
         (lambda d: (np.save(d / "v.npy", np.array([None])), d / "v.npy")[1], "not a readable .npy"),

@@ -153,8 +153,12 @@ def test_names_give_label_subject_and_split(tmp_path_factory, action, subject, t
     item = MSRAction3D(folder).items()[0]
     split = "train" if subject <= 5 else "test"
     assert (item.name, item.label, item.subject, item.split, item.problem) == (
-        f"a{action:02}_s{subject:02}_e{trial:02}", action - 1, subject, split, "",
-    )  # fmt: skip
+        f"a{action:02}_s{subject:02}_e{trial:02}",
+        action - 1,
+        subject,
+        split,
+        "",
+    )
 
 
 @given(st.text(st.characters(codec="ascii", exclude_characters="/\0"), min_size=1, max_size=20))

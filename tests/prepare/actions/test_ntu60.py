@@ -104,9 +104,13 @@ def test_worker_processes_read_zips(tmp_path):
 
 
 NAMES = st.lists(
-    st.lists(st.sampled_from(["a", "S001", "bß", "long name of a folder", "x" * 80]), min_size=1, max_size=4).map("/".join),
-    min_size=1, max_size=12, unique=True,
-)  # fmt: skip
+    st.lists(st.sampled_from(["a", "S001", "bß", "long name of a folder", "x" * 80]), min_size=1, max_size=4).map(
+        "/".join
+    ),
+    min_size=1,
+    max_size=12,
+    unique=True,
+)
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")
@@ -197,9 +201,7 @@ def test_directory_bytes_that_lie_are_refused(tmp_path):
     whole = bytearray(write_zip(tmp_path / "a.zip", ntu_files(ONE, person(0))).read_bytes())
     directory = whole.index(b"PK\x01\x02")
     second = whole.index(b"PK\x01\x02", directory + 4)
-    for at, value, message in (
-        (second, 0, "directory is damaged"), (second + 28, 0xFF, "damaged|ends in the middle"),
-    ):  # fmt: skip
+    for at, value, message in ((second, 0, "directory is damaged"), (second + 28, 0xFF, "damaged|ends in the middle")):
         broken = bytearray(whole)
         broken[at] = value
         (tmp_path / "a.zip").write_bytes(broken)
@@ -217,11 +219,16 @@ def bad_frame(kind: str) -> bytes:
     flipped = bytearray(good)
     flipped[len(good) // 2] ^= 1
     return {
-        "empty": b"", "text": b"<html>no more quota</html>", "truncated": good[: len(good) // 2], "end": good[:-5],
-        "flipped": bytes(flipped), "size": png_bytes(np.ones((240, 320), np.uint16)),
-        "8 bits": png_bytes(np.ones((424, 512), np.uint8)), "colour": png_bytes(np.ones((424, 512, 3), np.uint16), 2),
+        "empty": b"",
+        "text": b"<html>no more quota</html>",
+        "truncated": good[: len(good) // 2],
+        "end": good[:-5],
+        "flipped": bytes(flipped),
+        "size": png_bytes(np.ones((240, 320), np.uint16)),
+        "8 bits": png_bytes(np.ones((424, 512), np.uint8)),
+        "color": png_bytes(np.ones((424, 512, 3), np.uint16), 2),
         "nothing": png_bytes(np.zeros((424, 512), np.uint16)),
-    }[kind]  # fmt: skip
+    }[kind]
 
 
 @pytest.mark.parametrize(
@@ -234,7 +241,7 @@ def bad_frame(kind: str) -> bytes:
         ("flipped", "MDepth-00000001.png: a damaged PNG: wrong checksum"),
         ("size", "MDepth-00000001.png: 320x240 pixels; expected 512x424"),
         ("8 bits", "8-bit gray PNG; expected 16-bit gray depth"),
-        ("colour", "16-bit RGB PNG; expected 16-bit gray depth"),
+        ("color", "16-bit RGB PNG; expected 16-bit gray depth"),
         ("nothing", "none of its 1 frames has a valid depth pixel"),
     ],
 )
@@ -260,20 +267,29 @@ def test_frames_missing_empty_and_misnamed(tmp_path):
 
 def test_unknown_names_doubles_and_numbers_out_of_range(tmp_path):
     frame = png_bytes(person(0, 1)[0])
-    root = write_files(tmp_path / "räw data", {
-        f"a/{ONE}/MDepth-00000001.png": frame, f"b/{ONE}/MDepth-00000001.png": frame,
-        "a/S001C001P001R001/MDepth-00000001.png": frame, "a/S018C001P001R001A061/MDepth-00000001.png": frame,
-        "a/S001C009P001R001A001/MDepth-00000001.png": frame,
-    })  # fmt: skip
+    root = write_files(
+        tmp_path / "räw data",
+        {
+            f"a/{ONE}/MDepth-00000001.png": frame,
+            f"b/{ONE}/MDepth-00000001.png": frame,
+            "a/S001C001P001R001/MDepth-00000001.png": frame,
+            "a/S018C001P001R001A061/MDepth-00000001.png": frame,
+            "a/S001C009P001R001A001/MDepth-00000001.png": frame,
+        },
+    )
     write_zip(root / "c.zip", {"walk/MDepth-00000001.png": frame, f"{TWO}/MDepth-00000001.png": frame})
     write_zip(root / "skeletons.zip", {"skeletons/S001C001P001R001A001.skeleton": b"1"})
     report = convert(NTU60((root,)), tmp_path / "out.h5")
     reasons = " | ".join(reason for _, reason in report.skipped)
     assert report.written == 2 and len(report.skipped) == 6
     for words in (
-        "is there twice", "a/S001C001P001R001: holds MDepth-00000001.png, but is not called", "setup 18 in the name",
-        "camera 9 in the name is out of range; NTU RGB+D 60 has 1 to 3", "walk: holds MDepth", "skeletons.zip: no folder",
-    ):  # fmt: skip
+        "is there twice",
+        "a/S001C001P001R001: holds MDepth-00000001.png, but is not called",
+        "setup 18 in the name",
+        "camera 9 in the name is out of range; NTU RGB+D 60 has 1 to 3",
+        "walk: holds MDepth",
+        "skeletons.zip: no folder",
+    ):
         assert words in reasons, words
     with CloudsReader(tmp_path / "out.h5") as reader:
         assert reader.names == [ONE, TWO] and reader.skipped == report.skipped
@@ -304,7 +320,7 @@ def test_inputs_and_options_that_are_none(tmp_path):
         NTU60((tmp_path,), "cs")
     with pytest.raises(UsageError, match="--intrinsics v2: expected peers, kinect2 or a .json"):
         named_intrinsics("v2")
-    with pytest.raises(UsageError, match="--scale 0: expected millimetres"):
+    with pytest.raises(UsageError, match="--scale 0: expected millimeters"):
         NTU60((tmp_path,), scale=0)
 
 

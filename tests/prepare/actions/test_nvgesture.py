@@ -131,9 +131,9 @@ def test_camera_coordinates_project_back_onto_the_pixels(tmp_path):
     root = make_raw(tmp_path, [line()])
     image, camera = NvGesture(root), NvGesture(root, coordinates="camera")
     item = image.items()[0]
-    row, column, grey = image.read(item, RNG).sequence.points.T
+    row, column, gray = image.read(item, RNG).sequence.points.T
     x, y, z = camera.read(item, RNG).sequence.points.T
-    np.testing.assert_allclose(z, 255 - grey)
+    np.testing.assert_allclose(z, 255 - gray)
     np.testing.assert_allclose(x / z * INTRINSICS.fx + INTRINSICS.cx, column, atol=1e-3)
     np.testing.assert_allclose(y / z * INTRINSICS.fy + INTRINSICS.cy, row, atol=1e-3)
 
@@ -158,7 +158,7 @@ def test_names_splits_subjects_and_labels(tmp_path):
         (line(), r"_v2.lst:2: class_01/subject3_r0@2 is listed twice"),
         (line("../../secret", start=3), r"_v2.lst:2: the path .* leaves the data folder"),
     ],
-)  # fmt: skip
+)
 def test_a_bad_line_is_one_bad_item_that_names_list_and_line(tmp_path, text, message):
     items = NvGesture(make_raw(tmp_path, [line(), text])).items()
     problems = [item.problem for item in items if item.problem]

@@ -135,9 +135,13 @@ def test_damaged_files_and_strange_names(tmp_path):
     broken = bytearray(whole)
     broken[len(whole) // 2] ^= 0xFF
     files = {
-        "a02_s01_e01.npz": whole[: len(whole) // 2], "a03_s01_e01.npz": b"", "a04_s01_e01.npz": bytes(broken),
-        "a21_s01_e01.npz": whole, "walk.npz": whole, f"again/{MSR}_sdepth.npz": whole,
-    }  # fmt: skip
+        "a02_s01_e01.npz": whole[: len(whole) // 2],
+        "a03_s01_e01.npz": b"",
+        "a04_s01_e01.npz": bytes(broken),
+        "a21_s01_e01.npz": whole,
+        "walk.npz": whole,
+        f"again/{MSR}_sdepth.npz": whole,
+    }
     write_files(tmp_path, files)
     np.savez(tmp_path / "a05_s01_e01.npz", clouds=np.zeros(3))
     (tmp_path / "a06_s01_e01.npz").symlink_to(__file__)
@@ -299,10 +303,13 @@ def test_modelnet40_files_that_disagree(tmp_path):
     reasons = " | ".join(reason for _, reason in report.skipped)
     assert report.written == 6 and len(report.skipped) == 6, reasons
     for words in (
-        "label 40 of shape 0 is out of range; expected 0 to 39", "train3.h5: not a readable HDF5 file",
-        "train4.h5: in neither list file", "ply_data_train9.h5: listed in train_files.txt, but not there",
-        "no data set 'data' of its own", "shape 0 holds NaN",
-    ):  # fmt: skip
+        "label 40 of shape 0 is out of range; expected 0 to 39",
+        "train3.h5: not a readable HDF5 file",
+        "train4.h5: in neither list file",
+        "ply_data_train9.h5: listed in train_files.txt, but not there",
+        "no data set 'data' of its own",
+        "shape 0 holds NaN",
+    ):
         assert words in reasons, words
 
 
@@ -332,7 +339,7 @@ def recipe(name: str) -> dict:
 @pytest.mark.parametrize("name", ["shrec17", "ntu60", "modelnet40", "preprocessed"])
 def test_recipes_name_commands_that_exist(name):
     found = recipe(name)
-    assert found["name"] == name and found["get"]["licence"] and found["layout"]["tree"] and found["raw"]
+    assert found["name"] == name and found["get"]["license"] and found["layout"]["tree"] and found["raw"]
     program, *words = shlex.split(found["prepare"]["command"])
     assert program == "dpc" and words[:2] == ["prepare", name]
     assert dpc(*words[:2], "--help").returncode == 0

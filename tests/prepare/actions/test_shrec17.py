@@ -265,9 +265,18 @@ def test_folders_that_are_none(tmp_path):
 def test_the_command(tmp_path):
     make_raw(tmp_path / "raw" / "HandGestureDataset_SHREC2017")  # as the archive unpacks
     result = dpc(
-        "prepare", "shrec17", tmp_path / "raw", "-o", tmp_path / "o.h5", "--labels", "14", "--points", "256", "--jobs",
+        "prepare",
+        "shrec17",
+        tmp_path / "raw",
+        "-o",
+        tmp_path / "o.h5",
+        "--labels",
+        "14",
+        "--points",
+        "256",
+        "--jobs",
         "1",
-    )  # fmt: skip
+    )
     assert result.returncode == 0, result.stderr
     assert "2 sequences, 6 frames, 1536 points, 0 skipped" in result.stdout
     assert "train: 1 of the 1960 published gestures found" in result.stderr

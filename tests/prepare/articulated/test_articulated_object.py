@@ -169,7 +169,7 @@ def test_relative_motions_are_those_of_the_joints(tmp_path):
         assert np.ptp(values) >= 0.15 * (joint.upper - joint.lower) - 1e-9
 
 
-def test_frame_0_fits_its_sphere_and_is_centred():
+def test_frame_0_fits_its_sphere_and_is_centered():
     obj = chain().build("arm")
     _, sequence = draw(obj, rotation=0.0, translation=0.0, points_per_frame=4000)
     first = sequence.frame(0)
@@ -247,8 +247,10 @@ def test_glued_parts_hold_still_and_share_an_id():
     sequence = draw_sequence("s", studied, Articulation(), 5, generator(1)).sequence
     assert set(sequence.part) == {0, 1} and sequence.pose.shape == (4, 5, 4, 4)
     np.testing.assert_array_equal(sequence.pose[:, 2:], np.tile(np.eye(4), (4, 3, 1, 1)))
-    local = [transform(np.linalg.inv(sequence.pose[f, 1]), sequence.frame(f)[part_of(sequence, f) == 1].astype(float))
-             for f in range(4)]  # fmt: skip
+    local = [
+        transform(np.linalg.inv(sequence.pose[f, 1]), sequence.frame(f)[part_of(sequence, f) == 1].astype(float))
+        for f in range(4)
+    ]
     reach = [points[:, 1].max() for points in local]
     assert np.ptp(reach) < 0.02  # the forearm's end stays where it is, seen from the upper arm
 
@@ -315,8 +317,10 @@ def test_single_view_takes_what_the_camera_sees():
     for point in points_on(world, chosen):
         nearest = first_hit(camera.eye, point - camera.eye, world)
         assert nearest == pytest.approx(1, abs=1e-4)  # nothing stands before it
-    hidden = sum(first_hit(camera.eye, p - camera.eye, world) < 0.999
-                 for p in points_on(world, choose_on_surface(obj.areas, 80, generator(2))))  # fmt: skip
+    hidden = sum(
+        first_hit(camera.eye, p - camera.eye, world) < 0.999
+        for p in points_on(world, choose_on_surface(obj.areas, 80, generator(2)))
+    )
     assert hidden > 20  # while much of the whole surface is hidden
 
 
@@ -330,11 +334,18 @@ def test_the_camera_sees_the_whole_sphere():
     assert (closest < 0.7).mean() == pytest.approx(np.pi / 4, abs=0.03)  # the ball touches the image's sides
 
 
-@pytest.mark.parametrize("solid, area", [
-    (box((1, 2, 3)), 22), (cylinder(0.5, 2), 2.5 * np.pi), (ball(1), 4 * np.pi), (ring(1, 0.2), 0.8 * np.pi**2),
-    (plate([(0, 0), (2, 0), (2, 1), (0, 1)], 0.5), 2 * 2 + 6 * 0.5), (open_box((1, 1, 1), 0), 10),
-    (rod(np.zeros(3), np.array([1.0, 2, 2]), 0.1), 2 * np.pi * (0.3 + 0.01)),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "solid, area",
+    [
+        (box((1, 2, 3)), 22),
+        (cylinder(0.5, 2), 2.5 * np.pi),
+        (ball(1), 4 * np.pi),
+        (ring(1, 0.2), 0.8 * np.pi**2),
+        (plate([(0, 0), (2, 0), (2, 1), (0, 1)], 0.5), 2 * 2 + 6 * 0.5),
+        (open_box((1, 1, 1), 0), 10),
+        (rod(np.zeros(3), np.array([1.0, 2, 2]), 0.1), 2 * np.pi * (0.3 + 0.01)),
+    ],
+)
 def test_areas_of_the_solids(solid, area):
     doubled = np.linalg.norm(np.cross(solid[:, 1] - solid[:, 0], solid[:, 2] - solid[:, 0]), axis=1)
     assert doubled.sum() / 2 == pytest.approx(area, rel=0.03)  # walls of an open box have two sides
@@ -384,8 +395,21 @@ def test_bytes_dont_depend_on_jobs(tmp_path):
     written = []
     for jobs in (1, 2):
         path = tmp_path / f"{jobs}.h5"
-        done = dpc("prepare", "synthetic", "articulated", "--objects", 5, "--sequences-per-object", 2, "--points", 64,
-                   "--jobs", jobs, "-o", path)  # fmt: skip
+        done = dpc(
+            "prepare",
+            "synthetic",
+            "articulated",
+            "--objects",
+            5,
+            "--sequences-per-object",
+            2,
+            "--points",
+            64,
+            "--jobs",
+            jobs,
+            "-o",
+            path,
+        )
         assert done.returncode == 0, done.stderr
         written.append(path)
     first, second = (CloudsReader(path) for path in written)
@@ -419,11 +443,16 @@ def test_fps_spreads_the_points():
     assert nearest["fps"] > 1.3 * nearest["random"]
 
 
-@pytest.mark.parametrize("options, words", [
-    ({"view": "top"}, "--view top: expected full or single"), ({"joint_step": 0.0}, "--joint-step 0.0"),
-    ({"orientation": "left"}, "--orientation left: expected random or upright"),
-    ({"points_per_frame": 0}, "--points 0: expected 1 or more"), ({"max_parts": 1}, "--max-parts 1: expected 2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"view": "top"}, "--view top: expected full or single"),
+        ({"joint_step": 0.0}, "--joint-step 0.0"),
+        ({"orientation": "left"}, "--orientation left: expected random or upright"),
+        ({"points_per_frame": 0}, "--points 0: expected 1 or more"),
+        ({"max_parts": 1}, "--max-parts 1: expected 2"),
+    ],
+)
 def test_wrong_options_end_with_a_sentence(options, words):
     with pytest.raises(UsageError, match=words):
         Articulation(**options)

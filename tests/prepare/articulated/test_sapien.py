@@ -24,8 +24,13 @@ def load(path):
 
 def two(tmp_path, *more, **options):
     """Two boxes and a joint."""
-    return write_urdf(tmp_path / "r.urdf", link("a", box(1, 1, 1)), link("b", box(1, 0.5, 0.2), "0.5 0 0.7"),
-                      joint("j", "a", "b", **options), *more)  # fmt: skip
+    return write_urdf(
+        tmp_path / "r.urdf",
+        link("a", box(1, 1, 1)),
+        link("b", box(1, 0.5, 0.2), "0.5 0 0.7"),
+        joint("j", "a", "b", **options),
+        *more,
+    )
 
 
 def test_links_joined_by_fixed_joints_are_one_body(tmp_path):
@@ -38,8 +43,10 @@ def test_links_joined_by_fixed_joints_are_one_body(tmp_path):
     c, s = np.cos(0.3), np.sin(0.3)
     np.testing.assert_allclose(size, [c + 0.6 * s, s + 0.6 * c, 1.5], atol=1e-12)  # scaled, then turned by 0.3
     np.testing.assert_allclose(obj.joints[1].axis, [0, -1, 0])  # the file's axis has length 2
-    np.testing.assert_allclose(obj.areas.sum(), 2 * (0.6 + 1.5 + 0.9) + 2 * (0.05 + 0.7 + 0.035)
-                               + 2 * (0.008 + 0.008 + 0.01) + 2 * (0.45 + 0.36 + 0.2))  # fmt: skip
+    np.testing.assert_allclose(
+        obj.areas.sum(),
+        2 * (0.6 + 1.5 + 0.9) + 2 * (0.05 + 0.7 + 0.035) + 2 * (0.008 + 0.008 + 0.01) + 2 * (0.45 + 0.36 + 0.2),
+    )
 
 
 def test_every_kind_of_geometry(tmp_path):
@@ -52,12 +59,18 @@ def test_every_kind_of_geometry(tmp_path):
         names.append(f"m.{suffix}")
     (tmp_path / "textured.obj").write_text(CUBE_OBJ)  # its .mtl isn't there
     for name in names:
-        path = write_urdf(tmp_path / "r.urdf", link("a", f'<mesh filename="{name}"/>'), link("b", box(1, 1, 1)),
-                          joint("j", "a", "b"))  # fmt: skip
+        path = write_urdf(
+            tmp_path / "r.urdf", link("a", f'<mesh filename="{name}"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")
+        )
         assert load(path).body_areas == pytest.approx([22, 6])
-    path = write_urdf(tmp_path / "r.urdf", link("a", '<mesh filename="package://robot/textured.obj" scale="2 2 2"/>'),
-                      link("b", '<cylinder radius="0.5" length="2"/>'), link("c", '<sphere radius="1"/>'),
-                      joint("j", "a", "b"), joint("k", "a", "c"))  # fmt: skip
+    path = write_urdf(
+        tmp_path / "r.urdf",
+        link("a", '<mesh filename="package://robot/textured.obj" scale="2 2 2"/>'),
+        link("b", '<cylinder radius="0.5" length="2"/>'),
+        link("c", '<sphere radius="1"/>'),
+        joint("j", "a", "b"),
+        joint("k", "a", "c"),
+    )
     assert load(path).body_areas == pytest.approx([24, 2.5 * np.pi, 4 * np.pi], rel=0.01)
 
 
@@ -88,30 +101,52 @@ def test_equal_limits_and_floating_joints_are_fixed(tmp_path):
 
 def test_mimic_joints_follow(tmp_path):
     mimic = '<mimic joint="{}" multiplier="-2" offset="0.1"/>'
-    more = [link("c", box(1, 1, 1)), link("d", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("j")),
-            joint("l", "c", "d", more=mimic.format("k"))]  # fmt: skip
+    more = [
+        link("c", box(1, 1, 1)),
+        link("d", box(1, 1, 1)),
+        joint("k", "b", "c", more=mimic.format("j")),
+        joint("l", "c", "d", more=mimic.format("k")),
+    ]
     obj = load(two(tmp_path, *more))
     np.testing.assert_allclose(obj.follow(np.array([[0.5, 9, 9]])), [[0.5, -0.9, 1.9]])
-    ring = [link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("l")), link("d", box(1, 1, 1)),
-            joint("l", "b", "d", more=mimic.format("k"))]  # fmt: skip
+    ring = [
+        link("c", box(1, 1, 1)),
+        joint("k", "b", "c", more=mimic.format("l")),
+        link("d", box(1, 1, 1)),
+        joint("l", "b", "d", more=mimic.format("k")),
+    ]
     with pytest.raises(DataError, match="joint 'k' mimics itself, through k, l"):
         load(two(tmp_path, *ring))
     still = load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("nobody"))))
     assert (still.joints[1].lower, still.joints[1].upper) == (0.1, 0.1)
     fixed = load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("j")), limits="0.5 0.5"))
-    assert [(own.lower, own.upper) for own in fixed.joints] == [pytest.approx((-0.9, -0.9))]  # -2 x the leader's value + 0.1
+    assert [(own.lower, own.upper) for own in fixed.joints] == [
+        pytest.approx((-0.9, -0.9))
+    ]  # -2 x the leader's value + 0.1
 
 
-@pytest.mark.parametrize("elements, words", [
-    ([link("a"), link("b"), joint("j", "a", "c")], "joint 'j' has the child 'c'; there is no link of that name"),
-    ([link("a"), link("b"), link("c"), joint("j", "a", "b"), joint("k", "c", "b")], "child of two joints, 'j' and 'k'"),
-    ([link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")], "links b, a hang on each other in a cycle"),
-    ([link("a", box(1, 1, 1)), link("b"), link("c"), joint("j", "b", "c")], "2 links have no parent"),
-    ([link("a"), link("b"), joint("j", "a", "b", kind="screw")], "joint 'j' has the type 'screw'; expected revolute"),
-    ([link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")], "joint 'j' has the axis"),
-    ([link("a"), '<joint name="j" type="revolute"><child link="a"/></joint>'], "not a valid URDF"),
-    ([link("a", '<box size="1 x 1"/>')], "not a valid URDF"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "elements, words",
+    [
+        ([link("a"), link("b"), joint("j", "a", "c")], "joint 'j' has the child 'c'; there is no link of that name"),
+        (
+            [link("a"), link("b"), link("c"), joint("j", "a", "b"), joint("k", "c", "b")],
+            "child of two joints, 'j' and 'k'",
+        ),
+        (
+            [link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")],
+            "links b, a hang on each other in a cycle",
+        ),
+        ([link("a", box(1, 1, 1)), link("b"), link("c"), joint("j", "b", "c")], "2 links have no parent"),
+        (
+            [link("a"), link("b"), joint("j", "a", "b", kind="screw")],
+            "joint 'j' has the type 'screw'; expected revolute",
+        ),
+        ([link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")], "joint 'j' has the axis"),
+        ([link("a"), '<joint name="j" type="revolute"><child link="a"/></joint>'], "not a valid URDF"),
+        ([link("a", '<box size="1 x 1"/>')], "not a valid URDF"),
+    ],
+)
 def test_broken_urdfs_end_with_a_sentence(elements, words, tmp_path):
     with pytest.raises(DataError, match="r.urdf") as error:
         read_skeleton(write_urdf(tmp_path / "r.urdf", *elements))
@@ -132,8 +167,9 @@ def test_meshes_that_cannot_be_used(tmp_path):
     def with_mesh(name, text=None):
         if text is not None:
             (tmp_path / name).write_text(text)
-        return write_urdf(tmp_path / "r.urdf", link("a", f'<mesh filename="{name}"/>'), link("b", box(1, 1, 1)),
-                          joint("j", "a", "b"))  # fmt: skip
+        return write_urdf(
+            tmp_path / "r.urdf", link("a", f'<mesh filename="{name}"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")
+        )
 
     with pytest.raises(DataError, match="its mesh gone.obj is missing"):
         load(with_mesh("gone.obj"))
@@ -177,8 +213,12 @@ def test_layouts(tmp_path):
     assert [f.name for f in find_objects(flat / "8")] == ["8"]
     assert [f.name for f in find_objects(cabinet(tmp_path / "my robot.urdf"))] == ["my robot"]
     reader = Sapien(flat, pairs_per_object=2)
-    assert [(i.name, i.label) for i in reader.items()] == [("8_000", -1), ("8_001", -1), ("Safe_7_000", 0),
-                                                          ("Safe_7_001", 0)]  # fmt: skip
+    assert [(i.name, i.label) for i in reader.items()] == [
+        ("8_000", -1),
+        ("8_001", -1),
+        ("Safe_7_000", 0),
+        ("Safe_7_001", 0),
+    ]
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="no URDF found; expected a .urdf file, or a folder of objects"):
         find_objects(tmp_path / "empty")
@@ -191,8 +231,23 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
     cabinet(raw / "Bad" / "3" / "mobility.urdf")
     (raw / "Bad" / "3" / "meshes" / "cube.obj").unlink()
     output = tmp_path / "x.h5"
-    done = dpc("prepare", "sapien", raw, "-o", output, "--pairs-per-object", 3, "--frames", 2, "--points", 99,
-               "--jobs", 1, "--test-categories", "Good")  # fmt: skip
+    done = dpc(
+        "prepare",
+        "sapien",
+        raw,
+        "-o",
+        output,
+        "--pairs-per-object",
+        3,
+        "--frames",
+        2,
+        "--points",
+        99,
+        "--jobs",
+        1,
+        "--test-categories",
+        "Good",
+    )
     assert done.returncode == 0, done.stderr
     assert "3 sequences, 6 frames, 594 points, 2 skipped" in done.stdout
     assert "Bad_2: " in done.stderr and "no movable joint" in done.stderr
@@ -201,8 +256,23 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
         assert reader.class_names == ["Bad", "Good"] and reader.splits == ["test"] * 3
         assert reader.names == ["Good_1_000", "Good_1_001", "Good_1_002"] and reader.fields == ("part", "pose")
         assert reader.read(0).pose.shape == (2, 3, 4, 4)
-    again = dpc("prepare", "sapien", raw, "-o", output, "--pairs-per-object", 3, "--frames", 2, "--points", 98,
-                "--jobs", 1, "--test-categories", "Good")  # fmt: skip
+    again = dpc(
+        "prepare",
+        "sapien",
+        raw,
+        "-o",
+        output,
+        "--pairs-per-object",
+        3,
+        "--frames",
+        2,
+        "--points",
+        98,
+        "--jobs",
+        1,
+        "--test-categories",
+        "Good",
+    )
     assert again.returncode == 2 and "points 99 (now 98)" in again.stderr
 
 

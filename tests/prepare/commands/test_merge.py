@@ -124,9 +124,9 @@ def test_what_does_not_fit_is_refused(two, tmp_path):
     (tmp_path / "other" / "more" / "a.h5").write_bytes(same.read_bytes())
     with pytest.raises(DataError, match="sample 'more/a1' is in .*files and folders of one name"):
         merge([tmp_path / "other" / "more" / "a.h5", same], tmp_path / "no.h5", prefix=True)
-    metres = write(tmp_path / "mm.h5", ["m"], ["hand wave", "push", "bend"], length_unit="mm")
+    meters = write(tmp_path / "mm.h5", ["m"], ["hand wave", "push", "bend"], length_unit="mm")
     with pytest.raises(DataError, match="its length unit is 'mm', of .*a.h5 it is 'm'"):
-        merge([two[0], metres], tmp_path / "all.h5", force=True)
+        merge([two[0], meters], tmp_path / "all.h5", force=True)
     with pytest.raises(UsageError, match="named twice"):
         merge([two[0], two[0]], tmp_path / "x.h5")
     with pytest.raises(UsageError, match="named twice"):
@@ -261,12 +261,12 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
 def test_a_signal_stops_it_politely(two, tmp_path, monkeypatch):
     read = module.OpenFiles.read
 
-    def signalled(self, path, index):
+    def signaled(self, path, index):
         if index == 1:
             os.kill(os.getpid(), signal.SIGTERM)
         return read(self, path, index)
 
     with monkeypatch.context() as patch, pytest.raises(Stopped, match="SIGTERM; 2 of 3 samples are kept"):
-        patch.setattr(module.OpenFiles, "read", signalled)
+        patch.setattr(module.OpenFiles, "read", signaled)
         merge(two[:1], tmp_path / "all.h5")
     assert merge(two[:1], tmp_path / "all.h5").written == 3

@@ -26,8 +26,11 @@ def whole(tmp_path) -> Path:
         for k in range(12):
             points = rng.normal(size=(5 + k, 3)).astype(np.float32)
             old = "train" if k < 9 else "test"
-            writer.write(CloudSequence.from_frames(
-                f"s{k:02}", [points], split=old, label=k % 3, subject=1 + k // 3, track=[np.arange(5 + k)]))  # fmt: skip
+            writer.write(
+                CloudSequence.from_frames(
+                    f"s{k:02}", [points], split=old, label=k % 3, subject=1 + k // 3, track=[np.arange(5 + k)]
+                )
+            )
         writer.skipped = [("gone", "why")]
     return tmp_path / "all.h5"
 
@@ -110,9 +113,10 @@ def test_subjects_stay_together(whole, tmp_path):
 
 
 @given(
-    st.lists(st.integers(-1, 4), min_size=1, max_size=60), st.integers(0, 2**32 - 1),
+    st.lists(st.integers(-1, 4), min_size=1, max_size=60),
+    st.integers(0, 2**32 - 1),
     st.sampled_from([(0.8, 0.1, 0.1), (0.5, 0.5, 0.0), (1 / 3, 1 / 3, 1 / 3), (0.0, 0.0, 1.0), (0.99, 0.0, 0.01)]),
-)  # fmt: skip
+)
 def test_fractions_hold_in_every_class_and_in_all(strata, seed, fractions):
     got = by_fraction(range(len(strata)), strata, fractions, seed)
     assert got == by_fraction(range(len(strata)), strata, fractions, seed)

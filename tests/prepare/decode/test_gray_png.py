@@ -20,9 +20,13 @@ from dpcli.prepare.decode.depth_png import decode_depth_png
 from dpcli.prepare.decode.gray_png import decode_gray_png
 
 FILTERS = {
-    "none": cv2.IMWRITE_PNG_FILTER_NONE, "sub": cv2.IMWRITE_PNG_FILTER_SUB, "up": cv2.IMWRITE_PNG_FILTER_UP,
-    "average": cv2.IMWRITE_PNG_FILTER_AVG, "paeth": cv2.IMWRITE_PNG_FILTER_PAETH, "all": cv2.IMWRITE_PNG_ALL_FILTERS,
-}  # fmt: skip
+    "none": cv2.IMWRITE_PNG_FILTER_NONE,
+    "sub": cv2.IMWRITE_PNG_FILTER_SUB,
+    "up": cv2.IMWRITE_PNG_FILTER_UP,
+    "average": cv2.IMWRITE_PNG_FILTER_AVG,
+    "paeth": cv2.IMWRITE_PNG_FILTER_PAETH,
+    "all": cv2.IMWRITE_PNG_ALL_FILTERS,
+}
 
 
 def image_of(shape: tuple[int, int], dtype: type, seed: int = 0) -> np.ndarray:
@@ -54,9 +58,13 @@ def test_kornia_is_there():
 
 @settings(max_examples=60, deadline=None)
 @given(
-    height=st.integers(1, 40), width=st.integers(1, 40), dtype=st.sampled_from([np.uint8, np.uint16]),
-    filters=st.sampled_from(sorted(FILTERS)), level=st.integers(0, 9), seed=st.integers(0, 99),
-)  # fmt: skip
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    dtype=st.sampled_from([np.uint8, np.uint16]),
+    filters=st.sampled_from(sorted(FILTERS)),
+    level=st.integers(0, 9),
+    seed=st.integers(0, 99),
+)
 def test_values_are_opencvs(height, width, dtype, filters, level, seed):
     image = image_of((height, width), dtype, seed)
     data = png(image, cv2.IMWRITE_PNG_FILTER, FILTERS[filters], cv2.IMWRITE_PNG_COMPRESSION, level)
@@ -70,7 +78,9 @@ def test_interlaced_ones_and_ones_with_notes():
     image = image_of((21, 30), np.uint16)
     np.testing.assert_array_equal(decode_gray_png(interlaced(image)), image)
     plain = png(image)
-    noted = plain[:33] + chunk(b"tEXt", b"Comment\0depth in mm") + chunk(b"pHYs", struct.pack(">IIB", 1, 1, 0)) + plain[33:]
+    noted = (
+        plain[:33] + chunk(b"tEXt", b"Comment\0depth in mm") + chunk(b"pHYs", struct.pack(">IIB", 1, 1, 0)) + plain[33:]
+    )
     np.testing.assert_array_equal(decode_gray_png(noted), image)
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from dpcli.cli.prepare.animation import animation
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_pose, pinhole
-from dpcli.prepare.meshes.animated_mesh import Material, Texture, bounding_sphere, normalised
+from dpcli.prepare.meshes.animated_mesh import Material, Texture, bounding_sphere, normalized
 from dpcli.prepare.meshes.animation import animation_clip, list_clips, load_animation
 from dpcli.prepare.meshes.bone_parts import carry, choose_points, gap, heaviest_bones, rigid_parts
 from dpcli.prepare.meshes.filming import OBJECT_RADIUS, Filming, film
@@ -113,16 +113,17 @@ def test_morph_targets_add_up(tmp_path):
     np.testing.assert_allclose(mesh.positions[1] - mesh.positions[0], 0.5 * up + 1.0 * wide, atol=1e-6)
 
 
-def test_accessors_strided_normalised_and_sparse(tmp_path):
+def test_accessors_strided_normalized_and_sparse(tmp_path):
     file = GlbFile()
     rng = np.random.default_rng(3)
     rows = rng.normal(size=(5, 5)).astype("f4")
     view = file.view(rows.tobytes(), byteStride=20)
     inside = {"bufferView": view, "byteOffset": 8, "componentType": 5126, "count": 5, "type": "VEC3"}
     sparse = {
-        "count": 2, "indices": {"bufferView": file.view(np.array([1, 4], "u2").tobytes()), "componentType": 5123},
+        "count": 2,
+        "indices": {"bufferView": file.view(np.array([1, 4], "u2").tobytes()), "componentType": 5123},
         "values": {"bufferView": file.view(np.arange(6, dtype="f4").tobytes())},
-    }  # fmt: skip
+    }
     file.tree["accessors"] = [inside, {**inside, "sparse": sparse}, {**inside, "sparse": sparse}]
     del file.tree["accessors"][2]["bufferView"], file.tree["accessors"][2]["byteOffset"]
     bytes_, shorts = (
@@ -152,12 +153,12 @@ def test_a_texture_is_seen_where_it_was_painted(tmp_path):
     colors = np.array([[[255, 0, 0, 255], [0, 200, 0, 255]], [[0, 0, 120, 255], [90, 90, 0, 255]]], np.uint8)
     file.picture(np.repeat(np.repeat(colors, 16, 0), 16, 1))
     image = look(load_animation(file.write(tmp_path / "quad.glb"), None, 1))
-    for row, column in np.ndindex(2, 2):  # away from the seams, where neighbours mix
+    for row, column in np.ndindex(2, 2):  # away from the seams, where neighbors mix
         patch = image[32 * row + 3 : 32 * row + 29, 32 * column + 3 : 32 * column + 29]
         assert (patch == colors[row, column]).all()
 
 
-def test_vertex_colours_and_factors_multiply_in_linear_light(tmp_path):
+def test_vertex_colors_and_factors_multiply_in_linear_light(tmp_path):
     file = quad()
     file.tree["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 1, 1, 1]
     corners = [[65535, 0, 0], [65535, 0, 0], [0, 65535, 0], [0, 65535, 0]]  # red below, green above
@@ -177,8 +178,7 @@ def test_srgb_round_trip_and_known_value():
 
 
 @pytest.mark.parametrize(
-    "mode, middle",
-    [("MASK", (0, 0, 255, 255)), ("BLEND", (128, 0, 127, 255)), ("OPAQUE", (255, 0, 0, 255))],
+    "mode, middle", [("MASK", (0, 0, 255, 255)), ("BLEND", (128, 0, 127, 255)), ("OPAQUE", (255, 0, 0, 255))]
 )
 def test_transparency_shows_what_is_behind(tmp_path, mode, middle):
     file = quad()
@@ -194,7 +194,7 @@ def test_transparency_shows_what_is_behind(tmp_path, mode, middle):
 
 
 def test_alpha_is_the_share_of_a_pixel_that_is_covered():
-    """A square that ends in the middle of a pixel; its colour doesn't fade with its alpha."""
+    """A square that ends in the middle of a pixel; its color doesn't fade with its alpha."""
     mesh = square_mesh((0.2, 0.7, 0.1))
     half = mesh.moved(np.eye(3), np.array([1 / 64, 0, 0]), 1.0)  # half a pixel to the right
     image = look(half, samples=4)
@@ -208,10 +208,20 @@ def square_mesh(color):
 
     positions = np.array([[[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]], np.float32)
     return AnimatedMesh(
-        "square", np.zeros(1), positions, np.tile(np.float32([0, 0, 1]), (1, 4, 1)), np.array([[0, 1, 2], [0, 2, 3]]),
-        np.zeros(2, np.int64), (Material((*color, 1.0)),), np.ones((4, 4), np.float32), np.zeros((4, 2), np.float32),
-        np.zeros((4, 1), np.int64), np.ones((4, 1), np.float32), np.eye(4)[None, None], np.array([-1]),
-    )  # fmt: skip
+        "square",
+        np.zeros(1),
+        positions,
+        np.tile(np.float32([0, 0, 1]), (1, 4, 1)),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        np.zeros(2, np.int64),
+        (Material((*color, 1.0)),),
+        np.ones((4, 4), np.float32),
+        np.zeros((4, 2), np.float32),
+        np.zeros((4, 1), np.int64),
+        np.ones((4, 1), np.float32),
+        np.eye(4)[None, None],
+        np.array([-1]),
+    )
 
 
 def test_light_stays_with_the_world():
@@ -257,8 +267,8 @@ def test_the_bounding_ball():
     rng = np.random.default_rng(4)
     points = rng.normal(size=(30_000, 3))
     points *= (rng.uniform(0, 1, 30_000) ** (1 / 3) / np.linalg.norm(points, axis=1))[:, None]
-    centre, radius = bounding_sphere(3 * points + [1, 2, 3])
-    assert np.linalg.norm(3 * points + [1, 2, 3] - centre, axis=1).max() <= radius + 1e-9
+    center, radius = bounding_sphere(3 * points + [1, 2, 3])
+    assert np.linalg.norm(3 * points + [1, 2, 3] - center, axis=1).max() <= radius + 1e-9
     assert radius < 3.03
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
     assert bounding_sphere(corners)[1] == pytest.approx(np.sqrt(3), rel=1e-6)
@@ -267,7 +277,7 @@ def test_the_bounding_ball():
 def test_objects_fill_the_same_ball_whatever_their_size(tmp_path):
     mesh = load_animation(arm().write(tmp_path / "arm.glb"), None, 8)
     for scale in (1e-3, 1.0, 50.0):
-        ball = normalised(mesh.moved(np.eye(3), scale * np.array([3.0, -2, 1]), scale), OBJECT_RADIUS, yaw=0.7)
+        ball = normalized(mesh.moved(np.eye(3), scale * np.array([3.0, -2, 1]), scale), OBJECT_RADIUS, yaw=0.7)
         reach = np.linalg.norm(ball.positions, axis=-1)
         assert reach.max() == pytest.approx(OBJECT_RADIUS, rel=1e-4)
         points = choose_points(ball, 50, generator(0))
@@ -282,13 +292,13 @@ def test_objects_fill_the_same_ball_whatever_their_size(tmp_path):
 
 def test_without_travel_the_middle_stays(tmp_path):
     mesh = load_animation(quad(shift=4.0).write(tmp_path / "q.glb"), None, 5)
-    assert np.ptp(normalised(mesh, 1.0).positions[..., 0].mean(1)) > 0.5
-    still = normalised(mesh, 1.0, travel=False).positions
+    assert np.ptp(normalized(mesh, 1.0).positions[..., 0].mean(1)) > 0.5
+    still = normalized(mesh, 1.0, travel=False).positions
     np.testing.assert_allclose(still, np.broadcast_to(still[:1], still.shape), atol=1e-6)
 
 
 def test_points_of_a_part_move_as_one_body(tmp_path):
-    mesh = normalised(load_animation(arm().write(tmp_path / "arm.glb"), None, 6), OBJECT_RADIUS)
+    mesh = normalized(load_animation(arm().write(tmp_path / "arm.glb"), None, 6), OBJECT_RADIUS)
     points = choose_points(mesh, 400, generator(5))
     track, bone = carry(mesh, points), heaviest_bones(mesh, points)
     part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(float), 0.005, 4)
@@ -325,15 +335,15 @@ def test_bones_that_do_not_move_on_their_own_are_one_part():
     assert gap(turn, turn, points) == 0 and gap(turn, root, points) > 0.5
 
 
-def test_tracks_lie_on_the_object_and_have_its_colours(tmp_path):
-    """Shown points have the colour that the surface has there; points moved aside have not."""
+def test_tracks_lie_on_the_object_and_have_its_colors(tmp_path):
+    """Shown points have the color that the surface has there; points moved aside have not."""
     file = arm()
     attributes = file.tree["meshes"][0]["primitives"][0]["attributes"]
     ramp = np.linspace(0.1, 1, 10)
     attributes["COLOR_0"] = file.add(np.stack([ramp, 1 - ramp, 0 * ramp + 0.3], axis=1))
     path = file.write(tmp_path / "arm.glb")
     filming = Filming(size=128, test_azimuths=(30.0,), tracks=300, shading=0.0)
-    mesh = normalised(load_animation(path, None, 4), OBJECT_RADIUS)
+    mesh = normalized(load_animation(path, None, 4), OBJECT_RADIUS)
     clip = animation_clip(path, None, 4, filming)
     points = choose_points(mesh, 300, generator(0))
     corners = mesh.triangles[points.triangle]
@@ -379,10 +389,24 @@ def test_from_the_command_line(tmp_path, dpc):
 
 def broken_files() -> dict[str, tuple[GlbFile, str]]:
     """Files with one fault each, and a word of the message it must get."""
-    files = {name: arm() for name in (
-        "no animation", "nan key", "nan bone", "zero quaternion", "times fall", "bone missing", "draco", "circle", "no mesh",
-        "weights", "short", "outside", "version",
-    )}  # fmt: skip
+    files = {
+        name: arm()
+        for name in (
+            "no animation",
+            "nan key",
+            "nan bone",
+            "zero quaternion",
+            "times fall",
+            "bone missing",
+            "draco",
+            "circle",
+            "no mesh",
+            "weights",
+            "short",
+            "outside",
+            "version",
+        )
+    }
     trees = {name: file.tree for name, file in files.items()}
     del trees["no animation"]["animations"]
     files["nan key"].animate(1, "translation", [0, 1], [[0, 0, 0], [0, np.nan, 0]])
@@ -404,11 +428,20 @@ def broken_files() -> dict[str, tuple[GlbFile, str]]:
     trees["outside"]["meshes"][0]["primitives"][0]["material"] = 0
     trees["version"]["asset"]["version"] = "1.0"
     words = {
-        "no animation": "no animation", "nan key": "'shoulder': NaN", "nan bone": "bones of skin 0: NaN",
-        "zero quaternion": "key 1 is zero", "times fall": "do not rise", "bone missing": "bone 1 of 1",
-        "draco": "KHR_draco", "circle": "circle", "no mesh": "no triangles", "weights": "10 of 10 vertices",
-        "short": "truncated or damaged", "outside": "outside its folder", "version": "version 1.0",
-    }  # fmt: skip
+        "no animation": "no animation",
+        "nan key": "'shoulder': NaN",
+        "nan bone": "bones of skin 0: NaN",
+        "zero quaternion": "key 1 is zero",
+        "times fall": "do not rise",
+        "bone missing": "bone 1 of 1",
+        "draco": "KHR_draco",
+        "circle": "circle",
+        "no mesh": "no triangles",
+        "weights": "10 of 10 vertices",
+        "short": "truncated or damaged",
+        "outside": "outside its folder",
+        "version": "version 1.0",
+    }
     return {name: (file, words[name]) for name, file in files.items()}
 
 
@@ -457,7 +490,7 @@ def test_damage_never_ends_in_anything_but_an_error_in_words(tmp_path_factory, d
         pass
 
 
-def test_lost_weights_follow_their_neighbours(tmp_path):
+def test_lost_weights_follow_their_neighbors(tmp_path):
     """A real exporter's fault: 0/0 weights of a few vertices."""
     file = arm()
     accessor = file.tree["accessors"][file.tree["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"]]
@@ -494,7 +527,7 @@ def test_every_real_model_moves_and_has_parts(shared_data):
     assert len(files) == 60
     whole = []
     for path in files:
-        mesh = normalised(load_animation(path, clip_names(read_gltf(path))[-1], 4), OBJECT_RADIUS)
+        mesh = normalized(load_animation(path, clip_names(read_gltf(path))[-1], 4), OBJECT_RADIUS)
         assert np.isfinite(mesh.positions).all() and np.ptp(mesh.positions, axis=0).max() > 0.01, path
         points = choose_points(mesh, 500, generator(0))
         track, bone = carry(mesh, points), heaviest_bones(mesh, points)
@@ -514,8 +547,9 @@ def test_positions_agree_with_another_reader(shared_data):
     file = read_gltf(path)
     ours = [
         file.accessor(primitive["attributes"]["POSITION"], "positions")
-        for mesh in file.items("meshes") for primitive in mesh["primitives"]
-    ]  # fmt: skip
+        for mesh in file.items("meshes")
+        for primitive in mesh["primitives"]
+    ]
     theirs = [g.vertices for g in trimesh.load(path, process=False).geometry.values()]
     assert sorted(map(len, ours)) == sorted(map(len, theirs))
     for a in ours:

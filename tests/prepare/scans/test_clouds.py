@@ -69,7 +69,7 @@ def test_every_format_gives_the_same_points(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".csv", ".las"])
-def test_colours_are_kept(tmp_path, suffix):
+def test_colors_are_kept(tmp_path, suffix):
     save(tmp_path / "seq" / f"0{suffix}", color=COLOR)
     reader = CloudFolders(tmp_path / "seq", fps=5)
     sequence = reader.read(reader.items()[0], RNG).sequence
@@ -78,15 +78,15 @@ def test_colours_are_kept(tmp_path, suffix):
     np.testing.assert_allclose(sequence.points, POINTS, atol=2e-6)
 
 
-def test_a_frame_without_the_others_colours_is_refused(tmp_path):
+def test_a_frame_without_the_others_colors_is_refused(tmp_path):
     save(tmp_path / "0.ply", color=COLOR)
     save(tmp_path / "1.ply")
-    with pytest.raises(DataError, match=r"1.ply: no colours"):
+    with pytest.raises(DataError, match=r"1.ply: no colors"):
         read(tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npy", ".npz", ".bin", ".csv", ".xyz"])
-def test_points_with_nan_are_dropped_with_their_colours_and_counted(tmp_path, suffix):
+def test_points_with_nan_are_dropped_with_their_colors_and_counted(tmp_path, suffix):
     points = POINTS.copy()
     points[3, 1], points[7] = np.nan, np.inf
     color = None if suffix in (".npy", ".bin", ".xyz") else COLOR
@@ -132,7 +132,7 @@ def test_a_label_table_beside_the_data_is_no_cloud(tmp_path):
     assert [(i.name, i.label) for i in reader.items()] == [("a", 2)]
 
 
-def test_map_coordinates_keep_their_millimetres(tmp_path):
+def test_map_coordinates_keep_their_millimeters(tmp_path):
     base = np.array([500_000.0, 5_800_000.0, 100.0])
     save_las(tmp_path / "0.las", POINTS.astype(float) + base, scale=1e-4)
     save_las(tmp_path / "1.las", POINTS.astype(float) + base + [1, 0, 0], scale=1e-4)
@@ -151,8 +151,8 @@ def test_scale_stride_and_columns(tmp_path):
     np.testing.assert_allclose(sequence.time, [0, 0.2, 0.4])
 
 
-def test_a_recording_in_millimetres_keeps_its_sensor(tmp_path):
-    """What counts as far away is metres: 12 m of a scan in millimetres are not."""
+def test_a_recording_in_millimeters_keeps_its_sensor(tmp_path):
+    """What counts as far away is meters: 12 m of a scan in millimeters are not."""
     np.save(tmp_path / "0.npy", np.float32([[0, 0, 2000], [1000, 1000, 3000], [0, 1000, 12_000]]))
     sample = read(tmp_path, scale=1000.0)
     assert sample.notes == {}

@@ -34,12 +34,17 @@ def make_scene(seed, cityscapes=(26, 28, 27, 7)):
     disparity = [(256 * rng.uniform(near / 4, near, (H, W))).astype(np.uint16) for _ in range(2)]  # 12 to 48 m
     for one in disparity:
         one[rng.random((H, W)) < 0.2] = 0
-    flow = np.stack([
-        2**15 + rng.integers(-640, 640, (H, W)), 2**15 + rng.integers(-320, 320, (H, W)), rng.integers(0, 2, (H, W))
-    ], axis=-1).astype(np.uint16)  # fmt: skip
+    flow = np.stack(
+        [2**15 + rng.integers(-640, 640, (H, W)), 2**15 + rng.integers(-320, 320, (H, W)), rng.integers(0, 2, (H, W))],
+        axis=-1,
+    ).astype(np.uint16)
     instance = np.repeat([256 * number + 5 for number in cityscapes], W // 4).astype(np.uint16)
-    return {"disp_occ_0": disparity[0], "disp_occ_1": disparity[1], "flow_occ": flow,
-            "instance": np.tile(instance, (H, 1))}  # fmt: skip
+    return {
+        "disp_occ_0": disparity[0],
+        "disp_occ_1": disparity[1],
+        "flow_occ": flow,
+        "instance": np.tile(instance, (H, 1)),
+    }
 
 
 def write_scenes(raw, scenes):
@@ -170,14 +175,18 @@ def damage(path, change):
         path.write_bytes(change if isinstance(change, bytes) else png_bytes(change))
 
 
-@pytest.mark.parametrize("key, change, words", [
-    ("flow_occ", b"", "not a readable PNG"), ("flow_occ", png_bytes(make_scene(0)["flow_occ"])[:60], "not a readable"),
-    ("flow_occ", np.zeros((H, W), np.uint16), "expected 16 bits, 3 channels"),
-    ("disp_occ_0", np.zeros((H, W), np.uint8), "expected 16 bits, 1 channel"),
-    ("disp_occ_1", np.zeros((H, W - 1), np.uint16), "15x12 pixels; the scene's other images have 16x12"),
-    ("disp_occ_1", np.zeros((H, W), np.uint16), "no pixel has flow and both disparities"),
-    ("instance", np.zeros((H, W, 3), np.uint8), "expected 8 or 16 bits, 1 channel"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "key, change, words",
+    [
+        ("flow_occ", b"", "not a readable PNG"),
+        ("flow_occ", png_bytes(make_scene(0)["flow_occ"])[:60], "not a readable"),
+        ("flow_occ", np.zeros((H, W), np.uint16), "expected 16 bits, 3 channels"),
+        ("disp_occ_0", np.zeros((H, W), np.uint8), "expected 16 bits, 1 channel"),
+        ("disp_occ_1", np.zeros((H, W - 1), np.uint16), "15x12 pixels; the scene's other images have 16x12"),
+        ("disp_occ_1", np.zeros((H, W), np.uint16), "no pixel has flow and both disparities"),
+        ("instance", np.zeros((H, W, 3), np.uint8), "expected 8 or 16 bits, 1 channel"),
+    ],
+)
 def test_damaged_scenes(key, change, words, tmp_path):
     raw = write_scenes(tmp_path, {"000000": make_scene(0)})
     damage(raw / "training" / key / "000000_10.png", change)
@@ -186,11 +195,16 @@ def test_damaged_scenes(key, change, words, tmp_path):
         reader.read(reader.items()[0], None)
 
 
-@pytest.mark.parametrize("text, words", [
-    ("P_rect_00: 1 2 3\n", "no line 'P_rect_02:'; found P_rect_00"), ("", "no calibration at all"),
-    ("P_rect_02: 1 2 3\n", "P_rect_02 has 3 numbers"), ("P_rect_02: " + "0 " * 12, "focal length 0"),
-    ("P_rect_02: nan " + "1 " * 11, "all finite"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("P_rect_00: 1 2 3\n", "no line 'P_rect_02:'; found P_rect_00"),
+        ("", "no calibration at all"),
+        ("P_rect_02: 1 2 3\n", "P_rect_02 has 3 numbers"),
+        ("P_rect_02: " + "0 " * 12, "focal length 0"),
+        ("P_rect_02: nan " + "1 " * 11, "all finite"),
+    ],
+)
 def test_damaged_calibration(text, words, tmp_path):
     raw = write_scenes(tmp_path, {"000000": make_scene(0)})
     (raw / "training" / "calib_cam_to_cam" / "000000.txt").write_text(text)
@@ -270,8 +284,12 @@ def write_detection(raw, name="000003"):
     write_scan(raw / "training" / "velodyne" / f"{name}.bin", to_scanner(cloud))
     matrices = {"P0": P2, "P2": P2, "R0_rect": RECTIFY, "Tr_velo_to_cam": velodyne_to_camera()[:3]}
     write_calibration(raw / "training" / "calib" / f"{name}.txt", **matrices)
-    lines = [label_line("Car", *CARS[0]), label_line("DontCare", (-1000, -1000, -1000), (-1, -1, -1), -10),
-             label_line("Van", (6.0, 1.6, 20.0), (2.0, 1.8, 4.0), 0.0), label_line("Car", *CARS[1])]  # fmt: skip
+    lines = [
+        label_line("Car", *CARS[0]),
+        label_line("DontCare", (-1000, -1000, -1000), (-1, -1, -1), -10),
+        label_line("Van", (6.0, 1.6, 20.0), (2.0, 1.8, 4.0), 0.0),
+        label_line("Car", *CARS[1]),
+    ]
     (raw / "training" / "label_2").mkdir(parents=True, exist_ok=True)
     (raw / "training" / "label_2" / f"{name}.txt").write_text("\n".join(lines) + "\n")
     write_png(raw / "training" / "image_2" / f"{name}.png", np.zeros((375, 1242), np.uint8))
@@ -337,11 +355,14 @@ def test_detection_command_lists_and_notes(tmp_path):
         assert reader.length_unit == "m"
 
 
-@pytest.mark.parametrize("text, words", [
-    ("Car 0 0\n", r"000003.txt:1: 'Car 0 0'; expected a type and 14 numbers"),
-    ("\n" + label_line("Car", (0, 0, 9), (0, 1, 1), 0), r"000003.txt:2: a box of size 0.0"),
-    (label_line("Car", (0, 0, float("nan")), (1, 1, 1), 0), "expected finite numbers"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("Car 0 0\n", r"000003.txt:1: 'Car 0 0'; expected a type and 14 numbers"),
+        ("\n" + label_line("Car", (0, 0, 9), (0, 1, 1), 0), r"000003.txt:2: a box of size 0.0"),
+        (label_line("Car", (0, 0, float("nan")), (1, 1, 1), 0), "expected finite numbers"),
+    ],
+)
 def test_damaged_labels(text, words, tmp_path):
     write_detection(tmp_path)
     (tmp_path / "training" / "label_2" / "000003.txt").write_text(text)

@@ -138,18 +138,21 @@ def test_pickles_that_call_functions_are_refused(name, tmp_path):
         assert mark.exists()
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"pc": np.zeros((4, 5))}, r"pc is float64 \(4, 5\); expected floats \(views, points, 3\)"),
-    ({"pc": np.full((4, 40, 3), np.nan)}, "pc holds NaN"),
-    ({"segm": np.zeros((4, 40), int)}, "segm holds ids from 0 to 0; expected 1"),
-    ({"segm": np.ones((4, 39), int)}, r"segm is int64 \(4, 39\); expected whole numbers \(4, 40\)"),
-    ({"segm": np.full((4, 40), 9)}, "trans has no 4; found 'cam', 1, 2, 3"),
-    ({"trans": {1: []}}, "trans has no 'cam'"),
-    ({"trans": [1, 2]}, "trans"),
-    ({"trans": {"cam": [np.eye(4)] * 3, 1: [], 2: [], 3: []}}, r"trans\['cam'\] has shape \(3, 4, 4\)"),
-    ({"trans": {"cam": [2 * np.eye(4)] * 4, 1: [], 2: [], 3: []}}, r"trans\['cam'\] is not a rigid motion"),
-    ({"trans": {"cam": [np.nan * np.eye(4)] * 4, 1: [], 2: [], 3: []}}, "is not a rigid motion"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"pc": np.zeros((4, 5))}, r"pc is float64 \(4, 5\); expected floats \(views, points, 3\)"),
+        ({"pc": np.full((4, 40, 3), np.nan)}, "pc holds NaN"),
+        ({"segm": np.zeros((4, 40), int)}, "segm holds ids from 0 to 0; expected 1"),
+        ({"segm": np.ones((4, 39), int)}, r"segm is int64 \(4, 39\); expected whole numbers \(4, 40\)"),
+        ({"segm": np.full((4, 40), 9)}, "trans has no 4; found 'cam', 1, 2, 3"),
+        ({"trans": {1: []}}, "trans has no 'cam'"),
+        ({"trans": [1, 2]}, "trans"),
+        ({"trans": {"cam": [np.eye(4)] * 3, 1: [], 2: [], 3: []}}, r"trans\['cam'\] has shape \(3, 4, 4\)"),
+        ({"trans": {"cam": [2 * np.eye(4)] * 4, 1: [], 2: [], 3: []}}, r"trans\['cam'\] is not a rigid motion"),
+        ({"trans": {"cam": [np.nan * np.eye(4)] * 4, 1: [], 2: [], 3: []}}, "is not a rigid motion"),
+    ],
+)
 def test_damaged_samples(change, words, tmp_path):
     sample, _ = make_sample(0)
     raw = write(tmp_path / "raw", {0: {**sample, **change}}, {"train": [0]})
@@ -168,10 +171,16 @@ def test_missing_arrays_and_files(tmp_path):
         read_views(raw / "data" / "000000.npz")
 
 
-@pytest.mark.parametrize("text, words", [
-    (None, "not found; expected meta.json"), ("{", "not JSON"), ("[1]", "expected"), ('{"train": ["a"]}', "expected"),
-    ('{"train": [1, 1]}', "1 numbers are listed twice"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        (None, "not found; expected meta.json"),
+        ("{", "not JSON"),
+        ("[1]", "expected"),
+        ('{"train": ["a"]}', "expected"),
+        ('{"train": [1, 1]}', "1 numbers are listed twice"),
+    ],
+)
 def test_meta_json(text, words, tmp_path):
     if text is not None:
         (tmp_path / "meta.json").write_text(text)

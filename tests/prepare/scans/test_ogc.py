@@ -31,9 +31,7 @@ def make_room(seed, objects=3, points=50, frames=4, background=False):
             matrix[:3, :3], matrix[:3, 3] = random_rotation(rng), rng.normal(size=3)
         segm = (rng.permutation(points) % (objects + background) + (not background)).astype(np.int16)
         body = rng.normal(size=(points, 3))
-        cloud = np.stack([
-            (pose[s - 1] @ [*b, 1])[:3] if s else b for b, s in zip(body, segm)
-        ])  # fmt: skip
+        cloud = np.stack([(pose[s - 1] @ [*b, 1])[:3] if s else b for b, s in zip(body, segm)])
         arrays |= {f"pc_{t:02d}": cloud.astype(np.float32), f"segm_{t:02d}": segm, f"pose_{t:02d}": pose}
         bodies.append(body)
     return arrays, bodies
@@ -89,19 +87,22 @@ def test_background_is_a_part_that_stands_still(tmp_path):
     assert reader.read(items[1], None).sequence.pose.shape == (4, 4, 4, 4)
 
 
-@pytest.mark.parametrize("change, words", [
-    ({"pc_01": None}, r"frames \[0, 2, 3\]; expected pc_00.npy, pc_01.npy, ... without gaps"),
-    ({"segm_02": None}, "segm_02.npy: missing"),
-    ({"pc_01": np.zeros((50, 2))}, r"pc_01.npy: is float64 \(50, 2\); expected floats \(n, 3\)"),
-    ({"pc_00": np.full((50, 3), np.nan)}, "holds NaN"),
-    ({"segm_00": np.full(50, 4)}, "holds ids from 4 to 4; expected 1 to 3"),
-    ({"segm_00": np.ones(49, int)}, r"is int64 \(49,\); expected whole numbers \(50\)"),
-    ({"segm_00": np.array([{}], object)}, "not a readable .npy array"),
-    ({"pose_03": np.tile(2 * np.eye(4), (3, 1, 1))}, "matrix of object 1 is not a rigid motion"),
-    ({"pose_03": np.tile(np.diag([1.0, 1, -1, 1]), (3, 1, 1))}, "matrix of object 1 is not a rigid motion"),
-    ({"pose_03": np.full((3, 4, 4), np.nan)}, "is not a rigid motion"),
-    ({"pose_03": np.tile(np.eye(4), (2, 1, 1))}, "2 objects, 3 in pose_00"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"pc_01": None}, r"frames \[0, 2, 3\]; expected pc_00.npy, pc_01.npy, ... without gaps"),
+        ({"segm_02": None}, "segm_02.npy: missing"),
+        ({"pc_01": np.zeros((50, 2))}, r"pc_01.npy: is float64 \(50, 2\); expected floats \(n, 3\)"),
+        ({"pc_00": np.full((50, 3), np.nan)}, "holds NaN"),
+        ({"segm_00": np.full(50, 4)}, "holds ids from 4 to 4; expected 1 to 3"),
+        ({"segm_00": np.ones(49, int)}, r"is int64 \(49,\); expected whole numbers \(50\)"),
+        ({"segm_00": np.array([{}], object)}, "not a readable .npy array"),
+        ({"pose_03": np.tile(2 * np.eye(4), (3, 1, 1))}, "matrix of object 1 is not a rigid motion"),
+        ({"pose_03": np.tile(np.diag([1.0, 1, -1, 1]), (3, 1, 1))}, "matrix of object 1 is not a rigid motion"),
+        ({"pose_03": np.full((3, 4, 4), np.nan)}, "is not a rigid motion"),
+        ({"pose_03": np.tile(np.eye(4), (2, 1, 1))}, "2 objects, 3 in pose_00"),
+    ],
+)
 def test_damaged_rooms(change, words, tmp_path):
     arrays = {key: value for key, value in {**make_room(0)[0], **change}.items() if value is not None}
     write_raw(tmp_path, {"3_000000": arrays}, test=["3_000000"])
@@ -117,10 +118,15 @@ def test_truncated_array(tmp_path):
         read_room(path.parent)
 
 
-@pytest.mark.parametrize("lists, words", [
-    ({}, "no rooms listed"), ({"train": []}, "no rooms listed"), ({"train": ["a", "a"]}, "room a is listed 2 times"),
-    ({"train": ["a"], "val": ["a"]}, "room a is listed 2 times"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "lists, words",
+    [
+        ({}, "no rooms listed"),
+        ({"train": []}, "no rooms listed"),
+        ({"train": ["a", "a"]}, "room a is listed 2 times"),
+        ({"train": ["a"], "val": ["a"]}, "room a is listed 2 times"),
+    ],
+)
 def test_lists(lists, words, tmp_path):
     (tmp_path / "data").mkdir()
     with pytest.raises(DataError, match=words):
@@ -148,7 +154,7 @@ def meshes(tmp_path):
     return folder
 
 
-def test_shapes_are_centred_and_of_size_one(meshes):
+def test_shapes_are_centered_and_of_size_one(meshes):
     assert find_meshes(meshes) == ("class 0/box0.obj", "class 0/box2.obj", "class 1/box1.obj", "class 1/box3.obj")
     shape = load_shape(meshes / "class 0" / "box0.obj", "y")
     corners = shape.triangles.reshape(-1, 3)
@@ -249,9 +255,9 @@ def _scale_of(own):
 def test_single_view_shows_no_hidden_surface(meshes):
     shapes = [load_shape(meshes / name, "y") for name in find_meshes(meshes)]
     layout = draw_layout([s.hull for s in shapes], 1, RoomMotion(), generator(1))
-    placed = np.concatenate([
-        (s.triangles * size) @ p[:3, :3].T + p[:3, 3] for s, size, p in zip(shapes, layout.scale, layout.pose[0])
-    ])  # fmt: skip
+    placed = np.concatenate(
+        [(s.triangles * size) @ p[:3, :3].T + p[:3, 3] for s, size, p in zip(shapes, layout.scale, layout.pose[0])]
+    )
     low, high = placed.reshape(-1, 3).min(0), placed.reshape(-1, 3).max(0)
     eye = (low + high) / 2 + [0, 0, 0.7 * (high - low).max() / np.tan(np.pi / 6)]
     seen = points_on(placed, seen_by_camera(placed))
@@ -291,12 +297,17 @@ def test_generate_command(meshes, tmp_path):
         assert not np.array_equal(reader.read(0).points, reader.read(1).points)
 
 
-@pytest.mark.parametrize("raw, generate, changed, complaint", [
-    (False, False, {}, "neither was given"), (True, True, {}, "both were given"),
-    (False, True, {"objects": "9"}, "expected different numbers of 2 to 8"),
-    (False, True, {"objects": "a"}, "expected numbers"), (False, True, {"up": "x"}, "expected y or z"),
-    (False, True, {"fractions": "1,1,1"}, "that sum to 1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "raw, generate, changed, complaint",
+    [
+        (False, False, {}, "neither was given"),
+        (True, True, {}, "both were given"),
+        (False, True, {"objects": "9"}, "expected different numbers of 2 to 8"),
+        (False, True, {"objects": "a"}, "expected numbers"),
+        (False, True, {"up": "x"}, "expected y or z"),
+        (False, True, {"fractions": "1,1,1"}, "that sum to 1"),
+    ],
+)
 def test_wrong_use(raw, generate, changed, complaint, tmp_path):
     options = {"objects": "3", "rooms": 1, "frames": 1, "points": 0, "up": "y", "fractions": "1,0,0", **changed}
     with pytest.raises(UsageError, match=complaint):

@@ -138,10 +138,16 @@ def test_alignment_puts_what_stands_still_in_one_place(tmp_path):
         reader.read(item, None)
 
 
-@pytest.mark.parametrize("text, words", [
-    (None, "not found; --align needs it"), ("a b", "not lines of 12 numbers"), ("1 2 3", "expected 12 finite numbers"),
-    ("nan " * 12, "expected 12 finite numbers"), ("", "expected 12 finite numbers"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        (None, "not found; --align needs it"),
+        ("a b", "not lines of 12 numbers"),
+        ("1 2 3", "expected 12 finite numbers"),
+        ("nan " * 12, "expected 12 finite numbers"),
+        ("", "expected 12 finite numbers"),
+    ],
+)
 def test_damaged_poses(text, words, tmp_path):
     if text is not None:
         (tmp_path / "poses.txt").write_text(text)
@@ -195,7 +201,7 @@ def test_recipes_agree_with_the_readers(name):
     from dpcli.prepare.scans import kitti_det, kitti_sf, ogc
 
     recipe = tomllib.loads((ROOT / "data_recipes" / f"{name}.toml").read_text())
-    assert recipe["name"] == name and {"ask", "licence"} <= recipe["get"].keys() and recipe["layout"]["tree"]
+    assert recipe["name"] == name and {"ask", "license"} <= recipe["get"].keys() and recipe["layout"]["tree"]
     program, *words = shlex.split(recipe["prepare"]["command"])
     assert [program, *words[:2]] == ["dpc", "prepare", name] and name in get_command(app).commands
     split, count = recipe["split"], recipe["expect"]["sequences"]

@@ -35,9 +35,9 @@ def is_closed(triangles: np.ndarray) -> bool:
 
 def test_surface_nets_of_a_ball():
     grid = np.stack(np.meshgrid(*[np.arange(32.0)] * 3, indexing="ij"), axis=-1)
-    centre = np.array([15.3, 14.8, 16.1])
-    vertices, triangles = surface_nets(np.linalg.norm(grid - centre, axis=-1) - 10)
-    np.testing.assert_allclose(np.linalg.norm(vertices - centre, axis=1), 10, atol=0.15)
+    center = np.array([15.3, 14.8, 16.1])
+    vertices, triangles = surface_nets(np.linalg.norm(grid - center, axis=-1) - 10)
+    np.testing.assert_allclose(np.linalg.norm(vertices - center, axis=1), 10, atol=0.15)
     assert volume(vertices, triangles) == pytest.approx(4 / 3 * np.pi * 1000, rel=0.02)
     assert is_closed(triangles) and not is_closed(triangles[1:])
     edges = len(triangles) * 3 // 2
@@ -49,8 +49,8 @@ def test_shapes_against_the_balls_they_are_swept_from():
     shape = Shape(0, np.array([0.1, 0, 0.2]), np.array([0.3, 0.4, -0.1]), 0.2, 0.12)
     points = rng.uniform(-0.4, 0.8, (2000, 3))
     s = np.linspace(0, 1, 2001)[:, None]
-    centres, radii = shape.a + s * (shape.b - shape.a), shape.ra + s * (shape.rb - shape.ra)
-    swept = (np.linalg.norm(points[:, None] - centres, axis=-1) - radii[:, 0]).min(1)
+    centers, radii = shape.a + s * (shape.b - shape.a), shape.ra + s * (shape.rb - shape.ra)
+    swept = (np.linalg.norm(points[:, None] - centers, axis=-1) - radii[:, 0]).min(1)
     found = shape_distance(points, shape)
     sure = np.abs(swept) > 0.02  # the cone's slope is left out of our distance
     assert (np.sign(found) == np.sign(swept))[sure].all() and np.abs(found - swept).max() < 0.02

@@ -173,7 +173,7 @@ def test_a_video_depends_on_its_generator_and_the_seed_alone():
     assert first.points.shape != other.points.shape or (first.points != other.points).any()
     assert draw_subject(0, 3) == draw_subject(0, 3) != draw_subject(1, 3)
     assert first.part.dtype == np.int16 and first.part.min() >= 0 and first.part.max() < len(PARTS)
-    assert 1.2 < np.median(first.points[:, 2]) < 3.2  # metres in front of the camera
+    assert 1.2 < np.median(first.points[:, 2]) < 3.2  # meters in front of the camera
 
 
 def test_noise_has_the_stated_law():

@@ -77,8 +77,15 @@ def scene() -> dict[str, np.ndarray]:
         bones[frame, 1, :3, :3] = turn(axes[:, 0], 0.15 * frame) @ rest[1, :3, :3]
     cameras = np.stack([np.array([[70.0 + v, 0, 47 + v / 2], [0, 71.0 + v, 33], [0, 0, 1]]) for v in range(CAMERAS)])
     points = voxels @ axes.T + SHIFT
-    return {"points": points, "indices": np.tile([0, 1], (432, 1)), "weights": weights, "rest": rest, "bones": bones,
-            "poses": camera_poses(), "cameras": cameras}  # fmt: skip
+    return {
+        "points": points,
+        "indices": np.tile([0, 1], (432, 1)),
+        "weights": weights,
+        "rest": rest,
+        "bones": bones,
+        "poses": camera_poses(),
+        "cameras": cameras,
+    }
 
 
 def skinned(data: dict[str, np.ndarray], frame: int) -> np.ndarray:
@@ -122,8 +129,8 @@ def write_animal(folder: Path) -> dict[str, np.ndarray]:
             alpha = np.zeros((HEIGHT, WIDTH), np.uint8)
             for u, v in np.floor(pixel).astype(int):
                 alpha[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2] = 255
-            colour = np.full((HEIGHT, WIDTH, 3), 40 + 20 * view, np.uint8)
-            Image.fromarray(colour).save(pictures / f"img_{view:04d}.jpg", quality=95)
+            color = np.full((HEIGHT, WIDTH, 3), 40 + 20 * view, np.uint8)
+            Image.fromarray(color).save(pictures / f"img_{view:04d}.jpg", quality=95)
             Image.fromarray(alpha).save(pictures / f"img_{view:04d}_alpha.png")
     return data
 
@@ -187,8 +194,9 @@ def test_pictures_show_the_object_where_its_tracks_are(animal):
     boxes = {}
     for view, frame, rgba in clip.pictures():
         assert rgba.shape == (48, 48, 4)
-        pixel = np.floor(project(clip.header.intrinsics[view], clip.header.world_to_camera[view],
-                                 clip.track[frame].astype(float))).astype(int)  # fmt: skip
+        pixel = np.floor(
+            project(clip.header.intrinsics[view], clip.header.world_to_camera[view], clip.track[frame].astype(float))
+        ).astype(int)
         assert (rgba[pixel[:, 1], pixel[:, 0], 3] > 127).mean() > 0.99
         rows, columns = np.nonzero(rgba[..., 3] > 26)
         boxes.setdefault(view, []).append((columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
@@ -293,18 +301,19 @@ def test_similarity_keeps_every_pixel_and_meets_its_description():
     rng = np.random.default_rng(0)
     poses = np.linalg.inv(camera_poses())
     points = rng.normal(size=(50, 3)) * 2 + SHIFT
-    centre, radius = bounding_sphere(points)
-    assert np.linalg.norm(points - centre, axis=1).max() == pytest.approx(radius)
+    center, radius = bounding_sphere(points)
+    assert np.linalg.norm(points - center, axis=1).max() == pytest.approx(radius)
     up = up_direction(poses)
     np.testing.assert_allclose(up, UP, atol=1e-6)
-    world = into_orbit(up, poses[2], centre, radius)
+    world = into_orbit(up, poses[2], center, radius)
     np.testing.assert_allclose(world.rotation @ world.rotation.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(world.rotation) == pytest.approx(1)
     for pose in poses:
-        np.testing.assert_allclose(project(np.eye(3), world.pose(pose), world.points(points)),
-                                   project(np.eye(3), pose, points), atol=1e-10)  # fmt: skip
+        np.testing.assert_allclose(
+            project(np.eye(3), world.pose(pose), world.points(points)), project(np.eye(3), pose, points), atol=1e-10
+        )
     assert orbit_of(world.pose(poses[2]))[0] == pytest.approx(0, abs=1e-9)
-    # positive azimuth is towards the reference camera's right
+    # positive azimuth is toward the reference camera's right
     right = poses[2][0, :3]
     assert (world.rotation @ right)[0] > 0.99
 
@@ -315,9 +324,9 @@ def test_bounding_sphere_is_nearly_the_smallest():
     inside *= rng.random((500, 1)) ** (1 / 3) / np.linalg.norm(inside, axis=1, keepdims=True)
     pole = np.array([[0, 0.6, 0.8]])
     points = np.concatenate([inside[inside @ pole[0] > -0.2], pole, -pole])  # lopsided, yet the poles fix the sphere
-    centre, radius = bounding_sphere(3 * points + SHIFT)
-    assert 3 - 1e-9 <= radius < 3.03 and np.linalg.norm(centre - SHIFT) < 0.05
-    assert (np.linalg.norm(3 * points + SHIFT - centre, axis=1) <= radius + 1e-12).all()
+    center, radius = bounding_sphere(3 * points + SHIFT)
+    assert 3 - 1e-9 <= radius < 3.03 and np.linalg.norm(center - SHIFT) < 0.05
+    assert (np.linalg.norm(3 * points + SHIFT - center, axis=1) <= radius + 1e-12).all()
 
 
 def test_silhouettes_of_a_ball_give_its_sphere():
@@ -329,8 +338,8 @@ def test_silhouettes_of_a_ball_give_its_sphere():
         x, y, z = pose[:3, :3] @ ball + pose[:3, 3]
         u, v, reach = 480 + 700 * x / z, 320 + 700 * y / z, 700 * radius / z
         boxes.append((u - reach, v - reach, u + reach, v + reach))
-    centre, found = sphere_of_silhouettes(np.stack([camera] * len(poses)), poses, boxes)
-    np.testing.assert_allclose(centre, ball, atol=1e-3)
+    center, found = sphere_of_silhouettes(np.stack([camera] * len(poses)), poses, boxes)
+    np.testing.assert_allclose(center, ball, atol=1e-3)
     assert found == pytest.approx(radius, rel=1e-3)
 
 

@@ -24,14 +24,14 @@ from dpcli.store import ViewsReader
 RED = (200, 40, 30)
 
 
-def disc(centre: tuple[float, float], radius: float, size: tuple[int, int] = (64, 48), colour=RED) -> np.ndarray:
+def disc(center: tuple[float, float], radius: float, size: tuple[int, int] = (64, 48), color=RED) -> np.ndarray:
     """u8 (H,W,4): a disc with an exact soft edge (4 x 4 samples a pixel)."""
     width, height = size
     y, x = (np.mgrid[: 4 * height, : 4 * width] + 0.5) / 4
-    inside = ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius**2).astype(float)
+    inside = ((x - center[0]) ** 2 + (y - center[1]) ** 2 <= radius**2).astype(float)
     alpha = inside.reshape(height, 4, width, 4).mean(axis=(1, 3))
     rgba = np.zeros((height, width, 4), np.uint8)
-    rgba[alpha > 0, :3] = colour
+    rgba[alpha > 0, :3] = color
     rgba[..., 3] = np.round(255 * alpha)
     return rgba
 
@@ -59,7 +59,7 @@ def read(clip) -> dict[tuple[int, int], np.ndarray]:
 
 
 def centroid(rgba: np.ndarray) -> np.ndarray:
-    """Middle of the alpha, pixels (x, y), pixel centres at +0.5."""
+    """Middle of the alpha, pixels (x, y), pixel centers at +0.5."""
     weight = rgba[..., 3].astype(float)
     y, x = np.mgrid[: len(rgba), : rgba.shape[1]] + 0.5
     return np.array([(x * weight).sum(), (y * weight).sum()]) / weight.sum()
@@ -85,11 +85,14 @@ def test_numbers_survive_any_prefix_and_suffix(numbers, prefix):
     assert frame_numbers([f"{prefix}{number}_rgba" for number in numbers]) == numbers
 
 
-@pytest.mark.parametrize("stems", [
-    [f"1305031102.{675304 + 77 * k:06d}" for k in range(4)] + [f"1305031103.{1000 + 77 * k:06d}" for k in range(4)],
-    [f"{h:02d}-{m:02d}-{s:02d}" for h, m, s in ((9, 59, 58), (9, 59, 59), (10, 0, 0), (10, 0, 1), (10, 1, 0))],
-    [f"{k:03d}_{noise}" for k, noise in enumerate((77, 3, 500, 41))],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "stems",
+    [
+        [f"1305031102.{675304 + 77 * k:06d}" for k in range(4)] + [f"1305031103.{1000 + 77 * k:06d}" for k in range(4)],
+        [f"{h:02d}-{m:02d}-{s:02d}" for h, m, s in ((9, 59, 58), (9, 59, 59), (10, 0, 0), (10, 0, 1), (10, 1, 0))],
+        [f"{k:03d}_{noise}" for k, noise in enumerate((77, 3, 500, 41))],
+    ],
+)
 def test_names_of_several_numbers_are_read_from_left_to_right(tmp_path, stems):
     pictures = [disc((20 + 2 * k, 24), 8) for k in range(len(stems))]
     (tmp_path / "clip").mkdir()
@@ -115,7 +118,15 @@ def uneven_video(path: Path, kept: str = "lt(n,10)+not(mod(n,6))") -> Path:
     """Two seconds at 20 frames a second of which ffmpeg drops some: the first half second whole, then every sixth."""
     import imageio_ffmpeg
 
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", "testsrc=size=64x48:rate=20:duration=2"]
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-f",
+        "lavfi",
+        "-i",
+        "testsrc=size=64x48:rate=20:duration=2",
+    ]
     subprocess.run([*command, "-vf", f"select='{kept}'", "-fps_mode", "vfr", str(path)], check=True, timeout=60)
     return path
 
@@ -152,7 +163,7 @@ def test_gif_and_video_give_the_same_frames_as_the_folder(tmp_path):
         frames = open_frames(tmp_path / name)
         assert len(frames) == 5 and np.allclose(frames.times, times)
         for want, have in zip(expected, frames.read([0, 2, 4]), strict=True):
-            assert np.abs(want.astype(int) - have).max() <= (12 if name.endswith("gif") else 1)  # gif: 256 colours
+            assert np.abs(want.astype(int) - have).max() <= (12 if name.endswith("gif") else 1)  # gif: 256 colors
     clip = video_clip(tmp_path / "clip.gif", VideoOptions(frames=3, size=32))
     np.testing.assert_allclose(clip.header.time, [0, 0.2, 0.5])
 
@@ -185,8 +196,8 @@ def test_the_plain_background_is_found_beside_an_object_that_touches_the_border(
     rng = np.random.default_rng(0)
     picture = np.clip(rng.normal((90, 120, 200), 2, (40, 60, 3)), 0, 255).astype(np.uint8)
     picture[10:, 20:40] = RED
-    colour = matting.plain_background([matting.border_pixels(picture)], ["a"], matting.TOLERANCE)
-    np.testing.assert_allclose(colour, (90, 120, 200), atol=1.5)
+    color = matting.plain_background([matting.border_pixels(picture)], ["a"], matting.TOLERANCE)
+    np.testing.assert_allclose(color, (90, 120, 200), atol=1.5)
     busy = rng.integers(0, 256, (40, 60, 3), np.uint8)
     with pytest.raises(DataError, match="not plain"):
         matting.plain_background([matting.border_pixels(busy)], ["a"], matting.TOLERANCE)
@@ -204,7 +215,7 @@ def test_one_crop_keeps_the_motion(tmp_path):
         np.testing.assert_allclose(centroid(found[0, frame]), expected, atol=0.1)
     boxes = np.array([visible_box(picture) for picture in found.values()])
     assert boxes[:, 2].max() - boxes[:, 0].min() == pytest.approx(0.8 * 50, abs=2)
-    whole = read(video_clip(folder, VideoOptions(size=64, recentre=False)))
+    whole = read(video_clip(folder, VideoOptions(size=64, recenter=False)))
     np.testing.assert_array_equal(whole[0, 2][8:56], moving(4)[2])  # 64 x 48 padded to a square, not resampled
 
 
@@ -225,7 +236,7 @@ def test_pictures_follow_the_same_crop_as_intrinsics():
         np.testing.assert_allclose(centroid(crop.apply(picture, size)), crop.intrinsics(camera, size)[:2, 2], atol=0.05)
 
 
-def test_resizing_does_not_bleed_hidden_colours():
+def test_resizing_does_not_bleed_hidden_colors():
     picture = disc((24, 24), 12, (48, 48))
     picture[picture[..., 3] == 0, :3] = (0, 255, 0)
     for size in (20, 100):
@@ -245,10 +256,10 @@ def test_masks_cut_a_busy_background(tmp_path):
     busy = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(3)]
     discs = moving(3)
     folder = save(tmp_path / "clip", busy, "{:02d}.png")
-    grey = save(tmp_path / "grey", [picture[..., 3] for picture in discs], "m_{}.png")
+    gray = save(tmp_path / "gray", [picture[..., 3] for picture in discs], "m_{}.png")
     ids = save(tmp_path / "ids", [(picture[..., 3] > 127).astype(np.uint8) for picture in discs])
-    for masks in (grey, ids):
-        found = read(video_clip(folder, VideoOptions(size=64, recentre=False, mask=masks)))
+    for masks in (gray, ids):
+        found = read(video_clip(folder, VideoOptions(size=64, recenter=False, mask=masks)))
         for frame in range(3):
             strong = discs[frame][..., 3] > 200
             np.testing.assert_array_equal(found[0, frame][8:56][strong][:, :3], busy[frame][strong])
@@ -258,9 +269,12 @@ def test_masks_cut_a_busy_background(tmp_path):
     save(tmp_path / "inverse", [255 - picture[..., 3] for picture in discs])
     save(tmp_path / "empty", [np.zeros((48, 64), np.uint8)] * 3)
     for name, message in (
-        ("short", "1 masks for 3 frames"), ("wide", "10x10.*64x48"), ("inverse", "inverted"), ("empty", "an empty mask"),
+        ("short", "1 masks for 3 frames"),
+        ("wide", "10x10.*64x48"),
+        ("inverse", "inverted"),
+        ("empty", "an empty mask"),
         ("none", "does not exist"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(DataError, match=message):
             video_clip(folder, VideoOptions(size=64, mask=tmp_path / name))
 
@@ -291,7 +305,7 @@ def bad_clip(tmp_path: Path, kind: str) -> Path:
     [
         ("busy", "not plain.*\n.*--mask FOLDER"),
         ("sizes", "1.png is 50x48, 0.png is 64x48"),
-        ("white", "no object in any frame.*one colour only"),
+        ("white", "no object in any frame.*one color only"),
         ("one empty", r"no object in 1 frame: 2.png \(fully transparent\)\n.*--on-error skip"),
         ("mixed", "1 frame: 1.png without alpha"),
         ("nothing", "no frames"),
@@ -343,7 +357,7 @@ def test_warnings_name_the_frames(tmp_path, capsys):
 
 def test_keep_takes_the_whole_picture(tmp_path):
     busy = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-    found = read(video_clip(save(tmp_path / "c", [busy] * 2), VideoOptions(size=64, background="keep", recentre=False)))
+    found = read(video_clip(save(tmp_path / "c", [busy] * 2), VideoOptions(size=64, background="keep", recenter=False)))
     np.testing.assert_array_equal(found[0, 1][8:56, :, :3], busy)
     assert (found[0, 1][8:56, :, 3] == 255).all() and found[0, 1][:8].max() == 0
 
@@ -351,11 +365,20 @@ def test_keep_takes_the_whole_picture(tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        {"border": 1.0}, {"background": "pink"}, {"background": "1,2"}, {"background": "300,0,0"}, {"fps": 0.0},
-        {"holes": "some"}, {"radius": 0.0}, {"elevation": 91.0}, {"mask": Path("m"), "background": "white"},
-        {"views_cameras": Path("c.json")}, {"on_error": "go"}, {"tolerance": 0.7},
+        {"border": 1.0},
+        {"background": "pink"},
+        {"background": "1,2"},
+        {"background": "300,0,0"},
+        {"fps": 0.0},
+        {"holes": "some"},
+        {"radius": 0.0},
+        {"elevation": 91.0},
+        {"mask": Path("m"), "background": "white"},
+        {"views_cameras": Path("c.json")},
+        {"on_error": "go"},
+        {"tolerance": 0.7},
     ],
-)  # fmt: skip
+)
 def test_wrong_options_are_wrong_use(options):
     with pytest.raises(UsageError):
         VideoOptions(**options).check()
@@ -409,13 +432,18 @@ def test_views_belong_to_the_frames_that_are_used(tmp_path):
 @pytest.mark.parametrize(
     ("cameras", "message"),
     [
-        ("{}", "list of cameras"), ("[]", "list of cameras"), ("[1", "not readable JSON"), ('[{"azimuth": 1}]', "camera 0"),
-        ('[{"azimuth": 1, "elevation": "x"}]', "finite number"), ('[{"azimuth": 1, "elevation": NaN}]', "finite number"),
+        ("{}", "list of cameras"),
+        ("[]", "list of cameras"),
+        ("[1", "not readable JSON"),
+        ('[{"azimuth": 1}]', "camera 0"),
+        ('[{"azimuth": 1, "elevation": "x"}]', "finite number"),
+        ('[{"azimuth": 1, "elevation": NaN}]', "finite number"),
         ('[{"azimuth": 1, "elevation": 1, "fov": 3}]', "camera 0"),
         ('[{"azimuth": 1, "elevation": 1, "role": "reference"}]', "train or test"),
-        ('[{"azimuth": 1, "elevation": 95}]', "-90"), ('[{"azimuth": 1, "elevation": 1}]', "3 folders of 6 pictures"),
+        ('[{"azimuth": 1, "elevation": 95}]', "-90"),
+        ('[{"azimuth": 1, "elevation": 1}]', "3 folders of 6 pictures"),
     ],
-)  # fmt: skip
+)
 def test_bad_cameras_of_views(tmp_path, cameras, message):
     path = tmp_path / "cameras.json"
     path.write_text(cameras)
@@ -457,10 +485,10 @@ def blender_folder(folder: Path, cameras: int = 3, frames: int = 3, moving_camer
             pose[:3] = np.column_stack([right, np.cross(back, right), back, place])
             ball = np.array([0.2, -0.1, 0.1 + 0.1 * frame])
             x, y, z = pose[:3, :3].T @ (ball - place)
-            centre = (width / 2 + focal * x / -z, height / 2 - focal * y / -z)
+            center = (width / 2 + focal * x / -z, height / 2 - focal * y / -z)
             name = f"train/r_{view}_{frame}"
             (folder / "train").mkdir(parents=True, exist_ok=True)
-            Image.fromarray(disc(centre, 0.4 * focal / -z)).save(folder / f"{name}.png")
+            Image.fromarray(disc(center, 0.4 * focal / -z)).save(folder / f"{name}.png")
             rows.append({"file_path": f"./{name}", "time": frame / (frames - 1), "transform_matrix": pose.tolist()})
         poses.append(pose)
     (folder / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle_x, "frames": rows}))
@@ -482,15 +510,15 @@ def test_known_cameras_are_turned_into_our_world_exactly(tmp_path):
     found = read(clip)
     heights = []
     for frame in range(3):
-        rays, centres = [], []
+        rays, centers = [], []
         for view in range(3):
             u = np.array([*centroid(found[view, frame]), 1])
             ray = header.world_to_camera[view, :3, :3].T @ np.linalg.inv(header.intrinsics[view]) @ u
             rays.append(ray / np.linalg.norm(ray))
-            centres.append(-header.world_to_camera[view, :3, :3].T @ header.world_to_camera[view, :3, 3])
+            centers.append(-header.world_to_camera[view, :3, :3].T @ header.world_to_camera[view, :3, 3])
         across = np.eye(3) - np.einsum("vi,vj->vij", rays, rays)
-        point = np.linalg.solve(across.sum(0), np.einsum("vij,vj->i", across, np.array(centres)))
-        off = [np.linalg.norm(a @ (point - c)) for a, c in zip(across, centres)]
+        point = np.linalg.solve(across.sum(0), np.einsum("vij,vj->i", across, np.array(centers)))
+        off = [np.linalg.norm(a @ (point - c)) for a, c in zip(across, centers)]
         assert max(off) < 0.02 and np.linalg.norm(point) < 0.4
         heights.append(point[1])
     assert (np.diff(heights) > 0.05).all()  # what rises in the scene rises along +y

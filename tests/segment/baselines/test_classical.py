@@ -27,12 +27,12 @@ def no_warnings():
         yield
 
 
-def box_surface(rng: np.random.Generator, count: int, size: tuple, centre: tuple) -> np.ndarray:
+def box_surface(rng: np.random.Generator, count: int, size: tuple, center: tuple) -> np.ndarray:
     size = np.array(size)
     points = rng.uniform(-0.5, 0.5, (count, 3))
     axis = rng.choice(3, count, p=(1 / size) / (1 / size).sum())
     points[np.arange(count), axis] = rng.choice([-0.5, 0.5], count)
-    return points * size + centre
+    return points * size + center
 
 
 def two_boxes(

@@ -33,9 +33,14 @@ def moving(name: str, seed: int, frames: int = 3, points: int = 60, **fields) ->
     clouds = [np.float32(cloud[order] + t * SHIFT) for t, order in enumerate(orders)]
     wrong = [np.ones_like(c) for c in clouds]  # as if the input had a flow of its own
     return CloudSequence.from_frames(
-        name, clouds, track=orders, scene_flow=wrong, time=np.arange(frames) / 10, pose=np.tile(np.eye(4), (frames, 1, 1, 1)),
+        name,
+        clouds,
+        track=orders,
+        scene_flow=wrong,
+        time=np.arange(frames) / 10,
+        pose=np.tile(np.eye(4), (frames, 1, 1, 1)),
         **fields,
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +57,16 @@ def data(tmp_path_factory) -> Path:
 
 
 def estimate(data: object, output: object, **options) -> None:
-    given = {"flow": "nearest", "points": 20, "as_points": False, "split": "all", "seed": 0, "device": "cpu", "jobs": 1,
-             "force": False}  # fmt: skip
+    given = {
+        "flow": "nearest",
+        "points": 20,
+        "as_points": False,
+        "split": "all",
+        "seed": 0,
+        "device": "cpu",
+        "jobs": 1,
+        "force": False,
+    }
     run_flow_estimate(str(data), str(output), **{**given, **options})
 
 
@@ -88,7 +101,7 @@ def test_points_are_drawn_with_their_fields_and_small_frames_stay_whole():
     assert len({tuple(p) for p in drawn.points}) == 25
     np.testing.assert_array_equal(draw_points(sequence, 0, np.random.default_rng(0)).points, sequence.points)
     flow = FlowOfSequence("nearest", points=20)((0, sequence)).scene_flow
-    assert flow.shape == (25, 3) and not flow.any()  # towards the empty frame, and back to it
+    assert flow.shape == (25, 3) and not flow.any()  # toward the empty frame, and back to it
 
 
 def test_the_scale_rule():
@@ -189,7 +202,7 @@ def test_a_trained_estimator_is_loaded_once_and_sees_the_drawn_points(data, tmp_
     from dpcli.segment.flow.flow_network import FlowNetwork
 
     torch.manual_seed(0)
-    model = FlowNetwork(FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbours=6, iterations=2))
+    model = FlowNetwork(FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbors=6, iterations=2))
     torch.nn.init.normal_(model.last.weight, std=0.1)
     model_file.save_flow_model(tmp_path / "best.safetensors", model, {})
     loads, load = [], model_file.load_weights

@@ -98,7 +98,10 @@ def test_a_command_that_fails_deletes_no_network(dpc_here, data, run_folder, tmp
         (("--flow", "nosuch"), "--flow nosuch: expected icp"),
     ):
         done = dpc_here("segment", "train", data, "-o", folder, *TRAIN, "--force", *more)
-        assert done.returncode == 2 and said in done.stderr.decode() and b"--model" not in done.stderr, (more, done.stderr)
+        assert done.returncode == 2 and said in done.stderr.decode() and b"--model" not in done.stderr, (
+            more,
+            done.stderr,
+        )
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before, more
 
 
@@ -109,7 +112,9 @@ def test_a_killed_run_ends_like_an_uninterrupted_one(data, run_folder, tmp_path)
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
     codes = []
     for number, wait_for in ((signal.SIGTERM, "flows.npy"), (signal.SIGKILL, "state.pt")):
-        process = subprocess.Popen([str(w) for w in command], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            [str(w) for w in command], env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+        )
         deadline = time.time() + 120
         while not (folder / wait_for).exists() and process.poll() is None and time.time() < deadline:
             time.sleep(0.02)
@@ -132,7 +137,9 @@ def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tm
     predict = ("segment", "predict", data, "--model", run_folder, "--flow", "nearest", "--points", 48, "--pairs", "all")
     done = dpc(*predict, "-o", tmp_path / "parts.h5", "--picture", tmp_path / "parts.png", "--ply", tmp_path / "ply")
     assert done.returncode == 0, done.stderr.decode()
-    assert (tmp_path / "parts.png").read_bytes()[:4] == b"\x89PNG" and len(list((tmp_path / "ply").rglob("*.ply"))) == 18
+    assert (tmp_path / "parts.png").read_bytes()[:4] == b"\x89PNG" and len(
+        list((tmp_path / "ply").rglob("*.ply"))
+    ) == 18
     piped = dpc(*predict, "-o", "-")
     assert piped.returncode == 0
     judged = dpc("evaluate", "segmentation", "-", "--truth", data, "--json", stdin=piped.stdout)
@@ -149,7 +156,9 @@ def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tm
 
 @pytest.mark.parametrize("method", ["dbscan", "ward", "ssc", "trajaffn"])
 def test_classical_methods_write_the_same_kind_of_file(dpc_here, data, tmp_path, method):
-    done = dpc_here("segment", "predict", data, "--method", method, "--flow", "nearest", "-o", tmp_path / "p.h5", "--split", "test")
+    done = dpc_here(
+        "segment", "predict", data, "--method", method, "--flow", "nearest", "-o", tmp_path / "p.h5", "--split", "test"
+    )
     assert done.returncode == 0, done.stderr.decode()
     with PartsReader(tmp_path / "p.h5") as reader:
         assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
@@ -211,8 +220,8 @@ def true_flows(sequence: CloudSequence, scale: float):
     from dpcli.segment.frame_pairs import frame_parts, true_flow
 
     clouds = [sequence.frame(t) for t in range(sequence.num_frames)]
-    centre = np.concatenate(clouds).mean(0)
-    whole = [(c - centre) * scale for c in clouds]
+    center = np.concatenate(clouds).mean(0)
+    whole = [(c - center) * scale for c in clouds]
 
     def which(points):
         return int(np.argmin([np.abs(c[0] - points[0].numpy()).max() for c in whole]))
@@ -235,7 +244,7 @@ def test_motions_are_the_true_ones_in_the_inputs_own_coordinates(pairs):
     sequence.points = np.float32(sequence.points * 7 + [100, -50, 3])
     sequence.pose[:, :, :3, 3] = sequence.pose[:, :, :3, 3] * 7 + [100, -50, 3]
     scale = sequence_scale([sequence.frame(t) for t in range(3)])
-    options = Refinement(pairs=pairs, icp=0, vote=False)  # where parts touch, a neighbour frame votes otherwise
+    options = Refinement(pairs=pairs, icp=0, vote=False)  # where parts touch, a neighbor frame votes otherwise
     labels, sample = predict_parts(sequence, 0, two_halves, true_flows(sequence, scale), options, 0)
     assert rand_index(torch.tensor(labels), torch.tensor(np.int64(sequence.part))) == 1
     for (i, j), motion, flow in zip(sample.pairs, sample.motion, sample.flow):
@@ -257,10 +266,12 @@ def test_frames_without_points_change_nothing_for_the_others(empty, pairs):
     holed = CloudSequence.from_frames("d", clouds)
 
     def halves_and_flow(found: list):
-        """Masks from the points; flow from nearest neighbours; and what was asked for."""
+        """Masks from the points; flow from nearest neighbors; and what was asked for."""
+
         def estimate(first, second):
             found.append((len(first), len(second)))
             return torch.full_like(first, 0.01 * len(found)), torch.full_like(second, -0.01)
+
         return estimate
 
     asked, same = [], []
@@ -395,7 +406,19 @@ def test_the_way_back_ends_where_the_way_there_began():
 
 def test_supervised_training_learns_from_scene_flow(flow_data, tmp_path):
     def train(data: Path, name: str):
-        words = ("-o", tmp_path / name, "--supervised", "--points", 48, "--batch", 2, "--epochs", 1, "--pairs-per-epoch", 2)
+        words = (
+            "-o",
+            tmp_path / name,
+            "--supervised",
+            "--points",
+            48,
+            "--batch",
+            2,
+            "--epochs",
+            1,
+            "--pairs-per-epoch",
+            2,
+        )
         return CliRunner().invoke(app, ["segment", "train", str(data), *map(str, words)])
 
     assert train(flow_data, "run").exit_code == 0
@@ -479,22 +502,35 @@ def test_a_flow_estimator_is_trained_and_used(dpc, data, tmp_path):
 
 @pytest.mark.parametrize(
     "words",
-    [("--group", "foo"), ("--pooling", "foo"), ("--smooth", "-1"), ("--cold-start", "-0.5"), ("--motion-after", "-0.1"),
-     ("--lr", "0"), ("--lr", "1e+300"), ("--tau", "0"), ("--loss", "foo"), ("--consensus", "foo")],
-)  # fmt: skip
+    [
+        ("--group", "foo"),
+        ("--pooling", "foo"),
+        ("--smooth", "-1"),
+        ("--cold-start", "-0.5"),
+        ("--motion-after", "-0.1"),
+        ("--lr", "0"),
+        ("--lr", "1e+300"),
+        ("--tau", "0"),
+        ("--loss", "foo"),
+        ("--consensus", "foo"),
+    ],
+)
 def test_a_wrong_choice_is_named_before_anything_is_made(words, dpc_here, data, tmp_path):
     done = dpc_here("segment", "train", data, "-o", tmp_path / "model", *TRAIN, *words)
     assert done.returncode == 2 and f"{words[0]} {words[1]}".encode() in done.stderr and b"expected" in done.stderr
     assert not (tmp_path / "model").exists()
 
 
-@pytest.mark.parametrize("words, said", [
-    (("train", "--validation", "drawer", *TRAIN), "--validation drawer: holds out all of the 4 training sequences"),
-    (("predict", "--method", "ward", "--model", "x"), "--model x: --method ward uses no network"),
-    (("predict", "--method", "ward", "--method-option", "max_points=1"), "expected int, 2 or more"),
-    (("predict", "--method", "ward", "--method-option", "threshold=inf"), "expected a positive float"),
-    (("predict", "--method", "ward", "--parts", "40000"), "--parts 40000: more than the 512 points"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (("train", "--validation", "drawer", *TRAIN), "--validation drawer: holds out all of the 4 training sequences"),
+        (("predict", "--method", "ward", "--model", "x"), "--model x: --method ward uses no network"),
+        (("predict", "--method", "ward", "--method-option", "max_points=1"), "expected int, 2 or more"),
+        (("predict", "--method", "ward", "--method-option", "threshold=inf"), "expected a positive float"),
+        (("predict", "--method", "ward", "--parts", "40000"), "--parts 40000: more than the 512 points"),
+    ],
+)
 def test_what_cannot_be_meant_is_refused(words, said, dpc_here, data, tmp_path):
     done = dpc_here("segment", words[0], data, "-o", tmp_path / "out.h5", *words[1:])
     assert done.returncode == 2 and said.encode() in done.stderr, done.stderr

@@ -25,9 +25,12 @@ def panel(rng: np.random.Generator, count: int, corner: list, first: list, secon
 def cabinet(rng: np.random.Generator, count: int = 600) -> tuple[np.ndarray, np.ndarray]:
     """Points on an open box (0), its door (1) and its drawer's front (2), all in the closed position; part of each."""
     box = [
-        ([0, 0, 0], [0.6, 0, 0], [0, 0.4, 0]), ([0, 0, 0.5], [0.6, 0, 0], [0, 0.4, 0]), ([0, 0, 0], [0, 0.4, 0], [0, 0, 0.5]),
-        ([0.6, 0, 0], [0, 0.4, 0], [0, 0, 0.5]), ([0, 0.4, 0], [0.6, 0, 0], [0, 0, 0.5]),
-    ]  # fmt: skip
+        ([0, 0, 0], [0.6, 0, 0], [0, 0.4, 0]),
+        ([0, 0, 0.5], [0.6, 0, 0], [0, 0.4, 0]),
+        ([0, 0, 0], [0, 0.4, 0], [0, 0, 0.5]),
+        ([0.6, 0, 0], [0, 0.4, 0], [0, 0, 0.5]),
+        ([0, 0.4, 0], [0.6, 0, 0], [0, 0, 0.5]),
+    ]
     door, drawer = ([0, 0, 0.2], [0.6, 0, 0], [0, 0, 0.3]), ([0, 0, 0], [0.6, 0, 0], [0, 0, 0.2])
     panels = [*box, door, drawer]
     part = np.array([0] * 5 + [1, 2])
@@ -184,20 +187,20 @@ def test_starts_are_rigid_and_turn_about_their_edges() -> None:
 
 
 def test_turn_agrees_with_scipy() -> None:
-    axis, centre = np.array([[2.0, -1.0, 2.0]]) / 3, np.array([0.3, 0.1, -0.2])
-    motion = starts.turn(axis, np.array([0.7]), centre)[0]
+    axis, center = np.array([[2.0, -1.0, 2.0]]) / 3, np.array([0.3, 0.1, -0.2])
+    motion = starts.turn(axis, np.array([0.7]), center)[0]
     np.testing.assert_allclose(motion[:, :3], Rotation.from_rotvec(0.7 * axis[0]).as_matrix(), atol=1e-12)
-    np.testing.assert_allclose(motion[:, :3] @ centre + motion[:, 3], centre, atol=1e-12)
+    np.testing.assert_allclose(motion[:, :3] @ center + motion[:, 3], center, atol=1e-12)
 
 
 def test_components() -> None:
     points = np.concatenate([np.random.default_rng(0).random((30, 3)) + [x, 0, 0] for x in (0, 10)])
-    neighbours = cKDTree(points).query(points, 6)[1][:, 1:]
+    neighbors = cKDTree(points).query(points, 6)[1][:, 1:]
     chosen = np.ones(60, bool)
-    parts = starts.components(chosen, neighbours)
+    parts = starts.components(chosen, neighbors)
     assert sorted(len(part) for part in parts) == [30, 30]
     chosen[:30] = False
-    assert [part.tolist() for part in starts.components(chosen, neighbours)] == [list(range(30, 60))]
+    assert [part.tolist() for part in starts.components(chosen, neighbors)] == [list(range(30, 60))]
 
 
 def test_every_step_of_the_search_lowers_the_energy(pairs: list[tuple]) -> None:

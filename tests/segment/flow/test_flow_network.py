@@ -20,7 +20,7 @@ from dpcli.segment.flow.model_file import augmented, load_flow_model, save_flow_
 from dpcli.segment.flow.trainer import COLUMNS, chamfer, flow_loss, train_flow
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
-TINY = FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbours=6, iterations=3)
+TINY = FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbors=6, iterations=3)
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -40,15 +40,15 @@ def network(config: FlowConfig = TINY) -> FlowNetwork:
 
 
 def test_set_conv_written_out() -> None:
-    """The split first layer is the layer on [offset, feature]; then the rest, and the maximum over neighbours."""
+    """The split first layer is the layer on [offset, feature]; then the rest, and the maximum over neighbors."""
     torch.manual_seed(1)
     layer = SetConv(5, 7, "layer", 2)
-    points, features, centres = torch.randn(1, 20, 3), torch.randn(1, 20, 5), torch.randn(1, 4, 3)
-    _, idx = knn(centres, points, 6)
+    points, features, centers = torch.randn(1, 20, 3), torch.randn(1, 20, 5), torch.randn(1, 4, 3)
+    _, idx = knn(centers, points, 6)
     weight = torch.cat([layer.place.weight, layer.feature.weight], 1)
-    ours = layer(points, features, idx, centres)
+    ours = layer(points, features, idx, centers)
     for m in range(4):
-        rows = [torch.cat([points[0, j] - centres[0, m], features[0, j]]) for j in idx[0, m]]
+        rows = [torch.cat([points[0, j] - centers[0, m], features[0, j]]) for j in idx[0, m]]
         hidden = layer.rest(layer.first((torch.stack(rows) @ weight.T)[None]))
         torch.testing.assert_close(ours[0, m], hidden[0].amax(0), rtol=0, atol=1e-5)
 
@@ -138,8 +138,16 @@ def train(data: Path, folder: Path, steps: int, stop: StopRequest | None = None,
     run = RunFolder(folder, {"seed": 1}, columns=COLUMNS)
     with CloudsReader(data) as reader:
         return train_flow(
-            reader, run, steps=steps, batch=batch, seed=1, device="cpu", stop=stop or StopRequest(), points=64, log_every=5
-        )  # fmt: skip
+            reader,
+            run,
+            steps=steps,
+            batch=batch,
+            seed=1,
+            device="cpu",
+            stop=stop or StopRequest(),
+            points=64,
+            log_every=5,
+        )
 
 
 class StopAfter(StopRequest):

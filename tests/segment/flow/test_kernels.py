@@ -70,15 +70,15 @@ def test_norm_and_activation_are_the_formulas(shape: tuple[int, ...]) -> None:
 
 
 def test_lloyd_is_k_means_written_out() -> None:
-    points, centre = sphere(90, 7), sphere(5, 8).astype(np.float64)
-    centre[4] = 100.0  # owns no point and stays
-    ours, patch = centre.copy(), np.empty(90, np.int64)
+    points, center = sphere(90, 7), sphere(5, 8).astype(np.float64)
+    center[4] = 100.0  # owns no point and stays
+    ours, patch = center.copy(), np.empty(90, np.int64)
     kernels_icp.lloyd_kernel(points, ours, 4, patch)
     for _ in range(4):
-        own = ((points[:, None] - centre) ** 2).sum(2).argmin(1)
+        own = ((points[:, None] - center) ** 2).sum(2).argmin(1)
         for k in np.unique(own):
-            centre[k] = points[own == k].mean(0)
-    assert np.array_equal(patch, own) and np.allclose(ours, centre, atol=1e-7, rtol=0) and (ours[4] == 100).all()
+            center[k] = points[own == k].mean(0)
+    assert np.array_equal(patch, own) and np.allclose(ours, center, atol=1e-7, rtol=0) and (ours[4] == 100).all()
 
 
 @pytest.mark.parametrize("most", [1, 3, 50])
@@ -105,8 +105,8 @@ def test_nearest_point_is_the_first_of_the_nearest(count: int) -> None:
         assert (at, found) == (distance.argmin(), distance.min())
 
 
-def test_look_up_takes_the_nearest_of_the_neighbours_tried() -> None:
-    """Each point's match, tried alone or among others, is the nearest neighbour of its cell's point."""
+def test_look_up_takes_the_nearest_of_the_neighbors_tried() -> None:
+    """Each point's match, tried alone or among others, is the nearest neighbor of its cell's point."""
     surface = Surface(sphere(200, 2))
     search = surface._search
     points = np.ascontiguousarray(sphere(80, 3).T * np.float32(1.05))
@@ -115,10 +115,10 @@ def test_look_up_takes_the_nearest_of_the_neighbours_tried() -> None:
     kernels_icp._look_up(points, search[0], *search[2:], work, work.view(np.int32), at, far)
     grid, origin, rate = search[4:]
     cell = ((points.T - origin) * rate).astype(int)
-    centre = origin + (cell + 0.5) / rate
-    start = ((centre[:, None] - surface.points) ** 2).sum(2).argmin(1)
+    center = origin + (cell + 0.5) / rate
+    start = ((center[:, None] - surface.points) ** 2).sum(2).argmin(1)
     tried = ((surface.points[search[2][start]] - points.T[:, None]) ** 2).sum(2)
-    assert (at == search[2][start, tried.argmin(1)]).mean() > 0.97  # a cell's centre may lie half-way
+    assert (at == search[2][start, tried.argmin(1)]).mean() > 0.97  # a cell's center may lie half-way
     np.testing.assert_allclose(far, ((surface.points[at] - points.T) ** 2).sum(1), rtol=1e-5, atol=1e-9)
 
 
@@ -131,13 +131,13 @@ def slow_energy(search: _Search, label: np.ndarray, motion: np.ndarray, cost: np
     torn = away = 0.0
     for i, p in enumerate(search.points):
         away += np.linalg.norm(motion[0, :, :3] @ p + motion[0, :, 3] - place[i])
-        for other in label[source.neighbours[i]]:
+        for other in label[source.neighbors[i]]:
             if other != label[i]:
                 gap = np.linalg.norm(motion[other, :, :3] @ p + motion[other, :, 3] - place[i])
                 torn += 1 - options.tear + options.tear * min(gap / 0.15, 1)
     count = len(label)
     own = cost[label, np.arange(count)].mean() + (seen / (seen + search.scale**2)).mean()
-    return own + 0.5 * options.border * torn / source.neighbours.size + options.far * away / count
+    return own + 0.5 * options.border * torn / source.neighbors.size + options.far * away / count
 
 
 def test_energy_is_the_sum_of_its_terms() -> None:

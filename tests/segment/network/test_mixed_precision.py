@@ -21,8 +21,16 @@ CPU = torch.device("cpu")
 
 def small() -> PartConfig:
     layer = lambda c, s, r: Layer(c, s, r, (0.6 * r) ** 2, 16, 0.65 * r)  # noqa: E731
-    return PartConfig(((layer(4, 2, 0.25),), (layer(8, 2, 0.4), layer(8, 1, 0.4))), decoder=((16, 16), (16, 16)), slots=4,
-                      slot_width=16, slot_layers=1, embedding=16, motion_width=8, motion_layers=(8, 8))  # fmt: skip
+    return PartConfig(
+        ((layer(4, 2, 0.25),), (layer(8, 2, 0.4), layer(8, 1, 0.4))),
+        decoder=((16, 16), (16, 16)),
+        slots=4,
+        slot_width=16,
+        slot_layers=1,
+        embedding=16,
+        motion_width=8,
+        motion_layers=(8, 8),
+    )
 
 
 def boxes(count: int, points: int, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -99,8 +107,21 @@ def test_the_loss_falls() -> None:
 
 @pytest.mark.parametrize("words", [["--amp"], []])
 def test_the_switch_reaches_the_file(dpc_here, tmp_path, words: list[str]) -> None:
-    made = dpc_here("prepare", "synthetic", "articulated", "-o", tmp_path / "o.h5", "--objects", 1, "--sequences-per-object", 1,
-               "--frames", 2, "--points", 64)  # fmt: skip
+    made = dpc_here(
+        "prepare",
+        "synthetic",
+        "articulated",
+        "-o",
+        tmp_path / "o.h5",
+        "--objects",
+        1,
+        "--sequences-per-object",
+        1,
+        "--frames",
+        2,
+        "--points",
+        64,
+    )
     assert made.returncode == 0, made.stderr.decode()
     done = dpc_here("segment", "predict", tmp_path / "o.h5", "-o", tmp_path / "p.h5", *words)
     assert done.returncode == 0, done.stderr.decode()

@@ -14,7 +14,7 @@ from dpcli.segment.network.config import Layer, PartConfig, compact, find_config
 from dpcli.segment.network.icosahedron import find_rotation, icosahedral_group, trivial_group
 from dpcli.segment.network.kernel_points import kernel_points
 from dpcli.segment.network.motion_head import MotionHead, mean_rotation, quaternion_to_matrix, relative_labels
-from dpcli.segment.network.neighborhood import first_neighbourhood, nearest_neighbourhood
+from dpcli.segment.network.neighborhood import first_neighborhood, nearest_neighborhood
 from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.network.se3_conv import GroupConv, SpatialConv
 
@@ -35,8 +35,16 @@ def cloud() -> torch.Tensor:
 
 def small(**changes) -> PartConfig:
     layer = lambda c, s, r: Layer(c, s, r, (0.6 * r) ** 2, 16, 0.65 * r)  # noqa: E731
-    config = PartConfig(((layer(4, 2, 0.25),), (layer(8, 2, 0.4), layer(8, 1, 0.4))), decoder=((16, 16), (16, 16)), slots=4,
-                        slot_width=16, slot_layers=1, embedding=16, motion_width=8, motion_layers=(8, 8))  # fmt: skip
+    config = PartConfig(
+        ((layer(4, 2, 0.25),), (layer(8, 2, 0.4), layer(8, 1, 0.4))),
+        decoder=((16, 16), (16, 16)),
+        slots=4,
+        slot_width=16,
+        slot_layers=1,
+        embedding=16,
+        motion_width=8,
+        motion_layers=(8, 8),
+    )
     return dataclasses.replace(config, **changes)
 
 
@@ -66,11 +74,11 @@ def test_kernel_vertices_only_permute_and_uniform_ones_keep_apart():
 
 
 def test_spatial_convolution_equals_the_published_one(golden):
-    """Neighbours, kernel correlations and weights of EPN's inter convolution (golden/multibody_ops.npz)."""
+    """Neighbors, kernel correlations and weights of EPN's inter convolution (golden/multibody_ops.npz)."""
     radius, sigma, count, _ = golden["epn_hyper"]
     points = torch.tensor(golden["epn_xyz"]).mT
-    centres = points[:, golden["epn_sample_idx"][0]]
-    near = first_neighbourhood(points, centres, float(radius), int(count))
+    centers = points[:, golden["epn_sample_idx"][0]]
+    near = first_neighborhood(points, centers, float(radius), int(count))
     assert (near.index.numpy() == golden["epn_nbr_idx"]).all()
     rotations = golden["epn_anchors"].astype(np.float64)
     layer = Layer(5, 2, float(radius), float(sigma), int(count), 1.0)
@@ -115,7 +123,9 @@ def test_kernel_convolution_equals_its_reference_and_its_gradients_do():
     index = torch.randint(0, 30, (2, 70, 5), generator=rng)
     weight = (torch.randn(2, 70, 5, 13, generator=rng) - 0.5).clamp(min=0)
     matrix = torch.randn(39, 4, generator=rng, requires_grad=True)
-    ours, theirs = (f(features, index, weight, slot, matrix) for f in (kernel_convolution, kernel_convolution_reference))
+    ours, theirs = (
+        f(features, index, weight, slot, matrix) for f in (kernel_convolution, kernel_convolution_reference)
+    )
     assert (ours - theirs).abs().max() < 1e-4
     gradient = torch.randn(ours.shape, generator=rng)
     for a, b in zip(*(torch.autograd.grad(out, (features, matrix), gradient) for out in (ours, theirs))):
@@ -180,13 +190,13 @@ def test_a_cloud_s_masks_do_not_depend_on_what_it_is_computed_with(cloud):
     np.testing.assert_allclose(together[:1], alone, atol=1e-5)
 
 
-def test_neighbourhoods_do_not_jump(cloud):
+def test_neighborhoods_do_not_jump(cloud):
     """A point that leaves the ball, or the count, counts nothing there: weights move as little as the point does."""
-    near = nearest_neighbourhood(cloud, cloud[:, :50], 0.3, 16)
-    moved = nearest_neighbourhood(cloud * 1.0001, cloud[:, :50] * 1.0001, 0.3, 16)
+    near = nearest_neighborhood(cloud, cloud[:, :50], 0.3, 16)
+    moved = nearest_neighborhood(cloud * 1.0001, cloud[:, :50] * 1.0001, 0.3, 16)
     assert (near.window.sort(-1).values - moved.window.sort(-1).values).abs().max() < 2e-2
     assert (near.window >= 0).all() and near.window.max() <= 1
-    few = nearest_neighbourhood(cloud[:, :5], cloud[:, :5], 0.3, 16)
+    few = nearest_neighborhood(cloud[:, :5], cloud[:, :5], 0.3, 16)
     assert few.index.shape == (1, 5, 5)
 
 
@@ -196,14 +206,19 @@ def test_counts_of_the_released_and_the_compact_network(cloud):
     assert count_parameters(network) - count_parameters(network.motion) == 1_372_072
     assert paper_parameters(network) == 329_133  # the thesis's 0.31 M
     published = convolution_macs(release(), 512)
-    assert [round(published[key] / 1e6) for key in ("neighbour_sums", "spatial", "group", "shortcut")] == [3431, 4164, 3397, 173]
+    assert [round(published[key] / 1e6) for key in ("neighbor_sums", "spatial", "group", "shortcut")] == [
+        3431,
+        4164,
+        3397,
+        173,
+    ]
     ours = PartNetwork(compact())
     assert count_parameters(ours) <= 250_000
     assert macs(ours, torch.randn(1, 512, 3) * 0.3)["total"] <= 0.92e9
 
 
 def test_motion_head_finds_a_rotation_of_the_group_in_matching_features():
-    """With the right direction, features of the labelled pairs are equal: f2(T R_a) = f1(R_a) (facts 1.7)."""
+    """With the right direction, features of the labeled pairs are equal: f2(T R_a) = f1(R_a) (facts 1.7)."""
     group = icosahedral_group()
     torch.manual_seed(0)
     first = torch.randn(1, 2, 60, 8)  # [B, S, G, D]
@@ -236,7 +251,9 @@ def matrix_to_quaternion(matrix: torch.Tensor) -> torch.Tensor:
     return torch.tensor(Rotation.from_matrix(matrix.numpy()).as_quat()[:, [3, 0, 1, 2]], dtype=torch.float32)
 
 
-@pytest.mark.parametrize("points", [torch.zeros(1, 40, 3), torch.ones(1, 16, 3) * 4, torch.rand(1, 17, 3), torch.rand(1, 2, 3)])
+@pytest.mark.parametrize(
+    "points", [torch.zeros(1, 40, 3), torch.ones(1, 16, 3) * 4, torch.rand(1, 17, 3), torch.rand(1, 2, 3)]
+)
 def test_poor_clouds_give_finite_masks(points):
     with torch.inference_mode():
         mask = PartNetwork(compact()).eval()(points).mask

@@ -26,7 +26,7 @@ from dpcli.segment.training.losses import (
     invariance_loss,
     rigid_loss,
     smoothness_loss,
-    smoothness_neighbours,
+    smoothness_neighbors,
     supervised_loss,
 )
 
@@ -132,9 +132,9 @@ def test_smoothness_by_brute_force() -> None:
         within += [within[0]] * (16 - len(within))
         near += sum(float((mask[0, i] - mask[0, j]).abs().sum()) for j in nearest) / 8
         ball += sum(float((mask[0, i] - mask[0, j]).abs().sum()) for j in within) / 16
-    neighbours = smoothness_neighbours(points)
-    assert float(smoothness_loss(mask, neighbours)) == pytest.approx((3 * near + ball) / 60, rel=1e-5)
-    assert float(smoothness_loss(torch.ones_like(mask), neighbours)) == 0.0
+    neighbors = smoothness_neighbors(points)
+    assert float(smoothness_loss(mask, neighbors)) == pytest.approx((3 * near + ball) / 60, rel=1e-5)
+    assert float(smoothness_loss(torch.ones_like(mask), neighbors)) == 0.0
 
 
 def test_invariance_ignores_the_order_of_slots() -> None:
@@ -184,7 +184,7 @@ def test_supervised_gradient() -> None:
     assert torch.autograd.gradcheck(lambda m: supervised_loss(m, labels, dice_weight=0.3), (mask,))
 
 
-def test_assign_maximises() -> None:
+def test_assign_maximizes() -> None:
     score = torch.tensor(np.random.default_rng(7).normal(size=(4, 4, 4)))
     for item, columns in zip(score, assign(score)):
         best = max(sum(float(item[s, order[s]]) for s in range(4)) for order in permutations(range(4)))
@@ -253,10 +253,10 @@ def test_golden_losses(golden: dict[str, torch.Tensor]) -> None:
     loss.backward()
     torch.testing.assert_close(loss.detach(), golden["dynamic_loss"], rtol=0, atol=1e-6)
     torch.testing.assert_close(mask.grad, golden["dynamic_grad"], rtol=0, atol=1e-6)
-    neighbours = smoothness_neighbours(points)
+    neighbors = smoothness_neighbors(points)
     for weights, name in (((1, 0), "smooth_knn"), ((0, 1), "smooth_ball"), ((3, 1), "smooth_loss")):
-        torch.testing.assert_close(smoothness_loss(mask1, neighbours, weights), golden[name], rtol=0, atol=1e-6)
-    small = smoothness_neighbours(points, k=4, radius=0.05, ball_k=8, ball_radius=0.1)
+        torch.testing.assert_close(smoothness_loss(mask1, neighbors, weights), golden[name], rtol=0, atol=1e-6)
+    small = smoothness_neighbors(points, k=4, radius=0.05, ball_k=8, ball_radius=0.1)
     torch.testing.assert_close(smoothness_loss(flow, small), golden["flow_smooth"], rtol=0, atol=1e-6)
     torch.testing.assert_close(invariance_loss(mask1, mask2), golden["invariance"], rtol=0, atol=1e-5)
     labels = torch.where(golden["sup_valid"] > 0, golden["sup_gt"].argmax(-1), -1)

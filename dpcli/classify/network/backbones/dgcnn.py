@@ -73,8 +73,8 @@ class Dense(nn.Module):
 def image_statistics(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and biased variance (width) of rows (R,C) @ weight.T (C,width), without making it; differentiable."""
     mean = rows.mean(0)
-    centred = rows - mean.detach()  # they sum to zero: no gradient of the covariance passes through the mean
-    covariance = centred.T @ centred / len(rows)
+    centered = rows - mean.detach()  # they sum to zero: no gradient of the covariance passes through the mean
+    covariance = centered.T @ centered / len(rows)
     return weight @ mean, ((weight @ covariance) * weight).sum(1).clamp(min=0)
 
 
@@ -109,7 +109,7 @@ class DenseHead(nn.Module):
 class EdgeConv(nn.Module):
     """h([x_i, x_j - x_i]) with one linear layer, batch norm over all edges and ReLU; the maximum over j.
 
-    W [x_i, x_j - x_i] = W_b x_j + (W_a - W_b) x_i, so both products act on points, before neighbours are gathered.
+    W [x_i, x_j - x_i] = W_b x_j + (W_a - W_b) x_i, so both products act on points, before neighbors are gathered.
     """
 
     def __init__(self, inputs: int, width: int) -> None:
@@ -117,7 +117,7 @@ class EdgeConv(nn.Module):
         self.linear, self.norm = nn.Linear(2 * inputs, width), nn.BatchNorm1d(width, eps=_EPS)
 
     def forward(self, features: Tensor, idx: Tensor) -> Tensor:
-        """(B,N,width) from features (B,N,C) and neighbours idx (B,N,K)."""
+        """(B,N,width) from features (B,N,C) and neighbors idx (B,N,K)."""
         if not self.training:
             neighbor, own = _products(features, *self._folded())
             return torch.relu(pool_edges(neighbor, idx)[0] + own)
@@ -163,7 +163,7 @@ def _products(features: Tensor, weight: Tensor, bias: Tensor) -> tuple[Tensor, T
 def edge_statistics(neighbor: Tensor, own: Tensor, idx: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and biased variance (C) of neighbor_j + own_i over all edges, without making them; differentiable.
 
-    neighbor and own (B,N,C), idx (B,N,K), total (B,N,C) the sum of neighbor over each point's neighbours. Both parts are
+    neighbor and own (B,N,C), idx (B,N,K), total (B,N,C) the sum of neighbor over each point's neighbors. Both parts are
     measured from their means first, so that the difference of squares keeps its digits.
     """
     slots, edges = idx.shape[-1], idx.numel()
@@ -191,7 +191,7 @@ class InputTransform(nn.Module):
         self.matrix = nn.Linear((third, *hidden)[-1], 9)
 
     def forward(self, points: Tensor, idx: Tensor) -> Tensor:
-        """Points (B,N,3), neighbours (B,N,K) -> points (B,N,3) times the matrix."""
+        """Points (B,N,3), neighbors (B,N,K) -> points (B,N,3) times the matrix."""
         pooled = self.point.pool(self.edges.pool(points, points, idx, points))
         matrix = self.matrix(self.hidden(pooled)).view(-1, 3, 3)
         return full_precision(torch.matmul)(points, matrix + torch.eye(3).to(matrix))
@@ -271,7 +271,7 @@ def expect_widths(config: KinetConfig, published: tuple[tuple[int, ...], ...]) -
 
 
 def xavier_init(module: nn.Module) -> None:
-    """Xavier's uniform initialisation of every linear layer, zero biases: that of both published networks."""
+    """Xavier's uniform initialization of every linear layer, zero biases: that of both published networks."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)

@@ -1,7 +1,7 @@
-"""Nearest neighbours in coordinates or features, among the frames near in time: the graph of DGCNN and SpiderCNN; and pooling over it.
+"""Nearest neighbors in coordinates or features, among the frames near in time: the graph of DGCNN and SpiderCNN; and pooling over it.
 
 A static DGCNN or SpiderCNN joins a point to the nearest of the whole clip. A surface over time needs several frames in a
-neighbourhood (thesis eq. 3.1: |dt| <= temporal radius), so here the search is restricted to those; that is ours, like the
+neighborhood (thesis eq. 3.1: |dt| <= temporal radius), so here the search is restricted to those; that is ours, like the
 equal shares, which keep one dense frame from filling all slots. Distances are taken between pairs of frames only.
 """
 
@@ -151,10 +151,10 @@ def _nearest(query: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def pool_edges(values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum and sum over each point's neighbours, both (B,N,C), of values (B,N,C) at idx (B,N,K); differentiable.
+    """Maximum and sum over each point's neighbors, both (B,N,C), of values (B,N,C) at idx (B,N,K); differentiable.
 
     The gathered (B,N,K,C) are never all held: a kernel makes none, torch makes and pools them piece by piece on a CPU.
-    Equally large neighbours share the maximum's gradient, as in torch.amax.
+    Equally large neighbors share the maximum's gradient, as in torch.amax.
     """
     if values.dtype in (torch.float32, torch.float64) and idx.numel() and chosen_backend(values.device) == "numba":
         return _PooledByKernel.apply(values.contiguous(), idx.contiguous())

@@ -1,6 +1,6 @@
 """What Kinet asks of a static network, and where the networks are found: three methods make any of them a backbone.
 
-A backbone turns a clip into class logits on its own (the static stream) and shows the activations of its neighbourhoods
+A backbone turns a clip into class logits on its own (the static stream) and shows the activations of its neighborhoods
 before they are pooled; the dynamic stream fits its surfaces to those. docs/backbones.md writes one from scratch.
 """
 
@@ -26,7 +26,7 @@ BACKBONES = {
 
 @dataclass
 class Grouping:
-    """Centroids of one stage and their neighbours among its points. Frame numbers are float."""
+    """Centroids of one stage and their neighbors among its points. Frame numbers are float."""
 
     points: Tensor  # (B,N,3) what is grouped
     times: Tensor  # (B,N)
@@ -35,17 +35,17 @@ class Grouping:
     idx: Tensor  # (B,M,K) i64 into the N points
 
     def neighbor_times(self) -> Tensor:
-        """Frame number of each neighbour, (B,M,K)."""
+        """Frame number of each neighbor, (B,M,K)."""
         return gather_points(self.times[..., None], self.idx)[..., 0]
 
     def relative(self) -> Tensor:
-        """Neighbour minus centroid, (B,M,K,3)."""
+        """Neighbor minus centroid, (B,M,K,3)."""
         return gather_points(self.points, self.idx) - self.centers[:, :, None]
 
 
 @dataclass
 class Stage:
-    """One set of neighbourhoods and the layers that act on it: activations (B,M,K,C) before pooling, non-negative or not."""
+    """One set of neighborhoods and the layers that act on it: activations (B,M,K,C) before pooling, non-negative or not."""
 
     grouping: Grouping
     activations: list[Tensor]
@@ -62,7 +62,7 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        """Neighbourhoods that follow from positions alone. points (B,N,3) of all frames, times (B,N) their frame numbers."""
+        """Neighborhoods that follow from positions alone. points (B,N,3) of all frames, times (B,N) their frame numbers."""
 
     @abstractmethod
     def forward(self, groups: list[Grouping]) -> Tensor:

@@ -1,4 +1,4 @@
-"""PointNet++ over space-time neighbourhoods: the default backbone."""
+"""PointNet++ over space-time neighborhoods: the default backbone."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from dpcli.ops.grouped_mlp import frozen_activations
 
 @torch.no_grad()
 def group_clip(points: Tensor, times: Tensor, config: KinetConfig, reaches: Sequence[int]) -> list[Grouping]:
-    """Both stages' centroids (farthest points of the union of frames) and space-time neighbours. points (B,N,3), times (B,N).
+    """Both stages' centroids (farthest points of the union of frames) and space-time neighbors. points (B,N,3), times (B,N).
 
-    reaches: frames before and after that neighbours may come from; for each of them both stages, one after the other, about
+    reaches: frames before and after that neighbors may come from; for each of them both stages, one after the other, about
     the same centroids.
     """
     found: list[list[Grouping]] = [[] for _ in reaches]
@@ -45,7 +45,7 @@ def _neighbors(
 
 
 class SetAbstraction(SharedLayers):
-    """The shared layers, max-pooled over each centroid's neighbours."""
+    """The shared layers, max-pooled over each centroid's neighbors."""
 
     def forward(self, group: Grouping, features: Tensor | None) -> Tensor:
         """(B,M,C2) from features (B,N,F) of the points that were grouped."""
@@ -60,9 +60,9 @@ class SetAbstraction(SharedLayers):
 class PointNet2(Backbone):
     """Two set abstractions and a global head; of the config: centroids, neighbors, radii, grouping, widths.
 
-    With `static_temporal_radius` the static stream pools neighbourhoods of its own, such as those within a frame, and sees no
+    With `static_temporal_radius` the static stream pools neighborhoods of its own, such as those within a frame, and sees no
     motion (the text's "identical to common static models"; the release pools what the dynamic stream fits). The dynamic
-    stream then reads the same layers at its neighbourhoods, over what the static stream pooled. `group` gives the static
+    stream then reads the same layers at its neighborhoods, over what the static stream pooled. `group` gives the static
     stream's two stages first, then the dynamic stream's; while the static stream is in training, only its own.
     """
 
@@ -93,12 +93,12 @@ class PointNet2(Backbone):
         second, pooled = self.stage2.taps(groups[1], features)
         logits = self.head(groups[1].centers, pooled)
         shown = groups[2:] or groups
-        if shown is not groups:  # the same layers, at the dynamic stream's neighbours
+        if shown is not groups:  # the same layers, at the dynamic stream's neighbors
             first, second = self.stage1.taps(shown[0], None)[0], self.stage2.taps(shown[1], features)[0]
         return [Stage(group, taps) for group, taps in zip(shown, (first, second))], logits
 
     def macs_as_written(self) -> int:
-        """Multiply-adds of one clip as papers count them: each layer on every gathered neighbour, once."""
+        """Multiply-adds of one clip as papers count them: each layer on every gathered neighbor, once."""
         last = (self.head.linear1, self.head.linear2)
         total = (
             self.config.centroids[1] * sum(layer.weight.numel() for layer in last) + self.head.classify.weight.numel()

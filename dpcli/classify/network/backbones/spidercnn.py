@@ -1,9 +1,9 @@
 """SpiderCNN (Xu et al. 2018) over the points of a clip: the convolution-based backbone of thesis A.1.2.3.
 
-The published classification network on coordinates: neighbours found once, four convolutions whose kernels are a Taylor
-polynomial of the offset times a step function of the neighbour's rank, concatenation, the two largest of each channel,
+The published classification network on coordinates: neighbors found once, four convolutions whose kernels are a Taylor
+polynomial of the offset times a step function of the neighbor's rank, concatenation, the two largest of each channel,
 two hidden layers. 5,834,436 parameters for 20 classes; the thesis's table A.1 implies about 2.8 M, which neither published
-variant has. Ours: neighbours come from the frames within the temporal radius (`frame_graph`).
+variant has. Ours: neighbors come from the frames within the temporal radius (`frame_graph`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def monomials(offsets: Tensor) -> Tensor:
 
 
 class SpiderConv(nn.Module):
-    """sum_k W_k (f_k (x) g(x_k - x_i)) over the neighbours k by distance, group norm, ReLU; g has T Taylor channels."""
+    """sum_k W_k (f_k (x) g(x_k - x_i)) over the neighbors k by distance, group norm, ReLU; g has T Taylor channels."""
 
     def __init__(self, inputs: int, width: int, taylor: int, neighbors: int) -> None:
         super().__init__()
@@ -54,12 +54,12 @@ class SpiderConv(nn.Module):
         nn.init.zeros_(self.taylor.bias)
 
     def forward(self, features: Tensor, idx: Tensor, offsets: Tensor) -> Tensor:
-        """(B,N,width) from features (B,N,C), neighbours idx (B,N,K) and the monomials of their offsets (B,N,K,19)."""
+        """(B,N,width) from features (B,N,C), neighbors idx (B,N,K) and the monomials of their offsets (B,N,K,19)."""
         gathered, taylor = self._factors(features, idx, offsets)
         return self._normed(_RankedProducts.apply(gathered, taylor, self.kernel))
 
     def contributions(self, features: Tensor, idx: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Each neighbour's term of the sum (B,N,K,width), and the layer's output (B,N,width)."""
+        """Each neighbor's term of the sum (B,N,K,width), and the layer's output (B,N,width)."""
         gathered, taylor = self._factors(features, idx, offsets)
         terms = _terms(gathered, taylor, self.kernel)
         return terms, self._normed(terms.sum(2))
@@ -73,7 +73,7 @@ class SpiderConv(nn.Module):
 
 
 def _modulated(gathered: Tensor, taylor: Tensor, k: int) -> Tensor:
-    """Features of the k-th neighbours times each of their Taylor channels, (B,N,C*T)."""
+    """Features of the k-th neighbors times each of their Taylor channels, (B,N,C*T)."""
     return (gathered[:, :, k, :, None] * taylor[:, :, k, None, :]).flatten(2)
 
 
@@ -179,8 +179,8 @@ class SpiderCNN(Backbone):
     the frames; any other: the nearest of all of them), dropout (0.7 as published), and widths: convolutions, number of
     Taylor channels, hidden layers. Radii and centroids have no part: all points are centroids.
 
-    The taps: a convolution pools its neighbourhood by summing, and what it sums is a vector of the layer's own width for
-    each neighbour, as an edge's activation is in DGCNN before the maximum. Norm and ReLU come after the sum and so belong
+    The taps: a convolution pools its neighborhood by summing, and what it sums is a vector of the layer's own width for
+    each neighbor, as an edge's activation is in DGCNN before the maximum. Norm and ReLU come after the sum and so belong
     to the point. (The modulated features before the kernel would be other candidates, but are the layer's input, not its
     response, and T times as wide.)
     """
@@ -194,7 +194,7 @@ class SpiderCNN(Backbone):
         self.convs = nn.ModuleList(SpiderConv(a, b, taylor, config.neighbors) for a, b in zip((3, *widths), widths))
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        """The one graph, by coordinates, neighbours in order of distance."""
+        """The one graph, by coordinates, neighbors in order of distance."""
         config = self.config
         shared = config.grouping == "balanced"
         idx = frame_graph(points, times, config.neighbors, config.temporal_radius, shared)

@@ -19,7 +19,7 @@ from dpcli.classify.network.backbones.spidercnn import SpiderCNN, SpiderConv, _R
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
-from dpcli.classify.network.sync_norm import synchronise_norms
+from dpcli.classify.network.sync_norm import synchronize_norms
 from dpcli.classify.presets import BACKBONE_CHANGES, find_preset, with_backbone
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.mixed_precision import reduced_products
@@ -262,7 +262,7 @@ def test_pooling_in_pieces_is_gather_and_amax_ties_included(backend, monkeypatch
             torch.testing.assert_close(*both)
 
 
-def test_spider_conv_is_a_loop_over_points_and_neighbours():
+def test_spider_conv_is_a_loop_over_points_and_neighbors():
     torch.manual_seed(0)
     layer = trained_norms(SpiderConv(2, 8, 3, 4).double())
     nn.init.normal_(layer.bias)
@@ -320,8 +320,10 @@ def test_a_pooled_dense_layer_is_its_definition(training):
     ours, theirs = layer.pool(values), plain(values).amax(1)
     assert (theirs > 0).any()
     torch.testing.assert_close(ours, theirs)
-    grads = [torch.autograd.grad((out * weight).sum(), [values, *module.parameters()])
-             for out, module in ((ours, layer), (theirs, plain))]  # fmt: skip
+    grads = [
+        torch.autograd.grad((out * weight).sum(), [values, *module.parameters()])
+        for out, module in ((ours, layer), (theirs, plain))
+    ]
     for one, other in zip(*grads):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
     for one, other in zip(layer.buffers(), plain.buffers()):
@@ -413,7 +415,7 @@ def test_norms_over_processes_give_the_same_network(backbone, monkeypatch):
     monkeypatch.setattr("dpcli.classify.network.sync_norm._summed", lambda values: values)
     torch.manual_seed(0)
     plain = trained_norms(build_backbone(tiny(backbone))).train()
-    shared = synchronise_norms(copy.deepcopy(plain))
+    shared = synchronize_norms(copy.deepcopy(plain))
     groups = plain.group(*clip_points(body_like_clip(4, 12, 3)))
     logits, same = plain(groups), shared(groups)
     torch.testing.assert_close(same, logits, rtol=1e-3, atol=1e-4)
@@ -511,7 +513,9 @@ def test_a_model_file_knows_its_backbone(tmp_path):
         assert torch.isfinite(model(clip)[1]).all()
     with pytest.raises(UsageError, match="code of yours.*--backbone tests.support.tiny_backbone:TinyBackbone"):
         load_model(str(paths["tests.support.tiny_backbone:TinyBackbone"]))
-    own = load_model(str(paths["tests.support.tiny_backbone:TinyBackbone"]), "tests.support.tiny_backbone:TinyBackbone")[0]
+    own = load_model(
+        str(paths["tests.support.tiny_backbone:TinyBackbone"]), "tests.support.tiny_backbone:TinyBackbone"
+    )[0]
     assert isinstance(own.static, TinyBackbone)
     mixed = tmp_path / "mixed.safetensors"
     save_model(mixed, Kinet(tiny("dgcnn")), ModelInfo(tiny("spidercnn"), ["a", "b", "c"]))

@@ -1,0 +1,111 @@
+"""The house: which room may import which, how full a folder may be, and that no import goes in a circle."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "dpcli"
+COMMON = {"config_diff", "errors", "file_lock", "path_names", "standard_streams"}  # files that every room may import
+GROUND = {"store", "ops", "runtime", "draw"}
+ALLOWED = {
+    "store": set(),
+    "ops": set(),
+    "runtime": set(),
+    "draw": {"ops", "runtime"},
+    "prepare": GROUND,
+    "classify": GROUND,
+    "segment": GROUND,
+    "generate4d": GROUND,
+    "evaluate": GROUND,
+}
+FULL = 15  # modules in a folder, beside `__init__`
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+MODULES = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def imported(path: Path) -> Iterator[str]:
+    """The modules of the package that a file imports, wherever the import stands."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dpcli"):
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                yield full if full in MODULES else str(node.module)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in MODULES)
+
+
+IMPORTS = {name: set(imported(path)) & set(MODULES) - {name} for name, path in MODULES.items()}
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """The groups of nodes that reach one another, each sorted; none where the graph has no circle."""
+
+    def reachable(start: str) -> set[str]:
+        seen, todo = set(), list(graph[start])
+        while todo:
+            node = todo.pop()
+            if node not in seen:
+                seen.add(node)
+                todo.extend(graph[node])
+        return seen
+
+    reach = {node: reachable(node) for node in graph}
+    groups = {tuple(sorted({node} | {other for other in reach[node] if node in reach[other]})) for node in graph}
+    return sorted(list(group) for group in groups if len(group) > 1)
+
+
+def folders_of(room: str) -> dict[str, set[str]]:
+    """Which folders of a room import which others; files that lie in the room itself belong to none."""
+    inside = {name: name.split(".") for name in MODULES if name.startswith(f"dpcli.{room}.") and name.count(".") > 2}
+    graph: dict[str, set[str]] = {parts[2]: set() for parts in inside.values()}
+    for name, parts in inside.items():
+        graph[parts[2]] |= {inside[other][2] for other in IMPORTS[name] if other in inside} - {parts[2]}
+    return graph
+
+
+@pytest.mark.parametrize("room", ALLOWED)
+def test_a_room_imports_only_what_it_may(room):
+    for name in MODULES:
+        if name.startswith(f"dpcli.{room}"):
+            rooms = {other.split(".")[1] for other in IMPORTS[name] if other != "dpcli"} - {room, *COMMON}
+            assert rooms <= ALLOWED[room], f"{name} imports {sorted(rooms - ALLOWED[room])}"
+
+
+def test_every_room_is_known():
+    rooms = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    assert rooms == {*ALLOWED, "cli", "reproduce"}
+
+
+def test_no_file_imports_itself_through_others():
+    assert circles(IMPORTS) == []
+
+
+@pytest.mark.parametrize("room", [*ALLOWED, "cli"])
+def test_no_folder_of_a_room_imports_itself_through_others(room):
+    assert circles(folders_of(room)) == []
+
+
+def test_circles_are_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+
+
+def test_no_folder_is_too_full():
+    for folder in {path.parent for path in MODULES.values()}:
+        modules = [path for path in folder.glob("*.py") if path.name != "__init__.py"]
+        assert len(modules) <= FULL, f"{folder.relative_to(ROOT)} holds {len(modules)} modules"
+
+
+def test_every_folder_says_what_lives_there():
+    for path in MODULES.values():
+        if path.name == "__init__.py":
+            assert ast.get_docstring(ast.parse(path.read_text())), f"{path.relative_to(ROOT)} has no docstring"
