@@ -8,7 +8,7 @@ from torch.nn.functional import embedding_bag
 
 from dpcli.generate4d.scene.motion import Motion
 from dpcli.ops.farthest_point_sampling import fps
-from dpcli.ops.knn import knn
+from dpcli.ops.nearest_neighbors import knn
 from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix
 
 
