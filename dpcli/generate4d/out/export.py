@@ -6,6 +6,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,31 +18,29 @@ from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 from dpcli.store.pipes import check_replaced
 
-FORMATS = ("ply", "ply-sequence", "splat", "splat-sequence", "clouds", "cameras", "metrics")
-AXES = ("player", "keep")
 _SINGLE = {"ply": write_splat_ply, "splat": write_splat}
 
 
-def visible(scene: GaussianScene, least: float) -> np.ndarray:
-    """Which Gaussians are at least `least` opaque (0..1), indices i64 (M). DataError when none is."""
-    kept = np.flatnonzero(opacity_of(scene.opacity_logit) >= least)
+def opaque_indices(scene: GaussianScene, min_opacity: float) -> np.ndarray:
+    """Return the indices i64 (M) of Gaussians of at least that opacity (0..1). Raises DataError when there is none."""
+    kept = np.flatnonzero(opacity_of(scene.opacity_logit) >= min_opacity)
     if not len(kept):
-        raise DataError(f"no Gaussian is {least:g} opaque or more; the most opaque has {scene.opacity.max():.3g}")
+        raise DataError(f"no Gaussian is {min_opacity:g} opaque or more; the most opaque has {scene.opacity.max():.3g}")
     return kept
 
 
-def thinned(scene: GaussianScene, least: float) -> GaussianScene:
-    """The scene without Gaussians less than `least` opaque; frames, parts, control points and cameras stay."""
-    kept = visible(scene, least)
+def keep_opaque(scene: GaussianScene, min_opacity: float) -> GaussianScene:
+    """Return the scene without Gaussians below that opacity; frames, parts, control points and cameras stay."""
+    kept = opaque_indices(scene, min_opacity)
     if len(kept) == scene.num_gaussians:
         return scene
-    own = {key: getattr(scene, key) for key in scene.__dataclass_fields__}
-    own |= {
-        key: own[key][kept]
-        for key in ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part", "part_probability")
-    }
-    own |= {key: own[key][:, kept] for key in ("frame_mean", "frame_quaternion", "rigid_weight")}
-    return GaussianScene(**own)
+    of_gaussian = ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part", "part_probability")
+    of_frame = ("frame_mean", "frame_quaternion", "rigid_weight")
+    return replace(
+        scene,
+        **{key: getattr(scene, key)[kept] for key in of_gaussian},
+        **{key: getattr(scene, key)[:, kept] for key in of_frame},
+    )
 
 
 def export_file(
@@ -101,18 +100,18 @@ def as_sequence(
     scene: GaussianScene,
     name: str,
     *,
-    least: float = 0.3,
+    min_opacity: float = 0.3,
     points: int | None = None,
     rng: np.random.Generator | None = None,
     axes: str = "player",
 ) -> CloudSequence:
     """The Gaussians' means as a point cloud video: T frames of the same M points.
 
-    Kept: those at least `least` opaque; of them `points` drawn without replacement by `rng`, if there are more. `track`
+    Kept: those of at least `min_opacity`; of them `points` drawn without replacement by `rng`, if there are more. `track`
     is the index of the Gaussian, `part` its rigid part, `pose` the parts' motions, canonical to frame. axes player:
     x right, y down, z away from the reference camera at azimuth 0, as `clouds` have them.
     """
-    kept = visible(scene, least)
+    kept = opaque_indices(scene, min_opacity)
     if points is not None and points < len(kept):
         if rng is None:
             raise UsageError(f"{points} of {len(kept)} points: a generator must draw them")

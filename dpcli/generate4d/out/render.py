@@ -11,14 +11,14 @@ import numpy as np
 import torch
 
 from dpcli.draw.palette import part_colors
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.generate4d.out.camera_paths import Shot
 from dpcli.generate4d.out.picture_colors import weight_colors
+from dpcli.generate4d.render_settings import Color
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import GaussianScene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 
-COLORS = ("appearance", "part", "rigid", "depth")
 _TRAILS = 64  # Gaussians that draw trails in a scene without control points
 _TRAIL_SHARE = 0.4  # of the clip that a trail reaches back
 _FINE = 4  # fractional bits of line ends
@@ -27,15 +27,11 @@ _TRAIL_SHADE = 0.45  # of the part's color, so that trails show on it
 
 @dataclass(frozen=True)
 class Look:
-    """What is drawn: color by `color`; background u8 (r,g,b), None = transparent; trails of control points or not."""
+    """Holds what is drawn: colors, background u8 (r,g,b) or None (transparent), whether trails of control points show."""
 
-    color: str = "appearance"
+    color: Color = "appearance"
     background: tuple[int, int, int] | None = (255, 255, 255)
     trajectories: bool = False
-
-    def __post_init__(self) -> None:
-        if self.color not in COLORS:
-            raise UsageError(f"--color {self.color}: expected one of {', '.join(COLORS)}")
 
 
 class Renderer:

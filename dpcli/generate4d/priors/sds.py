@@ -49,13 +49,13 @@ def guided_noise(conditional: torch.Tensor, unconditional: torch.Tensor, scale: 
     return unconditional + scale * (conditional - unconditional)
 
 
-def distillation_loss(latents: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+def sds_loss(latents: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
     """Scalar whose derivative by latents (B,...) is gradient / B, gradient taken as constant. Its value: |gradient|^2 / 2B."""
     target = (latents - gradient).detach()
     return 0.5 * functional.mse_loss(latents, target, reduction="sum") / len(latents)
 
 
-class Zero123:
+class ScoreDistillation:
     """`Prior` by score distillation. The model is frozen; its conditioning on the video is computed once per frame.
 
     guidance_scale: classifier-free guidance. timestep: "annealed" by progress, or "random", uniform in t_range, one per
@@ -88,7 +88,7 @@ class Zero123:
         self._embedding = self._reference = torch.empty(0)  # [T, E] and [T, 4, h, w]
 
     @classmethod
-    def load(cls, model: str | None, device: str | torch.device = "auto", **options: Any) -> Zero123:
+    def load(cls, model: str | None, device: str | torch.device = "auto", **options: Any) -> ScoreDistillation:
         """From `--prior-model` (a folder or a hub id, see `load_zero123`) and the constructor's options."""
         device = choose_device(device) if isinstance(device, str) else device
         loaded = load_zero123(model, device)
@@ -134,7 +134,7 @@ class Zero123:
             abar = self.model.alphas_cumprod[timestep].to(latents.device)[:, None, None, None]
             noisy = abar.sqrt() * latents + (1 - abar).sqrt() * noise
             gradient = (1 - abar) * (self._noise_prediction(noisy, timestep, cameras, frames) - noise)
-        return distillation_loss(latents, _finite_views(gradient)).to(renders.device)
+        return sds_loss(latents, _finite_views(gradient)).to(renders.device)
 
     def _check(self, renders: torch.Tensor, cameras: Sequence[RelativeCamera], frames: Sequence[int]) -> None:
         if renders.ndim != 4 or renders.shape[-1] != 3 or renders.shape[1] != renders.shape[2]:

@@ -35,13 +35,13 @@ class CanonicalGaussians(nn.Module):
     def __len__(self) -> int:
         return len(self.mean)
 
-    def groups(self, config: FitConfig) -> list[dict]:
+    def parameter_groups(self, config: FitConfig) -> list[dict]:
         """Parameter groups for Adam, named, with their first rates."""
         rates = (config.rate_mean[0], config.rate_scale, config.rate_quaternion, config.rate_opacity, config.rate_color)
         return [{"params": [getattr(self, name)], "lr": rate, "name": name} for name, rate in zip(NAMES, rates)]
 
     @torch.no_grad()
-    def watch(self, gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
+    def add_screen_gradient(self, gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add up screen gradients (C,N,2) of Gaussians that are in a picture, in units of half its width and height."""
         seen = (radii > 0).reshape(*gradient.shape[:2], -1).any(-1)
         size = (gradient * gradient.new_tensor([width / 2, height / 2])).norm(dim=-1)
@@ -49,7 +49,7 @@ class CanonicalGaussians(nn.Module):
         self.seen += seen.sum(0)
 
     @torch.no_grad()
-    def grow_and_prune(
+    def densify_and_prune(
         self, optimizer: torch.optim.Optimizer, config: FitConfig, rng: torch.Generator, grow: bool
     ) -> None:
         """Copy or split the Gaussians with the largest mean screen gradient, then drop the transparent ones.
@@ -72,14 +72,14 @@ class CanonicalGaussians(nn.Module):
         split = new[size[new] > size.median()]
         offset = torch.randn(len(new), 3, generator=rng).to(self.mean.device) * self.log_scale[new].exp()
         offset = rotate(normalize(self.quaternion[new]), offset)
-        self._take(optimizer, torch.cat([old, new]), fresh=len(new))
+        self._keep_rows(optimizer, torch.cat([old, new]), fresh=len(new))
         kept = torch.full((len(mean_gradient),), -1, dtype=torch.long, device=old.device)
         kept[old] = torch.arange(len(old), device=old.device)
         self.mean[len(old) :] += offset * 0.5
         self.log_scale[kept[split]] -= 0.47  # log 1.6
         self.log_scale[len(old) :][torch.isin(new, split)] -= 0.47
 
-    def _take(self, optimizer: torch.optim.Optimizer, index: Tensor, fresh: int) -> None:
+    def _keep_rows(self, optimizer: torch.optim.Optimizer, index: Tensor, fresh: int) -> None:
         """Keep the rows `index` of everything; Adam forgets the last `fresh` of them."""
         for group in optimizer.param_groups:
             name = group.get("name")

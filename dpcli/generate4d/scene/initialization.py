@@ -1,4 +1,4 @@
-"""Where the first Gaussians are put: in a sphere, in the inflated silhouette of one view, or in the hull of several.
+"""The first Gaussians of a fit: in a sphere, in the inflated silhouette of one view, or in the visual hull of several.
 
 A single view says nothing about depth: a fit that starts from a sphere settles on any shape with that picture, most of
 them flat. Inflation gives every silhouette point a thickness by its distance from the outline, as a drawing is read.
@@ -11,16 +11,42 @@ import torch
 from torch import Tensor
 
 from dpcli.errors import DataError
+from dpcli.generate4d.config import FitConfig
+from dpcli.generate4d.targets import Targets
 
 
-def in_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray:
+def choose_start(config: FitConfig, targets: Targets) -> str:
+    """Return `sphere`, `inflate` or `hull`: what the settings say, else the hull where more than two views carve one."""
+    if config.start != "auto":
+        return config.start
+    return "hull" if targets.num_views > 2 else "inflate"
+
+
+def first_points(
+    kind: str, config: FitConfig, targets: Targets, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:  # [N, 3], [N, 3]
+    """Return positions and colors (0..1), f32, of the first Gaussians of the kind that `choose_start` returns."""
+    if kind == "sphere":
+        points = sample_sphere(config.gaussians, config.start_radius, rng)
+        return torch.from_numpy(points), torch.full((len(points), 3), 0.5)
+    reference, frame = targets.reference, targets.widest_frame()
+    if kind == "inflate":
+        camera = targets.intrinsics[reference], targets.world_to_camera[reference]
+        points, colors = inflate_silhouette(targets.picture(reference, frame), *camera, config.gaussians, rng)
+    else:
+        pictures = [targets.picture(view, frame) for view in range(targets.num_views)]
+        points, colors = carve_hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
+    return torch.from_numpy(points), torch.from_numpy(colors)
+
+
+def sample_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray:
     """Positions f32 (count,3), uniform in the volume of a sphere about the origin."""
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return (direction * radius * np.cbrt(rng.random((count, 1)))).astype(np.float32)
 
 
-def inflated(
+def inflate_silhouette(
     rgba: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and colors (count,3) f32 that fill one picture (H,W,4, 0..1) with round thickness about the origin's depth.
@@ -70,7 +96,7 @@ def ball_thickness(mask: np.ndarray) -> np.ndarray:
     return np.where(mask, ndimage.gaussian_filter(np.sqrt(squared.clip(0.25)), 1.0), 0.0)
 
 
-def hull(
+def carve_hull(
     pictures: list[np.ndarray], intrinsics: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions and colors (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
@@ -85,7 +111,7 @@ def hull(
     kept: list[np.ndarray] = []
     total = 0
     for _ in range(200):
-        points = in_sphere(20_000, 0.85, rng)
+        points = sample_sphere(20_000, 0.85, rng)
         seen = np.stack([_sample(o, points, k, p)[0][:, 3:] for o, k, p in zip(offsets, intrinsics, poses)])
         inside = (seen[..., 0] > 0.5).all(0)
         squared = seen[..., 1] ** 2
