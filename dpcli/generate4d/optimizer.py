@@ -22,6 +22,7 @@ from dpcli.generate4d.scene.initialization import choose_start, first_points, sp
 from dpcli.generate4d.scene.losses import arap_loss, picture_loss, roundness_loss, thickness_loss
 from dpcli.generate4d.scene.model import Instant, Model4D
 from dpcli.generate4d.targets import Targets
+from dpcli.runtime.seeds import Generate4DStream, torch_seed
 
 _REFRESH_EVERY = 50  # steps between two searches for neighbors
 _CARRIERS = 2048  # of the dense stage's Gaussians that the losses on parts and shape look at
@@ -64,9 +65,9 @@ class SceneOptimizer:
 
     def start(self) -> None:
         """Put the first Gaussians and parts where the settings say."""
-        rng = np.random.default_rng(np.random.SeedSequence([self.seed, 4001]))
+        rng = np.random.default_rng(np.random.SeedSequence([self.seed, int(Generate4DStream.FIRST_POINTS)]))
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(np.random.SeedSequence([self.seed, 4002]).generate_state(1)[0]))
+            torch.manual_seed(torch_seed(self.seed, Generate4DStream.FIRST_WEIGHTS))
             kind = choose_start(self.config, self.targets)
             mean, color = first_points(kind, self.config, self.targets, rng)
             gaussians = CanonicalGaussians(mean, color, opacity=0.05 if kind == "sphere" else 0.5)
@@ -109,8 +110,7 @@ class SceneOptimizer:
         return result
 
     def _step_generator(self) -> torch.Generator:
-        number = np.random.SeedSequence([self.seed, 4003, self.step]).generate_state(1)[0]
-        return torch.Generator().manual_seed(int(number))
+        return torch.Generator().manual_seed(torch_seed(self.seed, Generate4DStream.STEP, self.step))
 
     def _draw_pictures(self, rng: torch.Generator) -> tuple[list[int], list[int]]:
         """Return views and frames of the step's pictures: the reference in turn with random ones of the given views.

@@ -24,14 +24,14 @@ from dpcli.generate4d.targets import Targets, load_targets
 from dpcli.ops.cameras import orbit_of
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
-from dpcli.runtime.whole_file import whole_file
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import PICTURES, check_target, whole_file
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin, write_scene
-from dpcli.store.pipes import PICTURES, check_target
+from dpcli.store.writing.already_made import already_made
 
 
 def fit_scene(
@@ -56,8 +56,10 @@ def fit_scene(
     chosen, folder_path = choose_device(device), _run_folder(output, run)
     with input_file(views) as path:
         record = _record(path, config, supervision, seed)
-        if output != "-" and Path(output).exists() and not force:
-            _finished_before(Path(output), record)
+        refusal = "exists already and is no scene of this fit; --force replaces it"
+        made = output != "-" and not force
+        if made and already_made(Path(output), {"config": record}, scene_origin, refusal, ["config"]):
+            log.info(f"{output}: this fit is finished; --force fits again")
             if picture is not None:
                 write_preview(read_scene(Path(output)), _load(path, config, supervision), picture)
             return
@@ -128,17 +130,6 @@ def _write(output: str, scene: GaussianScene, targets: Targets, entry: dict, see
             length_unit=targets.length_unit,
             force=force,
         )
-
-
-def _finished_before(output: Path, record: dict) -> None:
-    """Nothing to fit when the file there is this very fit; UsageError when it is anything else."""
-    try:
-        history = scene_origin(output)[1]
-    except DataError:
-        history = []
-    if not history or history[-1].get("config") != record:
-        raise UsageError(f"{output}: exists already and is no scene of this fit; --force replaces it")
-    log.info(f"{output}: this fit is finished; --force fits again")
 
 
 def _run_folder(output: str, run: str | None) -> Path:
