@@ -1,4 +1,4 @@
-"""Pictures out, one at a time: a video (.mp4), an animation (.gif), a picture (.png) or a folder of pictures."""
+"""Writing pictures one after the other: as a video (.mp4), an animation (.gif), a picture (.png) or a folder."""
 
 from __future__ import annotations
 
@@ -14,11 +14,17 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import check_replaced, whole_file
 
 KINDS = (".mp4", ".gif", ".png")
-_QUALITY = 18  # x264's constant rate factor: visually lossless
+_X264 = ("-crf", "18", "-preset", "veryfast", "-threads", "2", "-movflags", "+faststart")  # crf 18: visually lossless
+_COLORS = 255  # of an animation
+_PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from
 
 
 def output_kind(path: Path) -> str:
-    """.mp4, .gif, .png, or "" for a folder; UsageError for anything else."""
+    """Return .mp4, .gif, .png, or "" for a folder. Raises UsageError for anything else.
+
+    >>> output_kind(Path("turn.GIF")), output_kind(Path("frames"))
+    ('.gif', '')
+    """
     kind = path.suffix.lower()
     if kind and kind not in KINDS and not path.is_dir():
         raise UsageError(f"-o {path}: expected a name that ends in {', '.join(KINDS)}, or a folder for pictures")
@@ -61,16 +67,7 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
                 pix_fmt_out="yuv420p",
                 macro_block_size=1,
                 quality=None,
-                output_params=[
-                    "-crf",
-                    str(_QUALITY),
-                    "-preset",
-                    "veryfast",
-                    "-threads",
-                    "2",
-                    "-movflags",
-                    "+faststart",
-                ],
+                output_params=list(_X264),
                 ffmpeg_log_level="error",
             )
             writer.send(None)
@@ -82,7 +79,7 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 
 def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """MPEG-4 part 2, which players read and browsers don't: what OpenCV alone can write."""
+    """Write MPEG-4 part 2, which players read and browsers don't: OpenCV alone can write no other."""
     import cv2
 
     log.warn("mp4 without H.264, so browsers may not play it; pip install imageio-ffmpeg")
@@ -95,7 +92,7 @@ def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> No
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
-    """Even width and height, as H.264's 4:2:0 needs: the last column and row are repeated."""
+    """Repeat the last column and row where width and height are odd: H.264's 4:2:0 needs even ones."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -103,7 +100,10 @@ def _even(picture: np.ndarray) -> np.ndarray:
 def _gif(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     from PIL import Image
 
-    images = [Image.fromarray(picture).quantize(128) for picture in pictures]
+    whole = list(pictures)
+    chosen = np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1)
+    table = Image.fromarray(chosen).quantize(_COLORS)  # one for all pictures, so that nothing flickers
+    images = [Image.fromarray(picture).quantize(palette=table, dither=Image.Dither.NONE) for picture in whole]
     pause = max(2, round(100 / fps)) * 10  # milliseconds; GIF counts in hundredths and players slow down below two
     images[0].save(path, save_all=True, append_images=images[1:], duration=pause, loop=0, disposal=1)
 

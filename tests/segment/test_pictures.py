@@ -12,7 +12,8 @@ from PIL import Image
 
 from dpcli.draw.palette import PALETTE, UNKNOWN, part_colors
 from dpcli.draw.ply import write_ply, write_ply_frames
-from dpcli.draw.shaded_points import FINE, _ball, draw_balls, view_matrix
+from dpcli.draw.points import FINE, Raster, _lit_ball, draw_balls
+from dpcli.draw.view import turntable_view
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.open3d_import import load_open3d
 from dpcli.segment.pictures import Look, matched_ids, parts_picture, there_and_back, turntable
@@ -31,12 +32,12 @@ def sequence() -> CloudSequence:
 def test_view_is_a_rotation_with_up_upwards() -> None:
     for up, axis in (("z", (0, 0, 1)), ("-y", (0, -1, 0)), ("x", (1, 0, 0))):
         for azimuth in np.linspace(-3, 3, 7):
-            view = view_matrix(azimuth, 0.4, up)
+            view = turntable_view(azimuth, 0.4, up)
             np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
             assert np.linalg.det(view) == pytest.approx(1)
             right, down, away = view @ np.array(axis)
             assert abs(right) < 1e-12 and down < 0 and away < 0  # seen from above, upright tips toward the viewer
-    np.testing.assert_allclose(view_matrix(np.pi / 2, 0, "z"), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(turntable_view(np.pi / 2, 0, "z"), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
 
 
 def test_the_nearest_ball_wins_whatever_the_order() -> None:
@@ -45,7 +46,8 @@ def test_the_nearest_ball_wins_whatever_the_order() -> None:
     points = np.concatenate([rng.uniform(-1, 1, (40, 2)), rng.permutation(40)[:, None]], 1)
     colors = np.eye(3)[rng.integers(0, 3, 40)] * 255
     picture = [
-        draw_balls(points[o], colors[o], (60, 50), np.zeros(2), 22, WHITE) for o in (slice(None), slice(39, None, -1))
+        draw_balls(points[o], colors[o], Raster(60, 50, np.zeros(2), 22), WHITE)
+        for o in (slice(None), slice(39, None, -1))
     ]
     np.testing.assert_array_equal(*picture)
     drawn = picture[0].astype(int)
@@ -71,12 +73,12 @@ def test_the_nearest_ball_wins_whatever_the_order() -> None:
 
 def test_the_far_fades_and_the_light_comes_from_above() -> None:
     points, colors = np.array([[-1, 0, 0], [1, 0, 5.0]]), np.zeros((2, 3))
-    image = draw_balls(points, colors, (80, 40), np.zeros(2), 15, WHITE)
+    image = draw_balls(points, colors, Raster(80, 40, np.zeros(2), 15), WHITE)
     assert image[:, :40].min() == 0 and image[:, 40:].min() > 50
-    offsets, light = _ball(9.0)
+    offsets, light = _lit_ball(9.0)
     assert len(light) == pytest.approx(np.pi * 81, rel=0.05) and 0.5 <= light.min() < 0.6 < 0.95 < light.max() <= 1
     assert light[offsets[:, 1] < 0].mean() > light[offsets[:, 1] > 0].mean() + 0.1
-    assert (draw_balls(points[:0], colors[:0], (8, 6), np.zeros(2), 1, WHITE) == 255).all()
+    assert (draw_balls(points[:0], colors[:0], Raster(8, 6, np.zeros(2), 1), WHITE) == 255).all()
 
 
 def test_colors_are_apart_also_for_the_color_blind() -> None:

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from dpcli.draw.animation import output_kind, write_pictures
+from dpcli.draw.palette import LIGHT
+from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.camera_paths import Lens, default_rate, plan_shots
 from dpcli.generate4d.out.picture_colors import parse_background
@@ -25,7 +27,6 @@ from dpcli.store.gaussians import read_scene, scene_origin
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
 _SHEET_SIDE = 160  # pixels of its pictures
-_WHITE = (255, 255, 255)
 
 
 def render_scene(
@@ -72,7 +73,7 @@ def _check_views(output: str | None, settings: RenderSettings, look: Look, *, ha
     unused = settings.changed("path", "frames", "fps")
     if not has_sheet:  # which has use for these
         unused += settings.changed("azimuth", "elevation", "radius", "fovy", "size", "time")
-        unused += ["background"] if look.background not in (None, _WHITE) else []
+        unused += ["background"] if look.background not in (None, LIGHT.background) else []
     if unused:
         raise UsageError(
             f"{', '.join(unused)}: not with --cameras, whose file says from where, how large and when every picture"
@@ -119,9 +120,7 @@ def _render_views(
 
 def _render_sheet(renderer: Renderer, look: Look, picture: Path, settings: RenderSettings) -> None:
     """Write the contact sheet: the reference camera and three more around the object as rows, instants as columns."""
-    from dpcli.generate4d.out.render import sheet
-
-    look = replace(look, background=look.background or _WHITE)
+    look = replace(look, background=look.background or LIGHT.background)
     scene, lens, time = renderer.scene, _lens(settings), settings.time
     lens = replace(lens, size=lens.size or _SHEET_SIDE)
     count = min(settings.columns, scene.num_frames)
@@ -131,5 +130,6 @@ def _render_sheet(renderer: Renderer, look: Look, picture: Path, settings: Rende
     for degrees in _SHEET_AROUND:
         turned = replace(lens, azimuth=azimuth + math.radians(degrees))
         shots = [plan_shots(scene, "fixed", turned, time=float(instant), frames=1)[0] for instant in instants]
-        rows.append((f"{math.degrees(turned.azimuth):+.0f}°", list(renderer.pictures(shots, look))))
-    write_pictures(picture, [sheet(rows, [f"{instant:.2f} s" for instant in instants])], 1, force=True)
+        title, marks = f"azimuth {math.degrees(turned.azimuth):+.0f}°", [f"{instant:.2f} s" for instant in instants]
+        rows.append(SheetRow(title, marks, list(renderer.pictures(shots, look))))
+    save_picture(contact_sheet(rows, LIGHT), picture)

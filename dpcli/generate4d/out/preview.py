@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from dpcli.draw.palette import part_colors
+from dpcli.draw.sheet import save_picture
 from dpcli.generate4d.out.picture_colors import weight_colors
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting.rasterization import rasterization
-from dpcli.runtime.whole_file import whole_file
 from dpcli.store.gaussians import SH_C0, GaussianScene
 
 
@@ -64,8 +64,6 @@ def write_preview(
     fitted: Model4D | GaussianScene, targets: Targets, path: Path, columns: int = 5, side: int = 128
 ) -> None:
     """Rows: input, render, parts in color, rigid weight, a view from 60 degrees to the side; columns: times."""
-    import imageio.v3 as imageio
-
     frames = np.unique(np.linspace(0, targets.num_frames - 1, columns).round().astype(int)).tolist()
     shrink = max(targets.size[1] // side, 1)
     wanted, intrinsics, poses = targets.at([targets.reference] * len(frames), frames, shrink)
@@ -106,5 +104,4 @@ def write_preview(
         draw(own_color, aside),
     ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
-    with whole_file(path) as part:
-        imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().cpu().numpy())
+    save_picture((sheet.clamp(0, 1) * 255).round().byte().cpu().numpy(), path)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from dpcli.draw.palette import part_colors
-from dpcli.errors import DataError
 from dpcli.generate4d.out.camera_paths import Shot
 from dpcli.generate4d.out.picture_colors import weight_colors
 from dpcli.generate4d.render_settings import Color
@@ -151,23 +150,3 @@ def render_views(renderer: Renderer, header: ViewsHeader, path: Path, look: Look
             for frame, time in enumerate(header.time.tolist()):
                 shot = Shot(time, pose, lens, tuple(header.size))
                 writer.add(view, frame, renderer.picture(shot, look))
-
-
-def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]) -> np.ndarray:
-    """A contact sheet u8 (H,W,3): rows of (name, pictures u8 (h,w,3) of one size), column titles above."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    if not rows or not rows[0][1]:
-        raise DataError("a contact sheet needs at least one picture")
-    gap, left, top = 4, 96, 22
-    height, width = rows[0][1][0].shape[:2]
-    page = Image.new("RGB", (left + len(titles) * (width + gap), top + len(rows) * (height + gap)), (255, 255, 255))
-    draw, font = ImageDraw.Draw(page), ImageFont.load_default(size=13)
-    for column, title in enumerate(titles):
-        draw.text((left + column * (width + gap) + width // 2, 4), title, fill=(60, 64, 72), font=font, anchor="ma")
-    for place, (name, pictures) in enumerate(rows):
-        y = top + place * (height + gap)
-        draw.text((6, y + height // 2), name, fill=(60, 64, 72), font=font, anchor="lm")
-        for column, picture in enumerate(pictures):
-            page.paste(Image.fromarray(picture), (left + column * (width + gap), y))
-    return np.asarray(page)

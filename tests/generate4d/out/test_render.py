@@ -16,7 +16,7 @@ from dpcli.draw.palette import PALETTE, part_colors
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, plan_shots
 from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colors
-from dpcli.generate4d.out.render import Look, Renderer, render_views, sheet
+from dpcli.generate4d.out.render import Look, Renderer, render_views
 from dpcli.generate4d.render_settings import CATALOG
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
@@ -312,15 +312,6 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
     assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
 
 
-def test_a_sheet_has_its_pictures_in_rows(renderer):
-    pictures = _moving(3)
-    page = sheet([("front", pictures), ("back", pictures[::-1])], ["0 s", "1 s", "2 s"])
-    np.testing.assert_array_equal(page[22 : 22 + 31, 96 : 96 + 40], pictures[0])
-    np.testing.assert_array_equal(page[22 + 35 : 22 + 66, 96 + 88 : 96 + 128], pictures[0])
-    with pytest.raises(DataError, match="at least one"):
-        sheet([], [])
-
-
 def test_the_command_draws_and_refuses(scene, tmp_path):
     import cv2
     from typer.testing import CliRunner
@@ -351,7 +342,7 @@ def test_the_command_draws_and_refuses(scene, tmp_path):
     )
     assert done.exit_code == 0, done.exception
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 7
-    assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (22 + 4 * (32 + 4), 96 + 3 * (32 + 4))
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (4 + 4 * (32 + 22), 4 + 3 * (32 + 4))
     for more, says in (
         ([str(tmp_path / "b.mp4"), "--background", "none"], "has no transparency"),
         ([str(tmp_path / "b.mp4"), "--cameras", str(tmp_path / "s.h5")], "-o FILE.h5"),
