@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from dpcli.draw.sheet import save_figure
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -44,7 +46,10 @@ class Panel:
 
 
 def draw_learning_curves(rows: Sequence[Mapping[str, Any]], panels: Sequence[Panel], path: Path, x: str) -> None:
-    """Write the panels side by side as a PNG; x: the column of the horizontal axis. Values of None are left out."""
+    """Write the panels side by side as a PNG; x: the column of the horizontal axis. Values of None are left out.
+
+    Raises DataError when it can't be written.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -63,7 +68,7 @@ def draw_learning_curves(rows: Sequence[Mapping[str, Any]], panels: Sequence[Pan
             right.set(ylabel=panel.right_label, ylim=panel.right_range)
         if len(lines) > 1:
             axes.legend(lines, [line.get_label() for line in lines], frameon=False, fontsize=8)
-    figure.savefig(path, format="png", dpi=120)
+    save_figure(figure, path, 120)
 
 
 def _plot(axes: Axes, rows: Sequence[Mapping[str, Any]], curves: Sequence[Curve], x: str) -> list[Any]:
