@@ -20,7 +20,7 @@ _PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen fr
 
 
 def output_kind(path: Path) -> str:
-    """Return .mp4, .gif, .png, or "" for a folder. Raises UsageError for anything else.
+    """Returns .mp4, .gif, .png, or "" for a folder. Raises UsageError for anything else.
 
     >>> output_kind(Path("turn.GIF")), output_kind(Path("frames"))
     ('.gif', '')
@@ -32,7 +32,7 @@ def output_kind(path: Path) -> str:
 
 
 def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, force: bool = False) -> None:
-    """Write u8 pictures (H,W,3), or (H,W,4) for .png and folders, all of one size, to what the name says.
+    """Writes u8 pictures (H,W,3), or (H,W,4) for .png and folders, all of one size, to what the name says.
 
     A .png takes the first one. Nothing half-written stays under the name. UsageError when it exists and `force` is off.
     """
@@ -79,7 +79,7 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 
 def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write MPEG-4 part 2, which players read and browsers don't: OpenCV alone can write no other."""
+    """Writes MPEG-4 part 2, which players read and browsers don't: OpenCV alone can write no other."""
     import cv2
 
     log.warn("mp4 without H.264, so browsers may not play it; pip install imageio-ffmpeg")
@@ -92,7 +92,7 @@ def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> No
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
-    """Repeat the last column and row where width and height are odd: H.264's 4:2:0 needs even ones."""
+    """Repeats the last column and row where width and height are odd: H.264's 4:2:0 needs even ones."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 

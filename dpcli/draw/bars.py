@@ -19,7 +19,7 @@ _INCH_PER_ROW = 0.75
 
 @dataclass(frozen=True)
 class Bars:
-    """A panel of bars: a group of them for each title, the first at the top; undefined numbers (nan) have no bar.
+    """Holds a panel of bars: a group of them for each title, the first at the top; undefined numbers (nan) have no bar.
 
     values: name in the legend -> one number for each title. most: the axis reaches at least this far; nothing beyond
     is shown when `cut`.
@@ -32,7 +32,7 @@ class Bars:
     cut: bool = False
 
     def draw(self, axes: Axes) -> None:
-        """Draw the bars on matplotlib's axes."""
+        """Draws the bars on matplotlib's axes."""
         places, height = np.arange(len(self.titles)), 0.8 / len(self.values)
         for number, (name, lengths) in enumerate(self.values.items()):
             offset = (number - (len(self.values) - 1) / 2) * height
@@ -49,7 +49,7 @@ class Bars:
 
 @dataclass(frozen=True)
 class Histogram:
-    """A panel that counts values (N), without undefined ones (nan), in 20 equal bins from 0 to `most`."""
+    """Holds a panel that counts values (N), without undefined ones (nan), in 20 equal bins from 0 to `most`."""
 
     values: np.ndarray
     unit: str
@@ -57,14 +57,14 @@ class Histogram:
     most: float = 100
 
     def draw(self, axes: Axes) -> None:
-        """Draw the histogram on matplotlib's axes."""
+        """Draws the histogram on matplotlib's axes."""
         axes.hist(self.values[~np.isnan(self.values)], bins=np.linspace(0, self.most, 21), color="#4c72b0")
         axes.set_xlabel(self.unit)
         axes.set_ylabel(self.counted)
 
 
 def draw_panels(panels: Sequence[Bars | Histogram], rows: int, headline: str, path: Path) -> None:
-    """Write panels side by side, as high as so many groups of bars need. Raises DataError when it can't be written."""
+    """Writes panels side by side, as high as so many groups of bars need. Raises DataError when it can't be written."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.2 * len(panels), 1.6 + _INCH_PER_ROW * max(rows, 3)), layout="constrained")

@@ -19,7 +19,7 @@ _NARROW, _WIDE = 0.6, 2.0  # a cell's width as a multiple of its height
 
 
 def spread_samples(labels: np.ndarray, count: int) -> list[int]:
-    """Return at most `count` samples: the first of each class (or of evenly chosen classes), then the second of each, ...
+    """Returns at most `count` samples: the first of each class (or of evenly chosen classes), then the second of each, ...
 
     >>> spread_samples(np.array([0, 0, 0, 1, 2, 2]), 4)
     [0, 1, 3, 4]
@@ -38,7 +38,7 @@ def spread_samples(labels: np.ndarray, count: int) -> list[int]:
 
 
 def clouds_sheet(reader: CloudsSource, path: Path, samples: int = 8, frames: int = 8, view: str | None = None) -> None:
-    """Write the sheet to `path`. Color: the file's own, else the rigid part, else depth (bright = near).
+    """Writes the sheet to `path`. Color: the file's own, else the rigid part, else depth (bright = near).
 
     The scale is the same within a row. Reads only the frames it shows. Raises DataError when the picture can't be written.
     """
@@ -66,13 +66,13 @@ def _row_title(reader: CloudsSource, index: int) -> str:
 
 
 def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return center and extent (2) of what is seen, without the farthest thousandth on each side (stray points)."""
+    """Returns center and extent (2) of what is seen, without the farthest thousandth on each side (stray points)."""
     low, high = np.percentile(points[:, :2], [0.1, 99.9], axis=0)
     return (low + high) / 2, np.maximum((high - low) * 1.1, 1e-6)
 
 
 def _cell_width(rows: list[np.ndarray]) -> int:
-    """Return one width for all cells, such that the widest row fills its cells."""
+    """Returns one width for all cells, such that the widest row fills its cells."""
     aspects = [extent[0] / extent[1] for extent in (_box(points)[1] for points in rows)]
     return int(_HEIGHT * np.clip(max(aspects), _NARROW, _WIDE))
 

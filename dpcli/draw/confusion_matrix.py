@@ -20,7 +20,7 @@ _DARK_SHARE = 0.55  # of a row, above which a cell's number is white
 
 
 def draw_confusion(confusion: np.ndarray, class_names: Sequence[str], headline: str, path: Path) -> None:
-    """Write the picture of a matrix of counts, truth (rows) by prediction (columns), whole numbers (C,C).
+    """Writes the picture of a matrix of counts, truth (rows) by prediction (columns), whole numbers (C,C).
 
     Color is the share of the row's truth, the number in a cell the count. Raises DataError when it can't be written.
     """

@@ -17,7 +17,7 @@ _MARKED = 30  # fewer points than this are marked on their line
 
 @dataclass(frozen=True)
 class Curve:
-    """A line: the log's column, its name in the legend, a factor of its values, matplotlib's name of its color."""
+    """Describes a line: the log's column, its name in the legend, a factor of its values, matplotlib's name of its color."""
 
     column: str
     label: str
@@ -27,7 +27,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """A plot of curves over one column, with a second axis on the right where `right` has curves.
+    """Describes a plot of curves over one column, with a second axis on the right where `right` has curves.
 
     rows: the log's rows that it shows; None: all. range, right_range: lowest and highest value shown, None: as it comes.
     change: where a dotted line stands.
@@ -46,7 +46,7 @@ class Panel:
 
 
 def draw_learning_curves(rows: Sequence[Mapping[str, Any]], panels: Sequence[Panel], path: Path, x: str) -> None:
-    """Write the panels side by side as a PNG; x: the column of the horizontal axis. Values of None are left out.
+    """Writes the panels side by side as a PNG; x: the column of the horizontal axis. Values of None are left out.
 
     Raises DataError when it can't be written.
     """

@@ -18,7 +18,7 @@ class Theme(NamedTuple):
 
     @property
     def page(self) -> RGB:
-        """The ground between the cells of a sheet: a little lighter than a dark cell, as white as a light one."""
+        """The color between the cells of a sheet: a little lighter than a dark cell, white beside a white one."""
         red, green, blue = (min(channel + 10, 255) for channel in self.background)
         return red, green, blue
 
@@ -50,7 +50,7 @@ UNKNOWN = (128, 128, 128)  # of part -1
 
 
 def part_colors(part: np.ndarray) -> np.ndarray:  # [...] -> [..., 3]
-    """Return the color u8 of each part id: the same id has the same color everywhere; -1 is gray, others repeat after 14.
+    """Returns the color u8 of each part id: the same id has the same color everywhere; -1 is gray, others repeat after 14.
 
     >>> part_colors(np.array([0, 14, -1])).tolist()
     [[0, 114, 178], [0, 114, 178], [128, 128, 128]]
@@ -61,7 +61,7 @@ def part_colors(part: np.ndarray) -> np.ndarray:  # [...] -> [..., 3]
 
 
 def heat_colors(values: np.ndarray, low: float = 0.06, high: float = 0.94) -> np.ndarray:  # [N] -> [N, 3]
-    """Return the color u8 of values 0..1 (clamped), blue to red: turbo (Mikhailov 2019) between two of its places.
+    """Returns the color u8 of values 0..1 (clamped), blue to red: turbo (Mikhailov 2019) between two of its places.
 
     >>> heat_colors(np.array([0.0, 1.0])).tolist()
     [[63, 61, 156], [169, 21, 1]]

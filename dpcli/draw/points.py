@@ -28,7 +28,7 @@ class Raster:
     scale: float
 
     def place(self, points: np.ndarray, fine: int = 1) -> np.ndarray:  # [N, 3] -> [N, 2]
-        """Return where points are in pixels from the upper left corner; fine: parts of a pixel in each direction."""
+        """Returns where points are in pixels from the upper left corner; fine: parts of a pixel in each direction."""
         return (points[:, :2] - self.center) * (self.scale * fine) + np.array([self.width, self.height]) * fine / 2
 
 
@@ -38,7 +38,7 @@ def nearest_writes(
     stamp: np.ndarray,  # [K, 2] offsets
     size: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # each [W]
-    """Return columns, rows, indices of points and of offsets of all writes inside a picture, the farthest point first.
+    """Returns columns, rows, indices of points and of offsets of all writes inside a picture, the farthest point first.
 
     Written in this order, each pixel ends with the nearest point, among equally near ones the later.
     """
@@ -57,7 +57,7 @@ def draw_dots(
     relief: bool = True,
     background: RGB = DARK.background,
 ) -> np.ndarray:  # [H, W, 3]
-    """Return an image u8 of points as square dots, colors u8; the nearest dot wins.
+    """Returns an image u8 of points as square dots, colors u8; the nearest dot wins.
 
     side: of a dot in pixels, by default larger where points lie apart. relief: closes gaps of one pixel and shades
     what lies behind its neighbors.
@@ -78,7 +78,7 @@ def draw_dots(
 
 
 def _dot_side(pixels: np.ndarray) -> int:
-    """Return the side of a dot in pixels, 1 to 4: larger when the points lie apart."""
+    """Returns the side of a dot in pixels, 1 to 4: larger when the points lie apart."""
     if len(pixels) < 2:
         return 3
     low, high = np.percentile(pixels, [5, 95], axis=0)
@@ -87,7 +87,7 @@ def _dot_side(pixels: np.ndarray) -> int:
 
 
 def _fill_gaps(image: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Close gaps one pixel wide, left where points on a grid are drawn a little apart."""
+    """Closes gaps one pixel wide, left where points on a grid are drawn a little apart."""
     for _ in range(2):  # rows, then columns
         left, right = depth[:, :-2], depth[:, 2:]
         gap = ~np.isfinite(depth[:, 1:-1]) & np.isfinite(left) & np.isfinite(right)
@@ -98,7 +98,7 @@ def _fill_gaps(image: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _shade_relief(image: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Darken pixels that lie behind their neighbors (eye-dome lighting, Boucheny 2009), so that shape shows."""
+    """Darkens pixels that lie behind their neighbors (eye-dome lighting, Boucheny 2009), so that shape shows."""
     padded = np.pad(depth, 1, constant_values=_FAR)
     drop = np.zeros_like(depth)
     drawn = np.isfinite(depth)
@@ -117,7 +117,7 @@ def draw_balls(
     background: RGB,
     depth: tuple[float, float] | None = None,
 ) -> np.ndarray:  # [H, W, 3]
-    """Return an image u8 of points as lit balls, colors u8, orthographic; the nearest ball wins.
+    """Returns an image u8 of points as lit balls, colors u8, orthographic; the nearest ball wins.
 
     depth: the nearest and farthest "away" for the fading, by default the points' own. The radius follows from the density.
     """
@@ -134,14 +134,14 @@ def draw_balls(
 
 
 def ball_radius(place: np.ndarray, height: int) -> float:  # [N, 2]
-    """Return the radius in pixels with which balls at these places overlap a little, in a picture of that height."""
+    """Returns the radius in pixels with which balls at these places overlap a little, in a picture of that height."""
     low, high = np.percentile(place, [2, 98], axis=0)
     area = float(np.prod(np.maximum(high - low, 1)))
     return float(np.clip(0.65 * np.sqrt(area / len(place)), _SMALLEST, max(_LARGEST * height, _SMALLEST)))
 
 
 def _lit_ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels (K,2) of a ball around its center's, and the light on each, f32 (K), 0..1."""
+    """Returns the pixels (K,2) of a ball around its center's, and the light on each, f32 (K), 0..1."""
     reach = int(radius)
     offsets = np.stack(np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1)), -1).reshape(-1, 2)
     offsets = offsets[(offsets**2).sum(1) <= radius**2]
@@ -152,7 +152,7 @@ def _lit_ball(radius: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _fade(colors: np.ndarray, away: np.ndarray, background: RGB, depth: tuple[float, float] | None) -> np.ndarray:
-    """Return colors f32 (N,3), mixed with the background the more the farther away."""
+    """Returns colors f32 (N,3), mixed with the background the more the farther away."""
     near, far = depth or (float(away.min()), float(away.max()))
     share = _FOG * np.clip((away - near) / max(far - near, 1e-9), 0, 1)[:, None]
     return (colors * (1 - share) + np.array(background) * share).astype(np.float32)

@@ -36,7 +36,7 @@ class CloudsSource(Protocol):
     frame_counts: np.ndarray  # [S]
 
     def read(self, index: int, frames: Any, fields: Any) -> PointSequence:
-        """Return some frames of a sequence with some of its fields."""
+        """Returns some frames of a sequence with some of its fields."""
 
 
 class ViewsSource(Protocol):
@@ -45,4 +45,4 @@ class ViewsSource(Protocol):
     header: Any  # num_views, num_frames, size, role, reference, camera_centers()
 
     def rgba(self, view: int, frame: int) -> np.ndarray:
-        """Return a picture u8 (H,W,4) with straight alpha."""
+        """Returns a picture u8 (H,W,4) with straight alpha."""

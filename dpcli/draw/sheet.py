@@ -28,7 +28,7 @@ class SheetRow(NamedTuple):
 
 
 def contact_sheet(rows: Sequence[SheetRow], theme: Theme = DARK) -> Any:
-    """Return a PIL image of rows of cells, all of one size, each row under its title.
+    """Returns a PIL image of rows of cells, all of one size, each row under its title.
 
     Raises DataError when there is no cell to draw.
     """
@@ -52,7 +52,7 @@ def contact_sheet(rows: Sequence[SheetRow], theme: Theme = DARK) -> Any:
 
 
 def spread_evenly(count: int, most: int) -> list[int]:
-    """Return at most `most` of the numbers 0 to count - 1, evenly spread, the first and the last among them.
+    """Returns at most `most` of the numbers 0 to count - 1, evenly spread, the first and the last among them.
 
     >>> spread_evenly(9, 3), spread_evenly(2, 5), spread_evenly(0, 4)
     ([0, 4, 8], [0, 1], [])
@@ -61,14 +61,14 @@ def spread_evenly(count: int, most: int) -> list[int]:
 
 
 def text_font(size: int) -> Any:
-    """Return the font of all sheets, letters `size` pixels high."""
+    """Returns the font of all sheets, letters `size` pixels high."""
     from PIL import ImageFont
 
     return ImageFont.load_default(size=size)
 
 
 def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB, size: int = 13) -> None:
-    """Write a text in one line on a PIL drawing, shortened to the room (pixels) there is."""
+    """Writes a text in one line on a PIL drawing, shortened to the room (pixels) there is."""
     font = text_font(size)
     while draw.textlength(text, font=font) > room and len(text) > 2:
         text = text[:-2] + "…"
@@ -76,7 +76,7 @@ def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB
 
 
 def save_picture(image: Any, path: Path) -> None:
-    """Write a PIL image, or an array u8 (H,W,3), whole or not at all. Raises DataError when it can't be written."""
+    """Writes a PIL image, or an array u8 (H,W,3), whole or not at all. Raises DataError when it can't be written."""
     from PIL import Image
 
     image = Image.fromarray(image) if isinstance(image, np.ndarray) else image
@@ -88,7 +88,7 @@ def save_picture(image: Any, path: Path) -> None:
 
 
 def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
-    """Write a matplotlib figure, whole or not at all. Raises DataError when it can't be written."""
+    """Writes a matplotlib figure, whole or not at all. Raises DataError when it can't be written."""
     try:
         with whole_file(path) as part:
             figure.savefig(part, dpi=dpi)

@@ -13,7 +13,7 @@ IMAGE_VIEW = "yx-z"  # row, column and a depth that grows toward the viewer
 
 
 def parse_view(text: str) -> np.ndarray:  # [3, 3]
-    """Return the rows of a signed permutation, f32, from names of the axes that point right, down and away.
+    """Returns the rows of a signed permutation, f32, from names of the axes that point right, down and away.
 
     Raises UsageError for a text that doesn't name each axis once.
 
@@ -30,7 +30,7 @@ def parse_view(text: str) -> np.ndarray:  # [3, 3]
 
 
 def default_view(length_unit: str) -> str:
-    """Return the view of a file from its unit: image coordinates (row, column, ...) are turned upright.
+    """Returns the view of a file from its unit: image coordinates (row, column, ...) are turned upright.
 
     >>> default_view("m"), default_view("pixel (row, column), gray level")
     ('xyz', 'yx-z')
@@ -39,7 +39,7 @@ def default_view(length_unit: str) -> str:
 
 
 def turntable_view(azimuth: float, elevation: float, up: str = "z") -> np.ndarray:  # [3, 3]
-    """Return the rows right, down and away, f64, of a camera that looks at the origin.
+    """Returns the rows right, down and away, f64, of a camera that looks at the origin.
 
     azimuth: radians about `up` (x, y, z or one with a minus). elevation: radians above the horizon.
 

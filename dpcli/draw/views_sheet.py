@@ -14,7 +14,7 @@ _HEIGHT = 150  # pixels of a cell
 
 
 def on_white(rgba: np.ndarray) -> np.ndarray:  # [H, W, 4] -> [H, W, 3]
-    """Return a picture u8 with straight alpha on white.
+    """Returns a picture u8 with straight alpha on white.
 
     >>> on_white(np.array([[[200, 0, 0, 0], [200, 0, 0, 255]]], np.uint8)).tolist()
     [[[255, 255, 255], [200, 0, 0]]]
@@ -24,7 +24,7 @@ def on_white(rgba: np.ndarray) -> np.ndarray:  # [H, W, 4] -> [H, W, 3]
 
 
 def views_sheet(reader: ViewsSource, path: Path, samples: int = 8, frames: int = 8) -> None:
-    """Write the sheet to `path`: at most `samples` views (the reference first) and `frames` moments, evenly spread."""
+    """Writes the sheet to `path`: at most `samples` views (the reference first) and `frames` moments, evenly spread."""
     from PIL import Image
 
     header = reader.header
@@ -43,7 +43,7 @@ def views_sheet(reader: ViewsSource, path: Path, samples: int = 8, frames: int =
 
 
 def view_title(reader: ViewsSource, view: int) -> str:
-    """Return a title such as `2 train · azimuth 90, elevation -20`; angles of the camera's place in degrees."""
+    """Returns a title such as `2 train · azimuth 90, elevation -20`; angles of the camera's place in degrees."""
     x, y, z = reader.header.camera_centers()[view]
     azimuth, elevation = np.rad2deg(np.arctan2(x, z)), np.rad2deg(np.arctan2(y, np.hypot(x, z)))
     return f"{view} {reader.header.role[view]} · azimuth {azimuth + 0.0:.0f}, elevation {elevation + 0.0:.0f}"

@@ -17,7 +17,7 @@ Start = Literal["auto", "sphere", "inflate", "hull"]
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a scene is fitted. Lengths are in the scene's unit (the object fits a sphere of 0.75), rates are Adam's.
+    """Holds how a scene is fitted. Lengths are in the scene's unit (the object fits a sphere of 0.75), rates are Adam's.
 
     Weights of losses are those of the thesis (5.4.3 and C.2) where it gives them, else those of SC4D (Wu et al. 2024):
     reconstruction 5000, silhouette a tenth of it, drift of control points 10, as-rigid-as-possible 10.
@@ -121,7 +121,7 @@ class FitConfig:
 
 @dataclass(frozen=True)
 class Supervision:
-    """What tells a fit how the object looks from where nobody filmed it. Raises UsageError for a value that is not legal."""
+    """Holds what guides the sides of the object that nobody filmed. Raises UsageError for a value that is not legal."""
 
     prior: Literal["none", "views", "zero123"] = setting(
         "none",
@@ -177,7 +177,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def resolve_settings(given: Given) -> tuple[FitConfig, Supervision]:
-    """Return the preset's settings with what a user gave over them. Raises UsageError where they don't fit one another.
+    """Returns the preset's settings with what a user gave over them. Raises UsageError where they don't fit one another.
 
     A limit below the number of Gaussians that the preset starts with lowers that number, unless it was given too.
     """

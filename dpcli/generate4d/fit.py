@@ -21,7 +21,7 @@ _AVERAGED = 8  # steps that the log's averages go on with after each row
 
 
 class FitRun:
-    """Runs a `SceneOptimizer` to its last step. `preview(model)` is called five times, the last time at the end."""
+    """Runs a `SceneOptimizer` to its last step. `preview(model)` is called after each fifth of the steps."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class FitRun:
         self._gaussians = 0
 
     def run(self) -> Model4D:
-        """Go from the folder's saved state, or the start, to the last step; return the model, on the fit's device.
+        """Goes from the folder's saved state, or the start, to the last step; returns the model, on the fit's device.
 
         Raises DpcError when the loss is no longer finite, Stopped after a signal, once the state is saved.
         """
@@ -83,7 +83,7 @@ class FitRun:
             self.preview(self.optimizer.model)
 
     def _averages(self) -> dict:
-        """Return the mean loss and PSNR of the latest steps, and the number of Gaussians."""
+        """Returns the mean loss and PSNR of the latest steps, and the number of Gaussians."""
         mean = {key: float(np.mean(values)) for key, values in self.recent.items()}
         psnr = -10 * math.log10(max(mean.get("squared", 1.0), 1e-10))
         return {"loss": round(mean.get("loss", math.nan), 3), "psnr": round(psnr, 2), "gaussians": self._gaussians}

@@ -12,7 +12,7 @@ from dpcli.generate4d.targets import Targets
 
 @torch.no_grad()
 def fitted_psnr(model: Model4D, targets: Targets) -> dict[str, float]:
-    """Return the PSNR in dB of each fitted view on white at the fitted size, mean over its frames.
+    """Returns the PSNR in dB of each fitted view on white at the fitted size, mean over its frames.
 
     Keys are `reference` and `train` with the view's index. The model must be on the CPU.
     """

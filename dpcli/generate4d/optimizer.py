@@ -32,7 +32,7 @@ _SMALLEST, _LARGEST = 1e-4, 0.4  # of a Gaussian, scene units: what a picture ca
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step found: its loss, the squared error of the reference view (nan without one), the Gaussians it had."""
+    """Holds the loss of a step, the reference view's squared error (nan without that view), and how many Gaussians there were."""
 
     loss: float
     squared_error: float
@@ -40,7 +40,7 @@ class StepResult:
 
 
 class SceneOptimizer:
-    """Fits a `Model4D` to pictures with Adam, first its dense stage, then the sparse one (thesis 5.4.4).
+    """Fits a `Model4D` to pictures with Adam, first its dense stage, then the sparse one (thesis 5.4.3.3).
 
     prior: judges random new views (eq. C.11); None: none does. regularize: adds the losses on thickness and roundness.
     `start` or `restore` must be called before the first step.
@@ -64,7 +64,7 @@ class SceneOptimizer:
         self.times = targets.times().to(self.device)
 
     def start(self) -> None:
-        """Put the first Gaussians and parts where the settings say."""
+        """Puts the first Gaussians and parts where the settings say."""
         rng = np.random.default_rng(np.random.SeedSequence([self.seed, int(Generate4DStream.FIRST_POINTS)]))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(torch_seed(self.seed, Generate4DStream.FIRST_WEIGHTS))
@@ -81,7 +81,7 @@ class SceneOptimizer:
         self.optimizer = self._new_optimizer()
 
     def take_step(self) -> StepResult:
-        """Take the next step. Raises FloatingPointError, with the model as it was, when the loss is not finite."""
+        """Takes the next step. Raises FloatingPointError, with the model as it was, when the loss is not finite."""
         config, rng = self.config, self._step_generator()
         if self.step == config.sparse_from:
             self._begin_sparse()
@@ -113,7 +113,7 @@ class SceneOptimizer:
         return torch.Generator().manual_seed(torch_seed(self.seed, Generate4DStream.STEP, self.step))
 
     def _draw_pictures(self, rng: torch.Generator) -> tuple[list[int], list[int]]:
-        """Return views and frames of the step's pictures: the reference in turn with random ones of the given views.
+        """Returns views and frames of the step's pictures: the reference in turn with random ones of the given views.
 
         Times are spread: picture i of the batch comes from the i-th part of the clip, in random rotation.
         """
@@ -135,7 +135,7 @@ class SceneOptimizer:
     def _picture_terms(
         self, instant: Instant, views: list[int], frames: list[int], rng: torch.Generator
     ) -> tuple[Tensor, float, dict]:
-        """Return the loss on the step's pictures, the reference view's squared error on white, the rasterizer's notes."""
+        """Returns the loss on the step's pictures, the reference view's squared error on white, the rasterizer's notes."""
         config = self.config
         truth, intrinsics, poses = (t.to(self.device) for t in self.targets.at(views, frames, self._shrink_factor()))
         height, width = truth.shape[1:3]
@@ -157,7 +157,7 @@ class SceneOptimizer:
         return loss, float(np.mean(squared)) if squared else math.nan, notes
 
     def _prior_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
-        """Return the prior's loss on random new views of the step's frames (C.11)."""
+        """Returns the prior's loss on random new views of the step's frames (C.11)."""
         size = min(max(self.targets.size), _PRIOR_SIZE)
         cameras, poses, intrinsics = novel_cameras(self.targets, len(frames), size, rng)
         white = torch.ones(len(frames), 3, device=self.device)
@@ -167,7 +167,7 @@ class SceneOptimizer:
         return self.prior.loss(rendered, cameras, frames, self.step / self.config.steps, rng)
 
     def _motion_terms(self, instant: Instant, frames: list[int]) -> Tensor:
-        """Return the losses on what carries the Gaussians: parts, the drift of control points, shape over time."""
+        """Returns the losses on what carries the Gaussians: parts, the drift of control points, shape over time."""
         config, motion, carriers = self.config, instant.motion, instant.carriers
         total = torch.zeros((), device=self.device)
         chosen = _thin(len(carriers))
@@ -195,7 +195,7 @@ class SceneOptimizer:
         return total
 
     def _begin_sparse(self) -> None:
-        """Put control points among the Gaussians and remember where the dense stage would move them (p-bar)."""
+        """Puts control points among the Gaussians and remembers where the dense stage would move them (p-bar)."""
         self.model.start_control()
         self._add_control_groups()
         with torch.no_grad():
@@ -222,7 +222,7 @@ class SceneOptimizer:
             self.optimizer.add_param_group({"params": [parameter], "lr": rate, "name": name})
 
     def _set_learning_rates(self) -> None:
-        """Set the rates that fall log-linearly from their first value to their last."""
+        """Sets the rates that fall log-linearly from their first value to their last."""
         share = self.step / max(self.config.steps - 1, 1)
         falling = {"mean": self.config.rate_mean, "network": self.config.rate_network}
         for group in self.optimizer.param_groups:
@@ -237,7 +237,7 @@ class SceneOptimizer:
 
     @torch.no_grad()
     def _clamp_gaussians(self) -> None:
-        """Keep sizes within what a picture can tell and colors within what it can show."""
+        """Keeps sizes within what a picture can tell and colors within what it can show."""
         self.model.gaussians.log_scale.clamp_(math.log(_SMALLEST), math.log(_LARGEST))
         self.model.gaussians.color.clamp_(0.0, 1.0)
 
@@ -248,7 +248,7 @@ class SceneOptimizer:
         self._neighbors = None
 
     def state(self) -> dict:
-        """Return all that `restore` needs to go on with the same steps."""
+        """Returns all that `restore` needs to go on with the same steps."""
         control = self.model.control
         return {
             "step": self.step,
@@ -262,7 +262,7 @@ class SceneOptimizer:
         }
 
     def restore(self, state: dict) -> None:
-        """Go on where the `state` of an earlier optimization with the same settings was saved."""
+        """Goes on where the `state` of an earlier optimization with the same settings was saved."""
         self.step = state["step"]
         gaussians = CanonicalGaussians.empty(len(state["gaussians"]["mean"]))
         gaussians.load_state_dict(state["gaussians"])
@@ -282,7 +282,7 @@ class SceneOptimizer:
 
 
 def _thin(count: int) -> Tensor:
-    """Return which carriers the losses look at: all control points, a fixed thin selection of dense Gaussians."""
+    """Returns which carriers the losses look at: all control points, a fixed thin selection of dense Gaussians."""
     if count <= _CARRIERS:
         return torch.arange(count)
     return torch.linspace(0, count - 1, _CARRIERS).long()

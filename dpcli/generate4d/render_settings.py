@@ -14,7 +14,7 @@ Color = Literal["appearance", "part", "rigid", "depth"]
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How a scene is drawn. None stands for the reference camera's own. Raises UsageError for a value that is not legal."""
+    """Holds how a scene is drawn. None stands for the reference camera's own. Raises UsageError for a value that is not legal."""
 
     path: Path = setting(
         "turntable",
@@ -51,7 +51,7 @@ class RenderSettings:
         check(self)
 
     def changed(self, *names: str) -> list[str]:
-        """Return those of the named settings that differ from their defaults."""
+        """Returns those of the named settings that differ from their defaults."""
         return [name for name in names if getattr(self, name) != getattr(RenderSettings, name)]
 
 

@@ -31,7 +31,7 @@ def export_scene(
     seed: int,
     force: bool,
 ) -> None:
-    """Write a scene in another format. Raises UsageError where the options or the name of `output` don't fit the format."""
+    """Writes a scene in another format. Raises UsageError where the options or the name of `output` don't fit the format."""
     if output == "-" and form != "clouds":
         raise UsageError(f"-o -: only --as clouds goes through a pipe; name a file or folder for {form}")
     if time is not None and not _is_single(form, Path(output)):
@@ -68,7 +68,7 @@ def _export_clouds(
 
 
 def _is_single(form: Format, output: Path) -> bool:
-    """Return whether that is one .ply or .splat, or was meant to be: such a suffix makes no folder."""
+    """Returns whether that is one .ply or .splat, or was meant to be: such a suffix makes no folder."""
     return form in _SPLATS and output.suffix.lower() in (".ply", ".splat", ".json")
 
 

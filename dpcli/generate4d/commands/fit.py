@@ -46,7 +46,7 @@ def fit_scene(
     device: str,
     force: bool,
 ) -> None:
-    """Fit a scene to a views file, or continue a stopped fit, and write it; do nothing where this fit is finished.
+    """Fits a scene to a views file, or continues a stopped fit, and writes it; does nothing where this fit is finished.
 
     run: folder of checkpoints, log, settings and previews, by default beside the output. picture: where the last preview
     is written. Raises UsageError, DataError for what a user can mend, Stopped after a signal.
@@ -66,11 +66,6 @@ def fit_scene(
         targets = _load(path, config, supervision)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)
         prior = _load_prior(supervision, targets, device)
-        log.info(
-            f"fitting {targets.name} on {chosen}: {targets.num_views} view(s) x {targets.num_frames} frames of"
-            f" {targets.size[0]} x {targets.size[1]}, {config.dense_steps} dense + {config.sparse_steps} sparse steps"
-        )
-        keep_freed_memory()
         optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize)
         model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
         scene = to_scene(model, targets, metrics)
@@ -88,13 +83,13 @@ def _groups(config: FitConfig, supervision: Supervision) -> dict[str, Any]:
 
 
 def _record(views: Path, config: FitConfig, supervision: Supervision, seed: int) -> dict[str, Any]:
-    """Return what makes a fit this one and no other: its settings, seed and input."""
+    """Returns what makes a fit this one and no other: its settings, seed and input."""
     settings = {"config": asdict(config), **asdict(supervision)}
     return {**json.loads(json.dumps(settings)), "seed": seed, "data": provenance.file_digest(views)}
 
 
 def _load(path: Path, config: FitConfig, supervision: Supervision) -> Targets:
-    """Return the pictures to fit. Raises DataError where given views are asked for and the file has none."""
+    """Returns the pictures to fit. Raises DataError where given views are asked for and the file has none."""
     given = supervision.prior == "views"
     targets = load_targets(path, config.size, ("train",) if given else ())
     if given and targets.num_views < 2:
@@ -106,8 +101,13 @@ def _load(path: Path, config: FitConfig, supervision: Supervision) -> Targets:
 
 
 def _optimize(optimizer: SceneOptimizer, folder: RunFolder, settings: str) -> tuple[Model4D, dict[str, Any]]:
-    """Run the fit in its folder; return the model, on the CPU, and the numbers that the scene file tells of the fit."""
-    targets = optimizer.targets
+    """Runs the fit in its folder; returns the model, on the CPU, and the numbers that the scene file tells of the fit."""
+    targets, config = optimizer.targets, optimizer.config
+    log.info(
+        f"fitting {targets.name} on {optimizer.device}: {targets.num_views} view(s) x {targets.num_frames} frames of"
+        f" {targets.size[0]} x {targets.size[1]}, {config.dense_steps} dense + {config.sparse_steps} sparse steps"
+    )
+    keep_freed_memory()
     with folder, stop_requested() as stop:
         with whole_file(folder.file("settings.toml")) as part:
             part.write_text(settings, encoding="utf-8")
@@ -145,7 +145,7 @@ def _preview_writer(folder: RunFolder, targets: Targets) -> Callable[[Model4D], 
 
 
 def _load_prior(supervision: Supervision, targets: Targets, device: str) -> Prior | None:
-    """Return the generative prior, prepared for the video; None where given views or regularizers do the work."""
+    """Returns the generative prior, prepared for the video; None where given views or regularizers do the work."""
     if supervision.prior != "zero123":
         return None
     from dpcli.generate4d.priors.sds import ScoreDistillation

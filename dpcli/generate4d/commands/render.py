@@ -39,7 +39,7 @@ def render_scene(
     device: str,
     force: bool,
 ) -> None:
-    """Draw a scene along a path into `output`, as a contact sheet into `picture`, or as a views file seen by `cameras`."""
+    """Draws a scene along a path into `output`, as a contact sheet into `picture`, or as a views file seen by `cameras`."""
     look = Look(settings.color, parse_background(settings.background), settings.trajectories)
     if output is None and picture is None:
         raise UsageError("nothing to write: -o FILE for a video, a picture or a folder, --picture FILE for a sheet")
@@ -67,7 +67,7 @@ def _lens(settings: RenderSettings) -> Lens:
 
 
 def _check_views(output: str | None, settings: RenderSettings, look: Look, *, has_sheet: bool) -> None:
-    """Raise UsageError where `output` can't be the views file of --cameras, or has no use for a setting that was given."""
+    """Raises UsageError where `output` can't be the views file of --cameras, or has no use for a setting that was given."""
     if output is None or (output != "-" and Path(output).suffix not in (".h5", ".hdf5")):
         raise UsageError("--cameras renders a views file: name it with -o FILE.h5, or - for a pipe")
     unused = settings.changed("path", "frames", "fps")
@@ -119,7 +119,7 @@ def _render_views(
 
 
 def _render_sheet(renderer: Renderer, look: Look, picture: Path, settings: RenderSettings) -> None:
-    """Write the contact sheet: the reference camera and three more around the object as rows, instants as columns."""
+    """Writes the contact sheet: the reference camera and three more around the object as rows, instants as columns."""
     look = replace(look, background=look.background or LIGHT.background)
     scene, lens, time = renderer.scene, _lens(settings), settings.time
     lens = replace(lens, size=lens.size or _SHEET_SIDE)

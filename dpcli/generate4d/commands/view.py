@@ -15,7 +15,7 @@ from dpcli.store.gaussians import read_scene, scene_origin
 def view_scene(
     scene_file: str, output: Path, *, title: str | None, min_opacity: float, fps: float | None, force: bool
 ) -> None:
-    """Write one self-contained HTML page of a scene. Raises UsageError for a name that isn't .html or that exists."""
+    """Writes one self-contained HTML page of a scene. Raises UsageError for a name that isn't .html or that exists."""
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"-o {output}: expected a name that ends in .html")
     if output.exists() and not force:

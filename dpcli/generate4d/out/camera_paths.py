@@ -1,4 +1,4 @@
-"""Where the camera is and what time it is in each picture of a clip."""
+"""Camera paths: the place of the camera and the time of the clip in each picture of a video."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SWING, _BOB = np.deg2rad(35.0), np.deg2rad(20.0)
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture: time in seconds, world_to_camera f64 (4,4), intrinsics f64 (3,3) in pixels, size (width, height)."""
+    """Describes one picture: time in seconds, world_to_camera f64 (4,4), intrinsics f64 (3,3) in pixels, size (width, height)."""
 
     time: float
     world_to_camera: np.ndarray
@@ -29,7 +29,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class Lens:
-    """A camera as far as a user describes it: radians and scene units; None stands for the scene's reference camera.
+    """Describes a camera as far as a user does: radians and scene units; None stands for the scene's reference camera.
 
     size: pixels of the picture's longer side.
     """
@@ -41,13 +41,13 @@ class Lens:
     size: int | None = None
 
     def place(self, scene: GaussianScene) -> tuple[float, float, float]:
-        """Return azimuth, elevation and radius, the reference camera's where they are None."""
+        """Returns azimuth, elevation and radius, the reference camera's where they are None."""
         reference = orbit_of(scene.camera_world_to_camera[scene.reference])
         asked = (self.azimuth, self.elevation, self.radius)
         return tuple(default if value is None else value for value, default in zip(asked, reference))
 
     def sensor(self, scene: GaussianScene) -> tuple[np.ndarray, tuple[int, int]]:
-        """Return intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`; centered with `fovy`."""
+        """Returns intrinsics f64 (3,3) and size (width, height): the reference camera's, scaled to `size`; centered with `fovy`."""
         width, height = scene.size
         zoom = self.size / max(width, height) if self.size else 1.0
         size = (max(1, round(width * zoom)), max(1, round(height * zoom)))
@@ -58,14 +58,14 @@ class Lens:
 
 
 def own_rate(scene: GaussianScene) -> float:
-    """Return the frames per second at which the clip was filmed, 15 for a scene of one frame."""
+    """Returns the frames per second at which the clip was filmed, 15 for a scene of one frame."""
     if scene.num_frames < 2:
         return _STILL_RATE
     return float((scene.num_frames - 1) / (scene.time[-1] - scene.time[0]))
 
 
 def clip_rate(scene: GaussianScene) -> float:
-    """Return the frames of the clip per second of a video: those it was filmed at, but at least 1 and at most 60.
+    """Returns the frames of the clip per second of a video: those it was filmed at, but at least 1 and at most 60.
 
     A faster clip plays slower than real time, since no screen shows more; a slower one plays faster.
     """
@@ -73,7 +73,7 @@ def clip_rate(scene: GaussianScene) -> float:
 
 
 def default_rate(scene: GaussianScene, path: Path) -> float:
-    """Return the pictures per second of a video: `clip_rate`, or a whole multiple of at least 24 where the camera moves."""
+    """Returns the pictures per second of a video: `clip_rate`, or a whole multiple of at least 24 where the camera moves."""
     rate = clip_rate(scene)
     return rate if path in ("fixed", "reference") else rate * math.ceil(_SMOOTH / rate - 1e-6)
 
@@ -87,7 +87,7 @@ def plan_shots(
     fps: float | None = None,
     time: float | None = None,
 ) -> list[Shot]:
-    """Return the pictures of a video, in which the scene plays over and over, or stands still at `time` (seconds).
+    """Returns the pictures of a video, in which the scene plays over and over, or stands still at `time` (seconds).
 
     The scene plays in real time where the clip has 1 to 60 frames per second, else at `clip_rate`, so that a loop has
     every frame. path: turntable goes once around, orbit also up and down, swing to and fro; fixed is a still camera,
@@ -102,7 +102,7 @@ def plan_shots(
 
 
 def _loop(scene: GaussianScene) -> float:
-    """Return the seconds that the clip takes in a video, its last frame's interval included."""
+    """Returns the seconds that the clip takes in a video, its last frame's interval included."""
     return scene.num_frames / clip_rate(scene)
 
 
@@ -114,7 +114,7 @@ def _usual_count(scene: GaussianScene, path: str, rate: float, still: bool) -> i
 
 
 def instants(scene: GaussianScene, count: int, rate: float) -> np.ndarray:
-    """Return the times f64 (count), seconds of the clip, of a video of `rate` pictures per second, looped."""
+    """Returns the times f64 (count), seconds of the clip, of a video of `rate` pictures per second, looped."""
     pace = clip_rate(scene) / own_rate(scene)  # seconds of the clip per second of the video
     return scene.time[0] + pace * np.mod(np.arange(count) / rate + 1e-9, _loop(scene))
 

@@ -20,7 +20,7 @@ _SINGLE = {"ply": write_splat_ply, "splat": write_splat}
 
 
 def opaque_indices(scene: GaussianScene, min_opacity: float) -> np.ndarray:
-    """Return the indices i64 (M) of Gaussians of at least that opacity (0..1). Raises DataError when there is none."""
+    """Returns the indices i64 (M) of Gaussians of at least that opacity (0..1). Raises DataError when there is none."""
     kept = np.flatnonzero(opacity_of(scene.opacity_logit) >= min_opacity)
     if not len(kept):
         raise DataError(f"no Gaussian is {min_opacity:g} opaque or more; the most opaque has {scene.opacity.max():.3g}")
@@ -28,7 +28,7 @@ def opaque_indices(scene: GaussianScene, min_opacity: float) -> np.ndarray:
 
 
 def keep_opaque(scene: GaussianScene, min_opacity: float) -> GaussianScene:
-    """Return the scene without Gaussians below that opacity; frames, parts, control points and cameras stay."""
+    """Returns the scene without Gaussians below that opacity; frames, parts, control points and cameras stay."""
     kept = opaque_indices(scene, min_opacity)
     if len(kept) == scene.num_gaussians:
         return scene
@@ -44,7 +44,7 @@ def keep_opaque(scene: GaussianScene, min_opacity: float) -> GaussianScene:
 def export_file(
     scene: GaussianScene, path: Path, form: str, *, time: float | None = None, axes: str = "player"
 ) -> None:
-    """One .ply or .splat: the canonical Gaussians, or those at `time` seconds."""
+    """Writes one .ply or .splat: the canonical Gaussians, or those at `time` seconds. Raises DataError when it can't."""
     _SINGLE[form](path, Splats.of(scene, time, axes))
 
 
@@ -57,9 +57,10 @@ def export_sequence(
     times: Sequence[float] | None = None,
     force: bool = False,
 ) -> list[Path]:
-    """frame0001.ply (or .splat), ... in `folder`, with cameras.json and metrics.json; the names players line up as a clip.
+    """Writes frame0001.ply (or .splat), ... into `folder`, with cameras.json and metrics.json; returns the frames' paths.
 
-    The folder appears whole. UsageError when it exists and `force` is off; then it is replaced.
+    Players show files of such names as a clip. The folder appears whole. Raises UsageError when it exists and `force` is
+    off, which would replace it.
     """
     if folder.exists() and not force:
         raise UsageError(f"{folder}: exists already; --force replaces it")
@@ -89,7 +90,7 @@ def _make_folder(part: Path, folder: Path) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
+    """Writes readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
     write_whole(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
 
@@ -102,7 +103,7 @@ def as_sequence(
     rng: np.random.Generator | None = None,
     axes: str = "player",
 ) -> CloudSequence:
-    """The Gaussians' means as a point cloud video: T frames of the same M points.
+    """Returns the Gaussians' means as a point cloud video: T frames of the same M points.
 
     Kept: those of at least `min_opacity`; of them `points` drawn without replacement by `rng`, if there are more. `track`
     is the index of the Gaussian, `part` its rigid part, `pose` the parts' motions, canonical to frame. axes player:
@@ -135,7 +136,7 @@ def write_clouds(
     length_unit: str = "",
     force: bool = False,
 ) -> None:
-    """A `clouds` file of one sequence."""
+    """Writes a `clouds` file of one sequence."""
     fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(sequence, key) is not None]
     with CloudsWriter(
         path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance, force=force

@@ -8,7 +8,7 @@ from dpcli.draw.learning_curves import Curve, Panel, draw_learning_curves
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """Write three panels of the log's rows as a PNG; a dotted line stands where the sparse stage begins."""
+    """Writes three panels of the log's rows as a PNG; a dotted line stands where the sparse stage begins."""
     change = next((row["step"] for row in rows if row["stage"] == "sparse"), None)
     panels = [
         Panel("PSNR, reference view", [Curve("psnr", "PSNR")], "dB", change=change),

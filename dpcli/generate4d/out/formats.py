@@ -1,4 +1,4 @@
-"""The legal words of `dpc generate4d export`, apart from the code that writes, so that --help is quick."""
+"""The legal words of `dpc generate4d export`; they stand apart from the code that writes so that --help is quick."""
 
 from __future__ import annotations
 

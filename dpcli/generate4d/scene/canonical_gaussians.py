@@ -34,17 +34,17 @@ class CanonicalGaussians(nn.Module):
         self.register_buffer("seen", torch.zeros(len(mean)))
 
     def __len__(self) -> int:
-        """Return N."""
+        """Returns N."""
         return len(self.mean)
 
     def parameter_groups(self, config: FitConfig) -> list[dict]:
-        """Return the parameter groups for Adam, named, with their first rates."""
+        """Returns the parameter groups for Adam, named, with their first rates."""
         rates = (config.rate_mean[0], config.rate_scale, config.rate_quaternion, config.rate_opacity, config.rate_color)
         return [{"params": [getattr(self, name)], "lr": rate, "name": name} for name, rate in zip(NAMES, rates)]
 
     @torch.no_grad()
     def add_screen_gradient(self, gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
-        """Add up the screen gradients (C,N,2) of Gaussians that are in a picture, in units of half its width and height."""
+        """Adds up the screen gradients (C,N,2) of Gaussians that are in a picture, in units of half its width and height."""
         seen = (radii > 0).reshape(*gradient.shape[:2], -1).any(-1)
         size = (gradient * gradient.new_tensor([width / 2, height / 2])).norm(dim=-1)
         self.gradient += (size * seen).sum(0)
@@ -54,7 +54,7 @@ class CanonicalGaussians(nn.Module):
     def densify_and_prune(
         self, optimizer: torch.optim.Optimizer, config: FitConfig, rng: torch.Generator, grow: bool
     ) -> None:
-        """Copy or split the Gaussians with the largest mean screen gradient, then drop the transparent ones.
+        """Copies or splits the Gaussians with the largest mean screen gradient, then drops the transparent ones.
 
         Small ones are cloned, large ones (above the median size) split in two of 1/1.6 the size, as in 3D Gaussian
         splatting (Kerbl et al. 2023); Adam's memory of a copy starts at zero. grow: False only prunes.
@@ -76,7 +76,7 @@ class CanonicalGaussians(nn.Module):
         self.log_scale[len(old) :][torch.isin(new, split)] -= _SPLIT
 
     def _choose_to_grow(self, keep: Tensor, config: FitConfig) -> Tensor:  # [N] -> [N]
-        """Return which of the Gaussians to keep are copied: those of the largest mean screen gradient, as room allows."""
+        """Returns which of the Gaussians to keep are copied: those of the largest mean screen gradient, as room allows."""
         chosen = torch.zeros_like(keep)
         room = min(int(config.grow_share * len(self)), config.most_gaussians - int(keep.sum()))
         if room > 0:
@@ -86,7 +86,7 @@ class CanonicalGaussians(nn.Module):
         return chosen
 
     def _keep_rows(self, optimizer: torch.optim.Optimizer, index: Tensor, fresh: int) -> None:
-        """Keep the rows `index` of all parameters; Adam forgets the last `fresh` of them."""
+        """Keeps the rows `index` of all parameters; Adam forgets the last `fresh` of them."""
         for group in optimizer.param_groups:
             name = group.get("name")
             if name not in NAMES:
@@ -106,5 +106,5 @@ class CanonicalGaussians(nn.Module):
 
     @classmethod
     def empty(cls, count: int) -> CanonicalGaussians:
-        """Return `count` Gaussians of no meaning, whose parameters are loaded next."""
+        """Returns `count` Gaussians of no meaning, whose parameters are loaded next."""
         return cls(torch.zeros(count, 3), torch.zeros(count, 3))

@@ -14,7 +14,7 @@ def temporal_loss(
     displacement: Tensor,  # [B, N, 3] taken as given
     part: Tensor,  # [B, N, S]
 ) -> Tensor:
-    """Return temporal-change preservation, eq. 5.3: how badly one rigid motion per part explains where points went.
+    """Returns temporal-change preservation, eq. 5.3: how badly one rigid motion per part explains where points went.
 
     The motion is that of weighted Kabsch; the squared distance is averaged over points and times.
 
@@ -30,7 +30,7 @@ def spatial_loss(
     part: Tensor,  # [B, N, S]
     neighbors: Tensor,  # [N, H] indices of points nearby; a row's own index fills what is missing
 ) -> Tensor:
-    """Return spatial coherence, eq. 5.4: the mean distance between part probabilities of a point and its neighbors.
+    """Returns spatial coherence, eq. 5.4: the mean distance between part probabilities of a point and its neighbors.
 
     >>> parts = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
     >>> round(spatial_loss(parts, torch.tensor([[1], [0]])).item(), 4)
@@ -41,7 +41,7 @@ def spatial_loss(
 
 
 def ball_neighbors(points: Tensor, radius: float, count: int) -> Tensor:  # [N, 3] -> [N, count]
-    """Return up to `count` other points within `radius`, nearest first, as indices; a point's own index fills the rest.
+    """Returns up to `count` other points within `radius`, nearest first, as indices; a point's own index fills the rest.
 
     >>> ball_neighbors(torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 1.5, 2).tolist()
     [[1, 0], [0, 1], [2, 2]]

@@ -15,7 +15,7 @@ def picture_loss(
     background: Tensor,  # [C, 3]
     foreground: float,
 ) -> Tensor:
-    """Return the mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
+    """Returns the mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
     truth = target[..., :3] + (1 - target[..., 3:]) * background[:, None, None]
     return (rendered - truth).square().mean() + foreground * (alpha - target[..., 3:]).square().mean()
 
@@ -25,7 +25,7 @@ def arap_loss(
     moved: Tensor,  # [B, N, 3]
     neighbors: Tensor,  # [N, H]
 ) -> Tensor:
-    """Return the as-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbors are from one rotation.
+    """Returns the as-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbors are from one rotation.
 
     The best rotation of each point is found without gradient. A row's own index, where neighbors lack, adds nothing.
     """
@@ -45,7 +45,7 @@ def _nearest_rotation(matrix: Tensor) -> Tensor:  # [..., 3, 3]
 
 
 def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:
-    """Return how far the longest axes exceed `aspect` times the geometric mean of the three, as a log ratio, mean over N.
+    """Returns how far the longest axes exceed `aspect` times the geometric mean of the three, as a log ratio, mean over N.
 
     Needles and discs along the line of sight look right in the one picture and wrong in all others.
     """
@@ -54,5 +54,5 @@ def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:
 
 
 def thickness_loss(gaussians: CanonicalGaussians, view_axis: Tensor) -> Tensor:
-    """Return the mean squared drift along the line of sight (unit vector (3)) from where the start put each Gaussian."""
+    """Returns the mean squared drift along the line of sight (unit vector (3)) from where the start put each Gaussian."""
     return ((gaussians.mean - gaussians.anchor) @ view_axis).square().mean()

@@ -28,7 +28,7 @@ class Motion:
     part_translation: Tensor  # [B, S, 3]: x -> R_s x + t_s
 
     def part_matrix(self) -> Tensor:  # [B, S, 4, 4]
-        """Return T_s^tau, which takes canonical positions of a part to those at the time."""
+        """Returns T_s^tau, which takes canonical positions of a part to those at the time."""
         matrix = torch.eye(4).to(self.part_translation).expand(*self.part_translation.shape[:2], 4, 4).clone()
         matrix[..., :3, :3], matrix[..., :3, 3] = to_matrix(self.part_quaternion), self.part_translation
         return matrix
@@ -38,7 +38,7 @@ def encode(
     values: Tensor,  # [..., D]
     frequencies: int,
 ) -> Tensor:  # [..., 2 * D * frequencies]
-    """Return sine and cosine of the values times 1, 2, 4, ... (Mildenhall et al. 2020), without the values themselves.
+    """Returns sine and cosine of the values times 1, 2, 4, ... (Mildenhall et al. 2020), without the values themselves.
 
     >>> encode(torch.tensor([0.0]), 2).tolist()
     [0.0, 0.0, 1.0, 1.0]
@@ -61,7 +61,8 @@ class Perceptron(nn.Module):
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> Tensor:  # [..., inputs] -> [..., width]
+        """Returns the last layer's activations."""
         hidden = x
         for index, layer in enumerate(self.layers):
             if index == self.skip_layer:
@@ -71,7 +72,7 @@ class Perceptron(nn.Module):
 
 
 def _head(width: int, outputs: int, bias: float = 0.0) -> nn.Linear:
-    """Return a last layer that gives `bias` at the start (zero translation, identity rotation: C.1.2)."""
+    """Returns a last layer that gives `bias` at the start (zero translation, identity rotation: C.1.2)."""
     head = nn.Linear(width, outputs)
     nn.init.zeros_(head.weight)
     nn.init.constant_(head.bias, bias)
@@ -108,7 +109,7 @@ class MotionField(nn.Module):
 
     @torch.no_grad()
     def start_parts(self, points: Tensor, seeds: Tensor) -> None:
-        """Let parts start as the cells of `seeds` (S,3) among `points` (N,3), with soft walls that the network corrects."""
+        """Lets parts start as the cells of `seeds` (S,3) among `points` (N,3), with soft walls that the network corrects."""
         self.seed.copy_(seeds)
         spacing = torch.cdist(seeds, seeds).fill_diagonal_(torch.inf).min(1).values.mean()
         self.seed_sharpness.copy_(4.0 / spacing.clamp(min=1e-6) ** 2 if self.parts > 1 else torch.zeros(()))
@@ -117,12 +118,12 @@ class MotionField(nn.Module):
 
     @torch.no_grad()
     def update_centers(self, points: Tensor) -> None:
-        """Turn parts about the middle of their points from now on: R and t change their coordinates at the next step."""
+        """Turns parts about the middle of their points from now on: R and t change their coordinates at the next step."""
         share = self.part_of(points, torch.zeros(1).to(points))[0]
         self.center.copy_(share.T @ points / share.sum(0)[:, None].clamp(min=1e-6))
 
     def part_of(self, points: Tensor, times: Tensor) -> Tensor:  # [B, N, S]
-        """Return m, the part probabilities of canonical points (N,3) at times (B) in 0..1."""
+        """Returns m, the part probabilities of canonical points (N,3) at times (B) in 0..1."""
         code = encode(points, _POINT_FREQUENCIES)
         if self.by_time:
             code = _join_codes(code, encode(times[:, None], _TIME_FREQUENCIES))
@@ -131,14 +132,14 @@ class MotionField(nn.Module):
         return logits.softmax(-1).expand(len(times), -1, -1)
 
     def part_motion(self, times: Tensor) -> tuple[Tensor, Tensor]:  # [B, S, 4], [B, S, 3]
-        """Return R_s as unit quaternion and t_s, which take x to R x + t, at times (B) in 0..1."""
+        """Returns R_s as unit quaternion and t_s, which take x to R x + t, at times (B) in 0..1."""
         hidden = self.movement(encode(times[:, None], _TIME_FREQUENCIES))
         turn = _quaternion(self.movement_turn(hidden).reshape(len(times), self.parts, 3))
         shift = self.movement_shift(hidden).reshape(len(times), self.parts, 3)
         return turn, self.center - rotate(turn, self.center) + shift
 
     def forward(self, points: Tensor, times: Tensor) -> Motion:
-        """Return the motion of canonical points (N,3) at times (B) in 0..1."""
+        """Returns the motion of canonical points (N,3) at times (B) in 0..1."""
         code = _join_codes(encode(points, _POINT_FREQUENCIES), encode(times[:, None], _TIME_FREQUENCIES))
         hidden = self.deformation(code)
         rest, turn = self.deformation_shift(hidden), _quaternion(self.deformation_turn(hidden))
@@ -165,7 +166,7 @@ def blend_motions(
     turn: Tensor,  # [..., 4]
     weight: Tensor,  # [..., 1] w, 0..1
 ) -> tuple[Tensor, Tensor]:  # [..., 3], [..., 4]
-    """Return the displacement w (R x + t - x) + (1 - w) d, eq. 5.6, and the unit quaternion blended likewise.
+    """Returns the displacement w (R x + t - x) + (1 - w) d, eq. 5.6, and the unit quaternion blended likewise.
 
     The thesis writes R x + t, a position, in place of the displacement. Quaternions must lie in one hemisphere.
     """
@@ -173,7 +174,7 @@ def blend_motions(
 
 
 def add_motions(rigid: Tensor, rigid_turn: Tensor, rest: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the sum of both displacements (...,3), eq. 5.5, and the product of both turns (...,4), w >= 0."""
+    """Returns the sum of both displacements (...,3), eq. 5.5, and the product of both turns (...,4), w >= 0."""
     both = multiply(turn, rigid_turn)
     return rigid + rest, torch.where(both[..., :1] < 0, -both, both)
 
@@ -184,5 +185,5 @@ def _join_codes(space: Tensor, time: Tensor) -> Tensor:  # [N, D], [B, E] -> [B,
 
 
 def _quaternion(vector: Tensor) -> Tensor:  # [..., 3] -> [..., 4]
-    """Return the unit quaternion (1, v) / norm: the identity at zero, of one sign only, turns below 180 degrees."""
+    """Returns the unit quaternion (1, v) / norm: the identity at zero, of one sign only, turns below 180 degrees."""
     return normalize(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))
