@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -55,25 +56,23 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     except ImportError:
         _mp4_by_opencv(path, pictures, fps)
         return
-    writer: Any = None
-    for picture in map(_even, pictures):
-        if writer is None:
-            size = picture.shape[1::-1]
-            writer = imageio_ffmpeg.write_frames(
-                str(path),
-                size,
-                fps=fps,
-                codec="libx264",
-                pix_fmt_out="yuv420p",
-                macro_block_size=1,
-                quality=None,
-                output_params=list(_X264),
-                ffmpeg_log_level="error",
-            )
+    frames = map(_even, pictures)
+    for first in frames:
+        writer = imageio_ffmpeg.write_frames(
+            str(path),
+            first.shape[1::-1],
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=1,
+            quality=None,
+            output_params=list(_X264),
+            ffmpeg_log_level="error",
+        )
+        with closing(writer):  # ends the encoder, also where a picture fails
             writer.send(None)
-        writer.send(np.ascontiguousarray(picture))
-    if writer is not None:
-        writer.close()
+            for picture in chain([first], frames):
+                writer.send(np.ascontiguousarray(picture))
     if not path.exists():
         raise DpcError("the video encoder wrote nothing; a .gif or a folder of pictures needs no encoder")
 

@@ -7,9 +7,9 @@ import pytest
 
 from dpcli.draw import points as points_module
 from dpcli.draw.palette import DARK
-from dpcli.draw.points import Raster, draw_dots
+from dpcli.draw.points import FINE, Raster, _lit_ball, draw_balls, draw_dots
 
-RED, GREEN = (255, 0, 0), (0, 255, 0)
+RED, GREEN, WHITE = (255, 0, 0), (0, 255, 0), (255, 255, 255)
 
 
 def loop_z_buffer(points: np.ndarray, colors: np.ndarray, raster: Raster, size: int) -> np.ndarray:
@@ -86,3 +86,51 @@ def test_shade_relief_darkens_only_what_lies_behind_its_neighbor() -> None:
     depth[:, 3:] = 14
     shaded = points_module._shade_relief(image, depth)
     assert (shaded[:, 3] < 200).all() and (shaded[:, [0, 1, 2, 4, 5]] == 200).all()
+
+
+def test_the_nearest_ball_wins_whatever_the_order() -> None:
+    """Against a loop over pixels: the color of the nearest ball that covers it, as told by its strongest channel."""
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.uniform(-1, 1, (40, 2)), rng.permutation(40)[:, None]], 1)
+    colors = np.eye(3)[rng.integers(0, 3, 40)] * 255
+    picture = [
+        draw_balls(points[o], colors[o], Raster(60, 50, np.zeros(2), 22), WHITE)
+        for o in (slice(None), slice(39, None, -1))
+    ]
+    np.testing.assert_array_equal(*picture)
+    drawn = picture[0].astype(int)
+    place = points[:, :2] * 22 * FINE + np.array([60, 50]) * FINE / 2
+    low, high = np.percentile(place, [2, 98], axis=0)
+    radius = min(0.65 * np.sqrt(np.prod(high - low) / 40), 0.03 * 50 * FINE)
+    checked = 0
+    for row in range(50):
+        for column in range(60):
+            fine = FINE * np.array([column, row]) + np.stack(np.meshgrid(np.arange(FINE), np.arange(FINE)), -1).reshape(
+                -1, 2
+            )
+            covers = ((fine[:, None] - np.floor(place)) ** 2).sum(-1) <= radius**2
+            winners = {int(np.argmin(np.where(own, points[:, 2], 99))) if own.any() else -1 for own in covers}
+            if len(winners) == 1:  # no edge inside the pixel
+                checked += 1
+                (winner,) = winners
+                expected = (255,) * 3 if winner < 0 else colors[winner]
+                assert drawn[row, column].argmax() == np.argmax(expected)
+                assert (drawn[row, column] == 255).all() == (winner < 0)
+    assert checked > 1500
+
+
+def test_the_far_fades_and_the_light_comes_from_above() -> None:
+    points, colors = np.array([[-1, 0, 0], [1, 0, 5.0]]), np.zeros((2, 3))
+    image = draw_balls(points, colors, Raster(80, 40, np.zeros(2), 15), WHITE)
+    assert image[:, :40].min() == 0 and image[:, 40:].min() > 50
+    offsets, light = _lit_ball(9.0)
+    assert len(light) == pytest.approx(np.pi * 81, rel=0.05) and 0.5 <= light.min() < 0.6 < 0.95 < light.max() <= 1
+    assert light[offsets[:, 1] < 0].mean() > light[offsets[:, 1] > 0].mean() + 0.1
+    assert (draw_balls(points[:0], colors[:0], Raster(8, 6, np.zeros(2), 1), WHITE) == 255).all()
+
+
+def test_a_side_and_no_relief_paint_plain_squares() -> None:
+    points, colors = np.array([[0.0, 0, 1], [0, 0, 2]], np.float32), np.array([RED, GREEN], np.uint8)
+    image = draw_dots(points, colors, Raster(9, 9, np.zeros(2), 1.0), side=3, relief=False, background=WHITE)
+    red = (image == RED).all(-1)
+    assert red.sum() == 9 and red[3:6, 3:6].all() and (image[~red] == 255).all()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from dpcli.draw.view import default_view, parse_view
+from dpcli.draw.view import default_view, parse_view, turntable_view
 from dpcli.errors import UsageError
 
 
@@ -29,3 +30,14 @@ def test_a_view_that_is_none(text: str) -> None:
 
 def test_image_coordinates_are_turned_upright() -> None:
     assert default_view("pixel (row, column), gray level") == "yx-z" and default_view("m") == "xyz"
+
+
+def test_view_is_a_rotation_with_up_upwards() -> None:
+    for up, axis in (("z", (0, 0, 1)), ("-y", (0, -1, 0)), ("x", (1, 0, 0))):
+        for azimuth in np.linspace(-3, 3, 7):
+            view = turntable_view(azimuth, 0.4, up)
+            np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
+            assert np.linalg.det(view) == pytest.approx(1)
+            right, down, away = view @ np.array(axis)
+            assert abs(right) < 1e-12 and down < 0 and away < 0  # seen from above, upright tips toward the viewer
+    np.testing.assert_allclose(turntable_view(np.pi / 2, 0, "z"), [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
