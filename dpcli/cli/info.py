@@ -94,7 +94,7 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
-    from dpcli.draw.contact_sheet import contact_sheet
+    from dpcli.draw.clouds_sheet import clouds_sheet
     from dpcli.evaluate.classification.confusion_picture import check_picture
     from dpcli.store import CloudsReader
 
@@ -107,7 +107,7 @@ def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
         _draw_views(path, picture, **options)
         return
     with CloudsReader(path) as reader:
-        contact_sheet(reader, picture, **options)
+        clouds_sheet(reader, picture, **options)
 
 
 def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str | None) -> None:

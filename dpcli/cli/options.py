@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
+Scene = Annotated[str, typer.Argument(help="A gaussians file, or - for a pipe.")]
 _LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
 Seed = Annotated[int, typer.Option("--seed", min=0, max=_LARGEST_SEED, help="Seed of all randomness.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. Default: the CPUs this process may use.")]

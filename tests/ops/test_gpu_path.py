@@ -13,7 +13,7 @@ import torch
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.presets import find_preset
-from dpcli.generate4d.fit import Fit
+from dpcli.generate4d.optimizer import SceneOptimizer, StepResult
 from dpcli.ops.backend import reference_only
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.store import ScoresReader
@@ -173,24 +173,25 @@ def test_a_scene_fitted_on_the_card_stops_and_goes_on(card, dpc_here, tmp_path, 
         "tiny",
         "--size",
         16,
-        "--gaussians",
-        40,
-        "--control-points",
-        8,
-        "--dense-steps",
-        2,
-        "--sparse-steps",
-        2,
+        "--set",
+        "gaussians=40",
+        "--set",
+        "control_points=8",
+        "--set",
+        "dense_steps=2",
+        "--set",
+        "sparse_steps=2",
     )
-    step = Fit._one_step
+    take_step = SceneOptimizer.take_step
 
-    def stop_after_three(fit: Fit) -> None:
-        step(fit)
-        if fit.step == 3:
+    def stop_after_three(optimizer: SceneOptimizer) -> StepResult:
+        result = take_step(optimizer)
+        if optimizer.step == 3:
             os.kill(os.getpid(), signal.SIGTERM)
+        return result
 
     with monkeypatch.context() as patched:
-        patched.setattr(Fit, "_one_step", stop_after_three)
+        patched.setattr(SceneOptimizer, "take_step", stop_after_three)
         done = dpc_here(*words)
     assert done.returncode not in (0, 1) and b"saved at step 3" in done.stderr, done.stderr
     done = dpc_here(*words)

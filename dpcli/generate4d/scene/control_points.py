@@ -13,7 +13,7 @@ from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quat
 
 
 class ControlPoints(nn.Module):
-    """K canonical positions (K,3) and log radii (K,), both learned; `neighbors` of them move each Gaussian."""
+    """Holds K canonical positions (K,3) and log radii (K), both learned; `neighbors` of them move each Gaussian."""
 
     def __init__(self, positions: Tensor, neighbors: int = 8) -> None:
         super().__init__()
@@ -24,16 +24,16 @@ class ControlPoints(nn.Module):
 
     @classmethod
     def among(cls, points: Tensor, count: int, neighbors: int = 8) -> ControlPoints:
-        """Farthest point sampling of at most `count` of the points (N,3)."""
+        """Returns at most `count` of the points (N,3) as control points, chosen by farthest point sampling."""
         chosen = fps(points.detach()[None], min(count, len(points)))[0]
         return cls(points[chosen], neighbors)
 
     def nearest(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, k]
-        """Indices of the control points that will move each point."""
+        """Returns the indices of the control points that will move each point."""
         return knn(points.detach()[None], self.position.detach()[None], self.neighbors)[1][0]
 
     def weights(self, points: Tensor, nearest: Tensor) -> Tensor:  # [N, k]
-        """omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
+        """Returns omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
         squared = (points[:, None] - self.position[nearest]).square().sum(-1)
         return (-squared / (2 * self.log_radius[nearest]).exp()).softmax(-1)
 
@@ -43,7 +43,7 @@ class ControlPoints(nn.Module):
         nearest: Tensor,  # [N, k]
         motion: Motion,  # of the control points
     ) -> tuple[Tensor, Tensor]:  # [B, N, 3], [B, N, 4]
-        """Positions of canonical points at the motion's times, and the quaternions that turn their frames (eq. 5.8).
+        """Returns positions of canonical points at the motion's times, and quaternions that turn their frames (eq. 5.8).
 
         The motion's quaternions must lie in one hemisphere (w >= 0), as `MotionField` gives them, so that they can be averaged.
         """
@@ -62,7 +62,7 @@ class ControlPoints(nn.Module):
 
 
 def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [N]
-    """Mean distance of each point to its `count` nearest others; 0.01 where there is no other."""
+    """Returns the mean distance of each point to its `count` nearest others; 0.01 where there is no other."""
     count = min(count, len(points) - 1)
     if count < 1:
         return torch.full((len(points),), 0.01).to(points)
@@ -71,5 +71,5 @@ def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [
 
 
 def turn_frames(turn: Tensor, quaternion: Tensor) -> Tensor:  # [B, N, 4], [N, 4] -> [B, N, 4]
-    """A Gaussian's own quaternion after the turn."""
+    """Returns the quaternions of Gaussians after a turn."""
     return multiply_quaternions(turn, normalize_quaternion(quaternion).expand_as(turn))
