@@ -92,7 +92,7 @@ def _carried_labels(frames: Sequence[np.ndarray], flows: Flows, before: int, t: 
         source = source + flows[before, t]
     elif (t, before) in flows:
         query = query + flows[t, before]
-    return labels[nearest(source, query)]
+    return labels[find_nearest(source, query)]
 
 
 def _matched(own: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -109,7 +109,7 @@ def _matched(own: np.ndarray, other: np.ndarray) -> np.ndarray:
     return ids
 
 
-def nearest(points: np.ndarray, query: np.ndarray, with_distance: bool = False) -> Any:
+def find_nearest(points: np.ndarray, query: np.ndarray, with_distance: bool = False) -> Any:
     """Index of the nearest of points for every query; with its distance, if wanted."""
     from scipy.spatial import cKDTree
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from dpcli.segment.flow.estimate import METHODS, estimate_flow
+from dpcli.segment.flow.estimators import METHODS, estimate_flow
 
 __all__ = ["METHODS", "estimate_flow"]

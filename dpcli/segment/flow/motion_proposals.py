@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.ops import fps_numpy
-from dpcli.segment.flow.kernels_icp import distinct_kernel, lloyd_kernel
+from dpcli.segment.flow.icp_kernels import distinct_kernel, lloyd_kernel
 
 ANGLES = (-0.6, -0.3, 0.3, 0.6)  # radians
 SHIFTS = (-0.18, -0.08, 0.08, 0.18)  # diameters
 
 
-def turn(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
+def turn_about(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
     """Motions (H,3,4): by angles (H) radians about unit axes (H,3) through centers (H,3) or (3) (Rodrigues)."""
     x, y, z = axes.T
     zero = np.zeros_like(x)
@@ -24,18 +24,18 @@ def turn(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarra
     return np.concatenate([rotation, offset[:, :, None]], 2)
 
 
-def shift(offsets: np.ndarray) -> np.ndarray:
+def shift_by(offsets: np.ndarray) -> np.ndarray:
     """Motions (H,3,4) without a turn, by offsets (H,3)."""
     return np.concatenate([np.broadcast_to(np.eye(3), (len(offsets), 3, 3)), offsets[:, :, None]], 2)
 
 
-def compose(after: np.ndarray, before: np.ndarray) -> np.ndarray:
+def compose_motions(after: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Motions (H,3,4) after one (3,4)."""
     rotation = after[:, :, :3] @ before[:, :3]
     return np.concatenate([rotation, after[:, :, :3] @ before[:, 3:] + after[:, :, 3:]], 2)
 
 
-def articulated(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
+def propose_motions(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
     """Motions (H,3,4) for a part (n,3): none; about its edges (doors, lids), about its normal (blades); along its axes
     (drawers); and onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
     """
@@ -45,17 +45,17 @@ def articulated(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
     hinge, across = np.array([0, 1, 0, 1]), np.array([1, 0, 2, 2])
     edges = center + np.array([-1, 1])[:, None, None] * (extent[across, None] * axes[across])  # [side, hinge, 3]
     angles = len(ANGLES)
-    turns = turn(
+    turns = turn_about(
         np.tile(np.repeat(axes[hinge], angles, 0), (2, 1)),
         np.tile(ANGLES, 8),
         np.repeat(edges.reshape(-1, 3), angles, 0),
     )
-    spins = turn(axes[[2, 2]], np.array([-0.4, 0.4]), center)
+    spins = turn_about(axes[[2, 2]], np.array([-0.4, 0.4]), center)
     offsets = np.concatenate([np.zeros((1, 3)), *(axes * by for by in SHIFTS), lonely - center])
-    return np.concatenate([turns, spins, shift(offsets)])
+    return np.concatenate([turns, spins, shift_by(offsets)])
 
 
-def distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: float, most: int) -> list[int]:
+def choose_distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: float, most: int) -> list[int]:
     """Indices of the best (lowest) scored motions, no two of which move every point to within `apart` of each other."""
     chosen = np.empty(most, np.int64)
     corners = points[:: max(1, len(points) // 12)]
@@ -64,7 +64,7 @@ def distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: 
     return chosen[:found].tolist()
 
 
-def voronoi(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
+def cluster_patches(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
     """Patch i64 (N) of each point (N,3 or more): k-means (Lloyd) from farthest points; the same every time."""
     center = points[fps_numpy(points[:, :3], min(count, len(points)))].astype(np.float64)
     patch = np.zeros(len(points), np.int64)
@@ -72,15 +72,15 @@ def voronoi(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
     return patch
 
 
-def centers(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
+def find_patch_centers(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
     """Up to `most` centers (Q,3) of patches of about `each` points; none for fewer than 6 points."""
     if len(points) < 6:
         return np.zeros((0, 3))
-    patch = voronoi(points, min(most, max(1, len(points) // each)))
+    patch = cluster_patches(points, min(most, max(1, len(points) // each)))
     return np.stack([points[patch == k].mean(0) for k in np.unique(patch)]).astype(np.float64)
 
 
-def components(chosen: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
+def find_components(chosen: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
     """Connected sets of the chosen points (mask (N)) in the graph of neighbors (N,k), as index arrays."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

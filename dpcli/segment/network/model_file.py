@@ -1,11 +1,13 @@
-"""A part network on disk."""
+"""The weights file of a part network, and the weights that come with the package."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
+from dpcli.errors import UsageError
 from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights_lookup import shipped_models
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.part_network import PartNetwork
 
@@ -14,20 +16,33 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
-    """Weights as float32, configuration and notes (a small JSON object) in the header."""
+    """Write the weights as float32, with the configuration and notes (a small JSON object) in the header."""
     header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
     save_weights(path, model.state_dict(), header)
 
 
 def find_model(name: str, option: str = "--model") -> Path:
-    """A network's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
+    """Return the file that a name means: a path, `best.safetensors` of a training folder, or a shipped name.
+
+    option: what messages call the name. Raises UsageError when there is none.
+    """
     return find_weights(name, SHIPPED, _MAKER, option)
 
 
 def load_model(name: str, option: str = "--model") -> tuple[PartNetwork, dict]:
-    """A part network in eval mode and its notes; name: a path, a training folder or a shipped model."""
+    """Return a part network in eval mode and its notes; arguments as `find_model`. Raises DataError for a damaged file."""
     path = find_model(name, option)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = PartNetwork(PartConfig.from_json(header["config"]))
     load_state(model, tensors, path)
     return model.eval(), json.loads(header["notes"])
+
+
+def default_model() -> str:
+    """Return the shipped model used when none is named. Raises UsageError when this installation has none."""
+    names = shipped_models(SHIPPED)
+    if not names:
+        raise UsageError(
+            "no trained part network comes with this installation; train one (`dpc segment train`) and name it with --model"
+        )
+    return names[0]

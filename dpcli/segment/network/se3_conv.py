@@ -172,7 +172,7 @@ def _activate(features: Tensor) -> Tensor:
     """
     if not _by_kernel(features):
         return nn.functional.leaky_relu(instance_norm(features), _LEAK)
-    from dpcli.segment.network.norm_kernels import norm_kernel
+    from dpcli.segment.network.instance_norm_kernel import norm_kernel
 
     batch, channels = len(features), features.shape[-1]
     rows = features[0].numel() // channels

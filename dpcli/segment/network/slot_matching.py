@@ -11,7 +11,7 @@ from torch import Tensor
 from dpcli.ops import gather_points, knn
 
 
-def assign(score: Tensor) -> Tensor:
+def hungarian_assignment(score: Tensor) -> Tensor:
     """Row-by-row optimal assignment of score (B,S,G), maximized (Kuhn 1955): columns (B,S) i64.
 
     With fewer columns than rows, rows left over get -1. Not finite counts as worst. Ties as scipy decides.
@@ -55,7 +55,7 @@ def match_slots(
     maximizes the sum of IoU (Hungarian method), as OGC (Song and Yang 2022) does. Carries no gradient.
     """
     carried = carry_mask(points1, flow, mask1.detach(), points2)
-    return assign(soft_iou(one_hot(carried), one_hot(mask2)))
+    return hungarian_assignment(soft_iou(one_hot(carried), one_hot(mask2)))
 
 
 def permute_slots(mask: Tensor, order: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def one_hot(mask: Tensor) -> Tensor:
     return torch.zeros_like(mask).scatter_(-1, mask.argmax(-1, keepdim=True), 1.0)
 
 
-def match_sequence(points: Sequence[Tensor], flows: Sequence[Tensor], masks: Sequence[Tensor]) -> Tensor:
+def match_slots_through_frames(points: Sequence[Tensor], flows: Sequence[Tensor], masks: Sequence[Tensor]) -> Tensor:
     """Orders (T,S) i64 that give every frame frame 0's slots: masks[t][:, orders[t]].
 
     points: T clouds (N_t,3); flows: T - 1 or more, flows[t] (N_t,3) leads from frame t to t + 1; masks: T of (N_t,S).
@@ -79,5 +79,5 @@ def match_sequence(points: Sequence[Tensor], flows: Sequence[Tensor], masks: Seq
     for t in range(1, len(points)):
         before = masks[t - 1][:, orders[-1]]
         carried = carry_mask(points[t - 1][None], flows[t - 1][None], before[None], points[t][None])
-        orders.append(assign(soft_iou(carried, masks[t][None]))[0])
+        orders.append(hungarian_assignment(soft_iou(carried, masks[t][None]))[0])
     return torch.stack(orders)

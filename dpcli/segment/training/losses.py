@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
-from dpcli.ops import apply_motions, gather_points, knn, space_time_ball_query
-from dpcli.segment.network.slot_matching import assign, one_hot, permute_slots, soft_iou
+from dpcli.ops import apply_motions
+from dpcli.segment.network.slot_matching import hungarian_assignment, one_hot, permute_slots, soft_iou
 
 
 def dynamic_loss(points: Tensor, flow: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
@@ -71,41 +69,12 @@ def consensus_weights(
     return torch.where(trusted, torch.exp(-tau * square), 1.0)
 
 
-class Neighbors(NamedTuple):
-    """Indices (B,N,k) i64 into the cloud: the nearest within a radius, and any within a larger one."""
-
-    nearest: Tensor
-    ball: Tensor
-
-
-def smoothness_neighbors(
-    points: Tensor, *, k: int = 8, radius: float = 0.1, ball_k: int = 16, ball_radius: float = 0.2
-) -> Neighbors:
-    """Neighbors of every point of (B,N,3) for `smoothness_loss`; the defaults are SAPIEN's.
-
-    The k nearest, those farther than `radius` replaced by the point itself; and the first ball_k in index order with
-    distance below ball_radius, unused places repeating the first. Other data sets: OGC-DR 8, 0.02, 16, 0.04; KITTI 32,
-    1.0, 64, 2.0. The flow's own loss has 4, 0.05, 8, 0.1.
-    """
-    squared, nearest = knn(points, points, k)
-    nearest = torch.where(squared > radius**2, nearest[..., :1], nearest)
-    still = torch.zeros(points.shape[:2], device=points.device)
-    ball, _ = space_time_ball_query(points, still, points, still, [ball_radius], ball_k)
-    return Neighbors(nearest, ball)
-
-
-def smoothness_loss(values: Tensor, neighbors: Neighbors, weights: tuple[float, float] = (3.0, 1.0)) -> Tensor:
-    """Mean over points and neighbors of |v_i - v_j|_1 summed over the channels of (B,N,S): 3 nearest + 1 ball."""
-    near, far = ((values[:, :, None] - gather_points(values, index)).abs().sum(-1).mean() for index in neighbors)
-    return weights[0] * near + weights[1] * far
-
-
 def invariance_loss(mask1: Tensor, mask2: Tensor) -> Tensor:
     """Two masks (B,N,S) of the same points, seen differently, should agree: mean |m1 - m2|_2 both ways, summed.
 
     Slots are matched by hard IoU first; in each direction the other mask is detached (OGC's last round).
     """
-    order = assign(soft_iou(one_hot(mask1.detach()), one_hot(mask2.detach())))
+    order = hungarian_assignment(soft_iou(one_hot(mask1.detach()), one_hot(mask2.detach())))
     forth = _length(mask1 - permute_slots(mask2, order).detach()).mean()
     back = _length(mask2 - permute_slots(mask1, order.argsort(1)).detach()).mean()
     return forth + back
@@ -129,7 +98,7 @@ def supervised_loss(
     truth = torch.nn.functional.one_hot(labels.clamp(min=0), parts).to(mask.dtype) * known
     inside, outside = _log(mask) * known, _log(1 - mask) * known
     gain = (inside.mT @ truth + outside.mT @ (1 - truth)) / mask.shape[1]  # [B, S, parts]
-    order = assign(gain)
+    order = hungarian_assignment(gain)
     bce = -gain.gather(2, order[..., None]).mean()
     if not dice_weight:
         return bce_weight * bce

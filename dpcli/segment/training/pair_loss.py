@@ -7,70 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpcli.errors import UsageError
 from dpcli.ops import apply_motions, weighted_kabsch
-from dpcli.segment.flow.object_icp import object_icp
+from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.flow.rigid_groups import rigid_groups
 from dpcli.segment.network.motion_head import quaternion_to_matrix, rotation_loss
 from dpcli.segment.network.part_network import FrameParts, PartNetwork
 from dpcli.segment.network.slot_matching import match_slots, permute_slots
-from dpcli.segment.training.losses import (
-    consensus_weights,
-    dynamic_loss,
-    invariance_loss,
-    rigid_loss,
-    smoothness_loss,
-    smoothness_neighbors,
-    supervised_loss,
-)
-
-
-@dataclass(frozen=True)
-class Objective:
-    """Weights and switches. Times are fractions of the whole training."""
-
-    form: str = "blended"  # per-part: eq. 4.8 as written; blended: the release's norm of the blended displacement
-    dynamic: float = 10.0
-    smooth: float = 0.1
-    invariance: float = 0.0
-    motion: float = 0.1
-    cold_start: float = 1.0  # of the bodies that the flow itself shows, see `rigid_groups`
-    cold_until: float = 1.0
-    supervised: bool = False
-    consensus: str = "thesis"  # eq. 4.7; release: squared and gated; none
-    tau: float = 20.0  # per unit of the object's diameter
-    flow_decay: float = 0.9  # alpha of eq. 4.6: 1 keeps the first flow ("past"), 0 takes the newest ("current")
-    motion_after: float = 0.3
-    consensus_after: float = 0.5
-    update_after: float = 0.4
-    smooth_after: float = 0.03
-
-    def __post_init__(self) -> None:
-        problems = {
-            f"--loss {self.form}: expected blended or per-part": self.form not in ("blended", "per-part"),
-            f"--consensus {self.consensus}: expected thesis, release or none": self.consensus
-            not in ("thesis", "release", "none"),
-            f"--flow-decay {self.flow_decay}: expected 0 to 1": not 0 <= self.flow_decay <= 1,
-            f"--tau {self.tau}: expected a number above 0": not self.tau > 0,
-        }
-        for option, weight in (
-            ("--smooth", self.smooth),
-            ("--invariance", self.invariance),
-            ("--cold-start", self.cold_start),
-        ):
-            problems[f"{option} {weight}: expected a weight, 0 or more"] = not weight >= 0
-        for option, share in (
-            ("--cold-until", self.cold_until),
-            ("--motion-after", self.motion_after),
-            ("--update-after", self.update_after),
-            ("--consensus-after", self.consensus_after),
-        ):
-            problems[f"{option} {share}: expected a fraction of the training, 0 or more"] = (
-                not share >= 0
-            )  # above 1: never
-        for message, wrong in problems.items():
-            if wrong:
-                raise UsageError(message)
+from dpcli.segment.smoothness import smoothness_loss, smoothness_neighbors
+from dpcli.segment.training.losses import consensus_weights, dynamic_loss, invariance_loss, rigid_loss, supervised_loss
+from dpcli.segment.training.settings import Objective
 
 
 @dataclass
@@ -206,7 +151,7 @@ def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Obje
     """Eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
     order = _match(batch, mask) if order is None else order
     both = torch.cat([order, order.argsort(1)])
-    newest, _, _ = object_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
+    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
     return objective.flow_decay * batch.flow + (1 - objective.flow_decay) * newest
 
 

@@ -11,7 +11,7 @@ from dpcli.segment.network.slot_matching import match_slots, permute_slots
 
 
 @torch.no_grad()
-def object_icp(
+def object_aware_icp(
     points1: Tensor,  # [B, N, 3]
     points2: Tensor,  # [B, M, 3]
     mask1: Tensor,  # [B, N, S]
@@ -55,7 +55,7 @@ def soft_match(moved: Tensor, points: Tensor, bias: Tensor, temperature: float) 
     fast = chosen_backend(moved.device) == "numba" and moved.dtype == points.dtype == bias.dtype == torch.float32
     if not fast or not points.shape[1]:
         return soft_match_reference(moved, points, bias, temperature)
-    from dpcli.segment.flow.kernels_match import soft_match_kernel
+    from dpcli.segment.flow.soft_match_kernel import soft_match_kernel
 
     out = torch.empty_like(moved, memory_format=torch.contiguous_format)
     columns = torch.nn.functional.pad(points.mT, (0, -points.shape[1] % 8))  # the kernel takes eight at a time

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.flow.kernels_icp import cover_kernel, hypotheses_kernel, icp_kernel, residual_kernel
+from dpcli.segment.flow.icp_kernels import cover_kernel, hypotheses_kernel, icp_kernel, residual_kernel
 
 _CELL, _MARGIN = 0.03, 0.12  # of the grid, in diameters of the cloud: callers scale their clouds to about 1
 _CELLS = 96  # at most, along an axis

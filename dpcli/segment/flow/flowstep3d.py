@@ -78,7 +78,7 @@ class _GatedUnit(nn.Module):
         return (1 - update) * hidden + update * proposal
 
 
-class FlowNetwork(nn.Module):
+class FlowStep3D(nn.Module):
     """Two clouds (B,N,3), (B,M,3) -> flows of the first after every iteration, each (B,N,3). N, M of 16 or more do best."""
 
     def __init__(self, config: FlowConfig) -> None:
