@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from dpcli.ops import knn, weighted_kabsch
 from dpcli.ops.rigid import rigid_flow, to_matrix
+from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.network.slot_matching import one_hot
 from dpcli.segment.segmenters import Flows
@@ -22,15 +20,9 @@ _TEMPERATURE = 0.01  # of object-aware ICP, in diameters
 Pairs = list[tuple[int, int]]
 
 
-@contextmanager
-def threads_for(frames: list[Tensor]) -> Iterator[None]:
-    """Give torch one thread within the block where frames are small: two gain nothing there, and wait for one another."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1 if max(len(frame) for frame in frames) <= _SMALL else threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+def threads_for(frames: list[Tensor]) -> int:
+    """Returns how many of torch's threads to use: one for small frames, of whose operations two threads gain nothing."""
+    return 1 if max(len(frame) for frame in frames) <= _SMALL else torch.get_num_threads()
 
 
 def fit_part_motions(
@@ -45,7 +37,7 @@ def fit_part_motions(
     by_size: dict[tuple[int, int], Pairs] = {}
     for i, j in pairs:
         by_size.setdefault((len(frames[i]), len(frames[j])), []).append((i, j))
-    with threads_for(frames):
+    with torch_threads(threads_for(frames)):
         for alike in by_size.values():
             for start in range(0, len(alike), _TOGETHER):
                 some = alike[start : start + _TOGETHER]

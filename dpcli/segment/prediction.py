@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dpcli.ops import fps, three_nn_interpolate
 from dpcli.runtime.seeds import generator
+from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.frame_pairs import choose_points, sequence_scale
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
@@ -106,7 +107,7 @@ def _find_flows_and_masks(
     neighbors = [(t, t + 1) for t in range(len(frames) - 1)]
     both = sorted({(min(pair), max(pair)) for pair in [*pairs, *neighbors]})
     workers = min(2, torch.get_num_threads())  # one of torch's threads in each: what is set now holds for new ones
-    with threads_for(frames), ThreadPoolExecutor(workers) as pool:
+    with torch_threads(threads_for(frames)), ThreadPoolExecutor(workers) as pool:
         early = None if segmenter.needs_flows else pool.submit(segmenter.segment, frames, {})
         found = list(pool.map(lambda pair: estimate(frames[pair[0]], frames[pair[1]]), both))
         flows = dict(zip(both, (forth for forth, _ in found)))
@@ -117,7 +118,7 @@ def _find_flows_and_masks(
 def _refine_masks(frames: list[Tensor], flows: Flows, masks: list[Tensor], options: Refinement) -> list[Tensor]:
     """Return the masks with bodies that move apart divided, the same slots in all frames, and small parts given up."""
     if options.split_bodies and len(frames) > 1:
-        with threads_for(frames):
+        with torch_threads(threads_for(frames)):
             masks = [
                 split_by_motion(cloud, flows[t, t + 1 if t + 1 < len(frames) else t - 1], mask)
                 for t, (cloud, mask) in enumerate(zip(frames, masks))

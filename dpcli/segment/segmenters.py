@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dpcli.runtime import provenance
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.segment.baselines.classical import classical_labels
 from dpcli.segment.baselines.settings import ClassicalSettings
 from dpcli.segment.network.model_file import find_model, load_model
@@ -19,7 +19,6 @@ from dpcli.segment.network.part_network import PartNetwork
 
 Flows = dict[tuple[int, int], Tensor]  # (t, u) -> flow (N_t,3) of frame t's points toward frame u
 _CHUNK = 8  # frames that the network sees at once
-_CLASSICAL_KEY = 7005  # keeps this generator apart from those of trainings
 
 
 class Segmenter(ABC):
@@ -57,7 +56,7 @@ class NetworkSegmenter(Segmenter):
         mixed: whether its products are made in bfloat16. Raises UsageError when there is no such network.
         """
         path = find_model(name)
-        model, notes = load_model(str(path))
+        model, notes = load_model(path)
         model.mixed = mixed
         about = {"model": notes, "weights": provenance.file_digest(path), **({"amp": True} if mixed else {})}
         return cls(model.to(device), device, about)
@@ -93,7 +92,7 @@ class ClassicalSegmenter(Segmenter):
             [frame.numpy() for frame in frames],
             {pair: flow.numpy() for pair, flow in flows.items()},
             self.settings,
-            rng=generator(self.seed, _CLASSICAL_KEY),
+            rng=generator(self.seed, SegmentStream.CLASSICAL),
         )
         return [torch.nn.functional.one_hot(torch.from_numpy(np.int64(own)), self.slots).float() for own in labels]
 

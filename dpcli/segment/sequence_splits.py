@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.store import CloudsReader
-
-_HELD_OUT_KEY = 7004  # keeps this generator apart from those of pairs
 
 
 def sequences_of_split(reader: CloudsReader, split: str, name: str) -> list[int]:
@@ -38,7 +36,7 @@ def hold_out_sequences(reader: CloudsReader, validation: str, seed: int) -> tupl
     else:
         if not 0 < share < 1:
             raise UsageError(f"--validation {validation}: expected auto, none, a fraction below 1, or class names")
-        order = generator(seed, _HELD_OUT_KEY).permutation(len(train))
+        order = generator(seed, SegmentStream.VALIDATION).permutation(len(train))
         count = max(1, round(share * len(train)))
         left, held = [train[i] for i in sorted(order[count:])], [train[i] for i in sorted(order[:count])]
     if not left:

@@ -11,21 +11,21 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, DpcError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.flow.estimators import METHODS, estimate_flow, find_estimator
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.sequence import POINT_FIELDS
+from dpcli.store.writing.already_made import WORK, already_made
 
 REACH = 99  # percentile of norms that stands for the largest: a few wrong matches must not decide the scale
-_KEY = 7006  # of the random draws of points
 _NO_MOTION = 1e-9  # of the cloud's reach: below this flow is rounding, and no factor makes it a cloud
 _WORTH_WORKERS = 200  # frames; fewer are done by one process before a second has started
 
@@ -53,7 +53,7 @@ class FlowOfSequence:
     def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
         """Return some points of each frame of a sequence, and their flow; its number in the file chooses the points."""
         index, sequence = numbered
-        drawn = draw_points(sequence, self.points, generator(self.seed, _KEY, index))
+        drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS, index))
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
         drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
         if self.as_points:
@@ -185,18 +185,12 @@ def _choose_processes(jobs: int | None, work: FlowOfSequence, frames: int) -> in
 
 
 def _already_there(target: Path, entry: dict) -> bool:
-    """Return whether `target` holds the flow of this very work; raise UsageError when it holds something else."""
-    if not target.exists():
-        return False
-    try:
-        with CloudsReader(target) as reader:
-            before = reader.provenance[-1:]
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(f"{target}: holds the flow of other data or choices; use another -o, or --force to replace it")
-    log.info(f"{target}: already complete, made from the same data (--force makes it again)")
-    return True
+    """Returns whether `target` holds the flow of this very work, and says so; UsageError when it holds something else."""
+    refusal = "holds the flow of other data or choices; use another -o, or --force to replace it"
+    made = already_made(target, entry, CloudsReader, refusal, WORK)
+    if made:
+        log.info(f"{target}: already complete, made from the same data (--force makes it again)")
+    return made
 
 
 def _estimate_sequences(

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.commands.settings_file import write_settings
 from dpcli.segment.flow.config import CATALOG, FlowConfig, FlowSchedule
 from dpcli.segment.flow.trainer import COLUMNS, FlowTrainer

@@ -11,10 +11,11 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
 from dpcli.segment.network.model_file import default_model
 from dpcli.segment.prediction import Estimate, predict_parts
@@ -23,7 +24,7 @@ from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segme
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
-from dpcli.store.pipes import PICTURES, check_target
+from dpcli.store.writing.already_made import WORK, already_made
 
 _ROWS = 8  # sequences in a picture
 
@@ -85,7 +86,7 @@ def predict_file(
                 force=force,
                 resume=True,
             ) as writer:
-                estimate = partial(estimate_flow_both_ways, method=settings.input.flow)
+                estimate = partial(estimate_flow_both_ways, method=str(estimator or settings.input.flow))
                 _predict_sequences(reader, sequences, segmenter, estimate, refinement, seed, writer, fields)
         _draw(target, drawings)
     return len(sequences)
@@ -107,19 +108,12 @@ def _open_segmenter(settings: PredictSettings, model: str | None, device: str, s
 
 
 def _already_there(target: Path, entry: dict) -> bool:
-    """Return whether `target` holds the parts of this very work; raise UsageError when it holds something else."""
-    if not target.exists():
-        return False
-    try:
-        before = PartsReader(target).provenance[-1:]
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(
-            f"{target}: holds parts of another model, data or choice; use another -o, or --force to replace it"
-        )
-    log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
-    return True
+    """Returns whether `target` holds the parts of this very work, and says so; UsageError when it holds something else."""
+    refusal = "holds parts of another model, data or choice; use another -o, or --force to replace it"
+    made = already_made(target, entry, PartsReader, refusal, WORK)
+    if made:
+        log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
+    return made
 
 
 def _predict_sequences(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.network.config import NetworkSettings
 from dpcli.segment.network.cost import measure_cost
 

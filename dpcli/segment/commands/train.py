@@ -13,11 +13,11 @@ import torch
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.commands.settings_file import write_settings
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
 from dpcli.segment.frame_pairs import MOTION_FIELDS, PairSource
@@ -27,7 +27,7 @@ from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.sequence_splits import hold_out_sequences
 from dpcli.segment.training.flow_store import first_flows
 from dpcli.segment.training.learning_curves import COLUMNS, draw_curves
-from dpcli.segment.training.settings import CATALOG, TrainSettings
+from dpcli.segment.training.settings import CATALOG, RunSettings, TrainSettings
 from dpcli.segment.training.trainer import Trainer
 from dpcli.store import CloudsReader, input_file
 
@@ -45,13 +45,15 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
         if supervised:
             _check_labels(reader)
         mixed = wanted(settings.precision.amp, chosen)
-        record = _describe_run(path, config, settings, seed, mixed)
+        used = _find_weights(settings)
+        record = _describe_run(path, config, settings, seed, mixed, used)
         folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_curves)
         training = PairSource(reader, learned, config.points, seed)
-        _check_flows(settings, record, folder, training)
+        estimator = used.get("flow_weights")
+        _check_flows(settings.run, estimator, record, folder, training)
         validation = PairSource(reader, held, config.points, seed) if held else None
         torch.manual_seed(seed)
-        model = _start_network(config, settings.run.init, folder).to(chosen)
+        model = _start_network(config, used.get("init_weights"), folder).to(chosen)
         model.mixed = mixed
         notes = {
             "command": provenance.command_line(),
@@ -66,46 +68,54 @@ def train_part_network(data: str, output: str, settings: TrainSettings, *, seed:
             f" {settings.schedule.epochs} epochs"
         )
         keep_freed_memory()
-        estimate = None if supervised else partial(estimate_flow_both_ways, method=settings.run.flow)
+        estimate = None if supervised else partial(estimate_flow_both_ways, method=str(estimator or settings.run.flow))
         with folder, stop_requested() as stop:  # last: with --force this deletes an earlier model
             write_settings(folder, CATALOG.to_toml(settings._asdict(), "segment train"))
             Trainer(model, folder, settings, training, validation, estimate, notes, stop, seed).run()
     return folder.file("best.safetensors")
 
 
-def _describe_run(path: Path, config: PartConfig, settings: TrainSettings, seed: int, mixed: bool) -> dict[str, Any]:
-    """Return what must be equal for a run to be continued; files by their digests, since what a path leads to may change."""
-    run = settings.run
+def _find_weights(settings: TrainSettings) -> dict[str, Path]:
+    """Returns the files of trained weights that the run starts from, by role."""
+    run, supervised = settings.run, settings.objective.supervised
     used = {
-        "flow_weights": None if settings.objective.supervised else find_estimator(run.flow),
+        "flow_weights": None if supervised else find_estimator(run.flow),
         "init_weights": find_model(run.init, "--init") if run.init else None,
     }
+    return {role: file for role, file in used.items() if file}
+
+
+def _describe_run(
+    path: Path, config: PartConfig, settings: TrainSettings, seed: int, mixed: bool, used: dict[str, Path]
+) -> dict[str, Any]:
+    """Returns what must be equal for a run to be continued; files by their digests, since what a path leads to may change."""
     record = {
         "network": json.loads(config.to_json()),
         "schedule": asdict(settings.schedule),
         "objective": asdict(settings.objective),
-        "flow": run.flow,
-        "validation": run.validation,
-        "init": run.init,
+        "flow": settings.run.flow,
+        "validation": settings.run.validation,
+        "init": settings.run.init,
         "seed": seed,
         "data": provenance.file_digest(path),
-        **{role: provenance.file_digest(file) for role, file in used.items() if file},
+        **{role: provenance.file_digest(file) for role, file in used.items()},
         **({"amp": True} if mixed else {}),
     }
     return json.loads(json.dumps(record))
 
 
-def _check_flows(settings: TrainSettings, record: dict[str, Any], run: RunFolder, training: PairSource) -> None:
-    """Raise UsageError where --flow or flows_of lies in the run's own folder, or flows_of is of other pairs.
+def _check_flows(
+    settings: RunSettings, estimator: Path | None, record: dict[str, Any], run: RunFolder, training: PairSource
+) -> None:
+    """Raises UsageError where the estimator's file is one that the run replaces, or flows_of is of other pairs.
 
     Only the same data, seed and choices give the same pairs.
     """
-    weights = None if settings.objective.supervised else find_estimator(settings.run.flow)
-    if weights is not None:
-        run.refuse_inside("--flow", weights)
-    if settings.run.flows_of is None:
+    if estimator is not None:
+        run.refuse_inside("--flow", estimator)
+    if settings.flows_of is None:
         return
-    folder = Path(settings.run.flows_of)
+    folder = Path(settings.flows_of)
     run.refuse_inside("flows_of", folder / "flows_first.npy")
     try:
         other = json.loads((folder / "config.json").read_text())
@@ -119,13 +129,12 @@ def _check_flows(settings: TrainSettings, record: dict[str, Any], run: RunFolder
     first_flows(folder, len(training.pairs), training.points)
 
 
-def _start_network(config: PartConfig, init: str | None, folder: RunFolder) -> PartNetwork:
-    """Return a new network, or one with the weights of --init. Raises UsageError where these are of another size."""
+def _start_network(config: PartConfig, init: Path | None, folder: RunFolder) -> PartNetwork:
+    """Returns a new network, or one with the weights of --init. Raises UsageError where these are of another size."""
     model = PartNetwork(config)
-    if init:
-        path = find_model(init, "--init")
-        folder.refuse_inside("--init", path)
-        other, _ = load_model(str(path), "--init")
+    if init is not None:
+        folder.refuse_inside("--init", init)
+        other, _ = load_model(init)
         if other.config != config:
             raise UsageError(
                 f"--init {init}: its network has another configuration; give the same --preset and network settings"

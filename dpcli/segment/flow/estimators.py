@@ -28,8 +28,9 @@ def find_estimator(method: str) -> Path | None:
         raise UsageError(f"--flow {method}: expected {', '.join(METHODS)}, or a trained estimator's file or folder")
     from dpcli.segment.flow.model_file import find_flow_model, load_flow_model
 
-    load_flow_model(method)
-    return find_flow_model(method)
+    path = find_flow_model(method)
+    load_flow_model(path)
+    return path
 
 
 def estimate_flow(points1: Tensor, points2: Tensor, method: str = "icp", *, device: str = "cpu") -> Tensor:

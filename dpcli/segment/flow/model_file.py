@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.flow.config import FlowConfig
 from dpcli.segment.flow.flowstep3d import FlowStep3D
 
@@ -25,13 +25,16 @@ def save_flow_model(path: Path, model: FlowStep3D, notes: dict) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def find_flow_model(name: str) -> Path:
-    """Return the weights file that a name means: a path, or a training folder. Raises UsageError when there is none."""
-    return find_weights(name, Path(__file__).parent / "weights", _MAKER, "--flow")
+def find_flow_model(name: str | Path) -> Path:
+    """Return the weights file that a name means, as `find_weights`; none comes with the package. Raises UsageError."""
+    return find_weights(name, None, _MAKER, "--flow")
 
 
-def load_flow_model(name: str) -> tuple[FlowStep3D, dict]:
-    """Return a flow network in eval mode and its notes; the last two are kept. Raises DataError for a damaged file."""
+def load_flow_model(name: str | Path) -> tuple[FlowStep3D, dict]:
+    """Return a flow network in eval mode and its notes; the last two are kept until their files change.
+
+    Raises DataError for a damaged file.
+    """
     path = find_flow_model(name)
     return _read_flow_model(path, path.stat().st_mtime_ns)
 

@@ -13,7 +13,7 @@ import torch
 
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.config import FlowConfig, FlowSchedule
 from dpcli.segment.flow.flowstep3d import FlowStep3D
@@ -23,7 +23,6 @@ from dpcli.segment.frame_pairs import PairSource
 from dpcli.store import CloudsReader
 
 COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "learning_rate", "seconds")
-_KEY = 7101  # keeps these generators apart from those of other trainings
 
 
 class FlowTrainer:
@@ -51,7 +50,7 @@ class FlowTrainer:
         self.steps, self.batch = schedule.steps, schedule.batch
         self.log_every = log_every or max(1, self.steps // 40)
         self.source, self.held = _training_and_held_out_pairs(reader, schedule.points, seed)
-        torch.manual_seed(int(generator(seed, _KEY, 0).integers(2**31)))
+        torch.manual_seed(int(generator(seed, SegmentStream.FLOW_TRAINING, 0).integers(2**31)))
         self.model = FlowStep3D(network).to(device)
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-3)
         self.step, self.best, self.sums, self.spent = 0, float("inf"), [0.0, 0.0, 0], 0.0
@@ -88,7 +87,7 @@ class FlowTrainer:
     def _one_step(self) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate()
-        rng = generator(self.seed, _KEY, 1, self.step)
+        rng = generator(self.seed, SegmentStream.FLOW_TRAINING, 1, self.step)
         pairs = []
         for number in rng.integers(len(self.source.pairs), size=self.batch):
             points = self.source.load(self.source.pairs[number]).points

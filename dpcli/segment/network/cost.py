@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from dpcli.runtime.memory import peak_memory
+from dpcli.runtime.device import peak_memory
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS
 from dpcli.segment.network.kernel_points import kernel_points

@@ -6,8 +6,7 @@ import json
 from pathlib import Path
 
 from dpcli.errors import UsageError
-from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
-from dpcli.runtime.weights_lookup import shipped_models
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights, shipped_models
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.part_network import PartNetwork
 
@@ -21,7 +20,7 @@ def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def find_model(name: str, option: str = "--model") -> Path:
+def find_model(name: str | Path, option: str = "--model") -> Path:
     """Return the file that a name means: a path, `best.safetensors` of a training folder, or a shipped name.
 
     option: what messages call the name. Raises UsageError when there is none.
@@ -29,9 +28,12 @@ def find_model(name: str, option: str = "--model") -> Path:
     return find_weights(name, SHIPPED, _MAKER, option)
 
 
-def load_model(name: str, option: str = "--model") -> tuple[PartNetwork, dict]:
-    """Return a part network in eval mode and its notes; arguments as `find_model`. Raises DataError for a damaged file."""
-    path = find_model(name, option)
+def load_model(name: str | Path) -> tuple[PartNetwork, dict]:
+    """Return a part network in eval mode and its notes; name: what `find_model` found or takes.
+
+    Raises DataError for a damaged file.
+    """
+    path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = PartNetwork(PartConfig.from_json(header["config"]))
     load_state(model, tensors, path)
