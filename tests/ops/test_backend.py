@@ -19,6 +19,7 @@ from tests.support.ops_helpers import backend
 def python(code: str, **environment: str) -> str:
     """Output of a fresh interpreter."""
     import os
+from pathlib import Path
 
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, env={**os.environ, **environment})
@@ -140,3 +141,9 @@ def test_keys_sort_as_distance_then_index() -> None:
     assert key_indices(order).tolist() == [1, 4, 0, 3, 5, 2]
     assert torch.equal(key_distances(order), distances[key_indices(order)])
     assert np.isinf(key_distances(order)[-1].item())
+
+
+def test_no_module_hides_a_function_of_the_package():
+    """A submodule of the same name would take the function's place as soon as anything imports it."""
+    modules = {path.stem for path in Path(ops.__file__).parent.iterdir()}
+    assert not modules & set(ops.__all__)
