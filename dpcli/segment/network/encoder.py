@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dpcli.ops import fps
-from dpcli.ops.gather import gather_points
+from dpcli.ops import fps, gather_points
 from dpcli.runtime.mixed_precision import full_precision
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpcli.ops import knn
-from dpcli.ops.gather import gather_points
+from dpcli.ops import gather_points, knn
 from dpcli.runtime.mixed_precision import full_precision
 
 
