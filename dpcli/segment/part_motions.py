@@ -28,7 +28,7 @@ def threads_for(frames: list[Tensor]) -> int:
 def fit_part_motions(
     frames: list[Tensor], masks: list[Tensor], flows: Flows, pairs: Pairs, steps: int
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return the motions (S,3,3), (S,3) of the parts for every pair of frames, refined by `steps` of object-aware ICP.
+    """Returns the motions (S,3,3), (S,3) of the parts for every pair of frames, refined by `steps` of object-aware ICP.
 
     frames: (N_t,3); masks: (N_t,S), a part in the same column of all; flows: at least of the pairs. Pairs of equally many
     points are refined together, `_TOGETHER` at a time.
@@ -52,7 +52,7 @@ def fit_part_motions(
 def _fit_pairs(
     first: Tensor, second: Tensor, mask1: Tensor, mask2: Tensor, flow: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
-    """Return motions (B,S,3,3), (B,S,3): the flow's own, or those of object-aware ICP where they lie nearer to frame 2."""
+    """Returns motions (B,S,3,3), (B,S,3): the flow's own, or those of object-aware ICP where they lie nearer to frame 2."""
     start = weighted_kabsch(first, first + flow, mask1)
     if steps == 0:
         return start
@@ -64,14 +64,14 @@ def _fit_pairs(
 
 
 def _measure_gap(first: Tensor, second: Tensor, mask1: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
-    """Return the mean distance (B,S) of each part's own points, moved, to frame 2."""
+    """Returns the mean distance (B,S) of each part's own points, moved, to frame 2."""
     share = one_hot(mask1)  # [B, N, S]
     squared, _ = knn(first + rigid_flow(first, share, rotation, shift), second, 1)
     return (share * squared.sqrt()).sum(1) / share.sum(1).clamp(min=1)
 
 
 def motion_in_input_units(motion: tuple[Tensor, Tensor], mask: Tensor, scale: float, center: Tensor) -> np.ndarray:
-    """Return the motions f32 (S,4,4) in the input's own coordinates; parts without points stand still.
+    """Returns the motions f32 (S,4,4) in the input's own coordinates; parts without points stand still.
 
     motion: (S,3,3), (S,3) of clouds that were centered at `center` (3) and then scaled; mask (N,S): of frame 1.
     """
@@ -82,6 +82,6 @@ def motion_in_input_units(motion: tuple[Tensor, Tensor], mask: Tensor, scale: fl
 
 
 def part_flow(points: Tensor, mask: Tensor, motion: tuple[Tensor, Tensor], scale: float) -> np.ndarray:
-    """Return the flow f32 (N,3) in the input's unit of points (N,3), scaled, that follow their parts (mask (N,S))."""
+    """Returns the flow f32 (N,3) in the input's unit of points (N,3), scaled, that follow their parts (mask (N,S))."""
     rotation, shift = motion
     return (rigid_flow(points[None], mask[None], rotation[None], shift[None])[0] / scale).numpy()

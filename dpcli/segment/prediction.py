@@ -43,7 +43,7 @@ class _Frames:
 def predict_parts(
     sequence: CloudSequence, index: int, segmenter: Segmenter, estimate: Estimate, options: Refinement, seed: int
 ) -> tuple[np.ndarray, PartsSample]:
-    """Return hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
+    """Returns hard ids i16 (P), the same id for the same part in all frames, and what else is said of the sequence.
 
     index: the sequence's number, for the random draws. Frames are thinned to `points`, centered and scaled together to
     diameter 1 (so no unit or place matters); masks are carried back to all points from the three nearest. One frame gives
@@ -67,7 +67,7 @@ def predict_parts(
 
 
 def pairs_to_report(frames: int, pairs: str) -> Pairs:
-    """Return the (source, target) frames whose motion is reported: adjacent ones forward, or every ordered pair.
+    """Returns the (source, target) frames whose motion is reported: adjacent ones forward, or every ordered pair.
 
     >>> pairs_to_report(3, "adjacent")
     [(0, 1), (1, 2)]
@@ -78,6 +78,7 @@ def pairs_to_report(frames: int, pairs: str) -> Pairs:
 
 
 def _prepare_frames(clouds: list[np.ndarray], index: int, options: Refinement, seed: int) -> _Frames:
+    """Returns the frames that have points, centered, scaled, and thinned by draws of the sequence's own generator."""
     filled = [cloud for cloud in clouds if len(cloud)]
     numbers = [t for t, cloud in enumerate(clouds) if len(cloud)] or [0]
     center = np.float32(np.concatenate(filled or [np.zeros((1, 3))]).mean(0))
@@ -88,7 +89,7 @@ def _prepare_frames(clouds: list[np.ndarray], index: int, options: Refinement, s
 
 
 def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
-    """Return at most so many far-apart points of a cloud, and at least `_FEWEST`, some of them twice if need be."""
+    """Returns at most so many far-apart points of a cloud, and at least `_FEWEST`, some of them twice if need be."""
     if len(cloud) == 0:
         return torch.zeros(_FEWEST, 3)
     if len(cloud) <= most:
@@ -100,7 +101,7 @@ def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
 def _find_flows_and_masks(
     frames: list[Tensor], pairs: Pairs, estimate: Estimate, segmenter: Segmenter
 ) -> tuple[Flows, list[Tensor]]:
-    """Return the flows between the frames of the pairs and between neighbors, both ways at once, and the masks.
+    """Returns the flows between the frames of the pairs and between neighbors, both ways at once, and the masks.
 
     Pairs of frames follow one another in one thread; a segmenter that needs no flows works beside them in a second one.
     """
@@ -116,7 +117,7 @@ def _find_flows_and_masks(
 
 
 def _refine_masks(frames: list[Tensor], flows: Flows, masks: list[Tensor], options: Refinement) -> list[Tensor]:
-    """Return the masks with bodies that move apart divided, the same slots in all frames, and small parts given up."""
+    """Returns the masks with bodies that move apart divided, the same slots in all frames, and small parts given up."""
     if options.split_bodies and len(frames) > 1:
         with torch_threads(threads_for(frames)):
             masks = [
@@ -131,7 +132,7 @@ def _refine_masks(frames: list[Tensor], flows: Flows, masks: list[Tensor], optio
 
 
 def _vote(frames: list[Tensor], flows: Flows, masks: list[Tensor]) -> list[Tensor]:
-    """Return each mask averaged, with twice the weight, with its neighbors' as the flow brings them."""
+    """Returns each mask averaged, with twice the weight, with its neighbors' as the flow brings them."""
     voted = []
     for t, mask in enumerate(masks):
         total, count = 2 * mask, 2
@@ -144,7 +145,7 @@ def _vote(frames: list[Tensor], flows: Flows, masks: list[Tensor]) -> list[Tenso
 
 
 def _give_up_small_parts(masks: list[Tensor], smallest: float) -> list[Tensor]:
-    """Return the masks without slots that have less than this share of the sequence's points, unless all have."""
+    """Returns the masks without slots that have less than this share of the sequence's points, unless all have."""
     share = torch.cat([one_hot(mask) for mask in masks]).mean(0)
     kept = (share >= smallest).float()
     if kept.sum() == 0:
@@ -153,7 +154,7 @@ def _give_up_small_parts(masks: list[Tensor], smallest: float) -> list[Tensor]:
 
 
 def _carry_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
-    """Return the mask (n,S) of thin points (n,3) at all points of the cloud (N,3)."""
+    """Returns the mask (n,S) of thin points (n,3) at all points of the cloud (N,3)."""
     if len(cloud) == 0:
         return mask[:0]
     if cloud.shape == thin.shape and torch.equal(cloud, thin):
@@ -165,7 +166,7 @@ def _carry_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
 def _find_motions(
     frames: _Frames, masks: list[Tensor], full: list[Tensor], flows: Flows, pairs: Pairs, steps: int
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return motions f32 (Q,S,4,4) in the input's own coordinates and the flow of all points, pair by pair."""
+    """Returns motions f32 (Q,S,4,4) in the input's own coordinates and the flow of all points, pair by pair."""
     slots, center = masks[0].shape[1], torch.from_numpy(frames.center)
     motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
     for q, ((i, _), own) in enumerate(zip(pairs, fit_part_motions(frames.thin, masks, flows, pairs, steps))):
@@ -177,7 +178,7 @@ def _find_motions(
 def _add_still_pairs(
     reported: Pairs, known: Pairs, clouds: list[np.ndarray], motion: np.ndarray, flow: list[np.ndarray]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return motions (Q,S,4,4) and flows of all reported pairs: those that are not known stand still."""
+    """Returns motions (Q,S,4,4) and flows of all reported pairs: those that are not known stand still."""
     motions = np.tile(np.eye(4, dtype=np.float32), (len(reported), motion.shape[1], 1, 1))
     flows = [np.zeros_like(clouds[i]) for i, _ in reported]
     place = {pair: number for number, pair in enumerate(reported)}

@@ -1,4 +1,4 @@
-"""What divides the frames of a sequence into parts: the part network, or a classical method, behind one interface."""
+"""The segmenters, which divide the frames of a sequence into parts: the part network, and the classical methods."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ _CHUNK = 8  # frames that the network sees at once
 
 
 class Segmenter(ABC):
-    """Divides frames into soft masks. needs_flows: whether `segment` looks at flows, so that it must wait for them."""
+    """Divides frames into soft masks.
+
+    needs_flows: whether `segment` looks at flows, so that it must wait for them.
+    """
 
     needs_flows: ClassVar[bool] = True
 
@@ -33,10 +36,10 @@ class Segmenter(ABC):
 
     @abstractmethod
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
-        """Return a mask (N_t,S) f32 for each frame (N_t,3); rows sum to 1. flows: between pairs of the frames."""
+        """Returns a mask (N_t,S) f32 for each frame (N_t,3); rows sum to 1. flows: between pairs of the frames."""
 
     def record(self) -> dict[str, Any]:
-        """Return what the provenance of a file says of the segmenter."""
+        """Returns what the provenance of a file says of the segmenter."""
         return {}
 
 
@@ -51,7 +54,7 @@ class NetworkSegmenter(Segmenter):
 
     @classmethod
     def load(cls, name: str, device: torch.device, mixed: bool) -> NetworkSegmenter:
-        """Return a segmenter of the trained network `name`: a file, a training folder or a shipped name.
+        """Returns a segmenter of the trained network `name`: a file, a training folder or a shipped name.
 
         mixed: whether its products are made in bfloat16. Raises UsageError when there is no such network.
         """
@@ -63,16 +66,19 @@ class NetworkSegmenter(Segmenter):
 
     @property
     def slots(self) -> int:
+        """The network's number of slots."""
         return self.model.config.slots
 
     @torch.inference_mode()
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
+        """Returns the masks that the network gives; it looks at no flow."""
         if len({len(frame) for frame in frames}) == 1:
             chunks = torch.stack(frames).split(_CHUNK)
             return [mask.cpu() for chunk in chunks for mask in self.model(chunk.to(self.device)).mask]
         return [self.model(frame[None].to(self.device)).mask[0].cpu() for frame in frames]
 
     def record(self) -> dict[str, Any]:
+        """Returns the network's notes and the digest of its file."""
         return self.about
 
 
@@ -85,9 +91,11 @@ class ClassicalSegmenter(Segmenter):
 
     @property
     def slots(self) -> int:
+        """The most parts that the method may find."""
         return max(self.settings.max_parts, self.settings.parts or 0)
 
     def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
+        """Returns the method's labels as masks of zeros and ones."""
         labels = classical_labels(
             [frame.numpy() for frame in frames],
             {pair: flow.numpy() for pair, flow in flows.items()},
@@ -97,4 +105,5 @@ class ClassicalSegmenter(Segmenter):
         return [torch.nn.functional.one_hot(torch.from_numpy(np.int64(own)), self.slots).float() for own in labels]
 
     def record(self) -> dict[str, Any]:
+        """Returns the method's resolved settings."""
         return {"classical": self.settings.used()}

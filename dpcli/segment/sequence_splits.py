@@ -1,4 +1,4 @@
-"""Which sequences of a clouds file a command takes, and which of them a training holds out."""
+"""The sequences of a clouds file that a command takes, and those that a training holds out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dpcli.store import CloudsReader
 
 
 def sequences_of_split(reader: CloudsReader, split: str, name: str) -> list[int]:
-    """Return the numbers of the sequences of a split, or of `all`. Raises DataError, naming the file, when it has none."""
+    """Returns the numbers of the sequences of a split, or of `all`. Raises DataError, naming the file, when it has none."""
     chosen = [i for i, own in enumerate(reader.splits) if split == "all" or own == split]
     if not chosen:
         raise DataError(f"{name}: no sequence of split {split!r}; it has {sorted(set(reader.splits))}")
@@ -16,7 +16,7 @@ def sequences_of_split(reader: CloudsReader, split: str, name: str) -> list[int]
 
 
 def hold_out_sequences(reader: CloudsReader, validation: str, seed: int) -> tuple[list[int], list[int]]:
-    """Return the (training, validation) sequences of two frames or more.
+    """Returns the (training, validation) sequences of two frames or more.
 
     Training: split `train`, or all when nothing is named so. validation: `auto`, the split `validation` if there is one,
     else nothing; `none`; a fraction of the training sequences; class names with commas, held out whole. Raises DataError
@@ -47,7 +47,7 @@ def hold_out_sequences(reader: CloudsReader, validation: str, seed: int) -> tupl
 
 
 def _hold_out_classes(reader: CloudsReader, train: list[int], names: str) -> tuple[list[int], list[int]]:
-    """Return the training sequences without and with the classes named, with commas between the names."""
+    """Returns the training sequences without and with the classes named, with commas between the names."""
     classes = [word.strip() for word in names.split(",")]
     unknown = [name for name in classes if name not in reader.class_names]
     if unknown:

@@ -20,7 +20,7 @@ class Neighbors(NamedTuple):
 def smoothness_neighbors(
     points: Tensor, *, k: int = 8, radius: float = 0.1, ball_k: int = 16, ball_radius: float = 0.2
 ) -> Neighbors:
-    """Return the neighbors of every point of (B,N,3) for `smoothness_loss`; the defaults are those for SAPIEN.
+    """Returns the neighbors of every point of (B,N,3) for `smoothness_loss`; the defaults are those for SAPIEN.
 
     nearest: the k nearest points, those farther than `radius` replaced by the point itself. ball: the first ball_k in
     index order with distance below ball_radius, unused places repeating the first. Other data sets: OGC-DR 8, 0.02, 16,
@@ -34,7 +34,7 @@ def smoothness_neighbors(
 
 
 def smoothness_loss(values: Tensor, neighbors: Neighbors, weights: tuple[float, float] = (3.0, 1.0)) -> Tensor:
-    """Return the weighted sum, a scalar, of the mean |v_i - v_j|_1 over nearest neighbors and over those of the ball.
+    """Returns the weighted sum, a scalar, of the mean |v_i - v_j|_1 over nearest neighbors and over those of the ball.
 
     values (B,N,S): a mask or a flow; the norm sums over its channels.
 

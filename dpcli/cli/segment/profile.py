@@ -27,7 +27,7 @@ def profile(given: Given, as_object: Json = False, device: Device = "auto") -> N
 
 
 def render_cost(cost: dict[str, Any]) -> str:
-    """Return the object of `profile_network` as lines for a person."""
+    """Returns the object of `profile_network` as lines for a person."""
     parameters, counts = cost["parameters"], cost["macs_per_frame"]
     parts = ", ".join(f"{key} {value:,}" for key, value in parameters.items() if key != "total")
     paper = cost["paper_style_parameters"]

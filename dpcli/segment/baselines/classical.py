@@ -24,7 +24,7 @@ def classical_labels(
     *,
     rng: np.random.Generator,
 ) -> list[np.ndarray]:  # T of [N_t]
-    """Return parts i64 (N_t) of every frame, 0 = the largest of the first, the same id for a part through the frames.
+    """Returns parts i64 (N_t) of every frame, 0 = the largest of the first, the same id for a part through the frames.
 
     flows[t, u] f32 (N_t,3) leads from frame t to u; what is missing is chained from what there is. settings.parts: their
     number, None to estimate it in each frame (at most max_parts; DBSCAN finds its own number and merges what is beyond).
@@ -45,6 +45,7 @@ def classical_labels(
 
 
 def _check_frames(frames: Sequence[np.ndarray], flows: Flows) -> None:
+    """Raises DataError for clouds and flows of wrong shapes, or with values that are not finite."""
     for t, points in enumerate(frames):
         if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
             raise DataError(f"frame {t}: points have shape {points.shape}; expected finite coordinates (points, 3)")
@@ -58,7 +59,7 @@ def _check_frames(frames: Sequence[np.ndarray], flows: Flows) -> None:
 def _label_frame(
     frames: Sequence[np.ndarray], flows: Flows, t: int, settings: ClassicalSettings, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return the parts i64 (N_t) of one frame, which no other frame knows of yet."""
+    """Returns the parts i64 (N_t) of one frame, which no other frame knows of yet."""
     from dpcli.ops import fps_numpy
 
     points = np.asarray(frames[t], np.float64)
@@ -83,7 +84,7 @@ def _label_frame(
 def _cluster(
     points: np.ndarray, motion: np.ndarray, settings: ClassicalSettings, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return raw clusters i64 (N); -1 for DBSCAN's outliers."""
+    """Returns raw clusters i64 (N); -1 for DBSCAN's outliers."""
     parts = settings.parts
     if settings.method == "dbscan":
         from sklearn.cluster import DBSCAN
@@ -103,12 +104,12 @@ def _cluster(
 
 
 def _join_features(points: np.ndarray, motion: np.ndarray, weight: float) -> np.ndarray:
-    """Return coordinates beside motion, which is scaled so that its distance is the root mean square over the frames."""
+    """Returns coordinates beside motion, which is scaled so that its distance is the root mean square over the frames."""
     return np.concatenate([points, motion.reshape(len(points), -1) * (weight / max(motion.shape[1], 1) ** 0.5)], 1)
 
 
 def _cluster_ward(space: np.ndarray, num_parts: int | None, threshold: float) -> np.ndarray:
-    """Return the clusters (N) of Ward linkage: so many, or as many as lie further apart than the threshold."""
+    """Returns the clusters (N) of Ward linkage: so many, or as many as lie further apart than the threshold."""
     from sklearn.cluster import AgglomerativeClustering
 
     if num_parts is None:
@@ -117,7 +118,7 @@ def _cluster_ward(space: np.ndarray, num_parts: int | None, threshold: float) ->
 
 
 def _merge_parts(parts: np.ndarray, points: np.ndarray, smallest: float, most: int) -> np.ndarray:
-    """Return parts 0..K-1, K <= most: outliers (-1) go to the nearest point's part, then the smallest to their neighbors."""
+    """Returns parts 0..K-1, K <= most: outliers (-1) go to the nearest point's part, then the smallest to their neighbors."""
     if (parts < 0).all():
         return np.zeros(len(parts), np.int64)
     inside = np.flatnonzero(parts >= 0)

@@ -65,6 +65,7 @@ class ClassicalSettings:
     reach: float = setting(0.1, "trajaffn: distance that counts as one, in diameters.", above=0)
 
     def __post_init__(self) -> None:
+        """Raises UsageError for a wrong value, or a setting that belongs to another method."""
         check(self)
         if self.method in ("ssc", "trajaffn") and self.motion == "none":
             raise UsageError(f"motion = none: --method {self.method} sees only motion; expected flow or residual")
@@ -74,14 +75,14 @@ class ClassicalSettings:
                 raise UsageError(self._refuse(field.name))
 
     def _refuse(self, name: str) -> str:
-        """Return why a setting that was changed can't be meant."""
+        """Returns why a setting that was changed can't be meant."""
         owners = [method for method, own in METHODS.items() if name in own] or list(METHODS)
         if self.method is None:
             return f"{name} belongs to --method {' or '.join(owners)}; the network finds its own number of parts"
         return f"{name} belongs to --method {' or '.join(owners)}; {self.method} has {', '.join(METHODS[self.method])}"
 
     def used(self) -> dict[str, Any]:
-        """Return the settings that the method reads, by name, with those that are left to it resolved."""
+        """Returns the settings that the method reads, by name, with those that are left to it resolved."""
         assert self.method is not None
         own = {name: getattr(self, name) for name in ("method", "parts", *_SHARED, *METHODS[self.method])}
         if self.motion == "auto":
@@ -91,5 +92,5 @@ class ClassicalSettings:
         return own
 
     def resolved(self) -> ClassicalSettings:
-        """Return the settings with those that are left to the method resolved."""
+        """Returns the settings with those that are left to the method resolved."""
         return dataclasses.replace(self, **self.used())

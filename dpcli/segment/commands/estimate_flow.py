@@ -45,13 +45,13 @@ class FlowOfSequence:
     device: str = "cpu"
 
     def fields(self, given: Sequence[str]) -> list[str]:
-        """Return the fields of the result: those of the input beside the flow; only the time where flow is the points."""
+        """Returns the fields of the result: those of the input beside the flow; only the time where flow is the points."""
         if self.as_points:
             return [name for name in given if name == "time"]
         return [*(name for name in given if name != "scene_flow"), "scene_flow"]
 
     def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
-        """Return some points of each frame of a sequence, and their flow; its number in the file chooses the points."""
+        """Returns some points of each frame of a sequence, and their flow; its number in the file chooses the points."""
         index, sequence = numbered
         drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS, index))
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
@@ -62,7 +62,7 @@ class FlowOfSequence:
 
 
 def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) -> CloudSequence:
-    """Return at most `points` random points of each frame in their own order, with their fields; 0 keeps all."""
+    """Returns at most `points` random points of each frame in their own order, with their fields; 0 keeps all."""
     starts, counts = sequence.frame_offsets[:-1], np.diff(sequence.frame_offsets)
     keep = [
         start + (np.sort(rng.choice(count, points, replace=False)) if 0 < points < count else np.arange(count))
@@ -86,7 +86,7 @@ def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) 
 
 
 def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, device: str = "cpu") -> np.ndarray:
-    """Return the flow f32 (P,3) of the points drawn from the frames `whole`: to the next frame, of the last frame back.
+    """Returns the flow f32 (P,3) of the points drawn from the frames `whole`: to the next frame, of the last frame back.
 
     icp and nearest look for the points in the whole next frame (icp in 1,024 of its points at most), a trained
     estimator in the points drawn from it, as it was trained. Zero in a single frame and toward a frame without points.
@@ -101,7 +101,7 @@ def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, devi
 
 
 def _frame_flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) -> np.ndarray:
-    """Return the flow f32 (N,3) of points (N,3) toward a frame (M,3); zero where either has no points."""
+    """Returns the flow f32 (N,3) of points (N,3) toward a frame (M,3); zero where either has no points."""
     if min(len(points), len(target)) == 0:
         return np.zeros_like(points)
     pair = (torch.from_numpy(np.ascontiguousarray(cloud))[None] for cloud in (points, target))
@@ -109,7 +109,7 @@ def _frame_flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) 
 
 
 def flow_as_points(sequence: CloudSequence) -> np.ndarray:
-    """Return flow f32 (P,3) scaled to the range of the coordinates (thesis A.1.5.2), forward in time in all frames.
+    """Returns flow f32 (P,3) scaled to the range of the coordinates (thesis A.1.5.2), forward in time in all frames.
 
     One factor a sequence: the 99th percentile of the flow's norms becomes that of the distances of all points from
     their mean. The largest norm counts where that percentile is 0; flow below 1e-9 of the distances becomes 0.
@@ -146,7 +146,7 @@ def estimate_flow_of_file(
     jobs: int | None,
     force: bool,
 ) -> EstimatedFlow:
-    """Write the flow of a clouds file; running again continues where a stopped or killed run ended.
+    """Writes the flow of a clouds file; running again continues where a stopped or killed run ended.
 
     flow, points, as_points: see `FlowOfSequence`. jobs: processes, None for as many as pay.
     """
@@ -178,7 +178,7 @@ def estimate_flow_of_file(
 
 
 def _choose_processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
-    """Return how many processes work: one for each core where rigid bodies are found, which takes one core, else one."""
+    """Returns how many processes work: one for each core where rigid bodies are found, which takes one core, else one."""
     if work.device != "cpu":
         return 1  # one process on an accelerator
     return jobs or (cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1)
@@ -196,7 +196,7 @@ def _already_there(target: Path, entry: dict) -> bool:
 def _estimate_sequences(
     reader: CloudsReader, chosen: list[int], work: FlowOfSequence, writer: CloudsWriter, jobs: int
 ) -> None:
-    """Write the flow of the sequences that an earlier run has not written."""
+    """Writes the flow of the sequences that an earlier run has not written."""
     done = len(writer.written_names)
     read = [name for name in work.fields(reader.fields) if name in reader.fields and name != "scene_flow"]
     todo = ((index, reader.read(index, fields=read)) for index in chosen[done:])

@@ -21,7 +21,7 @@ from dpcli.store import CloudsReader, input_file
 def train_flow_estimator(
     data: str, output: str, *, network: FlowConfig, schedule: FlowSchedule, seed: int, device: str, force: bool
 ) -> Path:
-    """Train on a clouds file; return `best.safetensors` of the folder `output`, which --flow of other commands takes.
+    """Trains on a clouds file; returns `best.safetensors` of the folder `output`, which --flow of other commands takes.
 
     Running again continues a stopped run of the same settings. Raises UsageError where the folder holds another run.
     """
@@ -49,7 +49,7 @@ def train_flow_estimator(
 
 
 def draw_flow_curves(rows: list[dict], path: Path) -> None:
-    """Draw the Chamfer distance in training and the end point error, where poses are known, over steps, as a PNG."""
+    """Draws the Chamfer distance in training and the end point error, where poses are known, over steps, as a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.6, 3.8), layout="constrained")

@@ -38,7 +38,7 @@ class Drawings:
     ply: Path | None = None
 
     def check(self) -> None:
-        """Raise UsageError or DataError, before the work, for files that can't be written."""
+        """Raises UsageError or DataError, before the work, for files that can't be written."""
         for path, option, kinds in ((self.picture, "--picture", PICTURES), (self.turntable, "--turntable", (".gif",))):
             if path is not None:
                 check_target(path, option, kinds)
@@ -55,7 +55,7 @@ def predict_file(
     device: str,
     force: bool,
 ) -> int:
-    """Write the parts of a clouds file and draw them; return the number of sequences.
+    """Writes the parts of a clouds file and draws them; returns the number of sequences.
 
     model: a trained network, None for the shipped one. Running again continues where a stopped run ended.
     """
@@ -93,7 +93,7 @@ def predict_file(
 
 
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:
-    """Return the segmenter that the options ask for. Raises UsageError for options that contradict one another."""
+    """Returns the segmenter that the options ask for. Raises UsageError for options that contradict one another."""
     classical, chosen = settings.classical, choose_device(device)
     if classical.method is None:
         return NetworkSegmenter.load(model or default_model(), chosen, wanted(settings.precision.amp, chosen))
@@ -126,7 +126,7 @@ def _predict_sequences(
     writer: PartsWriter,
     fields: list[str],
 ) -> None:
-    """Write the parts of the sequences that an earlier run has not written."""
+    """Writes the parts of the sequences that an earlier run has not written."""
     done = set(writer.written_names)
     with Progress("segment predict", len(sequences), "sequence") as bar, stop_requested() as stop:
         bar.skip(len(done))
@@ -146,7 +146,7 @@ def _predict_sequences(
 
 
 def _draw(target: Path, drawings: Drawings) -> None:
-    """Draw what was just written."""
+    """Draws what was just written."""
     if drawings == Drawings():
         return
     from dpcli.draw.ply import write_ply_frames

@@ -11,6 +11,6 @@ from dpcli.segment.network.cost import measure_cost
 
 
 def profile_network(settings: NetworkSettings, device: str) -> dict[str, Any]:
-    """Return parameters, multiply-adds, latency and memory of a part network with random weights."""
+    """Returns parameters, multiply-adds, latency and memory of a part network with random weights."""
     keep_freed_memory()
     return measure_cost(settings.config(), choose_device(device))

@@ -33,7 +33,7 @@ from dpcli.store import CloudsReader, input_file
 
 
 def train_part_network(data: str, output: str, settings: TrainSettings, *, seed: int, device: str, force: bool) -> Path:
-    """Train on a clouds file and return the file of the best weights; the folder `output` gets logs, curves, settings.
+    """Trains on a clouds file and returns the file of the best weights; the folder `output` gets logs, curves, settings.
 
     Running again continues a stopped run of the same settings. Raises UsageError where the folder holds another run.
     """
@@ -144,7 +144,7 @@ def _start_network(config: PartConfig, init: Path | None, folder: RunFolder) -> 
 
 
 def _check_labels(reader: CloudsReader) -> None:
-    """Raise DataError where the file lacks what --supervised learns from."""
+    """Raises DataError where the file lacks what --supervised learns from."""
     missing = [] if "part" in reader.fields else ["part"]
     if not any(name in reader.fields for name in MOTION_FIELDS):
         missing.append(" or ".join(MOTION_FIELDS))

@@ -1,4 +1,7 @@
-"""Scene flow between two frames: nearest points, rigid bodies found by ICP, or a network trained without labels."""
+"""This folder holds all that estimates scene flow: nearest points, rigid bodies by ICP, a network and its training.
+
+Nothing here knows of part networks but their slot matching.
+"""
 
 from __future__ import annotations
 

@@ -37,12 +37,12 @@ class FlowConfig:
         check(self)
 
     def to_json(self) -> str:
-        """Return the text that a weights file keeps."""
+        """Returns the text that a weights file keeps."""
         return json.dumps(dataclasses.asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> FlowConfig:
-        """Return the sizes that `to_json` wrote."""
+        """Returns the sizes that `to_json` wrote."""
         values = json.loads(text)
         return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
 
@@ -60,7 +60,7 @@ class FlowSchedule:
 
 
 def release() -> FlowConfig:
-    """Return the widths stated for FlowStep3D on SAPIEN.
+    """Returns the widths stated for FlowStep3D on SAPIEN.
 
     What is known of it leaves joints open, so the count differs from its 629,207 parameters, and its checkpoints don't
     load.

@@ -17,7 +17,7 @@ _FEWEST, _MOST = 16, 1024  # points of a frame that ICP works with
 
 
 def find_estimator(method: str) -> Path | None:
-    """Return the weights file of a trained estimator, or None for the methods that need none.
+    """Returns the weights file of a trained estimator, or None for the methods that need none.
 
     The network is read at once, so that a damaged file ends a command before its work, and kept for the first pair.
     Raises UsageError for an unknown name, DataError for a damaged file.
@@ -34,7 +34,7 @@ def find_estimator(method: str) -> Path | None:
 
 
 def estimate_flow(points1: Tensor, points2: Tensor, method: str = "icp", *, device: str = "cpu") -> Tensor:
-    """Return the flow (B,N,3) f32 that takes points1 (B,N,3) to where they are in the second frame, points2 (B,M,3).
+    """Returns the flow (B,N,3) f32 that takes points1 (B,N,3) to where they are in the second frame, points2 (B,M,3).
 
     method "nearest": to the nearest point, ties to the lowest index. "icp": few rigid bodies found by propose and
     verify (`find_bodies`), each point moved by its own. Anything else is the file or run folder of a trained estimator
@@ -57,7 +57,7 @@ def estimate_flow(points1: Tensor, points2: Tensor, method: str = "icp", *, devi
 
 
 def estimate_flow_both_ways(first: Tensor, second: Tensor, method: str) -> tuple[Tensor, Tensor]:
-    """Return the flow forth (N,3) and back (M,3) between two frames (N,3), (M,3), by the methods of `estimate_flow`.
+    """Returns the flow forth (N,3) and back (M,3) between two frames (N,3), (M,3), by the methods of `estimate_flow`.
 
     ICP runs once: its bodies' motions are inverted for the way back, and each point of frame 2 belongs to the body of
     the nearest point that was moved there, so that both frames tell of the same bodies.
@@ -78,7 +78,7 @@ def estimate_flow_both_ways(first: Tensor, second: Tensor, method: str) -> tuple
 
 
 def estimate_body_flow(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> np.ndarray:
-    """Return the flow f32 (N,3) of the rigid bodies of points1 (N,3), found toward points2 (M,3); any unit of length.
+    """Returns the flow f32 (N,3) of the rigid bodies of points1 (N,3), found toward points2 (M,3); any unit of length.
 
     Clouds of more than 1,024 points are thinned by farthest points for the search; every point then takes the body of
     the nearest one kept. Below 16 points, or without extent, all points shift by the difference of the means.
@@ -88,7 +88,7 @@ def estimate_body_flow(points1: np.ndarray, points2: np.ndarray, search: BodySea
 
 
 def find_bodies_at_any_scale(points1: np.ndarray, points2: np.ndarray, search: BodySearch | None = None) -> Bodies:
-    """Return what `find_bodies` finds for clouds (N,3), (M,3) of any size and unit: labels (N), motions f64 (K,3,4)."""
+    """Returns what `find_bodies` finds for clouds (N,3), (M,3) of any size and unit: labels (N), motions f64 (K,3,4)."""
     center = points1.mean(0, dtype=np.float64)
     size = 2 * np.sqrt(((points1 - center) ** 2).sum(1).max())
     if min(len(points1), len(points2)) < _FEWEST or not size > 0:
@@ -108,10 +108,10 @@ def find_bodies_at_any_scale(points1: np.ndarray, points2: np.ndarray, search: B
 
 
 def _thin(points: np.ndarray) -> np.ndarray:
-    """Return the indices of at most 1,024 farthest points."""
+    """Returns the indices of at most 1,024 farthest points."""
     return np.arange(len(points)) if len(points) <= _MOST else fps_numpy(points, _MOST)
 
 
 def _move_each(motion: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return each point (N,3) moved by its own motion (N,3,4)."""
+    """Returns each point (N,3) moved by its own motion (N,3,4)."""
     return np.einsum("nij,nj->ni", motion[:, :, :3], points) + motion[:, :, 3]

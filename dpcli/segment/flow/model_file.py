@@ -20,18 +20,18 @@ _MOST, _FEWEST = 2048, 16  # points the network sees at once; fewer than the lat
 
 
 def save_flow_model(path: Path, model: FlowStep3D, notes: dict) -> None:
-    """Write the weights as float32, with the configuration and notes (a small JSON object) in the header."""
+    """Writes the weights as float32, with the configuration and notes (a small JSON object) in the header."""
     header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
     save_weights(path, model.state_dict(), header)
 
 
 def find_flow_model(name: str | Path) -> Path:
-    """Return the weights file that a name means, as `find_weights`; none comes with the package. Raises UsageError."""
+    """Returns the weights file that a name means, as `find_weights`; none comes with the package. Raises UsageError."""
     return find_weights(name, None, _MAKER, "--flow")
 
 
 def load_flow_model(name: str | Path) -> tuple[FlowStep3D, dict]:
-    """Return a flow network in eval mode and its notes; the last two are kept until their files change.
+    """Returns a flow network in eval mode and its notes; the last two are kept until their files change.
 
     Raises DataError for a damaged file.
     """
@@ -41,6 +41,7 @@ def load_flow_model(name: str | Path) -> tuple[FlowStep3D, dict]:
 
 @functools.lru_cache(maxsize=2)
 def _read_flow_model(path: Path, _changed: int) -> tuple[FlowStep3D, dict]:
+    """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = FlowStep3D(FlowConfig.from_json(header["config"]))
     load_state(model, tensors, path)
@@ -49,7 +50,7 @@ def _read_flow_model(path: Path, _changed: int) -> tuple[FlowStep3D, dict]:
 
 @torch.inference_mode()
 def trained_flow(points1: Tensor, points2: Tensor, name: str, device: str = "cpu") -> Tensor:
-    """Return the flow (B,N,3) of clouds (B,N,3), (B,M,3) by the trained network `name`, on the inputs' device.
+    """Returns the flow (B,N,3) of clouds (B,N,3), (B,M,3) by the trained network `name`, on the inputs' device.
 
     Each pair is scaled to diameter 1 for the network, clouds of more than 2,048 points are thinned by farthest points and
     the flow is interpolated; below 16 points, or without extent, all shift by the difference of the means.
@@ -61,6 +62,7 @@ def trained_flow(points1: Tensor, points2: Tensor, name: str, device: str = "cpu
 
 
 def _estimate_pair(model: FlowStep3D, points1: Tensor, points2: Tensor) -> Tensor:
+    """Returns the flow (1,N,3) of one pair of clouds (1,N,3), (1,M,3)."""
     center = points1.mean(1, keepdim=True)
     size = 2 * (points1 - center).square().sum(-1).max().sqrt()
     shift = points2.mean(1, keepdim=True) - center
@@ -75,11 +77,12 @@ def _estimate_pair(model: FlowStep3D, points1: Tensor, points2: Tensor) -> Tenso
 
 
 def _thin(points: Tensor) -> Tensor:
+    """Returns at most 2,048 farthest points of a cloud (1,N,3)."""
     return points if points.shape[1] <= _MOST else gather_points(points, fps(points, _MOST))
 
 
 def augment_pair(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return a training pair f32 (2,N,3) changed at random, as FlowStep3D is trained on SAPIEN.
+    """Returns a training pair f32 (2,N,3) changed at random, as FlowStep3D is trained on SAPIEN.
 
     Both frames are scaled by 0.95 to 1.05 per axis, turned by at most 10 degrees about y and shifted by at most 0.05; the
     second is shifted by at most 0.01 more.

@@ -1,10 +1,10 @@
-"""Few rigid bodies that explain two frames: the classical start of the flow. Propose motions, verify, keep what pays.
+"""The search for few rigid bodies that explain two frames: it proposes motions, verifies them, and keeps the best.
 
-One motion is fitted to the whole first. Then, as long as it pays: regions that are badly explained are moved by ICP
-from many starts that articulated things make likely (turned about their own edges, shifted along their axes), every
-motion found is tried on the whole cloud, and the best one becomes a further body. The energy counts both clouds' badly
-explained points and the borders between bodies, so that a motion pays only if it explains more than it costs (in the
-spirit of PEARL, Isack and Boykov 2012).
+One motion is fitted to the whole first. Then, as long as the energy falls enough: regions that are badly explained are
+moved by ICP from many starts that articulated things make likely (turned about their own edges, shifted along their
+axes), every motion found is tried on the whole cloud, and the best one becomes a further body. The energy counts both
+clouds' badly explained points and the borders between bodies, so that a motion is added only if it explains more than
+it costs (in the spirit of PEARL, Isack and Boykov 2012).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _IDENTITY = np.eye(3, 4)
 
 @dataclass(frozen=True)
 class BodySearch:
-    """What the search may do. Lengths are in spacings of the points, or in diameters of the first cloud."""
+    """Holds what the search may do. Lengths are in spacings of the points, or in diameters of the first cloud."""
 
     most: int = 6  # bodies
     scale: float = 1.25  # spacings: a residual of this counts one half
@@ -43,7 +43,10 @@ class BodySearch:
 
 @dataclass
 class Bodies:
-    """label i64 (N): body of each source point; motion f64 (K,3,4): x_target = R x_source + t; body 0 came first."""
+    """Holds bodies and their motions.
+
+    label i64 (N): the body of each source point; motion f64 (K,3,4): x_target = R x_source + t; body 0 was found first.
+    """
 
     label: np.ndarray
     motion: np.ndarray
@@ -52,11 +55,16 @@ class Bodies:
 
 
 def find_bodies(source: np.ndarray, target: np.ndarray, search: BodySearch | None = None) -> Bodies:
-    """Bodies of source (N,3) and their motions onto target (M,3), by points alone; N, M >= 9, diameter about 1."""
+    """Returns the bodies of source (N,3) and their motions onto target (M,3), from points alone.
+
+    The clouds have a diameter of about 1, and 9 points or more.
+    """
     return _BodyFinder(Surface(source), Surface(target), search or BodySearch()).run()
 
 
 class _BodyFinder:
+    """Searches the bodies of one pair of clouds."""
+
     def __init__(self, source: Surface, target: Surface, options: BodySearch) -> None:
         self.source, self.target, self.options = source, target, options
         self.points = source.points.astype(np.float64)
@@ -67,6 +75,7 @@ class _BodyFinder:
         self.patches = [motion_proposals.cluster_patches(feature, count) for count in options.patches]
 
     def run(self) -> Bodies:
+        """Returns the bodies of the whole search: grow, look at each again, prune, tighten."""
         found = self._add_bodies(self._fit_one_body())
         for _ in range(self.options.second_looks):
             if len(found.motion) > 1:
@@ -74,7 +83,7 @@ class _BodyFinder:
         return self._tighten_motions(self._drop_needless_bodies(found))
 
     def _add_bodies(self, bodies: Bodies) -> Bodies:
-        """With further bodies, as long as they pay."""
+        """Returns the bodies with further ones, as long as each lowers the energy by `gain`."""
         while len(bodies.motion) < self.options.most:
             better = self._add_best_body(bodies)
             if better is None or better.energy > bodies.energy - self.options.gain:
@@ -83,7 +92,7 @@ class _BodyFinder:
         return bodies
 
     def _replace_motions(self, bodies: Bodies) -> Bodies:
-        """With other motions for the bodies after the first, where the energy falls."""
+        """Returns the bodies with other motions for those after the first, where that lowers the energy."""
         for k in range(1, len(bodies.motion)):
             for motion in self._find_other_motions(bodies, k):
                 cost, motions = bodies.cost.copy(), bodies.motion.copy()
@@ -94,7 +103,7 @@ class _BodyFinder:
         return _drop_empty_bodies(bodies)
 
     def _find_other_motions(self, bodies: Bodies, k: int) -> np.ndarray:
-        """Motions (H,3,4) of body k's points that ICP ends at when it starts from the first body's."""
+        """Returns motions (H,3,4) of body k's points that ICP ends at when it starts from the first body's motion."""
         region = np.flatnonzero(bodies.label == k)
         if len(region) < 8:
             return np.zeros((0, 3, 4))
@@ -108,7 +117,7 @@ class _BodyFinder:
         return ends[[h for h in chosen if score[h] < 0.6]]
 
     def _drop_needless_bodies(self, bodies: Bodies) -> Bodies:
-        """Without bodies whose points the others explain nearly as well."""
+        """Returns the bodies without those whose points the others explain nearly as well."""
         while len(bodies.motion) > 1:
             fewer = [self._drop_body(bodies, k) for k in range(len(bodies.motion))]
             best = min(fewer, key=lambda tried: tried.energy)
@@ -118,6 +127,7 @@ class _BodyFinder:
         return bodies
 
     def _drop_body(self, bodies: Bodies, k: int) -> Bodies:
+        """Returns the bodies without body k, whose points go to the others."""
         cost = np.delete(bodies.cost, k, 0)
         label = np.where(bodies.label == k, cost.argmin(0), bodies.label - (bodies.label > k))
         return _drop_empty_bodies(
@@ -125,7 +135,7 @@ class _BodyFinder:
         )
 
     def _tighten_motions(self, bodies: Bodies) -> Bodies:
-        """Refitted, ever tighter, as long as the energy falls."""
+        """Returns the bodies with motions refitted, ever tighter, as long as the energy falls."""
         for tight in self.options.polish:
             refined = self._refit_motions(bodies, tight)
             if refined.energy < bodies.energy:
@@ -133,13 +143,15 @@ class _BodyFinder:
         return bodies
 
     def _saturate(self, squared: np.ndarray) -> np.ndarray:
+        """Returns squared residuals as costs between 0 and 1; one half at `scale`."""
         return squared / (squared + self.scale**2)
 
     def _measure_cost(self, motion: np.ndarray) -> np.ndarray:
+        """Returns the saturated residuals (N) of all source points under one motion (3,4)."""
         return self._saturate(self.target.residuals(self.source.columns, motion, self.options.share))
 
     def _fit_one_body(self) -> Bodies:
-        """One motion for all, the best of those found from a few small turns."""
+        """Returns one body with one motion for all points, the best of those found from a few small turns."""
         turns = motion_proposals.turn_about(np.tile(np.eye(3), (2, 1)), np.repeat([-0.2, 0.2], 3), self.points.mean(0))
         nobody = np.zeros(len(self.points), np.int64)
         ends, _ = self.target.icp_many(
@@ -151,7 +163,10 @@ class _BodyFinder:
         return self._with_energy(nobody, motion[None], self._measure_cost(motion)[None])
 
     def _with_energy(self, label: np.ndarray, motion: np.ndarray, cost: np.ndarray) -> Bodies:
-        """With its energy: both clouds' mean saturated residuals, the borders, and the way from the first body."""
+        """Returns bodies with their energy.
+
+        It sums both clouds' mean saturated residuals, the borders, and the way from the first body.
+        """
         options = self.options
         energy = energy_kernel(
             self.points,
@@ -170,13 +185,13 @@ class _BodyFinder:
         return Bodies(label, motion, energy, cost)
 
     def _assign_points(self, label: np.ndarray, cost: np.ndarray) -> np.ndarray:
-        """Each point to the body that explains it and its neighbors best, neighbors preferring the same (ICM)."""
+        """Returns labels (N): each point goes to the body that explains it and its neighbors best (ICM)."""
         label = label.copy()
         assign_kernel(cost, self.source.neighbors, label, self.options.extra, self.options.border, 6)
         return label
 
     def _add_best_body(self, now: Bodies) -> Bodies | None:
-        """The best of all ways found to add a body, refined; None where no motion explains a region better."""
+        """Returns the best of all ways found to add a body, refined; None where no motion explains a region better."""
         proposals = sorted(self._propose_motions(now), key=lambda item: item[0])[: self.options.tried]
         best = None
         for _, motion, region in proposals:
@@ -198,6 +213,7 @@ class _BodyFinder:
         return _drop_empty_bodies(best)
 
     def _refit_motions(self, bodies: Bodies, tight: float = 1.0) -> Bodies:
+        """Returns the bodies with each motion refined by ICP on its own points; tight: factor of the residuals' scale."""
         motions = []
         for k, motion in enumerate(bodies.motion):
             own = np.ascontiguousarray(self.source.columns[:, bodies.label == k])
@@ -208,7 +224,10 @@ class _BodyFinder:
         return self._with_energy(self._assign_points(bodies.label, cost), np.stack(motions), cost)
 
     def _propose_motions(self, now: Bodies) -> list[tuple[float, np.ndarray, np.ndarray]]:
-        """(gain, motion, region): ICP of every badly explained region from every start; the best few of each."""
+        """Returns (gain, motion, region) for the best few motions of every badly explained region.
+
+        They come from ICP of the region from every start of `motion_proposals`.
+        """
         own = now.motion[now.label]
         moved = np.einsum("nij,nj->ni", own[:, :, :3], self.points) + own[:, :, 3]
         normals = np.einsum("nij,nj->ni", own[:, :, :3], self.source.normals)
@@ -230,7 +249,7 @@ class _BodyFinder:
         return proposals
 
     def _find_bad_regions(self, current: np.ndarray) -> list[np.ndarray]:
-        """Where the cost is high: connected badly explained points, and patches of two sizes; the worst first."""
+        """Returns regions of high cost, the worst first: connected badly explained points, and patches of two sizes."""
         around = 0.5 * current + 0.5 * current[self.source.neighbors].mean(1)
         regions = [
             r for level in (0.35, 0.55) for r in motion_proposals.find_components(around > level, self.source.neighbors)
@@ -242,6 +261,6 @@ class _BodyFinder:
 
 
 def _drop_empty_bodies(bodies: Bodies) -> Bodies:
-    """Without bodies that own no point."""
+    """Returns the bodies without those that own no point."""
     used, label = np.unique(bodies.label, return_inverse=True)
     return Bodies(label.reshape(-1), bodies.motion[used], bodies.energy, bodies.cost[used])

@@ -56,7 +56,7 @@ class FlowTrainer:
         self.step, self.best, self.sums, self.spent = 0, float("inf"), [0.0, 0.0, 0], 0.0
 
     def run(self) -> FlowStep3D:
-        """Train from wherever the folder's state says to the last step; return the network.
+        """Trains from wherever the folder's state says to the last step; returns the network.
 
         Raises Stopped when a stop was asked for, after saving.
         """
@@ -82,9 +82,11 @@ class FlowTrainer:
         return self.model.eval()
 
     def _rate(self) -> float:
+        """Returns the learning rate of the step."""
         return max(1e-3 * 0.5 ** (self.step * self.batch // 400_000), 1e-5)
 
     def _one_step(self) -> None:
+        """Learns from one batch of pairs, drawn and changed at random."""
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate()
         rng = generator(self.seed, SegmentStream.FLOW_TRAINING, 1, self.step)
@@ -102,7 +104,7 @@ class FlowTrainer:
         self.step += 1
 
     def _end_interval(self, started: float) -> None:
-        """Validate, write a row of the log, and save."""
+        """Validates, writes a row of the log, and saves."""
         loss, chamfer_sum, count = self.sums
         value, error = self._validate()
         seconds = self.spent + time.monotonic() - started
@@ -127,7 +129,7 @@ class FlowTrainer:
 
     @torch.inference_mode()
     def _validate(self, most: int = 64) -> tuple[float | None, float | None]:
-        """Return loss and mean end point error (diameters) of at most 64 held-out pairs, forth only; None where unknown."""
+        """Returns loss and mean end point error (diameters) of at most 64 held-out pairs, forth only; None where unknown."""
         if self.held is None:
             return None, None
         self.model.eval()
@@ -165,7 +167,7 @@ class FlowTrainer:
 
 
 def _training_and_held_out_pairs(reader: CloudsReader, points: int, seed: int) -> tuple[PairSource, PairSource | None]:
-    """Return the pairs of split `train`, or of all sequences where none is named so, and those of split `validation`."""
+    """Returns the pairs of split `train`, or of all sequences where none is named so, and those of split `validation`."""
     long = [i for i in range(len(reader)) if reader.frame_counts[i] > 1]
     train = [i for i in long if reader.splits[i] == "train"]
     if "train" not in reader.splits:

@@ -34,7 +34,7 @@ class NetworkSettings:
         check(self)
 
     def config(self) -> PartConfig:
-        """Return the sizes of the network that these settings describe."""
+        """Returns the sizes of the network that these settings describe."""
         chosen = {"group": self.group, "pooling": self.pooling, "slots": self.slots, "points": self.points}
         without_motion = {} if self.motion_head else {"motion_width": 0}
         return dataclasses.replace(SIZES[self.sizes](), **chosen, **without_motion)
@@ -87,18 +87,18 @@ class PartConfig:
     points: int = 512  # per frame in training
 
     def __post_init__(self) -> None:
-        """Raise UsageError for a rotation group or pooling that does not exist."""
+        """Raises UsageError for a rotation group or pooling that does not exist."""
         for name, legal in (("group", get_args(Group)), ("pooling", get_args(Pooling))):
             if getattr(self, name) not in legal:
                 raise UsageError(f"{name} = {getattr(self, name)}: expected one of {', '.join(legal)}")
 
     def to_json(self) -> str:
-        """Return the text that a weights file keeps."""
+        """Returns the text that a weights file keeps."""
         return json.dumps(dataclasses.asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> PartConfig:
-        """Return the sizes that `to_json` wrote."""
+        """Returns the sizes that `to_json` wrote."""
         values = json.loads(text)
         values["layers"] = tuple(tuple(Layer(**layer) for layer in block) for block in values["layers"])
         for key in ("decoder", "motion_layers"):
@@ -107,7 +107,7 @@ class PartConfig:
 
 
 def compact() -> PartConfig:
-    """Return our sizes: less than 0.25 M parameters and 0.92 G multiply-adds per 512-point frame, all of them counted."""
+    """Returns our sizes: less than 0.25 M parameters and 0.92 G multiply-adds per 512-point frame, all of them counted."""
 
     def layer(channels: int, stride: int, radius: float) -> Layer:
         return Layer(channels, stride, radius, (0.6 * radius) ** 2, 32, 0.65 * radius)
@@ -117,7 +117,7 @@ def compact() -> PartConfig:
 
 
 def release() -> PartConfig:
-    """Return the sizes of the network released for SAPIEN: 1,432,365 parameters."""
+    """Returns the sizes of the network released for SAPIEN: 1,432,365 parameters."""
     rows = (
         (32, 2, 0.2, 0.02, 96),
         (32, 1, 0.08**0.5, 0.04, 48),

@@ -17,12 +17,12 @@ from dpcli.segment.network.part_network import PartNetwork
 
 
 def count_parameters(module: nn.Module) -> int:
-    """Return the number of all trainable numbers."""
+    """Returns the number of all trainable numbers."""
     return sum(p.numel() for p in module.parameters())
 
 
 def paper_parameters(module: nn.Module) -> int:
-    """Return the number of trainable numbers in plain 1x1 layers and layer norms.
+    """Returns the number of trainable numbers in plain 1x1 layers and layer norms.
 
     This is how the thesis's 0.25 M and 0.31 M come about: the tool that counted them saw no convolution over space or
     group, no attention, no group norm and no queries.
@@ -35,7 +35,7 @@ def paper_parameters(module: nn.Module) -> int:
 
 
 def convolution_macs(config: PartConfig, points: int) -> dict[str, int]:
-    """Return the multiply-adds of one frame's convolutions, by kind; a neighbor counts whether its weight is zero or not."""
+    """Returns the multiply-adds of one frame's convolutions, by kind; a neighbor counts whether its weight is zero or not."""
     group, kernel = GROUPS[config.group](), kernel_points(config.kernel, config.group)
     rotations, positions, nearby = len(group), len(kernel.points), len(group.nearby)
     total = {"neighbor_sums": 0, "spatial": 0, "group": 0, "shortcut": 0}
@@ -53,7 +53,7 @@ def convolution_macs(config: PartConfig, points: int) -> dict[str, int]:
 
 
 def count_macs(model: PartNetwork, points: torch.Tensor) -> dict[str, int]:
-    """Return the multiply-adds of one frame (1,N,3) by part of the network; the motion head's are half of a pair's."""
+    """Returns the multiply-adds of one frame (1,N,3) by part of the network; the motion head's are half of a pair's."""
     from torch.utils.flop_counter import FlopCounterMode
 
     result = convolution_macs(model.config, points.shape[1])
@@ -76,7 +76,7 @@ def count_macs(model: PartNetwork, points: torch.Tensor) -> dict[str, int]:
 
 
 def measure_latency(model: PartNetwork, points: torch.Tensor, repeats: int = 5) -> float:
-    """Return the median milliseconds that the masks of points (B,N,3) take."""
+    """Returns the median milliseconds that the masks of points (B,N,3) take."""
     times = []
     with torch.inference_mode():
         for _ in range(repeats + 1):
@@ -89,7 +89,7 @@ def measure_latency(model: PartNetwork, points: torch.Tensor, repeats: int = 5) 
 
 
 def measure_cost(config: PartConfig, device: torch.device) -> dict[str, Any]:
-    """Return everything that `dpc segment profile` prints, as one object; the weights are random."""
+    """Returns everything that `dpc segment profile` prints, as one object; the weights are random."""
     torch.manual_seed(0)
     model = PartNetwork(config).to(device).eval()
     frames = torch.nn.functional.normalize(torch.randn(4, config.points, 3), dim=-1).to(device) * 0.5

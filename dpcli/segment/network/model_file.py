@@ -15,13 +15,13 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
-    """Write the weights as float32, with the configuration and notes (a small JSON object) in the header."""
+    """Writes the weights as float32, with the configuration and notes (a small JSON object) in the header."""
     header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
     save_weights(path, model.state_dict(), header)
 
 
 def find_model(name: str | Path, option: str = "--model") -> Path:
-    """Return the file that a name means: a path, `best.safetensors` of a training folder, or a shipped name.
+    """Returns the file that a name means: a path, `best.safetensors` of a training folder, or a shipped name.
 
     option: what messages call the name. Raises UsageError when there is none.
     """
@@ -29,7 +29,7 @@ def find_model(name: str | Path, option: str = "--model") -> Path:
 
 
 def load_model(name: str | Path) -> tuple[PartNetwork, dict]:
-    """Return a part network in eval mode and its notes; name: what `find_model` found or takes.
+    """Returns a part network in eval mode and its notes; name: what `find_model` found or takes.
 
     Raises DataError for a damaged file.
     """
@@ -41,7 +41,7 @@ def load_model(name: str | Path) -> tuple[PartNetwork, dict]:
 
 
 def default_model() -> str:
-    """Return the shipped model used when none is named. Raises UsageError when this installation has none."""
+    """Returns the shipped model used when none is named. Raises UsageError when this installation has none."""
     names = shipped_models(SHIPPED)
     if not names:
         raise UsageError(

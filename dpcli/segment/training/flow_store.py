@@ -35,13 +35,14 @@ class FlowStore:
             self._take_first_flows(take_from)
 
     def _take_first_flows(self, folder: Path) -> None:
+        """Copies the first flows of another run, which nothing has corrected yet."""
         first, known = first_flows(folder, len(self._known), self._first.shape[2])
         for pair in np.flatnonzero(known):
             self._first[pair] = first[pair]
         self._known[:] = known & (_THERE | _BODIES)
 
     def get(self, pair: int) -> torch.Tensor | None:
-        """Return the flow (2,N,3) of a pair, or None when it has not been estimated yet."""
+        """Returns the flow (2,N,3) of a pair, or None when it has not been estimated yet."""
         if pair in self.corrected:
             return self.corrected[pair]
         if pair in self.estimated:
@@ -50,21 +51,21 @@ class FlowStore:
         return torch.from_numpy(np.array((self._now if known & _CORRECTED else self._first)[pair])) if known else None
 
     def shows_bodies(self, pair: int) -> bool | None:
-        """Return whether the pair's first flow showed more than one body; None when it has not been estimated yet."""
+        """Returns whether the pair's first flow showed more than one body; None when it has not been estimated yet."""
         if pair in self.estimated:
             return self.estimated[pair][1]
         return bool(self._known[pair] & _BODIES) if self._known[pair] else None
 
     def put_first(self, pair: int, flow: torch.Tensor, shows_bodies: bool) -> None:
-        """Keep an estimate (2,N,3), and whether it shows more than one body."""
+        """Keeps an estimate (2,N,3), and whether it shows more than one body."""
         self.estimated[pair] = (flow.detach().clone(), shows_bodies)
 
     def put(self, pair: int, flow: torch.Tensor) -> None:
-        """Keep a corrected flow (2,N,3)."""
+        """Keeps a corrected flow (2,N,3)."""
         self.corrected[pair] = flow.detach().clone()
 
     def pending(self) -> dict[str, dict[str, torch.Tensor]]:
-        """Return what `flush` will write, for the trainer's own state; `restore` takes it back."""
+        """Returns what `flush` will write, for the trainer's own state; `restore` takes it back."""
         return {
             "first": {str(pair): flow for pair, (flow, _) in self.estimated.items()},
             "telling": {str(pair): torch.tensor(shows_bodies) for pair, (_, shows_bodies) in self.estimated.items()},
@@ -72,13 +73,13 @@ class FlowStore:
         }
 
     def restore(self, pending: dict[str, dict[str, torch.Tensor]]) -> None:
-        """Write what a run that was killed may not have written."""
+        """Writes what a run that was killed may not have written."""
         self.estimated = {int(p): (flow, bool(pending["telling"][p])) for p, flow in pending["first"].items()}
         self.corrected = {int(p): flow for p, flow in pending["corrected"].items()}
         self.flush()
 
     def flush(self) -> None:
-        """Write what is pending."""
+        """Writes what is pending."""
         for pair, (flow, shows_bodies) in self.estimated.items():
             self._first[pair] = flow.numpy()
             self._known[pair] |= _THERE + _BODIES * shows_bodies
@@ -91,7 +92,7 @@ class FlowStore:
 
 
 def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return what another run's folder has estimated already: `flows_first.npy` and `flows_known.npy`.
+    """Returns what another run's folder has estimated already: `flows_first.npy` and `flows_known.npy`.
 
     Raises UsageError where there is nothing, or flows of other pairs.
     """
@@ -106,6 +107,7 @@ def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.n
 
 
 def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+    """Opens an array file, and reserves its room on the disk at once."""
     try:
         array = _map_file(path, shape, dtype, fresh)
         with path.open("r+b") as file:
@@ -116,6 +118,7 @@ def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.nd
 
 
 def _map_file(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+    """Returns the array of a file, mapped into memory; a new one where it is `fresh` or has another shape."""
     if not fresh and path.exists():
         array = np.lib.format.open_memmap(path, "r+")
         if array.shape == shape:

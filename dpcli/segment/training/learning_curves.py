@@ -1,4 +1,4 @@
-"""The picture of a training run."""
+"""The learning curves of a part network's training."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ COLUMNS = (
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """Loss and its terms (left), validation and flow error where there is a truth (right), over epochs, as a PNG."""
+    """Draws the loss and its terms (left), validation and flow error (right), over epochs, as a PNG.
+
+    Of validation and flow error only what the truth of the data lets us know is drawn.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

@@ -1,4 +1,4 @@
-"""What a segmentation is trained with: rigidity of the flow, smoothness, invariance, consensus; and labels, if there are."""
+"""The losses of a part network: rigidity of the flow, invariance, consensus; and cross-entropy with labels."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from dpcli.segment.network.slot_matching import hungarian_assignment, one_hot, p
 
 
 def dynamic_loss(points: Tensor, flow: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """Release form: mean_i |sum_s m_is (R_s p_i + t_s) - (p_i + f_i)|_2, a scalar; (B,N,3), (B,N,3), (B,N,S), motions.
+    """Returns the rigidity loss as released: mean_i |sum_s m_is (R_s p_i + t_s) - (p_i + f_i)|_2, a scalar.
 
-    OGC's "dynamic rigid consistency". The moved points are detached: the gradient reaches the mask only. At a residual
+    points (B,N,3), flow (B,N,3), mask (B,N,S), rotation (B,S,3,3), translation (B,S,3). OGC's "dynamic rigid
+    consistency" (Song and Yang 2022). The moved points are detached: the gradient reaches the mask only. At a residual
     of exactly zero it is zero.
     """
     moved = apply_motions(points, rotation, translation).detach()
@@ -28,16 +29,20 @@ def rigid_loss(
     translation: Tensor,  # [B, S, 3]
     beta: Tensor | None = None,  # [B, N, S]
 ) -> Tensor:
-    """Thesis equation 4.8: mean over points and slots of beta_is m_is |p_i + f_i - (R_s p_i + t_s)|_2, a scalar.
+    """Returns the rigidity loss of thesis equation 4.8, a scalar.
 
-    beta: `consensus_weights`, detached here; None counts as 1. The gradient reaches the mask only.
+    It is the mean over points and slots of beta_is m_is |p_i + f_i - (R_s p_i + t_s)|_2. beta: `consensus_weights`,
+    detached here; None counts as 1. The gradient reaches the mask only.
     """
     weighted = mask * residuals(points, flow, rotation, translation).detach()
     return (weighted if beta is None else weighted * beta.detach()).mean()
 
 
 def residuals(points: Tensor, flow: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """How far each slot's motion takes a point from where the flow does: |R_s p_i + t_s - p_i - f_i|_2, (B,N,S)."""
+    """Returns how far (B,N,S) each slot's motion takes a point from where the flow does.
+
+    That is |R_s p_i + t_s - p_i - f_i|_2; points (B,N,3), flow (B,N,3), rotation (B,S,3,3), translation (B,S,3).
+    """
     gap = apply_motions(points, rotation, translation) - (points + flow)[:, None]
     return _length(gap).mT
 
@@ -53,11 +58,18 @@ def consensus_weights(
     mask: Tensor | None = None,  # [B, N, S]
     gate: float = 1e-5,
 ) -> Tensor:  # [B, N, S]
-    """beta of thesis equation 4.7: how well the motion head's motion of slot s agrees with the flow at point i.
+    """Returns beta of thesis equation 4.7: how well the motion head's motion of slot s agrees with the flow at point i.
 
-    form "thesis": exp(-tau r_is), r the residual's norm. "release": exp(-tau r_is^2), and only for slots with
-    sum_i m_is r_is^2 < gate (needs mask), 1 for the others. The thesis states no tau; the release has 2, or 0.5 with
-    gate 5 for OGC-DR. Carries no gradient. Raises ValueError for another form, or the release's without a mask.
+    form "thesis": exp(-tau r_is), r the residual's norm. "release": exp(-tau r_is^2), and only for slots with sum_i
+    m_is r_is^2 < gate (needs mask), 1 for the others. The thesis states no tau; the release has 2, or 0.5 with gate 5
+    for OGC-DR. Carries no gradient. Raises ValueError for another form, or the release's without a mask.
+
+    A point that stands still agrees with the identity, and less with a shift by 1:
+
+    >>> points, shift = torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+    >>> beta = consensus_weights(points, torch.zeros(1, 1, 3), torch.eye(3).expand(1, 2, 3, 3), shift, tau=2.0)
+    >>> [round(weight, 4) for weight in beta[0, 0].tolist()]
+    [1.0, 0.1353]
     """
     gap = residuals(points, flow, rotation, translation).detach()
     if form == "thesis":
@@ -70,9 +82,10 @@ def consensus_weights(
 
 
 def invariance_loss(mask1: Tensor, mask2: Tensor) -> Tensor:
-    """Two masks (B,N,S) of the same points, seen differently, should agree: mean |m1 - m2|_2 both ways, summed.
+    """Returns how much two masks (B,N,S) of the same points, seen differently, disagree: mean |m1 - m2|_2, both ways.
 
-    Slots are matched by hard IoU first; in each direction the other mask is detached (OGC's last round).
+    Slots are matched by hard IoU first; in each direction the other mask is detached (OGC's last round), and the two
+    are summed.
     """
     order = hungarian_assignment(soft_iou(one_hot(mask1.detach()), one_hot(mask2.detach())))
     forth = _length(mask1 - permute_slots(mask2, order).detach()).mean()
@@ -87,11 +100,11 @@ def supervised_loss(
     bce_weight: float = 2.0,
     dice_weight: float = 0.0,
 ) -> Tensor:
-    """Binary cross-entropy of each slot with the part it is matched to (Hungarian on that cost), plus Dice; a scalar.
+    """Returns the binary cross-entropy of each slot with the part it is matched to, plus Dice; a scalar.
 
-    labels: part ids i64 from 0, -1 = unknown: such points count nothing, but stay in the denominator, as in the
-    release. Parts beyond the number of slots find no slot; slots beyond the parts should stay empty. Dice is
-    1 - (2 sum m g + 1) / (sum m + sum g + 1), the mean over slots.
+    The Hungarian match is made on that cost. labels: part ids i64 from 0, -1 = unknown: such points count nothing, but
+    stay in the denominator, as in the release. Parts beyond the number of slots find no slot; slots beyond the parts
+    should stay empty. Dice is 1 - (2 sum m g + 1) / (sum m + sum g + 1), the mean over slots.
     """
     known = (labels >= 0).to(mask.dtype)[..., None]
     parts = max(int(labels.max()) + 1, mask.shape[2])
@@ -108,12 +121,12 @@ def supervised_loss(
 
 
 def _log(share: Tensor) -> Tensor:
-    """Logarithm, not below that of 1e-30; without a gradient there."""
+    """Returns the logarithm, not below that of 1e-30; without a gradient there."""
     return share.clamp(min=1e-30).log()
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """Euclidean norm of the last axis; its gradient at zero is zero, not NaN."""
+    """Returns the Euclidean norm of the last axis; its gradient at zero is zero, not NaN."""
     square = vectors.square().sum(-1)
     zero = square == 0
     return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())

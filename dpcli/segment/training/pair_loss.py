@@ -1,4 +1,4 @@
-"""The loss of one batch of pairs: which of the thesis's terms are on, and how much each counts (section 4.4.4)."""
+"""The loss of one batch of pairs: it says which of the thesis's terms are on, and how much each counts (section 4.4.4)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ from dpcli.segment.training.settings import Objective
 
 @dataclass
 class Batch:
-    """B pairs: points (2B,N,3), frames 1 then frames 2; flow (2B,N,3) of each to the other; part (2B,N), -1 unknown."""
+    """Holds B pairs.
+
+    points (2B,N,3): frames 1, then frames 2; flow (2B,N,3): of each to the other; part (2B,N): -1 unknown.
+    """
 
     points: Tensor
     flow: Tensor
@@ -28,18 +31,18 @@ class Batch:
 
     @property
     def other(self) -> Tensor:
-        """Each frame's counterpart."""
+        """The points of each frame's counterpart."""
         return swap(self.points)
 
 
 def swap(values: Tensor) -> Tensor:
-    """Frames 2 first, then frames 1."""
+    """Returns the values of frames 2 first, then those of frames 1."""
     return values.roll(len(values) // 2, 0)
 
 
 @dataclass
 class Outcome:
-    """The loss to minimize, its terms for the log, and the corrected flow if it was asked for."""
+    """Holds the loss to minimize, its terms for the log, and the corrected flow if it was asked for."""
 
     loss: Tensor
     terms: dict[str, float]
@@ -49,7 +52,11 @@ class Outcome:
 def pair_loss(
     model: PartNetwork, batch: Batch, objective: Objective, progress: float, training: bool = True
 ) -> Outcome:
-    """Every term that is on at `progress` (0 to 1)."""
+    """Returns the loss of a batch with every term that is on at `progress`.
+
+    progress: the share (0 to 1) of the training that is over. training: where it is off, nothing is matched, corrected
+    or turned.
+    """
     frames = model(batch.points)
     if objective.supervised:
         return _supervised(model, batch, frames, objective)
@@ -82,7 +89,10 @@ def pair_loss(
 
 
 def _cold_start(batch: Batch, mask: Tensor) -> Tensor:
-    """Cross-entropy with the bodies that each frame's flow shows; frames that show one body say nothing and are left out."""
+    """Returns the cross-entropy with the bodies that each frame's flow shows.
+
+    Frames that show one body teach nothing and are left out.
+    """
     bodies = rigid_groups(batch.points, batch.flow, most=mask.shape[-1])
     telling = bodies.amax(1) > 0
     return supervised_loss(mask[telling], bodies[telling]) if telling.any() else mask.sum() * 0
@@ -91,6 +101,7 @@ def _cold_start(batch: Batch, mask: Tensor) -> Tensor:
 def _rigidity(
     batch: Batch, mask: Tensor, rotation: Tensor, translation: Tensor, beta: Tensor | None, objective: Objective
 ) -> Tensor:
+    """Returns the rigidity loss in the form that the objective names, weighted by the consensus where there is one."""
     if objective.form == "per-part":  # the mean over slots of eq. 4.8, times their number: of the blended form's size
         return mask.shape[-1] * rigid_loss(batch.points, batch.flow, mask, rotation, translation, beta)
     if beta is None:
@@ -100,25 +111,29 @@ def _rigidity(
 
 
 def _weighted_dynamic(batch: Batch, mask: Tensor, rotation: Tensor, translation: Tensor, trust: Tensor) -> Tensor:
+    """Returns `dynamic_loss` with one weight per point, trust (2B,N)."""
     moved = apply_motions(batch.points, rotation, translation).detach()
     gap = torch.einsum("bns,bsnd->bnd", mask, moved) - (batch.points + batch.flow)
     return (trust * (gap.square().sum(-1) + 1e-12).sqrt()).mean()
 
 
 def _match(batch: Batch, mask: Tensor) -> Tensor:
-    """The order of frames 2's slots that agrees with frames 1's, (B,S)."""
+    """Returns the order (B,S) of frames 2's slots that agrees with frames 1's."""
     first = len(batch.points) // 2
     return match_slots(batch.points[:first], batch.flow[:first], mask[:first], batch.points[first:], mask[first:])
 
 
 def _matched(mask: Tensor, order: Tensor) -> Tensor:
-    """Masks with frames 2's slots in the order of frames 1's."""
+    """Returns masks with frames 2's slots in the order of frames 1's."""
     first = len(mask) // 2
     return torch.cat([mask[:first], permute_slots(mask[first:], order)])
 
 
 def _motion(model: PartNetwork, batch: Batch, frames: FrameParts, matched: Tensor, rotation: Tensor) -> Tensor:
-    """The motion head against the rotations that flow and masks imply, slots of more than 2 % of the points only."""
+    """Returns the motion head's loss against the rotations that flow and masks imply.
+
+    Only slots of more than 2 % of the points count.
+    """
     confidence, residual = model.pair(batch.points, frames, matched)
     half = len(matched) // 2
     share = matched.mean(1)
@@ -129,7 +144,10 @@ def _motion(model: PartNetwork, batch: Batch, frames: FrameParts, matched: Tenso
 
 @torch.no_grad()
 def _consensus(model: PartNetwork, batch: Batch, frames: FrameParts, order: Tensor, objective: Objective) -> Tensor:
-    """beta (2B,N,S) of eq. 4.7. The head gives frames 1 to 2; frames 2 to 1 have its inverse, in frames 2's slots."""
+    """Returns beta (2B,N,S) of eq. 4.7.
+
+    The head gives frames 1 to 2; frames 2 to 1 have its inverse, in frames 2's slots.
+    """
     mask = frames.mask.detach()
     rotation, translation = model.motions(batch.points, frames, _matched(mask, order))
     back = order.argsort(1)
@@ -142,13 +160,13 @@ def _consensus(model: PartNetwork, batch: Batch, frames: FrameParts, order: Tens
 
 
 def _permute(values: Tensor, order: Tensor) -> Tensor:
-    """values (B,S,...) in the order (B,S)."""
+    """Returns values (B,S,...) in the order (B,S)."""
     return values.gather(1, order.view(*order.shape, *[1] * (values.ndim - 2)).expand_as(values))
 
 
 @torch.no_grad()
 def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Objective) -> Tensor:
-    """Eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
+    """Returns the flow of eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
     order = _match(batch, mask) if order is None else order
     both = torch.cat([order, order.argsort(1)])
     newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
@@ -156,7 +174,7 @@ def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Obje
 
 
 def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective: Objective) -> Outcome:
-    """Labels for the masks, the true flow for the motion head."""
+    """Returns the loss with labels for the masks and the true flow for the motion head."""
     terms = {"mask": supervised_loss(frames.mask, batch.part)}
     if model.motion is not None:
         truth = torch.nn.functional.one_hot(batch.part.clamp(0, model.config.slots - 1), model.config.slots).float()
@@ -167,7 +185,7 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
 
 
 def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-    """Each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
+    """Returns each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
     rotation = quaternion_to_matrix(torch.randn(half, 4, generator=rng)).to(points)
     rotation = torch.cat([rotation, rotation])

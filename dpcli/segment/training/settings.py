@@ -50,7 +50,7 @@ class Schedule:
         check(self)
 
     def rate(self, step: int, steps: int) -> float:
-        """Return the learning rate of one step (from 0) of `steps`."""
+        """Returns the learning rate of one step (from 0) of `steps`."""
         warm = max(1, min(100, steps // 10))
         if step < warm:
             return self.learning_rate * (step + 1) / warm

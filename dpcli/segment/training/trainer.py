@@ -66,7 +66,7 @@ class Trainer:
         self.checking: list[Batch] | None = None
 
     def run(self) -> None:
-        """Train from wherever the folder's state says to the last epoch."""
+        """Trains from wherever the folder's state says to the last epoch."""
         state = self.folder.load_state()
         shape = (len(self.training.pairs), self.training.points)
         first = self.settings.run.flows_of
@@ -83,10 +83,11 @@ class Trainer:
             save_model(self.folder.file("best.safetensors"), self.model, self.notes)
 
     def _steps(self) -> int:
-        """Return the steps of an epoch: whole batches; the few pairs left over come in another epoch's order."""
+        """Returns the steps of an epoch: whole batches; the few pairs left over come in another epoch's order."""
         return max(len(epoch_order(self.training, 0, self.schedule.pairs_per_epoch or None)) // self.schedule.batch, 1)
 
     def _run_epoch(self, bar: Progress) -> None:
+        """Learns from the pairs that are left of the epoch, and saves now and then."""
         self.model.train()
         started = time.monotonic()
         steps, rate = self._steps(), 0.0
@@ -106,7 +107,7 @@ class Trainer:
         self._end_epoch(rate, started)
 
     def _epoch_pairs(self, steps: int) -> Iterator[Pair]:
-        """Yield the epoch's pairs from `self.step` on; while the cold start lasts, only those whose flow shows bodies.
+        """Yields the epoch's pairs from `self.step` on; while the cold start lasts, only those whose flow shows bodies.
 
         The others, half of them or more in slow scenes, show one body, from which the cold start learns nothing.
         """
@@ -120,12 +121,13 @@ class Trainer:
                 yield pair
 
     def _shows_bodies(self, pair: Pair) -> bool:
-        """Return whether the pair's first flow shows more than one body; it is estimated now if the pair is new."""
+        """Returns whether the pair's first flow shows more than one body; it is estimated now if the pair is new."""
         if self.flows.shows_bodies(pair.number) is None:
             self._find_flow(pair, torch.from_numpy(self.training.load(pair).points))
         return bool(self.flows.shows_bodies(pair.number))
 
     def _step(self, pairs: list[Pair], step: int, steps: int) -> float:
+        """Learns from one batch of pairs and keeps their corrected flows; returns the learning rate."""
         loaded = [self.training.load(pair) for pair in pairs]
         batch = self._load_batch(pairs, loaded)
         rotation = None
@@ -142,6 +144,7 @@ class Trainer:
         return rate
 
     def _optimize(self, loss: torch.Tensor, rate: float) -> None:
+        """Takes a step along the gradient, whose norm is clipped at 5; none where it is not finite."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
@@ -151,7 +154,7 @@ class Trainer:
             self.optimizer.step()
 
     def _load_batch(self, pairs: list[Pair], loaded: list[LoadedPair]) -> Batch:
-        """Return points, labels and the flows as they stand, estimated now where a pair is new."""
+        """Returns points, labels and the flows as they stand, estimated now where a pair is new."""
         batch, flow = self._assemble(loaded, lambda i, frames: self._find_flow(pairs[i], frames))
         self._measure_flow_error(flow, loaded)
         return batch
@@ -159,7 +162,7 @@ class Trainer:
     def _assemble(
         self, loaded: list[LoadedPair], estimate: Callable[[int, torch.Tensor], torch.Tensor]
     ) -> tuple[Batch, torch.Tensor]:
-        """Return a batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames)."""
+        """Returns a batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames)."""
         points = torch.from_numpy(np.stack([pair.points for pair in loaded]))  # [B, 2, N, 3]
         if self.objective.supervised:
             flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
@@ -169,7 +172,7 @@ class Trainer:
         return Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))), flow
 
     def _find_flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
-        """Return the flow (2,N,3) that is kept for a pair; a new pair's is estimated."""
+        """Returns the flow (2,N,3) that is kept for a pair; a new pair's is estimated."""
         known = self.flows.get(pair.number)
         if known is None:
             known = torch.stack(self.estimate(*frames))
@@ -177,25 +180,29 @@ class Trainer:
         return known
 
     def _keep_flow(self, pairs: list[Pair], flow: torch.Tensor) -> None:
+        """Keeps the corrected flows (2B,N,3) of the pairs."""
         for pair, both in zip(pairs, flow.cpu().unflatten(0, (2, -1)).transpose(0, 1)):
             self.flows.put(pair.number, both)
 
     def _measure_flow_error(self, flow: torch.Tensor, loaded: list[LoadedPair]) -> None:
-        """Note for the log how far the flow in use is from the true one, where the data know that."""
+        """Notes for the log how far the flow in use is from the true one, where the data know that."""
         if all(pair.flow is not None for pair in loaded):
             truth = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
             self._count({"flow_error": float((flow - truth).norm(dim=-1).mean())})
 
     def _count(self, values: dict[str, float]) -> None:
+        """Adds values to the epoch's means."""
         for key, value in values.items():
             entry = self.sums.setdefault(key, [0.0, 0.0])
             entry[0], entry[1] = entry[0] + value, entry[1] + 1
 
     def _mean(self, key: str) -> float | None:
+        """Returns the epoch's mean of a value so far, None where there is none."""
         total, count = self.sums.get(key, (0.0, 0.0))
         return total / count if count else None
 
     def _end_epoch(self, rate: float, started: float) -> None:
+        """Validates, writes a row of the log and the weights, and saves."""
         row = {key: self._mean(key) for key in self.sums}
         if self.validation is not None:
             row |= self.validate()
@@ -215,7 +222,7 @@ class Trainer:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float | None]:
-        """Return the loss on held-out pairs, which chooses the best weights, and the mean Rand index, None without labels.
+        """Returns the loss on held-out pairs, which chooses the best weights, and the mean Rand index, None without labels.
 
         The loss compares masks with the bodies that the pairs' first flow shows, or with the labels when supervised. The
         Rand index is for people to watch: nothing is chosen by it.
@@ -239,6 +246,7 @@ class Trainer:
         return {"validation_loss": loss, "validation_rand_index": float(np.mean(scores)) if scores else None}
 
     def _validation_batches(self) -> list[Batch]:
+        """Returns the held-out pairs with their first flows, which are estimated once."""
         assert self.validation is not None
         pairs = epoch_order(self.validation, 0, self.schedule.validation_pairs)
         batches = []
@@ -273,7 +281,7 @@ class Trainer:
 
 
 def rand_index(labels: torch.Tensor, truth: torch.Tensor) -> float:
-    """Return the share of ordered point pairs (itself included) on which two labelings (N) agree about same or different.
+    """Returns the share of ordered point pairs (itself included) on which two labelings (N) agree about same or different.
 
     >>> rand_index(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 1, 1]))
     0.625
