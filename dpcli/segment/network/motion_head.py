@@ -16,7 +16,10 @@ from dpcli.segment.network.icosahedron import GROUPS, RotationGroup
 
 
 def relative_labels(rotation: Tensor, group: RotationGroup) -> tuple[Tensor, Tensor]:
-    """For T (...,3,3): label i64 (...,G), l(a) = argmax_l trace(R_a^T T R_l), and residual R_a^T T R_l (...,G,3,3)."""
+    """Returns, for T (...,3,3), label i64 (...,G) and residual (...,G,3,3) of every rotation a of the group.
+
+    l(a) = argmax_l trace(R_a^T T R_l); the residual is R_a^T T R_l.
+    """
     anchors = group.rotations_like(rotation)
     turned = torch.einsum("gij,...ik->...gjk", anchors, rotation)  # R_a^T T
     label = torch.einsum("...gjk,lkj->...gl", turned, anchors).argmax(-1)
@@ -24,7 +27,7 @@ def relative_labels(rotation: Tensor, group: RotationGroup) -> tuple[Tensor, Ten
 
 
 class MotionHead(nn.Module):
-    """Confidence (B,S,a,l) of every pair of rotations, softmax over l, and residual quaternions (B,S,a,l,4)."""
+    """Computes confidence (B,S,a,l) of every pair of rotations, softmax over l, and residual quaternions (B,S,a,l,4)."""
 
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
@@ -42,9 +45,10 @@ class MotionHead(nn.Module):
             self.residual.bias.copy_(torch.tensor([1.0, 0, 0, 0]))  # start from no residual
 
     def part_features(self, features: Tensor, points: Tensor, mask: Tensor) -> Tensor:
-        """Eq. 4.3 and max over points: features (B,P,G,C), points (B,P,3), mask (B,P,S) -> (B,S,G,D).
+        """Returns the features (B,S,G,D) of each part by eq. 4.3, the maximum over its points.
 
-        Coordinates are centered on the part, weighted by the mask, so that they depend on nothing but the part.
+        features (B,P,G,C), points (B,P,3), mask (B,P,S). Coordinates are centered on the part, weighted by the mask, so
+        that they depend on nothing but the part.
         """
         anchors = self.group.rotations_like(points)
         share = mask / mask.sum(1, keepdim=True).clamp(min=1e-6)
@@ -56,7 +60,7 @@ class MotionHead(nn.Module):
         return torch.stack(slots, 1)
 
     def forward(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """part_features of frame 1 and, slots matched to it, of frame 2."""
+        """Returns confidence and residuals from `part_features` of frame 1 and, slots matched to it, of frame 2."""
         half = self.pair.weight.chunk(2, 1)
         target, source = second @ half[0].T, first @ half[1].T + self.pair.bias
         hidden = torch.relu(source[:, :, :, None] + target[:, :, None])  # [B, S, a, l, D]
@@ -65,8 +69,11 @@ class MotionHead(nn.Module):
         return torch.softmax(3 * self.confidence(hidden).squeeze(-1), -1), self.residual(hidden)
 
     def candidates(self, confidence: Tensor, residual: Tensor, best: int = 4) -> Tensor:
-        """Rotations (B,S,best+1,3,3) from frame 1 to 2: for the k-th most confident target of every source, averaged over
-        sources by confidence, and the overall most confident pair's own."""
+        """Returns rotations (B,S,best+1,3,3) from frame 1 to 2.
+
+        They are, for the k-th most confident target of every source, the average over sources by confidence, and the
+        overall most confident pair's own.
+        """
         anchors = self.group.rotations_like(confidence)
         weight, target = confidence.topk(min(best, confidence.shape[-1]), -1)  # [B, S, a, k]
         picked = residual.gather(3, target[..., None].expand(*target.shape, 4))
@@ -80,9 +87,10 @@ class MotionHead(nn.Module):
 def rotation_loss(
     confidence: Tensor, residual: Tensor, rotation: Tensor, weight: Tensor, group: RotationGroup
 ) -> Tensor:
-    """Squared error of the residual at the labeled pair (as the release has it) plus 0.1 of the confidences' cross-entropy.
+    """Returns the squared error of the residual at the labeled pair plus 0.1 of the confidences' cross-entropy.
 
     rotation (B,S,3,3): each part's from frame 1 to 2. weight (B,S): how much each counts, e.g. its share of the points.
+    The error is taken at the labeled pair only, as the release has it.
     """
     label, wanted = relative_labels(rotation.mT, group)
     at = residual.gather(3, label[..., None, None].expand(*label.shape, 1, 4)).squeeze(3)
@@ -94,10 +102,10 @@ def rotation_loss(
 def choose_motion(
     rotations: Tensor, first: Tensor, mask1: Tensor, second: Tensor, mask2: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Of candidate rotations (B,S,M,3,3) the one with the least mask-weighted two-way Chamfer distance (B.6, B.7).
+    """Returns, of candidate rotations (B,S,M,3,3), the one with the least two-way Chamfer distance (B.6, B.7).
 
-    first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S) matched to mask1. The translation joins the parts'
-    weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
+    The distance is weighted by the masks. first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S) matched to mask1.
+    The translation joins the parts' weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
     """
     share1, share2 = (m / m.sum(1, keepdim=True).clamp(min=1e-6) for m in (mask1, mask2))
     center1, center2 = torch.einsum("bps,bpi->bsi", share1, first), torch.einsum("bps,bpi->bsi", share2, second)

@@ -1,4 +1,4 @@
-"""Object-aware ICP: flow refined part by part, correspondences only between points of the same part (OGC)."""
+"""Object-aware ICP (OGC, Song and Yang 2022): flow refined part by part, between points of the same part only."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dpcli.segment.network.slot_matching import match_slots, permute_slots
 
 
 @torch.no_grad()
-def object_icp(
+def object_aware_icp(
     points1: Tensor,  # [B, N, 3]
     points2: Tensor,  # [B, M, 3]
     mask1: Tensor,  # [B, N, S]
@@ -21,7 +21,7 @@ def object_icp(
     temperature: float = 0.01,
     order: Tensor | None = None,  # [B, S]
 ) -> tuple[Tensor, Tensor, Tensor]:  # [B, N, 3], [B, S, 3, 3], [B, S, 3]
-    """Refined flow (B,N,3) and the motions (B,S,3,3), (B,S,3) of frame 1's slots, from a first flow.
+    """Returns refined flow (B,N,3) and the motions (B,S,3,3), (B,S,3) of frame 1's slots, from a first flow.
 
     Frame 2's slots are matched once (`order`: `match_slots`, if it is known already). In each iteration point i moved
     by its flow corresponds to points n with weights softmax(-|p_i + f_i - q_n| / temperature) times the probability of
@@ -48,14 +48,14 @@ _ROW_NS = 2.0  # measured, per pair of points
 
 
 def soft_match(moved: Tensor, points: Tensor, bias: Tensor, temperature: float) -> Tensor:
-    """(B,N,3): mean of points (B,M,3) weighted by softmax over them of bias (B,N,M) - distance to moved (B,N,3) / temperature.
+    """Returns the mean (B,N,3) of points (B,M,3), weighted by softmax of bias - distance / temperature.
 
-    bias may be -inf, but not in a whole row. Carries no gradient.
+    bias (B,N,M) may be -inf, but not in a whole row; distances are to moved (B,N,3). Carries no gradient.
     """
     fast = chosen_backend(moved.device) == "numba" and moved.dtype == points.dtype == bias.dtype == torch.float32
     if not fast or not points.shape[1]:
         return soft_match_reference(moved, points, bias, temperature)
-    from dpcli.segment.flow.kernels_match import soft_match_kernel
+    from dpcli.segment.flow.soft_match_kernel import soft_match_kernel
 
     out = torch.empty_like(moved, memory_format=torch.contiguous_format)
     columns = torch.nn.functional.pad(points.mT, (0, -points.shape[1] % 8))  # the kernel takes eight at a time
@@ -66,6 +66,6 @@ def soft_match(moved: Tensor, points: Tensor, bias: Tensor, temperature: float) 
 
 
 def soft_match_reference(moved: Tensor, points: Tensor, bias: Tensor, temperature: float) -> Tensor:
-    """The torch twin of `soft_match`: same arguments, same result up to rounding."""
+    """Returns what `soft_match` does, from the same arguments, by torch alone; equal up to rounding."""
     logits = torch.cdist(moved, points, compute_mode="donot_use_mm_for_euclid_dist")
     return logits.div_(-temperature).add_(bias).softmax(-1) @ points

@@ -1,4 +1,4 @@
-"""Parts that the network took for one although they move apart: split where the flow of the frame shows two bodies."""
+"""The split of parts that the network took for one although the frame's flow shows that they move apart."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ _RIGID = 3e-4  # mean residual of one motion, diameters, up to which `rigid_grou
 
 
 def split_by_motion(points: Tensor, flow: Tensor, mask: Tensor, smallest: float = 0.03) -> Tensor:
-    """Mask (N,S) of one frame with moving-apart slots divided, given its flow (N,3) to another frame.
+    """Returns the mask (N,S) of one frame with slots divided whose points move apart.
 
-    A slot whose points move as several rigid bodies, each of at least `smallest` of the frame's points, keeps the largest;
-    the others get slots that no point has, as long as there are any. Probabilities move along, so rows still sum to 1.
+    flow (N,3): to another frame. A slot whose points move as several rigid bodies, each of at least `smallest` of the
+    frame's points, keeps the largest; the others get slots that no point has, as long as there are any. Probabilities
+    move along, so rows still sum to 1.
     """
     mask = mask.clone()
     labels = mask.argmax(1)
@@ -37,8 +38,12 @@ def split_by_motion(points: Tensor, flow: Tensor, mask: Tensor, smallest: float 
 
 
 def _moves_as_one(points: Tensor, flow: Tensor, mask: Tensor) -> list[bool]:
-    """Of each slot, whether one motion explains the flow (N,3) of its points so well that nothing is left to look for:
-    a second body must save 3 % (its `gain`) of the least tolerance, 0.01. Most slots do, and all looks were slow."""
+    """Returns, for each slot, whether one motion explains the flow (N,3) of its points so well that no search is
+    needed.
+
+    A second body must save 3 % (its `gain`) of the least tolerance, 0.01. Most slots move as one, and a search of all
+    was slow.
+    """
     share = one_hot(mask)
     motions = weighted_kabsch(points[None], (points + flow)[None], share[None])
     residual = (rigid_flow(points[None], share[None], *motions)[0] - flow).norm(dim=1)

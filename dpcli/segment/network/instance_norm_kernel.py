@@ -1,4 +1,4 @@
-"""CPU kernel of the convolutions' norm and activation: three passes over a cloud's features instead of eight."""
+"""The CPU kernel of the convolutions' norm and activation: three passes over a cloud's features instead of eight."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ _ROWS = 64  # summed in float32 before they are added to a float64
 
 @kernel
 def _means(features, start, step, rows, shift, squared, part, out):
-    """out f64 (16): means over rows start, start + step, .. of features less shift f32 (16), or of its squares."""
+    """Computes the means f64 (16), in `out`, of rows start, start + step, .. of features less shift f32 (16).
+
+    squared: of the squares of these differences instead.
+    """
     width, zero = np.uintp(WIDTH), np.uintp(0)
     low_shift, high_shift = load(shift, zero), load(shift, width)
     out[:] = 0.0
@@ -37,7 +40,7 @@ def _means(features, start, step, rows, shift, squared, part, out):
 
 @kernel
 def norm_kernel(features, rows, channels, slope, first, last):
-    """`instance_norm` and leaky ReLU in place: features, a flat f32 (B*rows*channels), of clouds first..last.
+    """Applies `instance_norm` and leaky ReLU in place to features, a flat f32 (B*rows*channels), of clouds first..last.
 
     channels must be a multiple of 16. Sums of 64 rows are float32, sums of those float64.
     """

@@ -1,4 +1,4 @@
-"""CPU kernel of object-aware ICP: where the points of one frame lie in another, softly."""
+"""The CPU kernel of object-aware ICP: where the points of one frame lie in another, softly."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _BINARY = np.float32(1.4426950408889634)  # exp(x) = 2^(this x)
 
 @kernel
 def soft_match_kernel(moved, target, bias, temperature, out, first, last):
-    """out (B,N,3): mean of target (B,3,M) weighted by softmax(bias (B,N,M) - |moved (B,N,3) - target| / temperature).
+    """Computes out (B,N,3): the mean of target (B,3,M) weighted by softmax(bias - |moved - target| / temperature).
 
-    float32; rows first..last of the B * N. A row of `bias` holds at least one finite number. target may have further
-    columns, up to a multiple of 8: finite numbers that nobody reads.
+    float32; moved (B,N,3), bias (B,N,M); rows first..last of the B * N. A row of `bias` holds at least one finite
+    number. target may have further columns, up to a multiple of 8: finite numbers that nobody reads.
     """
     rows, count = np.uintp(moved.shape[1]), np.uintp(bias.shape[2])
     width, end = np.uintp(WIDTH), np.uintp(target.shape[2])

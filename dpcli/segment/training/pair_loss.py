@@ -1,4 +1,4 @@
-"""The loss of one batch of pairs: which of the thesis's terms are on, and how much each counts (section 4.4.4)."""
+"""The loss of one batch of pairs: it says which of the thesis's terms are on, and how much each counts (section 4.4.4)."""
 
 from __future__ import annotations
 
@@ -7,76 +7,24 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpcli.errors import UsageError
 from dpcli.ops import apply_motions, weighted_kabsch
 from dpcli.ops.rotations import normalize_quaternion, quaternion_to_matrix
-from dpcli.segment.flow.object_icp import object_icp
+from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.flow.rigid_groups import rigid_groups
 from dpcli.segment.network.motion_head import rotation_loss
 from dpcli.segment.network.part_network import FrameParts, PartNetwork
 from dpcli.segment.network.slot_matching import match_slots, permute_slots
-from dpcli.segment.training.losses import (
-    consensus_weights,
-    dynamic_loss,
-    invariance_loss,
-    rigid_loss,
-    smoothness_loss,
-    smoothness_neighbors,
-    supervised_loss,
-)
-
-
-@dataclass(frozen=True)
-class Objective:
-    """Weights and switches. Times are fractions of the whole training."""
-
-    form: str = "blended"  # per-part: eq. 4.8 as written; blended: the release's norm of the blended displacement
-    dynamic: float = 10.0
-    smooth: float = 0.1
-    invariance: float = 0.0
-    motion: float = 0.1
-    cold_start: float = 1.0  # of the bodies that the flow itself shows, see `rigid_groups`
-    cold_until: float = 1.0
-    supervised: bool = False
-    consensus: str = "thesis"  # eq. 4.7; release: squared and gated; none
-    tau: float = 20.0  # per unit of the object's diameter
-    flow_decay: float = 0.9  # alpha of eq. 4.6: 1 keeps the first flow ("past"), 0 takes the newest ("current")
-    motion_after: float = 0.3
-    consensus_after: float = 0.5
-    update_after: float = 0.4
-    smooth_after: float = 0.03
-
-    def __post_init__(self) -> None:
-        problems = {
-            f"--loss {self.form}: expected blended or per-part": self.form not in ("blended", "per-part"),
-            f"--consensus {self.consensus}: expected thesis, release or none": self.consensus
-            not in ("thesis", "release", "none"),
-            f"--flow-decay {self.flow_decay}: expected 0 to 1": not 0 <= self.flow_decay <= 1,
-            f"--tau {self.tau}: expected a number above 0": not self.tau > 0,
-        }
-        for option, weight in (
-            ("--smooth", self.smooth),
-            ("--invariance", self.invariance),
-            ("--cold-start", self.cold_start),
-        ):
-            problems[f"{option} {weight}: expected a weight, 0 or more"] = not weight >= 0
-        for option, share in (
-            ("--cold-until", self.cold_until),
-            ("--motion-after", self.motion_after),
-            ("--update-after", self.update_after),
-            ("--consensus-after", self.consensus_after),
-        ):
-            problems[f"{option} {share}: expected a fraction of the training, 0 or more"] = (
-                not share >= 0
-            )  # above 1: never
-        for message, wrong in problems.items():
-            if wrong:
-                raise UsageError(message)
+from dpcli.segment.smoothness import smoothness_loss, smoothness_neighbors
+from dpcli.segment.training.losses import consensus_weights, dynamic_loss, invariance_loss, rigid_loss, supervised_loss
+from dpcli.segment.training.settings import Objective
 
 
 @dataclass
 class Batch:
-    """B pairs: points (2B,N,3), frames 1 then frames 2; flow (2B,N,3) of each to the other; part (2B,N), -1 unknown."""
+    """Holds B pairs.
+
+    points (2B,N,3): frames 1, then frames 2; flow (2B,N,3): of each to the other; part (2B,N): -1 unknown.
+    """
 
     points: Tensor
     flow: Tensor
@@ -84,18 +32,18 @@ class Batch:
 
     @property
     def other(self) -> Tensor:
-        """Each frame's counterpart."""
+        """The points of each frame's counterpart."""
         return swap(self.points)
 
 
 def swap(values: Tensor) -> Tensor:
-    """Frames 2 first, then frames 1."""
+    """Returns the values of frames 2 first, then those of frames 1."""
     return values.roll(len(values) // 2, 0)
 
 
 @dataclass
 class Outcome:
-    """The loss to minimize, its terms for the log, and the corrected flow if it was asked for."""
+    """Holds the loss to minimize, its terms for the log, and the corrected flow if it was asked for."""
 
     loss: Tensor
     terms: dict[str, float]
@@ -105,7 +53,11 @@ class Outcome:
 def pair_loss(
     model: PartNetwork, batch: Batch, objective: Objective, progress: float, training: bool = True
 ) -> Outcome:
-    """Every term that is on at `progress` (0 to 1)."""
+    """Returns the loss of a batch with every term that is on at `progress`.
+
+    progress: the share (0 to 1) of the training that is over. training: where it is off, nothing is matched, corrected
+    or turned.
+    """
     frames = model(batch.points)
     if objective.supervised:
         return _supervised(model, batch, frames, objective)
@@ -138,7 +90,10 @@ def pair_loss(
 
 
 def _cold_start(batch: Batch, mask: Tensor) -> Tensor:
-    """Cross-entropy with the bodies that each frame's flow shows; frames that show one body say nothing and are left out."""
+    """Returns the cross-entropy with the bodies that each frame's flow shows.
+
+    Frames that show one body teach nothing and are left out.
+    """
     bodies = rigid_groups(batch.points, batch.flow, most=mask.shape[-1])
     telling = bodies.amax(1) > 0
     return supervised_loss(mask[telling], bodies[telling]) if telling.any() else mask.sum() * 0
@@ -147,6 +102,7 @@ def _cold_start(batch: Batch, mask: Tensor) -> Tensor:
 def _rigidity(
     batch: Batch, mask: Tensor, rotation: Tensor, translation: Tensor, beta: Tensor | None, objective: Objective
 ) -> Tensor:
+    """Returns the rigidity loss in the form that the objective names, weighted by the consensus where there is one."""
     if objective.form == "per-part":  # the mean over slots of eq. 4.8, times their number: of the blended form's size
         return mask.shape[-1] * rigid_loss(batch.points, batch.flow, mask, rotation, translation, beta)
     if beta is None:
@@ -156,25 +112,29 @@ def _rigidity(
 
 
 def _weighted_dynamic(batch: Batch, mask: Tensor, rotation: Tensor, translation: Tensor, trust: Tensor) -> Tensor:
+    """Returns `dynamic_loss` with one weight per point, trust (2B,N)."""
     moved = apply_motions(batch.points, rotation, translation).detach()
     gap = torch.einsum("bns,bsnd->bnd", mask, moved) - (batch.points + batch.flow)
     return (trust * (gap.square().sum(-1) + 1e-12).sqrt()).mean()
 
 
 def _match(batch: Batch, mask: Tensor) -> Tensor:
-    """The order of frames 2's slots that agrees with frames 1's, (B,S)."""
+    """Returns the order (B,S) of frames 2's slots that agrees with frames 1's."""
     first = len(batch.points) // 2
     return match_slots(batch.points[:first], batch.flow[:first], mask[:first], batch.points[first:], mask[first:])
 
 
 def _matched(mask: Tensor, order: Tensor) -> Tensor:
-    """Masks with frames 2's slots in the order of frames 1's."""
+    """Returns masks with frames 2's slots in the order of frames 1's."""
     first = len(mask) // 2
     return torch.cat([mask[:first], permute_slots(mask[first:], order)])
 
 
 def _motion(model: PartNetwork, batch: Batch, frames: FrameParts, matched: Tensor, rotation: Tensor) -> Tensor:
-    """The motion head against the rotations that flow and masks imply, slots of more than 2 % of the points only."""
+    """Returns the motion head's loss against the rotations that flow and masks imply.
+
+    Only slots of more than 2 % of the points count.
+    """
     confidence, residual = model.pair(batch.points, frames, matched)
     half = len(matched) // 2
     share = matched.mean(1)
@@ -185,7 +145,10 @@ def _motion(model: PartNetwork, batch: Batch, frames: FrameParts, matched: Tenso
 
 @torch.no_grad()
 def _consensus(model: PartNetwork, batch: Batch, frames: FrameParts, order: Tensor, objective: Objective) -> Tensor:
-    """beta (2B,N,S) of eq. 4.7. The head gives frames 1 to 2; frames 2 to 1 have its inverse, in frames 2's slots."""
+    """Returns beta (2B,N,S) of eq. 4.7.
+
+    The head gives frames 1 to 2; frames 2 to 1 have its inverse, in frames 2's slots.
+    """
     mask = frames.mask.detach()
     rotation, translation = model.motions(batch.points, frames, _matched(mask, order))
     back = order.argsort(1)
@@ -198,21 +161,21 @@ def _consensus(model: PartNetwork, batch: Batch, frames: FrameParts, order: Tens
 
 
 def _permute(values: Tensor, order: Tensor) -> Tensor:
-    """values (B,S,...) in the order (B,S)."""
+    """Returns values (B,S,...) in the order (B,S)."""
     return values.gather(1, order.view(*order.shape, *[1] * (values.ndim - 2)).expand_as(values))
 
 
 @torch.no_grad()
 def _corrected(batch: Batch, mask: Tensor, order: Tensor | None, objective: Objective) -> Tensor:
-    """Eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
+    """Returns the flow of eq. 4.6: alpha of the flow before, 1 - alpha of what object-aware ICP makes of it."""
     order = _match(batch, mask) if order is None else order
     both = torch.cat([order, order.argsort(1)])
-    newest, _, _ = object_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
+    newest, _, _ = object_aware_icp(batch.points, batch.other, mask, swap(mask), batch.flow, 20, 0.01, both)
     return objective.flow_decay * batch.flow + (1 - objective.flow_decay) * newest
 
 
 def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective: Objective) -> Outcome:
-    """Labels for the masks, the true flow for the motion head."""
+    """Returns the loss with labels for the masks and the true flow for the motion head."""
     terms = {"mask": supervised_loss(frames.mask, batch.part)}
     if model.motion is not None:
         truth = torch.nn.functional.one_hot(batch.part.clamp(0, model.config.slots - 1), model.config.slots).float()
@@ -223,7 +186,7 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
 
 
 def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-    """Each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
+    """Returns each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
     rotation = quaternion_to_matrix(normalize_quaternion(torch.randn(half, 4, generator=rng))).to(points)
     rotation = torch.cat([rotation, rotation])

@@ -14,10 +14,11 @@ from dpcli.ops import knn
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow import estimate_flow
-from dpcli.segment.flow.config import FlowConfig, find_flow_config
-from dpcli.segment.flow.flow_network import FlowNetwork, SetConv
-from dpcli.segment.flow.model_file import augmented, load_flow_model, save_flow_model
-from dpcli.segment.flow.trainer import COLUMNS, chamfer, flow_loss, train_flow
+from dpcli.segment.flow.config import PRESETS, FlowConfig, FlowSchedule
+from dpcli.segment.flow.flowstep3d import FlowStep3D, SetConv
+from dpcli.segment.flow.losses import chamfer, flow_loss
+from dpcli.segment.flow.model_file import augment_pair, load_flow_model, save_flow_model
+from dpcli.segment.flow.trainer import COLUMNS, FlowTrainer
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 TINY = FlowConfig(local=(8, 8), deep=(8, 8), hidden=8, head=8, neighbors=6, iterations=3)
@@ -31,10 +32,10 @@ def clouds(seed: int, count: int = 64) -> tuple[torch.Tensor, torch.Tensor]:
     return tuple(torch.tensor(rng.random((2, count, 3)) * 0.6, dtype=torch.float32) for _ in range(2))
 
 
-def network(config: FlowConfig = TINY) -> FlowNetwork:
+def network(config: FlowConfig = TINY) -> FlowStep3D:
     """With a last layer that does something, as after training."""
     torch.manual_seed(0)
-    model = FlowNetwork(config)
+    model = FlowStep3D(config)
     torch.nn.init.normal_(model.last.weight, std=0.1)
     return model.eval()
 
@@ -55,16 +56,16 @@ def test_set_conv_written_out() -> None:
 
 @pytest.mark.parametrize(("name", "count"), [("compact", 125_988), ("release", 555_844)])
 def test_configurations(name: str, count: int) -> None:
-    config = find_flow_config(name)
-    assert sum(p.numel() for p in FlowNetwork(config).parameters()) == count
+    config = PRESETS[name]["network"]
+    assert sum(p.numel() for p in FlowStep3D(config).parameters()) == count
     assert FlowConfig.from_json(config.to_json()) == config
-    with pytest.raises(UsageError, match="compact, release"):
-        find_flow_config("huge")
+    with pytest.raises(UsageError, match="norm = none: expected one of layer, batch"):
+        FlowConfig(norm="none")
 
 
 def test_untrained_network_gives_the_global_match_and_every_weight_learns() -> None:
     torch.manual_seed(0)
-    fresh = FlowNetwork(TINY)
+    fresh = FlowStep3D(TINY)
     flows = fresh(*clouds(0))
     assert len(flows) == 3 and all(f.shape == (2, 64, 3) for f in flows)
     torch.testing.assert_close(flows[0], flows[-1])  # the last layer starts at zero
@@ -109,7 +110,7 @@ def test_golden_chamfer(golden_file) -> None:
 def test_augmented_is_affine_and_moves_frames_apart_a_little() -> None:
     pair = np.random.default_rng(4).random((2, 30, 3)).astype(np.float32)
     pair[1] = pair[0]
-    changed = augmented(pair, np.random.default_rng(5))
+    changed = augment_pair(pair, np.random.default_rng(5))
     assert changed.dtype == np.float32 and changed.shape == pair.shape
     gap = changed[1] - changed[0]
     np.testing.assert_allclose(gap, np.broadcast_to(gap[0], gap.shape), atol=1e-6)
@@ -134,20 +135,15 @@ def data(tmp_path_factory) -> Path:
     return path
 
 
-def train(data: Path, folder: Path, steps: int, stop: StopRequest | None = None, batch: int = 2) -> FlowNetwork:
+def train(data: Path, folder: Path, steps: int, stop: StopRequest | None = None, batch: int = 2) -> FlowStep3D:
     run = RunFolder(folder, {"seed": 1}, columns=COLUMNS)
+    schedule, device = FlowSchedule(steps=steps, batch=batch, points=64), torch.device("cpu")
     with CloudsReader(data) as reader:
-        return train_flow(
-            reader,
-            run,
-            steps=steps,
-            batch=batch,
-            seed=1,
-            device="cpu",
-            stop=stop or StopRequest(),
-            points=64,
-            log_every=5,
+        trainer = FlowTrainer(
+            reader, run, FlowConfig(), schedule, seed=1, device=device, stop=stop or StopRequest(), log_every=5
         )
+        with run:
+            return trainer.run()
 
 
 class StopAfter(StopRequest):

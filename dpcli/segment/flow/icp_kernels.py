@@ -1,4 +1,4 @@
-"""CPU kernels of the classical flow: nearest points through a grid filled on demand, and robust ICP steps."""
+"""CPU kernels of the search for rigid bodies: nearest points through a grid filled on demand, and robust ICP steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FAR = np.float32(1e30)
 
 @kernel
 def nearest_point(x, y, z, cloud, squared, bits):
-    """Index of and squared distance to the nearest column of cloud (3,M); the first of equals.
+    """Returns the index of and squared distance to the nearest column of cloud (3,M); the first of equals.
 
     Scratch: squared f32 (M) and its bits, the same memory as i32. The bits of numbers that are not negative sort as
     they do, and the least of integers vectorizes: 4.5 times as fast as the least of floats.
@@ -44,11 +44,11 @@ def nearest_point(x, y, z, cloud, squared, bits):
 
 @kernel
 def _look_up(points, cloud, around, near, grid, origin, cells_per_unit, work, bits, at, far):
-    """As nearest_point for points f32 (3,n), but only among the neighbors of the point nearest to the center of each
-    one's cell of the grid: column i64 (n) and squared distance f32 (n) into `at` and `far`.
+    """Finds the nearest of cloud (3,M) for points f32 (3,n) through a grid: columns and squared distances.
 
-    near f32 (M,3,16): the places of the neighbors `around` (M,k), far away beyond the k. Scratch: work f32, of at least
-    M and 16 n, and its bits. In three passes, because a search point by point waits for memory each time.
+    They go into at i64 (n) and far f32 (n). Only the neighbors of the point nearest to the center of each one's cell
+    are tried. near f32 (M,3,16): the places of the neighbors `around` (M,k), far away beyond the k. Scratch: work f32,
+    of at least M and 16 n, and its bits. In three passes, because a search point by point waits for memory each time.
     """
     count, lanes, top = np.uintp(points.shape[1]), np.uintp(near.shape[2]), np.int32(0)
     ends = np.int32(grid.shape[0] - 1), np.int32(grid.shape[1] - 1), np.int32(grid.shape[2] - 1)
@@ -79,7 +79,7 @@ def _look_up(points, cloud, around, near, grid, origin, cells_per_unit, work, bi
 
 @kernel
 def _solve(matrix, vector):
-    """Cholesky solution of a 6x6 system, in place; reads the lower triangle."""
+    """Solves a 6x6 system by Cholesky, in place; reads the lower triangle."""
     for i in range(6):
         for j in range(i + 1):
             s = matrix[i, j]
@@ -98,7 +98,7 @@ def _solve(matrix, vector):
 
 @kernel
 def _compose(motion, v, center):
-    """motion (3,4) in place: afterwards turn by the rotation vector v[:3] about center and shift by v[3:]."""
+    """Lets motion (3,4), in place, also turn by the rotation vector v[:3] about center and shift by v[3:]."""
     angle = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     a = math.sin(angle) / angle if angle > 1e-9 else 1.0
     b = (1 - math.cos(angle)) / (angle * angle) if angle > 1e-4 else 0.5
@@ -118,7 +118,7 @@ def _compose(motion, v, center):
 
 @kernel
 def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_unit, motion, steps, wide, narrow, share):
-    """Gauss-Newton steps of robust ICP: motion (3,4) f64 in place, source (3,n) onto cloud (3,M).
+    """Makes Gauss-Newton steps of robust ICP: motion (3,4) f64 in place, source (3,n) onto cloud (3,M).
 
     Each point's residual is its distance to the nearest point's plane plus `share` times the distance to the point
     itself (both squared), weighted by Geman and McClure's 1 / (1 + d^2/s^2)^2 with s falling from wide to narrow.
@@ -220,7 +220,10 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
 
 @kernel
 def residual_kernel(source, cloud, normals, around, near, grid, origin, cells_per_unit, motion, share, out):
-    """Squared residuals (n) of source moved by motion: (1 - share) plane distance^2 + share point distance^2."""
+    """Computes squared residuals (n) of source (3,n) moved by motion, as f64 into `out`.
+
+    A residual is (1 - share) plane distance^2 + share point distance^2.
+    """
     count = source.shape[1]
     moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
     at, far = np.empty(count, np.int64), np.empty(count, np.float32)
@@ -256,7 +259,10 @@ def hypotheses_kernel(
     scale,
     out,
 ):
-    """ICP from every one of motions (H,3,4), in place; out (H): mean of d^2 / (d^2 + scale^2) afterwards."""
+    """Runs ICP from every one of motions (H,3,4), in place.
+
+    out (H): the mean of d^2 / (d^2 + scale^2) afterwards, d^2 as in `residual_kernel` with `share_out`.
+    """
     squared = np.empty(source.shape[1])
     for h in range(len(motions)):
         icp_kernel(
@@ -273,7 +279,7 @@ def hypotheses_kernel(
 
 @kernel
 def cover_kernel(moved, normals, queries, share, out):
-    """Squared residuals (M) of queries (3,M) to the moved cloud (3,N), by exhaustion; as residual_kernel's."""
+    """Computes squared residuals (M) of queries (3,M) to the moved cloud (3,N), by exhaustion, as `residual_kernel`."""
     scratch = np.empty(moved.shape[1], np.float32)
     bits = scratch.view(np.int32)
     for i in range(queries.shape[1]):
@@ -285,7 +291,7 @@ def cover_kernel(moved, normals, queries, share, out):
 
 @kernel
 def _gap(m, px, py, pz, x, y, z):
-    """How far from (x, y, z) the motion m (3,4) takes the point p."""
+    """Returns how far from (x, y, z) the motion m (3,4) takes the point p."""
     a = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz + m[0, 3] - x
     b = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz + m[1, 3] - y
     c = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz + m[2, 3] - z
@@ -294,11 +300,11 @@ def _gap(m, px, py, pz, x, y, z):
 
 @kernel
 def energy_kernel(points, normals, label, motion, cost, neighbors, target, share, scale, tear, border, distance):
-    """What bodies cost (see `bodies`): both clouds' mean saturated residuals, the borders, and the way from body 0.
+    """Returns what bodies cost: both clouds' mean saturated residuals, the borders, and the way from body 0.
 
     points (N,3), their normals (N,3), label (N), motion (K,3,4), cost (K,N) saturated residuals, neighbors (N,k),
     target f32 (3,M). A border point costs more, from 1 - tear to 1, the farther apart (0.15 is far) its two motions
-    take it.
+    take it. The weights are those of `rigid_bodies.BodySearch`.
     """
     count, near = neighbors.shape
     moved, turned = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
@@ -329,8 +335,11 @@ def energy_kernel(points, normals, label, motion, cost, neighbors, target, share
 
 @kernel
 def assign_kernel(cost, neighbors, label, extra, border, rounds):
-    """Labels (N) in place, all at once per round: the least of own and neighbors' mean cost (K,N), halved, plus `extra`
-    for all bodies but the first, less twice the border's cost for every share of neighbors that agrees."""
+    """Improves labels (N) in place, all at once per round, by iterated conditional modes (ICM; Besag 1986).
+
+    A label is the least of own and neighbors' mean cost (K,N), halved, plus `extra` for all bodies but the first, less
+    twice the border's cost for every share of neighbors that agrees.
+    """
     bodies, count = cost.shape
     near = neighbors.shape[1]
     unary = np.empty((count, bodies))
@@ -360,9 +369,10 @@ def assign_kernel(cost, neighbors, label, extra, border, rounds):
 
 @kernel
 def lloyd_kernel(points, center, rounds, patch):
-    """k-means in place: center f64 (K,D), patch i64 (N) of points f32 (N,D); a center without points stays.
+    """Runs k-means (Lloyd) in place: center f64 (K,D), patch i64 (N) of points f32 (N,D).
 
-    Distances in float64, ties to the lowest patch; means in float32 in the points' order, as numpy takes them.
+    A center without points stays. Distances in float64, ties to the lowest patch; means in float32 in the points'
+    order, as numpy takes them.
     """
     total, own = np.empty(center.shape, np.float32), np.empty(len(center), np.int64)
     for _ in range(rounds):
@@ -388,7 +398,7 @@ def lloyd_kernel(points, center, rounds, patch):
 
 @kernel
 def distinct_kernel(moved, order, apart, chosen):
-    """Of places f64 (H,n,3), taken in the given order, those no two of which are within `apart` at every point.
+    """Chooses, of places f64 (H,n,3) in the given order, those no two of which are within `apart` at every point.
 
     Fills chosen i64 from its start; returns how many there are, its length at most.
     """

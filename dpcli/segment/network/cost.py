@@ -1,8 +1,7 @@
-"""What a part network costs: parameters and multiply-adds as they are, the paper's way of counting beside them, time, memory."""
+"""The cost of a part network: parameters and multiply-adds, the paper's count beside them, time and memory."""
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from typing import Any
@@ -10,22 +9,24 @@ from typing import Any
 import torch
 from torch import nn
 
-from dpcli.runtime.device import choose_device, peak_memory
-from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.segment.network.config import PartConfig, find_config
+from dpcli.runtime.device import peak_memory
+from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS
 from dpcli.segment.network.kernel_points import kernel_points
 from dpcli.segment.network.part_network import PartNetwork
 
 
 def count_parameters(module: nn.Module) -> int:
-    """Every trainable number."""
+    """Returns the number of all trainable numbers."""
     return sum(p.numel() for p in module.parameters())
 
 
 def paper_parameters(module: nn.Module) -> int:
-    """As the counting tool saw them that gives the thesis's 0.25 M and 0.31 M: plain 1x1 layers and layer norms;
-    no convolution over space or group, no attention, no group norm, no queries."""
+    """Returns the number of trainable numbers in plain 1x1 layers and layer norms.
+
+    This is how the thesis's 0.25 M and 0.31 M come about: the tool that counted them saw no convolution over space or
+    group, no attention, no group norm and no queries.
+    """
     inside_attention = {id(m) for a in module.modules() if isinstance(a, nn.MultiheadAttention) for m in a.modules()}
     counted = (nn.Linear, nn.LayerNorm)
     return sum(
@@ -34,7 +35,7 @@ def paper_parameters(module: nn.Module) -> int:
 
 
 def convolution_macs(config: PartConfig, points: int) -> dict[str, int]:
-    """Multiply-adds of one frame's convolutions, by kind, every neighbor counted whether its weight is zero or not."""
+    """Returns the multiply-adds of one frame's convolutions, by kind; a neighbor counts whether its weight is zero or not."""
     group, kernel = GROUPS[config.group](), kernel_points(config.kernel, config.group)
     rotations, positions, nearby = len(group), len(kernel.points), len(group.nearby)
     total = {"neighbor_sums": 0, "spatial": 0, "group": 0, "shortcut": 0}
@@ -51,8 +52,8 @@ def convolution_macs(config: PartConfig, points: int) -> dict[str, int]:
     return total
 
 
-def macs(model: PartNetwork, points: torch.Tensor) -> dict[str, int]:
-    """Multiply-adds of one frame (1,N,3) by part of the network; the motion head's are half of what a pair costs."""
+def count_macs(model: PartNetwork, points: torch.Tensor) -> dict[str, int]:
+    """Returns the multiply-adds of one frame (1,N,3) by part of the network; the motion head's are half of a pair's."""
     from torch.utils.flop_counter import FlopCounterMode
 
     result = convolution_macs(model.config, points.shape[1])
@@ -74,8 +75,8 @@ def macs(model: PartNetwork, points: torch.Tensor) -> dict[str, int]:
     return {**result, "total": sum(result.values())}
 
 
-def latency(model: PartNetwork, points: torch.Tensor, repeats: int = 5) -> float:
-    """Median milliseconds of the masks of all frames given."""
+def measure_latency(model: PartNetwork, points: torch.Tensor, repeats: int = 5) -> float:
+    """Returns the median milliseconds that the masks of points (B,N,3) take."""
     times = []
     with torch.inference_mode():
         for _ in range(repeats + 1):
@@ -87,12 +88,12 @@ def latency(model: PartNetwork, points: torch.Tensor, repeats: int = 5) -> float
     return round(statistics.median(times[1:]), 1)
 
 
-def measure(config: PartConfig, device: torch.device) -> dict[str, Any]:
-    """Everything `dpc segment profile` prints, as one object."""
+def measure_cost(config: PartConfig, device: torch.device) -> dict[str, Any]:
+    """Returns everything that `dpc segment profile` prints, as one object; the weights are random."""
     torch.manual_seed(0)
     model = PartNetwork(config).to(device).eval()
     frames = torch.nn.functional.normalize(torch.randn(4, config.points, 3), dim=-1).to(device) * 0.5
-    counts = macs(model, frames[:1])
+    counts = count_macs(model, frames[:1])
     parts = {name: count_parameters(module) for name, module in model.named_children()}
     linear = sum(count_parameters(m) for m in model.modules() if isinstance(m, nn.MultiheadAttention))
     return {
@@ -103,35 +104,8 @@ def measure(config: PartConfig, device: torch.device) -> dict[str, Any]:
         "paper_style_parameters": {"total": paper_parameters(model), "rule": "1x1 layers and layer norms only"},
         "macs_per_frame": counts,
         "uncounted": "neighbor search, norms, activations, softmax, interpolation between levels",
-        "latency_ms": {"four_frames": latency(model, frames)},
+        "latency_ms": {"four_frames": measure_latency(model, frames)},
         "peak_memory_mb": round(peak_memory() / 2**20, 1),
         "device": str(device),
         "threads": torch.get_num_threads(),
     }
-
-
-def render(result: dict[str, Any]) -> str:
-    """The object of `measure` as lines for a person."""
-    parameters, counts = result["parameters"], result["macs_per_frame"]
-    parts = ", ".join(f"{key} {value:,}" for key, value in parameters.items() if key != "total")
-    paper = result["paper_style_parameters"]
-    shares = ", ".join(f"{key.replace('_', ' ')} {value / 1e6:.0f}" for key, value in counts.items() if key != "total")
-    return "\n".join(
-        [
-            f"part network, {result['group']} group, {result['points']} points a frame, {result['slots']} slots",
-            f"parameters    {parameters['total']:,} ({parts})",
-            f"  paper style {paper['total']:,}: {paper['rule']}",
-            f"multiply-adds {counts['total'] / 1e9:.3f} G per frame (M: {shares})",
-            f"  not counted: {result['uncounted']}",
-            f"latency       {result['latency_ms']['four_frames']} ms for four frames on {result['device']}"
-            f" with {result['threads']} threads",
-            f"peak memory   {result['peak_memory_mb']} MB of the process",
-        ]
-    )
-
-
-def run_profile(config: str, group: str | None, points: int | None, as_object: bool, device: str) -> None:
-    """`dpc segment profile`."""
-    keep_freed_memory()
-    result = measure(find_config(config).changed(group=group, points=points), choose_device(device))
-    print(json.dumps(result) if as_object else render(result))

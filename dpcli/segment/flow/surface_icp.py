@@ -1,10 +1,10 @@
-"""A cloud prepared for many searches: normals, neighbors, a grid of nearest points; and the ICP onto it."""
+"""A cloud prepared for many searches (normals, neighbors, a grid of nearest points), and the ICP onto it."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.flow.kernels_icp import cover_kernel, hypotheses_kernel, icp_kernel, residual_kernel
+from dpcli.segment.flow.icp_kernels import cover_kernel, hypotheses_kernel, icp_kernel, residual_kernel
 
 _CELL, _MARGIN = 0.03, 0.12  # of the grid, in diameters of the cloud: callers scale their clouds to about 1
 _CELLS = 96  # at most, along an axis
@@ -14,9 +14,10 @@ SHARE = 0.3  # of the distance to the point itself in an ICP step, besides the d
 
 
 class Surface:
-    """points (N,3), f32, of diameter about 1 and N >= 9.
+    """Holds points (N,3) f32, of diameter about 1 and N >= 9, with what a search needs.
 
-    `neighbors` i64 (N,8) without the point itself; `normals` f32 (N,3) by the plane through 8 points, of either sign.
+    `neighbors` i64 (N,8) without the point itself; `normals` f32 (N,3) by the plane through 8 points, of either sign;
+    `spacing`: mean distance of neighbors.
     """
 
     def __init__(self, points: np.ndarray) -> None:
@@ -48,7 +49,10 @@ class Surface:
         )
 
     def icp(self, source: np.ndarray, motion: np.ndarray, steps: int, wide: float, narrow: float) -> np.ndarray:
-        """Motion (3,4) that brings source (3,n) f32 onto the cloud, from a first one; robust, point to plane."""
+        """Returns the motion (3,4) that brings source (3,n) f32 onto the cloud, from a first one.
+
+        The ICP is robust and point to plane.
+        """
         motion = motion.copy()
         icp_kernel(source, *self._search, motion, steps, wide, narrow, SHARE)
         return motion
@@ -63,7 +67,7 @@ class Surface:
         share: float,
         scale: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The same from motions (H,3,4): where they end (h,3,4), and their mean saturated residuals (h).
+        """Returns where ICP ends from motions (H,3,4): motions (h,3,4), and their mean saturated residuals (h).
 
         After a third of the steps the worse half is given up.
         """
@@ -77,18 +81,18 @@ class Surface:
         return motions, score
 
     def residuals(self, source: np.ndarray, motion: np.ndarray, share: float) -> np.ndarray:
-        """Squared residuals (n) of source (3,n) f32, moved: point to plane, and `share` of point to point."""
+        """Returns squared residuals (n) of source (3,n) f32, moved: point to plane, and `share` of point to point."""
         out = np.empty(source.shape[1])
         residual_kernel(source, *self._search, motion, share, out)
         return out
 
     def covered_by(self, moved: np.ndarray, normals: np.ndarray, share: float) -> np.ndarray:
-        """Squared residuals (N) of this cloud's points to another one, moved (n,3), with its normals (n,3)."""
+        """Returns squared residuals (N) of this cloud's points to another one, moved (n,3), with its normals (n,3)."""
         out = np.empty(len(self.points))
         cover_kernel(columns(moved), columns(normals), self.columns, share, out)
         return out
 
 
 def columns(points: np.ndarray) -> np.ndarray:
-    """(N,3) as contiguous f32 (3,N)."""
+    """Returns points (N,3) as contiguous f32 (3,N)."""
     return np.ascontiguousarray(np.asarray(points, np.float32).T)

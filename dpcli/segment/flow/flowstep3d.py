@@ -17,7 +17,7 @@ from dpcli.segment.flow.config import FlowConfig
 
 
 class _Norm(nn.Module):
-    """Batch or layer normalization of the last axis, whatever stands before it."""
+    """Normalizes the last axis by batch or by layer, whatever stands before it."""
 
     def __init__(self, kind: str, channels: int) -> None:
         super().__init__()
@@ -28,6 +28,7 @@ class _Norm(nn.Module):
 
 
 def _mlp(channels: list[int], norm: str) -> nn.Sequential:
+    """Returns linear layers of these widths, each with a norm and ReLU."""
     layers: list[nn.Module] = []
     for before, after in zip(channels, channels[1:]):
         layers += [nn.Linear(before, after, bias=False), _Norm(norm, after), nn.ReLU()]
@@ -35,10 +36,10 @@ def _mlp(channels: list[int], norm: str) -> nn.Sequential:
 
 
 class SetConv(nn.Module):
-    """Maximum over neighbors of an MLP of [offset, feature]: (B,N,3), (B,N,C), idx (B,M,k), (B,M,3) -> (B,M,C').
+    """Computes the maximum over neighbors of an MLP of [offset, feature].
 
-    The first layer is linear, so it runs before the gathering, on N points rather than M k neighbors. `own` (B,M,C'),
-    if given, is added to it at every center.
+    (B,N,3), (B,N,C), idx (B,M,k), centers (B,M,3) -> (B,M,C'). The first layer is linear, so it runs before the
+    gathering, on N points rather than M k neighbors. `own` (B,M,C'), if given, is added to it at every center.
     """
 
     def __init__(self, before: int, after: int, norm: str, depth: int = 3) -> None:
@@ -51,18 +52,21 @@ class SetConv(nn.Module):
     def forward(
         self, points: Tensor, features: Tensor, idx: Tensor, centers: Tensor, own: Tensor | None = None
     ) -> Tensor:
+        """Returns features (B,M,C') at the centers."""
         shift = -self.place(centers) if own is None else own - self.place(centers)
         gathered = gather_points(self.feature(features) + self.place(points), idx)
         return self.rest(self.first(gathered + shift[:, :, None])).amax(2)
 
 
 class _Level(NamedTuple):
+    """Holds the points of one level and their features."""
+
     points: Tensor  # [B, n, 3]
     features: Tensor  # [B, n, C]
 
 
 class _GatedUnit(nn.Module):
-    """A GRU whose gates are set convolutions over the cloud: hidden (B,n,H), input (B,n,I) -> hidden."""
+    """Is a GRU whose gates are set convolutions over the cloud: hidden (B,n,H), input (B,n,I) -> hidden (B,n,H)."""
 
     def __init__(self, hidden: int, given: int, norm: str) -> None:
         super().__init__()
@@ -78,8 +82,11 @@ class _GatedUnit(nn.Module):
         return (1 - update) * hidden + update * proposal
 
 
-class FlowNetwork(nn.Module):
-    """Two clouds (B,N,3), (B,M,3) -> flows of the first after every iteration, each (B,N,3). N, M of 16 or more do best."""
+class FlowStep3D(nn.Module):
+    """Estimates the flow of a first cloud (B,N,3) toward a second (B,M,3), in several iterations.
+
+    N and M should be 16 or more.
+    """
 
     def __init__(self, config: FlowConfig) -> None:
         super().__init__()
@@ -101,8 +108,10 @@ class FlowNetwork(nn.Module):
     def forward(
         self, points1: Tensor, points2: Tensor, iterations: int | None = None, decay: float = 1.0
     ) -> list[Tensor]:
-        """Flows f32 (B,N,3): the global match's, then iterations - 1 corrected ones. decay: factor of the correction from
-        one iteration to the next (the release is said to test with 0.5)."""
+        """Returns flows f32 (B,N,3): the global match's, then iterations - 1 corrected ones.
+
+        decay: factor of the correction from one iteration to the next (the release is said to test with 0.5).
+        """
         first, second = self._encode(points1), self._encode(points2)
         coarse = self._global_match(first[-1], second[-1])
         near, other = first[1], second[1]
@@ -120,7 +129,7 @@ class FlowNetwork(nn.Module):
         return flows
 
     def _encode(self, points: Tensor) -> list[_Level]:
-        """Levels of N/2, N/4, N/8, N/16 points; the first layer sees positions relative to the cloud's mean."""
+        """Returns levels of N/2, N/4, N/8, N/16 points; the first layer sees positions relative to the cloud's mean."""
         levels, features = [], points - points.mean(1, keepdim=True)
         for layer in self.encoder:
             chosen = fps(points, max(points.shape[1] // 2, 1))
@@ -132,7 +141,10 @@ class FlowNetwork(nn.Module):
         return levels
 
     def _global_match(self, first: _Level, second: _Level) -> Tensor:
-        """Soft correspondences of the coarsest points: weights exp(-(1 - cosine) / (exp(s) + 0.03)), normalized."""
+        """Returns the flow (B,n,3) of the coarsest points by soft correspondences, as FLOT (Puy et al. 2020).
+
+        The weights are exp(-(1 - cosine) / (exp(s) + 0.03)), normalized.
+        """
         cosine = nn.functional.normalize(first.features, dim=-1) @ nn.functional.normalize(second.features, dim=-1).mT
         logits = (cosine - 1) / (self.sharpness.exp() + 0.03)
         distance = torch.cdist(first.points, second.points)
@@ -140,13 +152,14 @@ class FlowNetwork(nn.Module):
         return logits.softmax(-1) @ second.points - first.points
 
     def _compare(self, near: _Level, flow: Tensor, other: _Level) -> Tensor:
-        """Each warped point with its nearest points in the other frame: (B,n,hidden)."""
+        """Returns features (B,n,hidden) of each warped point with its nearest points in the other frame."""
         warped = near.points + flow
         squared, idx = knn(warped, other.points, self.config.correlated)
         idx = torch.where(squared > self.config.radius**2, idx[..., :1], idx)
         return self.correlate(other.points, other.features, idx, warped, self.own(near.features))
 
     def _correction(self, hidden: Tensor, points: Tensor, idx: Tensor) -> Tensor:
+        """Returns the correction (B,n,3) of the flow that the hidden state (B,n,H) says."""
         for layer in self.head:
             hidden = layer(points, hidden, idx, points)
         return self.last(hidden)
