@@ -7,22 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.evaluate.classification.protocol import ClassificationReport
-from dpcli.evaluate.classification.tables import percent
 from dpcli.evaluate.proportions import divide
-from dpcli.store.pipes import FIGURES, check_target
+from dpcli.evaluate.text_tables import percent
 
 _INCH_PER_CLASS = 0.30  # a cell holds three digits at this size
 _SMALLEST = 3.2  # inches of matrix, however few the classes
 _LONGEST_NAME = 28  # characters of a class name on an axis
 
 
-def check_picture(path: Path) -> None:
-    """`check_target` for the figures of this package."""
-    check_target(path, "--picture", FIGURES)
-
-
-def confusion_picture(report: ClassificationReport, path: Path) -> None:
-    """Draw the confusion matrix of the main scores: color = share of the row's truth, number = samples."""
+def draw_confusion_matrix(report: ClassificationReport, path: Path) -> None:
+    """Draws the confusion matrix of the main scores: color = share of the row's truth, number = samples."""
     from matplotlib.figure import Figure
 
     confusion = report.main.confusion

@@ -9,7 +9,8 @@ import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.networks import full_precision
-from dpcli.evaluate.networks.weights import check, fill, find, load_state, named
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
+from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
 
 VARIANTS = {"openai": "clip-openai", "laion": "clip-laion"}
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -32,10 +33,10 @@ class Clip:
         """
         if variant not in VARIANTS:
             raise UsageError(f"CLIP variant {variant!r}: expected one of {', '.join(VARIANTS)}")
-        weights, path = named(VARIANTS[variant]), find(VARIANTS[variant], folder)
-        found = check(path, weights, digest=False)
+        weights, path = weights_named(VARIANTS[variant]), find_weights(VARIANTS[variant], folder)
+        found = check_file(path, weights, digest=False)
         if found.state != "present":
-            raise DataError(f"{path}: damaged weights ({found.said}); delete it and fetch it again")
+            raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
         return cls.open(path.parent, device)
 
     @classmethod
@@ -45,7 +46,7 @@ class Clip:
         if path is None or not (folder / "config.json").is_file():
             raise DataError(f"{folder}: expected config.json and {' or '.join(_FILES)}")
         model = _model(folder)
-        fill(model, load_state(path), path)
+        fill_module(model, load_tensors(path), path)
         return cls(model, device)
 
     def embed(

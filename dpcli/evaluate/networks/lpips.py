@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks import full_precision
-from dpcli.evaluate.networks.trunks import alexnet, squeezenet, vgg16
-from dpcli.evaluate.networks.weights import fill, find, load_state, state_of
+from dpcli.evaluate.networks.lpips_trunks import alexnet, squeezenet, vgg16
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
+from dpcli.evaluate.networks.weights import find_weights
 
 HEADS = Path(__file__).parent / "heads"  # the linear weights, BSD-2, see LPIPS.md there
 NETS = {"alex": (alexnet, "alexnet"), "vgg": (vgg16, "vgg16"), "squeeze": (squeezenet, "squeezenet")}
@@ -43,7 +44,7 @@ class Lpips(nn.Module):
         """With the published trunk from the weights folder. DataError when it is absent, damaged or another network's."""
         made = cls(net)
         name = NETS[net][1]
-        fill(made.trunk, state_of(name, folder), find(name, folder))
+        fill_module(made.trunk, load_weights(name, folder), find_weights(name, folder))
         return made
 
     @torch.no_grad()
@@ -118,7 +119,7 @@ class Lpips(nn.Module):
 def load_heads(net: str, channels: tuple[int, ...]) -> list[nn.Parameter]:
     """The published non-negative weights of each layer's channels, f32 (1,C,1,1), as they came with `lpips` 0.1.4."""
     path = HEADS / f"lpips-v0.1-{net}.safetensors"
-    state = load_state(path)
+    state = load_tensors(path)
     heads = [state[f"lin{layer}.model.1.weight"] for layer in range(len(channels))]
     if tuple(head.shape[1] for head in heads) != channels:
         raise DataError(f"{path}: not the heads of {net}")

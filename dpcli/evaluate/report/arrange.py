@@ -11,8 +11,8 @@ from dpcli.errors import DataError
 from dpcli.evaluate.report.blocks import Cell, Report, Section, Table, table
 from dpcli.evaluate.report.classification_section import SHOWN_HERE, classification_blocks
 from dpcli.evaluate.report.collect import Collected, Result
-from dpcli.evaluate.report.general import denominator, detail_lists, headline, metric_blocks
-from dpcli.evaluate.report.thesis import beside_table, chosen_tables
+from dpcli.evaluate.report.metric_tables import denominator, detail_lists, headline, metric_blocks
+from dpcli.evaluate.report.thesis_tables import beside_table, chosen_tables
 
 
 def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[str] = ()) -> Report:

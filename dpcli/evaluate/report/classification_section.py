@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, table, title_of
+from dpcli.evaluate.metric_titles import title_of
+from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, table
 from dpcli.evaluate.report.charts import confusion_grid
 
 SHOWN_HERE = ("streams", "per_class", "confusion")

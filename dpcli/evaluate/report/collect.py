@@ -10,8 +10,8 @@ from typing import Any, BinaryIO
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.report.blocks import Figure, Table
-from dpcli.evaluate.report.clouds import part_blocks
-from dpcli.evaluate.report.strips import strip_figure
+from dpcli.evaluate.report.error_clouds import part_blocks
+from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.pipes import standard_input
 
@@ -173,17 +173,19 @@ def _checked(found: Any, where: str) -> dict[str, Any]:
 
 def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
+    from dpcli.evaluate.classification.protocol import evaluate_classification
+    from dpcli.evaluate.classification.result_json import classification_json
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
-    return Result(_plain(as_json(report, str(path), ScoresReader(path).provenance)), str(path))
+    return Result(_plain(classification_json(report, str(path), ScoresReader(path).provenance)), str(path))
 
 
 def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[Result]:
     """Segmentation, and motion where the truth has poses and the prediction frame pairs."""
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion, motion_json
-    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation, segmentation_json
+    from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
+    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+    from dpcli.evaluate.segmentation.result_json import motion_json, segmentation_json
 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
@@ -206,7 +208,7 @@ def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) ->
 
 def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
     from dpcli.evaluate.video.comparison import evaluate_video
-    from dpcli.evaluate.video.tables import video_json
+    from dpcli.evaluate.video.result_json import video_json
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")

@@ -7,7 +7,7 @@ from html import escape
 from importlib.resources import files
 
 from dpcli.evaluate.report.blocks import MISSING, Cell, Figure, Report, Section, Table
-from dpcli.evaluate.report.clouds import palette_words
+from dpcli.evaluate.report.error_clouds import palette_words
 
 _LONG, _LONG_NAME = 44, 26  # characters from which a cell, a row's name, may break into lines
 

@@ -1,4 +1,4 @@
-"""Segmentation and motion by class, as bars."""
+"""Draws segmentation and motion metrics by class, as bars."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ _SHOWN = ("ap", "pq", "f1", "miou", "ri")
 _INCH_PER_ROW = 0.75
 
 
-def segmentation_picture(report: SegmentationReport, path: Path) -> None:
-    """Scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
+def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
+    """Draws the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
     rows = class_rows(report.main, report.classes, report.class_names)
     bars, spread = _panels(len(rows), 2)
     values = {TITLES[key]: [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
@@ -30,8 +30,8 @@ def segmentation_picture(report: SegmentationReport, path: Path) -> None:
     bars.figure.savefig(path, dpi=150)
 
 
-def motion_picture(report: MotionReport, path: Path) -> None:
-    """End-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
+def draw_motion_bars(report: MotionReport, path: Path) -> None:
+    """Draws the end-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
     rows = class_rows(report.main, report.classes, report.class_names)
     errors, accuracy = _panels(len(rows), 2)
     titles = [f"{title} ({own.pairs})" for title, own in rows]
@@ -58,7 +58,7 @@ def _panels(rows: int, count: int) -> list:
 
 
 def _bars(axes, titles: list[str], values: dict[str, list[float]]) -> None:
-    """One group of horizontal bars for each title, the first at the top; undefined numbers have no bar."""
+    """Draws one group of horizontal bars for each title, the first at the top; undefined numbers have no bar."""
     places, height = np.arange(len(titles)), 0.8 / len(values)
     for number, (name, lengths) in enumerate(values.items()):
         offset = (number - (len(values) - 1) / 2) * height

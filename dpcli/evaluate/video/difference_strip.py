@@ -1,4 +1,4 @@
-"""Truth, prediction and their difference side by side, some instants of each view, as one picture."""
+"""Draws truth, prediction and their difference side by side, some instants of each view, as one picture."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.sources import Picture, View
+from dpcli.evaluate.video.source import Picture, View
 
 _INSTANTS, _MOST_VIEWS = 6, 8
 _SIDE, _GAP, _TITLE = 160, 4, 18  # pixels
 
 
-class Strip:
+class DifferenceStrip:
     """Collects small cells while a video is scored (`evaluate_video`'s `watch`), and writes them as one picture.
 
     For each of the first eight views three rows: truth, prediction, and four times the absolute difference.
@@ -33,7 +33,7 @@ class Strip:
         self.rows.setdefault(title, []).append((frame, np.concatenate([theirs, ours, apart])))
 
     def save(self, path: Path) -> None:
-        """Write the picture. DataError when there is nothing to show, or it can't be written."""
+        """Writes the picture. DataError when there is nothing to show, or it can't be written."""
         from PIL import Image, ImageDraw
 
         if not self.rows:
@@ -57,7 +57,7 @@ class Strip:
 
 
 def _small(colors: np.ndarray) -> np.ndarray:
-    """f32 (3,H,W) in 0..1 -> f32 (S,S,3), the longer side filling the cell."""
+    """Returns a picture f32 (3,H,W) in 0..1 as f32 (S,S,3), the longer side filling the cell."""
     from PIL import Image
 
     image = Image.fromarray((np.nan_to_num(colors).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8))

@@ -20,7 +20,7 @@ _REACH = _TAPS // 2
 
 @dataclass(frozen=True)
 class PictureStatistics:
-    """One row per frame, in the order the frames came; F frames.
+    """Holds one row per frame, in the order the frames came; F frames.
 
     frame i64 (F): its number. squared f64 (F), values i64 (F): sum of squared errors, and of how many values; inside,
     inside_values: the same over the object's pixels. data_range f64 (F). similarity f64 (F), windows i64 (F): sum of
@@ -38,13 +38,13 @@ class PictureStatistics:
     multi_scale: np.ndarray
 
     def __add__(self, other: PictureStatistics) -> PictureStatistics:
-        """Statistics of both sets of frames together."""
+        """Returns the statistics of both sets of frames together."""
         return picture_merge([self, other])
 
 
 @dataclass(frozen=True)
 class PictureMetrics:
-    """Means over frames; psnr in dB. NaN = undefined or not asked for.
+    """Holds means over frames; psnr in dB. NaN = undefined or not asked for.
 
     pixels: of one frame. exact: frames without any error, which count as PSNR_CAP. without_object: frames whose mask is
     empty, which psnr_foreground leaves out. worst: frame of the largest squared error, -1 = none has any.
@@ -63,7 +63,7 @@ class PictureMetrics:
 
 
 def planar(picture: np.ndarray) -> np.ndarray:
-    """(H,W) or (H,W,C) of any number type -> contiguous f32 (C,H,W). ValueError on another shape."""
+    """Returns a picture (H,W) or (H,W,C) of any number type as contiguous f32 (C,H,W). ValueError on another shape."""
     if picture.ndim not in (2, 3):
         raise ValueError(f"a picture must have shape (H,W) or (H,W,C), but has {picture.shape}")
     picture = picture[..., None] if picture.ndim == 2 else picture
@@ -71,7 +71,7 @@ def planar(picture: np.ndarray) -> np.ndarray:
 
 
 def check_pair(predicted: np.ndarray, truth: np.ndarray, data_range: float) -> None:
-    """ValueError when shapes differ; DataError for values that are not finite, or not of a picture in 0..data_range."""
+    """Raises ValueError when shapes differ; DataError for values that are not finite, or not of a picture in 0..data_range."""
     if predicted.shape != truth.shape:
         raise ValueError(f"pictures of shapes {predicted.shape} and {truth.shape}; expected equal ones")
     if not data_range > 0:
@@ -93,7 +93,13 @@ def check_pair(predicted: np.ndarray, truth: np.ndarray, data_range: float) -> N
 
 
 def psnr_of(squared: np.ndarray | float, values: np.ndarray | float, data_range: np.ndarray | float) -> np.ndarray:
-    """10 log10(range^2 / mean squared error) in dB, at most PSNR_CAP; NaN for no values."""
+    """Returns 10 log10(range^2 / mean squared error) in dB, at most PSNR_CAP; NaN for no values.
+
+    squared: sum of squared errors, values: their number, data_range: largest possible difference; numbers or arrays.
+
+    >>> float(psnr_of(0.25, 25, 1.0)), float(psnr_of(0.0, 25, 1.0))
+    (20.0, 100.0)
+    """
     mean = divide(squared, values)
     with np.errstate(divide="ignore"):
         return np.minimum(10 * np.log10(divide(np.square(data_range), 1.0)) - 10 * np.log10(mean), PSNR_CAP)
@@ -106,9 +112,12 @@ def psnr(
     data_range: float = 1.0,
     mask: np.ndarray | None = None,  # bool (H,W)
 ) -> float:
-    """Peak signal-to-noise ratio in dB over all values, or over those of the pixels in `mask`; at most PSNR_CAP.
+    """Returns the peak signal-to-noise ratio (PSNR) in dB over all values, or over those of the pixels in `mask`; at most PSNR_CAP.
 
     NaN for an empty mask. Raises as `check_pair`.
+
+    >>> round(psnr(np.full((4, 4), 0.5), np.full((4, 4), 0.6)), 3)
+    20.0
     """
     check_pair(predicted, truth, data_range)
     predicted, truth = planar(predicted), planar(truth)
@@ -118,11 +127,15 @@ def psnr(
 
 
 def ssim(predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0, border: str = "valid") -> float:
-    """Structural similarity (Wang et al. 2004): Gaussian window 11 x 11 of sigma 1.5, population variances, K 0.01, 0.03.
+    """Returns the structural similarity SSIM (Wang et al. 2004): Gaussian window 11 x 11 of sigma 1.5, population variances, K 0.01, 0.03.
 
     Mean over windows and channels of pictures (H,W) or (H,W,C). border "valid": windows inside the picture (what
     scikit-image and the authors' code average); "reflect": a window per pixel, the picture mirrored at its edges
     (torchmetrics). ValueError when the picture is too small; else raises as `check_pair`.
+
+    >>> ramp = np.tile(np.linspace(0, 1, 16, dtype=np.float32), (16, 1))
+    >>> ssim(ramp, ramp), round(ssim(ramp, 1 - ramp), 3)
+    (1.0, -0.588)
     """
     check_pair(predicted, truth, data_range)
     whole, _, windows = similarity(planar(predicted), planar(truth), data_range, border)
@@ -130,7 +143,7 @@ def ssim(predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0, b
 
 
 def ms_ssim(predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0, border: str = "valid") -> float:
-    """Multi-scale structural similarity (Wang et al. 2003) over five scales, each half the size of the one before.
+    """Returns the multi-scale structural similarity MS-SSIM (Wang et al. 2003) over five scales, each half the size of the one before.
 
     Negative factors count as 0. `border` is that of the last scale's similarity; the contrast-structure factors are
     means over the windows inside the picture (torchmetrics, whose value "reflect" gives, does the same).
@@ -141,7 +154,7 @@ def ms_ssim(predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0
 
 
 def multi_scale(predicted: np.ndarray, truth: np.ndarray, data_range: float, border: str) -> float:
-    """`ms_ssim` of contiguous f32 (C,H,W)."""
+    """Returns `ms_ssim` of contiguous f32 (C,H,W)."""
     coarsest = min(truth.shape[1:]) >> (len(SCALE_WEIGHTS) - 1)
     if coarsest < _TAPS:
         raise ValueError(f"MS-SSIM needs at least {_TAPS << 4} pixels a side, but the picture has {truth.shape[1:]}")
@@ -162,11 +175,11 @@ def _halved(picture: np.ndarray) -> np.ndarray:
 
 
 def similarity(predicted: np.ndarray, truth: np.ndarray, data_range: float, border: str) -> tuple[float, float, int]:
-    """Sums over windows of SSIM and of its contrast-structure factor, and their number, of contiguous f32 (C,H,W)."""
+    """Returns the sums over windows of SSIM and of its contrast-structure factor, and their number, of contiguous f32 (C,H,W)."""
     pad = _padding(truth.shape, border)
     single = np.float32
     constants = (single(data_range / 2), single((K1 * data_range) ** 2), single((K2 * data_range) ** 2))
-    sums = _kernels().similarity_sums(predicted, truth, window()[: _REACH + 1].astype(single), pad, *constants)
+    sums = _kernels().similarity_sums(predicted, truth, gaussian_window()[: _REACH + 1].astype(single), pad, *constants)
     return float(sums[0]), float(sums[1]), _windows(truth.shape, pad)
 
 
@@ -184,8 +197,8 @@ def _windows(shape: tuple[int, ...], pad: int) -> int:
     return channels * (height + cut) * (width + cut)
 
 
-def window() -> np.ndarray:
-    """Weights of the Gaussian window along one axis, f64 (11), sum 1."""
+def gaussian_window() -> np.ndarray:
+    """Returns the weights of the Gaussian window along one axis, f64 (11), sum 1."""
     weights = np.exp(-0.5 * (np.arange(-_REACH, _REACH + 1) / SIGMA) ** 2)
     return weights / weights.sum()
 
@@ -199,7 +212,7 @@ def _kernels():  # -> module; it imports numba
 def ssim_reference(
     predicted: np.ndarray, truth: np.ndarray, *, data_range: float = 1.0, border: str = "valid"
 ) -> float:
-    """The float64 numpy twin of `ssim`, after the paper's formula: same arguments, same result to rounding."""
+    """Returns `ssim` by its float64 numpy twin, after the paper's formula: same arguments, same result to rounding."""
     check_pair(predicted, truth, data_range)
     pictures = [np.moveaxis(np.atleast_3d(p).astype(np.float64), -1, 0) for p in (predicted, truth)]
     whole, _, windows = _similarity_numpy(*pictures, data_range, _padding(pictures[0].shape, border))
@@ -220,9 +233,9 @@ def _similarity_numpy(
 
 
 def _filtered(planes: np.ndarray) -> np.ndarray:
-    """f64 (C,H,W) -> (C,H-10,W-10)."""
-    rows = np.lib.stride_tricks.sliding_window_view(planes, _TAPS, axis=1) @ window()
-    return np.lib.stride_tricks.sliding_window_view(rows, _TAPS, axis=2) @ window()
+    """Returns f64 (C,H,W) averaged over the Gaussian window, (C,H-10,W-10)."""
+    rows = np.lib.stride_tricks.sliding_window_view(planes, _TAPS, axis=1) @ gaussian_window()
+    return np.lib.stride_tricks.sliding_window_view(rows, _TAPS, axis=2) @ gaussian_window()
 
 
 def picture_update(
@@ -236,7 +249,7 @@ def picture_update(
     border: str = "valid",
     metrics: Iterable[str] = ("psnr", "ssim"),
 ) -> PictureStatistics:
-    """Statistics of one frame. Without a mask the object's share is empty. similarity_range: SSIM's, if it has its own."""
+    """Returns the statistics of one frame. Without a mask the object's share is empty. similarity_range: SSIM's, if it has its own."""
     inside = np.zeros(truth.shape[1:], np.uint8) if mask is None else mask
     squared, object_squared = _kernels().squared_errors(predicted, truth, inside)
     own = data_range if similarity_range is None else similarity_range
@@ -258,7 +271,7 @@ def picture_update(
 
 
 def picture_merge(parts: Iterable[PictureStatistics]) -> PictureStatistics:
-    """Statistics of several sets of frames, one after the other. ValueError for none."""
+    """Returns the statistics of several sets of frames, one after the other. ValueError for none."""
     rows = [[getattr(part, f.name) for f in fields(PictureStatistics)] for part in parts]
     if not rows:
         raise ValueError("no statistics to merge")
@@ -266,12 +279,12 @@ def picture_merge(parts: Iterable[PictureStatistics]) -> PictureStatistics:
 
 
 def frame_psnr(found: PictureStatistics) -> np.ndarray:
-    """PSNR of each frame in dB, f64 (F)."""
+    """Returns the PSNR of each frame in dB, f64 (F)."""
     return psnr_of(found.squared, found.values, found.data_range)
 
 
 def picture_compute(found: PictureStatistics) -> PictureMetrics:
-    """Metrics of RGB frames: each the mean of the frames' own values."""
+    """Returns the metrics of RGB frames: each the mean of the frames' own values."""
     each = frame_psnr(found)
     objects = psnr_of(found.inside, found.inside_values, found.data_range)
     return PictureMetrics(

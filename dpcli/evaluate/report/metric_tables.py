@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.report.blocks import (
     Cell,
     Figure,
@@ -17,7 +18,6 @@ from dpcli.evaluate.report.blocks import (
     is_number,
     sort_key,
     table,
-    title_of,
 )
 from dpcli.evaluate.report.charts import curve, histogram
 

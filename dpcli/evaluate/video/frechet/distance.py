@@ -1,4 +1,4 @@
-"""Frechet distance between two sets of features taken as normal distributions, and its sufficient statistics."""
+"""The Frechet distance between two sets of features taken as normal distributions, and its sufficient statistics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TINY = 1e-10  # singular values under it are not rooted by TF-GAN's square root
 
 @dataclass(frozen=True)
 class FeatureStatistics:
-    """Sufficient statistics of N samples of D features, all f64.
+    """Holds the sufficient statistics of N samples of D features, all f64.
 
     rows (R,D): samples as they came, at most D of them. count, total (D), outer (D,D): how many more were summed up,
     their sum, and the sum of their outer products; None where none was. Few samples keep every digit this way: a
@@ -30,18 +30,19 @@ class FeatureStatistics:
 
     @property
     def samples(self) -> int:
+        """The number N of samples."""
         return self.count + len(self.rows)
 
     @property
     def mean(self) -> np.ndarray:
-        """f64 (D). DataError without samples."""
+        """The mean, f64 (D). DataError without samples."""
         if not self.samples:
             raise DataError("no features: an empty set has no mean")
         return (self.rows.sum(0) + (0 if self.total is None else self.total)) / self.samples
 
     @property
     def covariance(self) -> np.ndarray:
-        """f64 (D,D), denominator N - 1. DataError for fewer than two samples."""
+        """The covariance, f64 (D,D), denominator N - 1. DataError for fewer than two samples."""
         self._check_spread()
         factor = self._deviations(self.mean)
         summed = factor.T @ factor
@@ -52,7 +53,7 @@ class FeatureStatistics:
         return summed / (self.samples - 1)
 
     def factor(self) -> np.ndarray:
-        """A f64 (R,D) with A^T A = covariance; R = number of samples, or D where some are summed up."""
+        """Returns A, f64 (R,D), with A^T A = covariance; R = number of samples, or D where some are summed up."""
         self._check_spread()
         if self.outer is None:
             return self._deviations(self.mean) / np.sqrt(self.samples - 1)
@@ -60,7 +61,7 @@ class FeatureStatistics:
         return np.sqrt(values.clip(0))[:, None] * vectors.T
 
     def __add__(self, other: FeatureStatistics) -> FeatureStatistics:
-        """Statistics of both sets together. DataError when they have different numbers of features."""
+        """Returns the statistics of both sets together. DataError when they have different numbers of features."""
         if self.rows.shape[1] != other.rows.shape[1]:
             raise DataError(
                 f"features of {self.rows.shape[1]} and of {other.rows.shape[1]} values: two networks' can't be compared"
@@ -81,7 +82,7 @@ class FeatureStatistics:
 
 
 def feature_update(features: np.ndarray, before: FeatureStatistics | None = None) -> FeatureStatistics:
-    """Statistics of features (N,D), and of those before. DataError for NaN and infinite ones, ValueError for shapes."""
+    """Returns the statistics of features f (N,D) together with those before. DataError for NaN and infinite ones, ValueError for shapes."""
     rows = np.asarray(features, np.float64)
     if rows.ndim != 2:
         raise ValueError(f"features must have shape (N,D), but have {rows.shape}")
@@ -96,7 +97,7 @@ def feature_update(features: np.ndarray, before: FeatureStatistics | None = None
 
 
 def feature_merge(parts: Iterable[FeatureStatistics]) -> FeatureStatistics:
-    """Statistics of all sets together. DataError when there is none."""
+    """Returns the statistics of all sets together. DataError when there is none."""
     parts = list(parts)
     if not parts:
         raise DataError("no features to merge: no video had enough frames")
@@ -106,12 +107,17 @@ def feature_merge(parts: Iterable[FeatureStatistics]) -> FeatureStatistics:
 def frechet_distance(
     a: FeatureStatistics, b: FeatureStatistics, *, root: str = "eig", jitter: float = 1e-6, single: str = "error"
 ) -> float:
-    """|mu_a - mu_b|^2 + Tr(S_a + S_b - 2 (S_a S_b)^(1/2)), in float64, never under 0 (Dowson & Landau 1982).
+    """Returns |mu_a - mu_b|^2 + Tr(S_a + S_b - 2 (S_a S_b)^(1/2)), in float64, never under 0 (Dowson & Landau 1982).
 
     root: how the trace of (S_a S_b)^(1/2) is found. eig: the sum of the singular values of A B^T, where S_a = A^T A, S_b
     = B^T B: exact for any rank; scipy: scipy.linalg.sqrtm of the product, with `jitter` on both diagonals where that is
     not finite (StyleGAN-V, DisCo, pytorch-fid); svd: TF-GAN's symmetric square roots (VideoGPT).
     single: with fewer than two samples on a side, "error" (DataError) or "mean": the first term alone (common_metrics).
+    ValueError for another root.
+
+    >>> left, right = (feature_update(np.array([[0.0], [2.0]]) + shift) for shift in (0, 3))
+    >>> round(frechet_distance(left, right), 9)
+    9.0
     """
     if root not in ROOTS:
         raise ValueError(f"root {root!r}: expected {', '.join(ROOTS)}")
@@ -132,10 +138,13 @@ def frechet_distance(
 
 
 def single_video_distance(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """|f - g|^2 + (std f - std g)^2, std over a video's D features with denominator D - 1: one video against one.
+    """Returns |f - g|^2 + (std f - std g)^2, std over a video's D features with denominator D - 1: one video against one.
 
     What Consistent4D's script gives with numpy < 2.2, whose `cov` reads one row of features as D observations of one
     variable (numpy 2.2 and later give NaN). f, g (D). DataError for features that are not finite.
+
+    >>> single_video_distance(np.array([0.0, 2.0]), np.array([1.0, 3.0]))
+    2.0
     """
     f, g = (feature_update(np.asarray(values).reshape(1, -1)).rows[0] for values in (predicted, truth))
     if f.shape != g.shape or len(f) < 2:
@@ -148,7 +157,7 @@ def _sum(own: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
 
 
 def _folded(found: FeatureStatistics) -> FeatureStatistics:
-    """The same with its rows summed up where they are more than the sums would be."""
+    """Returns the same statistics, rows summed up where they are more than the sums would be."""
     rows = found.rows
     if len(rows) <= rows.shape[1]:
         return found

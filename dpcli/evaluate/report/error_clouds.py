@@ -9,15 +9,15 @@ from html import escape
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from dpcli.draw.palette import PALETTE, UNKNOWN
-from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.proportions import mean_defined
 from dpcli.evaluate.report.blocks import Figure, Table, cell, table, text_of
 from dpcli.evaluate.report.charts import histogram
-from dpcli.evaluate.segmentation.motion_metrics import true_flow, true_motion
-from dpcli.evaluate.segmentation.part_matching import mean_iou, overlap
-from dpcli.evaluate.segmentation.truth_pairing import Compared, Comparison
+from dpcli.evaluate.segmentation.part_matching import hungarian_matching, mean_iou
+from dpcli.evaluate.segmentation.part_overlap import overlap
+from dpcli.evaluate.segmentation.rigid_motion import true_flow, true_motion
+from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair
 
 _WORST, _MEDIAN = 3, 2
 _MOST_POINTS = 1500  # of a cloud on the page
@@ -55,31 +55,31 @@ def part_blocks(
 ) -> list[Table | Figure]:
     """How errors are spread over sequences, frames and pairs, the worst sequences by name, and clouds of some."""
     fields = ("part", "pose") if motion else ("part",)
-    with Comparison(path, truth, split=split, intersect=intersect, fields=fields) as comparison:
-        errors = [_errors(row, compared, motion) for row, compared in zip(comparison.rows, comparison, strict=True)]
+    with PairedSequences(path, truth, split=split, intersect=intersect, fields=fields) as paired:
+        errors = [_sequence_error(row, pair, motion) for row, pair in zip(paired.rows, paired, strict=True)]
         known = [own for own in errors if not np.isnan(own.mean)]
         shown = _chosen(known)
-        unit = comparison.truth.length_unit
+        unit = paired.truth.length_unit
         clouds = [
-            (title, own, frame, _cloud(comparison, own, frame, unit if motion else "")) for title, own, frame in shown
+            (title, own, frame, _cloud(paired, own, frame, unit if motion else "")) for title, own, frame in shown
         ]
     return [*_spreads(known, unit), _sequence_table(known, unit), *([_figure(clouds)] if clouds else [])]
 
 
-def _errors(row: tuple[int, int], compared: Compared, motion: bool) -> SequenceError:
-    offsets, truth, said = compared.truth.frame_offsets, compared.truth.part, compared.predicted.part
+def _sequence_error(row: tuple[int, int], pair: SequencePair, motion: bool) -> SequenceError:
+    offsets, truth, said = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
     spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
     ious = [mean_iou(truth[span], said[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
     errors = []
     if motion:
-        for (source, target), flow in zip(compared.said.pairs.tolist(), compared.said.flow, strict=True):
-            errors.append(mean_defined(_flow_error(compared, source, target, flow)))
-    return SequenceError(row, compared.truth.name, np.array(ious), np.array(errors))
+        for (source, target), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
+            errors.append(mean_defined(_flow_error(pair, source, target, flow)))
+    return SequenceError(row, pair.truth.name, np.array(ious), np.array(errors))
 
 
-def _flow_error(compared: Compared, source: int, target: int, flow: np.ndarray) -> np.ndarray:
+def _flow_error(pair: SequencePair, source: int, target: int, flow: np.ndarray) -> np.ndarray:
     """End-point error f64 (N) of the points of a frame, NaN without a true part."""
-    truth = compared.truth
+    truth = pair.truth
     span = slice(int(truth.frame_offsets[source]), int(truth.frame_offsets[source + 1]))
     points, part = truth.points[span], truth.part[span]
     real = true_flow(points, np.maximum(part, 0), true_motion(truth.pose, source, target))
@@ -94,21 +94,20 @@ def _chosen(errors: Sequence[SequenceError]) -> list[tuple[str, SequenceError, i
     return [(title, own, int(np.nanargmin(np.abs(own.iou - own.mean)))) for title, own in picked]
 
 
-def _cloud(comparison: Comparison, own: SequenceError, frame: int, unit: str) -> Cloud:
+def _cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -> Cloud:
     """A frame of a sequence, predicted parts renamed to the true ones they cover best; thinned evenly."""
     ours, theirs = own.row
-    truth = comparison.truth.read(theirs, fields=comparison.fields)
-    predicted = comparison.predicted.read(ours, fields=("part",))
-    compared = Compared(truth, predicted, comparison.predicted.read_parts(ours))
+    truth = paired.truth.read(theirs, fields=paired.fields)
+    predicted = paired.predicted.read(ours, fields=("part",))
+    pair = SequencePair(truth, predicted, paired.predicted.read_parts(ours))
     span = slice(int(truth.frame_offsets[frame]), int(truth.frame_offsets[frame + 1]))
     part = _renamed(truth.part[span], predicted.part[span])
     error = np.where(truth.part[span] >= 0, (part != truth.part[span]).astype(np.float64), np.nan)
-    if unit or "pose" in comparison.fields:
-        pairs = [
-            (pair, flow) for pair, flow in zip(compared.said.pairs.tolist(), compared.said.flow) if pair[0] == frame
-        ]
-        if pairs:
-            error = _flow_error(compared, *pairs[0][0], pairs[0][1])
+    if unit or "pose" in paired.fields:
+        from_frame = [row for row, source in enumerate(pair.parts.pairs[:, 0].tolist()) if source == frame]
+        if from_frame:
+            row = from_frame[0]
+            error = _flow_error(pair, *pair.parts.pairs[row].tolist(), pair.parts.flow[row])
         else:
             unit = ""
     keep = np.unique(np.linspace(0, len(error) - 1, min(len(error), _MOST_POINTS)).round().astype(int))
@@ -118,8 +117,7 @@ def _cloud(comparison: Comparison, own: SequenceError, frame: int, unit: str) ->
 def _renamed(truth: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Predicted ids i (N) as the true ids that overlap them most, one to one; the others come after all true ids."""
     found = overlap(truth, part)
-    union = found.truth_sizes[:, None] + found.sizes - found.shared
-    rows, columns = linear_sum_assignment(divide(found.shared, union), maximize=True)
+    rows, columns = hungarian_matching(found.shared / found.union)
     free = int(max(truth.max(initial=0), 0)) + 1
     names = np.arange(free, free + len(found.ids))
     names[columns] = np.where(found.shared[rows, columns] > 0, found.truth_ids[rows], names[columns])

@@ -1,24 +1,26 @@
-"""Temporal consistency: how well each frame is explained by the one before, moved along the optical flow."""
+"""Warping error: how well each frame is explained by the one before, moved along the optical flow (Lai et al. 2018)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.proportions import divide
-from dpcli.evaluate.video.frechet_features import check_picture_values
+from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.video.frechet.frame_inputs import check_picture_values
+from dpcli.evaluate.video.learned.base import FrameGap, LearnedMetric, LearnedScore
+from dpcli.evaluate.video.learned.optical_flow import optical_flow, seen_in_both, warped
 
 SMALLEST = 16  # pixels a side
-SLOPE, OFFSET = 0.01, 0.5  # of the tolerated loop, in squared pixels (Sundaram et al. 2010, eq. 5)
 
 
 @dataclass(frozen=True)
 class WarpingStatistics:
-    """Sums over pairs of neighboring frames: what `warping_compute` divides.
+    """Holds sums over pairs of neighboring frames: what `warping_compute` divides.
 
     squared, absolute: of the prediction's errors over `values` numbers (pixels that both frames show, times 3 channels);
     truth_squared, truth_absolute: of the truth's own, 0 where there is none. pixels: all, seen or not.
@@ -33,13 +35,13 @@ class WarpingStatistics:
     pairs: int = 0
 
     def __add__(self, other: WarpingStatistics) -> WarpingStatistics:
-        """Statistics of both together."""
+        """Returns the statistics of both together."""
         return WarpingStatistics(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
 @dataclass(frozen=True)
 class WarpingMetrics:
-    """Warping errors of colors in 0..1: mean squared (what the field reports) and absolute, and the truth's own.
+    """Holds warping errors of colors in 0..1: mean squared (what the field reports) and absolute, and the truth's own.
 
     occluded: share of the pixels left out. NaN = undefined: no pairs, no pixel seen twice, or no truth.
     """
@@ -53,8 +55,8 @@ class WarpingMetrics:
     flow_of: str
 
 
-class Warping:
-    """Warping error of a video while its frames stream in; holds the frame before.
+class WarpingError:
+    """Sums the warping error of a video while its frames stream in; holds the frame before.
 
     E = mean over the pixels seen in both frames of (x_t(p) - x_(t-1)(p + f(p)))^2 (Lai et al. 2018, eq. 6 and 7), f the
     flow from frame t back to t - 1 of OpenCV's DIS on 8-bit gray pictures: of the truth, else of the prediction, which
@@ -68,7 +70,7 @@ class Warping:
         self.flow_of = "prediction"
 
     def add(self, predicted: np.ndarray, truth: np.ndarray | None = None) -> None:
-        """The next frame, f32 (3,H,W) in 0..1. DataError as `check_picture_values`, and for pictures under 16 pixels.
+        """Takes the next frame, f32 (3,H,W) in 0..1. DataError as `check_picture_values`, and for pictures under 16 pixels.
 
         ValueError for sizes that differ, and for a truth that comes and goes.
         """
@@ -78,27 +80,27 @@ class Warping:
         self.flow_of = "prediction" if truth is None else "truth"
         gray = _gray(predicted if truth is None else truth)
         if self._before is not None:
-            self._found += _pair(self._before, (predicted, truth, gray))
+            self._found += _compare_pair(self._before, (predicted, truth, gray))
         self._before = (predicted, truth, gray)
 
     def restart(self) -> None:
-        """Frames are missing here: the next one is no neighbor of the last one."""
+        """Says that frames are missing here: the next one is no neighbor of the last one."""
         self._before = None
 
     def result(self) -> WarpingStatistics:
-        """DataError when no two frames followed each other."""
+        """Returns the sums of all pairs. DataError when no two frames followed each other."""
         if not self._found.pairs:
             raise DataError("temporal consistency compares neighboring frames: at least 2 in a row are needed")
         return self._found
 
 
 def warping_merge(parts: Iterable[WarpingStatistics]) -> WarpingStatistics:
-    """Statistics of all videos together."""
+    """Returns the statistics of all videos together."""
     return reduce(WarpingStatistics.__add__, parts, WarpingStatistics())
 
 
 def warping_compute(found: WarpingStatistics, flow_of: str = "truth") -> WarpingMetrics:
-    """Statistics -> errors per value. flow_of: whose flow moved the frames; without a truth it has no errors."""
+    """Returns the errors per value. flow_of: whose flow moved the frames; without a truth it has no errors."""
     sums = (found.squared, found.absolute, found.truth_squared, found.truth_absolute)
     errors = [float(divide(one, found.values)) for one in sums]
     if flow_of != "truth":
@@ -107,36 +109,7 @@ def warping_compute(found: WarpingStatistics, flow_of: str = "truth") -> Warping
     return WarpingMetrics(*errors, hidden, found.pairs, flow_of)
 
 
-def optical_flow(gray: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Flow f32 (H,W,2), x and y in pixels, with other(p + f(p)) = gray(p); u8 (H,W). OpenCV's DIS, preset medium."""
-    import cv2
-
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(gray, other, None)
-
-
-def moved(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """picture(p + flow(p)), bilinear: (H,W,C) of C <= 4 with flow (H,W,2) in pixels -> f32 (H,W,C); edges repeat."""
-    import cv2
-
-    where = _partners(flow)
-    source = np.ascontiguousarray(picture, np.float32)
-    return cv2.remap(source, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def seen_in_both(back: np.ndarray, forth: np.ndarray) -> np.ndarray:
-    """bool (H,W): pixels whose partner lies inside, and whose loop back (H,W,2) and forth (H,W,2) closes.
-
-    Inside is half a pixel wider than the outermost centers: a flow near 0 doesn't push the edge out.
-    """
-    height, width = back.shape[:2]
-    where = _partners(back)
-    inside = (where >= -0.5).all(-1) & (where[..., 0] <= width - 0.5) & (where[..., 1] <= height - 0.5)
-    returned = moved(forth, back)
-    lengths = np.square(back).sum(-1) + np.square(returned).sum(-1)
-    return inside & (np.square(back + returned).sum(-1) <= SLOPE * lengths + OFFSET)
-
-
-def _pair(before: Sequence[np.ndarray | None], now: Sequence[np.ndarray | None]) -> WarpingStatistics:
+def _compare_pair(before: Sequence[np.ndarray | None], now: Sequence[np.ndarray | None]) -> WarpingStatistics:
     back, forth = optical_flow(now[2], before[2]), optical_flow(before[2], now[2])
     seen = seen_in_both(back, forth)
     squared, absolute = _errors(before[0], now[0], back, seen)
@@ -145,14 +118,8 @@ def _pair(before: Sequence[np.ndarray | None], now: Sequence[np.ndarray | None])
 
 
 def _errors(before: np.ndarray, now: np.ndarray, back: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
-    apart = (now.transpose(1, 2, 0) - moved(before.transpose(1, 2, 0), back))[seen].astype(np.float64)
+    apart = (now.transpose(1, 2, 0) - warped(before.transpose(1, 2, 0), back))[seen].astype(np.float64)
     return float(np.square(apart).sum()), float(np.abs(apart).sum())
-
-
-def _partners(flow: np.ndarray) -> np.ndarray:
-    height, width = flow.shape[:2]
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1)
-    return (grid + flow).astype(np.float32)
 
 
 def _gray(picture: np.ndarray) -> np.ndarray:
@@ -168,3 +135,43 @@ def _check(picture: np.ndarray, other: np.ndarray) -> None:
         raise ValueError(f"frames of shapes {picture.shape} and {other.shape}; expected equal ones")
     if min(picture.shape[1:]) < SMALLEST:
         raise DataError(f"frames of {picture.shape[2]}x{picture.shape[1]}: optical flow needs {SMALLEST} pixels a side")
+
+
+class WarpingMetric(LearnedMetric):
+    """Measures the mean squared warping error along the truth's flow, then over views; the truth's own stands beside it.
+
+    A view counts the same whatever its share of occluded pixels, as it does in comparisons and intervals.
+    """
+
+    def __init__(self) -> None:
+        self._parts: dict[str, Any] = {}
+
+    def start(self, view: str) -> None:
+        """Begins a view."""
+        self._warping, self._gap, self._view = WarpingError(), FrameGap(), view
+
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
+        """Compares the next frame with the one before, moved along the flow, unless frames between them are missing."""
+        if self._gap.before(frame):
+            self._warping.restart()
+        self._warping.add(predicted, truth)
+
+    def end(self) -> None:
+        """Ends the view. DataError when no two frames followed each other."""
+        self._parts[self._view] = self._warping.result()
+
+    def score(self) -> LearnedScore:
+        """Returns the mean over the pixels of each view, then over views."""
+        each = {view: warping_compute(part) for view, part in self._parts.items()}
+        value, own = (
+            mean_defined(np.array([getattr(one, key) for one in each.values()])) for key in ("squared", "truth_squared")
+        )
+        shown = [one for one in each.values() if not np.isnan(one.squared)]
+        counts = {"views": len(shown), "pairs": sum(one.pairs for one in shown)}
+        choices = {
+            "flow": "OpenCV DIS of the truth, forward-backward check",
+            "error": "mean square, colors in 0..1",
+            "mean": "over the pixels of each view, then over views",
+            "occluded": round(warping_compute(warping_merge(self._parts.values())).occluded, 4),
+        }
+        return LearnedScore("warping", value, {view: one.squared for view, one in each.items()}, own, counts, choices)

@@ -10,7 +10,8 @@ from importlib.resources import as_file, files
 from typing import Any
 
 from dpcli.errors import UsageError
-from dpcli.evaluate.report.blocks import Cell, Table, is_number, table, title_of
+from dpcli.evaluate.metric_titles import title_of
+from dpcli.evaluate.report.blocks import Cell, Table, is_number, table
 from dpcli.runtime.toml_file import read_toml
 
 _FACTOR = {("fraction", "percent"): 100.0, ("", "1/100 length unit"): 100.0}
