@@ -38,7 +38,7 @@ def info(
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights_lookup import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary
     from dpcli.store import input_file
     from dpcli.store.summary import summary
 
@@ -66,8 +66,8 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
     from dpcli.draw.contact_sheet import contact_sheet
+    from dpcli.runtime.whole_file import FIGURES, check_target
     from dpcli.store import CloudsReader
-    from dpcli.store.pipes import FIGURES, check_target
 
     if kind not in ("clouds", "parts", "views"):
         raise UsageError(

@@ -15,7 +15,7 @@ _LIMITS = {"scale": 1, "dropout": 1, "crop": 1, "speed": 10}  # what a range mus
 class Augmentation:
     """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays as it is.
 
-    The defaults are ours (chosen on a validation subject: docs/experiments.md). `PEERS` scales the axes only, from the
+    The defaults are ours (chosen on a validation subject: docs/experiments/classify.md). `PEERS` scales the axes only, from the
     camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does.
     """
 

@@ -113,6 +113,6 @@ class PictureOptions(FormOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.picture is not None:
-            from dpcli.store.pipes import FIGURES, check_target
+            from dpcli.runtime.whole_file import FIGURES, check_target
 
             check_target(self.picture, "--picture", FIGURES)

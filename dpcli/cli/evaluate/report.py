@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -57,6 +56,7 @@ def report(
     _check_output(output, force)
     from dpcli.evaluate.commands.report import run_report
     from dpcli.runtime.progress import log
+    from dpcli.runtime.whole_file import write_whole
 
     made = run_report(results, form, truth=truth, split=split, beside=beside or [], title=title, pictures=pictures)
     for text in made.duplicates:
@@ -64,7 +64,7 @@ def report(
     if output in (None, "-"):
         typer.echo(made.text, nl=False)
     else:
-        _write(Path(output), made.text)
+        write_whole(Path(output), made.text.encode("utf-8"))
         log.info(f"wrote {output}: {made.results} results, {len(made.text.encode()) / 1e6:.2f} MB")
 
 
@@ -89,14 +89,3 @@ def _check_output(output: str | None, force: bool) -> None:
         raise UsageError(f"{output}: exists already; --force replaces it")
     if not Path(output).absolute().parent.is_dir():
         raise DataError(f"-o {output}: the folder {Path(output).parent} does not exist; create it first")
-
-
-def _write(path: Path, text: str) -> None:
-    """Writes beside the target first, so that a page that exists is whole."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, "utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
