@@ -1,4 +1,4 @@
-"""What every result of `dpc evaluate` holds, whatever was evaluated: samples left out, intervals, tables, one object."""
+"""Results of `dpc evaluate`, whatever was evaluated: samples left out, intervals, tables, one JSON object."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NAMES_IN_NOTE = 10
 
 @dataclass
 class LeftOut:
-    """Samples that a file holds and that don't count: `reason` says why, `names` which."""
+    """Holds samples of a file that don't count: `reason` says why, `names` which."""
 
     reason: str
     names: list[str]

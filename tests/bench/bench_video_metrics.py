@@ -22,9 +22,10 @@ import numpy as np
 import torch
 
 from dpcli.evaluate.video.frame_pass import in_threads
-from dpcli.evaluate.video.image_metrics import picture_compute, picture_merge, ssim_reference
+from dpcli.evaluate.video.picture_statistics import picture_compute, picture_merge
 from dpcli.evaluate.video.protocol import VideoProtocol, score_frame
-from dpcli.evaluate.video.source import Picture
+from dpcli.evaluate.video.sources.source import Picture
+from dpcli.evaluate.video.ssim import ssim_reference
 from dpcli.runtime.progress import Progress, log
 
 _BLOCK = 25  # frames timed at once

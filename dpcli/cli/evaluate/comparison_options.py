@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ComparisonOptions:
-    """How each file is evaluated."""
+    """Says how each file is evaluated."""
 
     truth: Annotated[
         Path | None,

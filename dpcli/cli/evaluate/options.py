@@ -75,7 +75,7 @@ Confidence = Annotated[float, typer.Option("--confidence", help="Confidence leve
 
 @dataclass(frozen=True)
 class IntervalOptions:
-    """How bootstrap intervals are found."""
+    """Says how bootstrap intervals are found."""
 
     confidence: Confidence = 0.95
     resamples: Annotated[
@@ -94,7 +94,7 @@ class IntervalOptions:
 
 @dataclass(frozen=True)
 class FormOptions:
-    """In which form a result is printed. UsageError for two forms at once."""
+    """Says in which form a result is printed. UsageError for two forms at once."""
 
     as_markdown: Annotated[bool, typer.Option("--markdown", help="Print the tables as markdown.")] = False
     as_object: Json = False
@@ -106,7 +106,7 @@ class FormOptions:
 
 @dataclass(frozen=True)
 class PictureOptions(FormOptions):
-    """In which form a result is printed, and where its picture goes. Raises before the work where it can't be written."""
+    """Says in which form a result is printed, and where its picture goes. Raises before the work where it can't be written."""
 
     picture: Picture = None
 

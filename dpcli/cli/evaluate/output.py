@@ -1,4 +1,4 @@
-"""How the commands of `dpc evaluate` print what they found: tables, markdown, or one JSON object."""
+"""Prints what the commands of `dpc evaluate` found: tables, markdown, or one JSON object."""
 
 from __future__ import annotations
 

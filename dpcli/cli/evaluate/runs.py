@@ -18,7 +18,7 @@ def runs(
     files: Annotated[
         list[str],
         typer.Argument(
-            metavar="FILE...",
+            metavar="FILE",
             help="Scores, parts or gaussians files, videos, or files of what `dpc evaluate ... --json` printed.",
         ),
     ],

@@ -24,7 +24,7 @@ from dpcli.evaluate.choices import (
 
 @dataclass(frozen=True)
 class ProtocolOptions:
-    """What the numbers of a video stand for."""
+    """Says what the numbers of a video stand for."""
 
     protocol: Annotated[
         str,

@@ -18,7 +18,7 @@ from dpcli.evaluate.segmentation.metrics import segmentation_weighted
 from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, motion_weighted
 from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
-from dpcli.evaluate.video.open_source import is_media
+from dpcli.evaluate.video.sources.open_source import is_media
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 
 # metrics that are no mean over views can't be compared view by view

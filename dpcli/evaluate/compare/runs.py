@@ -16,7 +16,7 @@ from dpcli.evaluate.bootstrap import Interval
 from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, history_seed
 from dpcli.evaluate.compare.measure_file import measure_file
 from dpcli.evaluate.results import samples_json
-from dpcli.evaluate.video.open_source import is_media
+from dpcli.evaluate.video.sources.open_source import is_media
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 
 class Trunk(nn.Module):
-    """A stack of layers whose outputs are taken at a few places.
+    """Applies a stack of layers whose outputs are taken at a few places.
 
     taps: positions in `features` after which a map is taken. channels: of those maps. smallest: least height and
     width whose last map still has a pixel.
@@ -22,7 +22,7 @@ class Trunk(nn.Module):
         self,
         pictures: Tensor,  # [B, 3, H, W]
     ) -> list[Tensor]:  # of [B, C, h, w]
-        """Feature maps at the taps, the shallowest first. `pictures` are already scaled as the network was trained."""
+        """Returns feature maps at the taps, the shallowest first. `pictures` are already scaled as the network was trained."""
         maps, last = [], self.taps[-1]
         for position, layer in enumerate(self.features[: last + 1]):
             pictures = layer(pictures)
@@ -32,7 +32,7 @@ class Trunk(nn.Module):
 
 
 class Fire(nn.Module):
-    """SqueezeNet's module: 1 x 1 to few channels, then 1 x 1 and 3 x 3 side by side (Iandola et al. 2016)."""
+    """Applies SqueezeNet's module: 1 x 1 to few channels, then 1 x 1 and 3 x 3 side by side (Iandola et al. 2016)."""
 
     def __init__(self, channels: int, squeezed: int, expanded: int):
         super().__init__()
@@ -44,13 +44,13 @@ class Fire(nn.Module):
         self,
         x: Tensor,  # [B, channels, h, w]
     ) -> Tensor:  # [B, 2 expanded, h, w]
-        """Both expansions, each after a ReLU."""
+        """Returns both expansions, each after a ReLU."""
         x = self.squeeze(x).relu_()
         return torch.cat([self.expand1x1(x), self.expand3x3(x)], 1).relu_()
 
 
 def alexnet() -> Trunk:
-    """AlexNet in torchvision's one-tower form (Krizhevsky 2014); maps relu1 to relu5."""
+    """Returns AlexNet in torchvision's one-tower form (Krizhevsky 2014); maps relu1 to relu5."""
     return Trunk(
         [
             *_conv(3, 64, 11, stride=4, padding=2),
@@ -68,7 +68,7 @@ def alexnet() -> Trunk:
 
 
 def vgg16() -> Trunk:
-    """VGG16 without batch norm (Simonyan & Zisserman 2015); maps relu1_2, 2_2, 3_3, 4_3 and 5_3."""
+    """Returns VGG16 without batch norm (Simonyan & Zisserman 2015); maps relu1_2, 2_2, 3_3, 4_3 and 5_3."""
     layers: list[nn.Module] = []
     before = 3
     for channels, times in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
@@ -80,7 +80,7 @@ def vgg16() -> Trunk:
 
 
 def squeezenet() -> Trunk:
-    """SqueezeNet 1.1 (Iandola et al. 2016); maps after the first ReLU and after fires 3, 5, 6, 7, 8 and 9."""
+    """Returns SqueezeNet 1.1 (Iandola et al. 2016); maps after the first ReLU and after fires 3, 5, 6, 7, 8 and 9."""
     return Trunk(
         [
             *_conv(3, 64, 3, stride=2),

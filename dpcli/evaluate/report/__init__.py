@@ -1,4 +1,4 @@
-"""One page, or one document, from many results: collect them, arrange them as sections, write HTML, markdown or LaTeX."""
+"""This folder makes one page, or one document, from many results: collect them, arrange them as sections, write HTML, markdown or LaTeX."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _ROWS = 200  # sequences listed
 
 @dataclass(frozen=True)
 class SequenceError:
-    """One sequence: mIoU of each frame f64 (F), NaN where no part is true; end-point errors f64 (pairs), of means."""
+    """Holds one sequence: mIoU of each frame f64 (F), NaN where no part is true; end-point errors f64 (pairs), of means."""
 
     row: tuple[int, int]
     name: str
@@ -36,12 +36,13 @@ class SequenceError:
 
     @property
     def mean(self) -> float:
+        """The mean over frames of the mIoU; NaN = undefined."""
         return mean_defined(self.iou)
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """What is drawn of a frame: points f32 (N,3), true and predicted part i (N), error f64 (N) >= 0 (NaN = unknown)."""
+    """Holds what is drawn of a frame: points f32 (N,3), true and predicted part i (N), error f64 (N) >= 0 (NaN = unknown)."""
 
     points: np.ndarray
     truth: np.ndarray
@@ -53,7 +54,7 @@ class Cloud:
 def part_blocks(
     path: Path, truth: Path, *, split: str | None = None, motion: bool = False, intersect: bool = False
 ) -> list[Table | Figure]:
-    """How errors are spread over sequences, frames and pairs, the worst sequences by name, and clouds of some."""
+    """Returns how errors are spread over sequences, frames and pairs, the worst sequences by name, and clouds of some."""
     fields = ("part", "pose") if motion else ("part",)
     with PairedSequences(path, truth, split=split, intersect=intersect, fields=fields) as paired:
         errors = [_sequence_error(row, pair, motion) for row, pair in zip(paired.rows, paired, strict=True)]
@@ -78,7 +79,7 @@ def _sequence_error(row: tuple[int, int], pair: SequencePair, motion: bool) -> S
 
 
 def _flow_error(pair: SequencePair, source: int, target: int, flow: np.ndarray) -> np.ndarray:
-    """End-point error f64 (N) of the points of a frame, NaN without a true part."""
+    """Returns the end-point error f64 (N) of the points of a frame, NaN without a true part."""
     truth = pair.truth
     span = slice(int(truth.frame_offsets[source]), int(truth.frame_offsets[source + 1]))
     points, part = truth.points[span], truth.part[span]
@@ -87,7 +88,7 @@ def _flow_error(pair: SequencePair, source: int, target: int, flow: np.ndarray) 
 
 
 def _chosen(errors: Sequence[SequenceError]) -> list[tuple[str, SequenceError, int]]:
-    """The worst sequences by mIoU and those in the middle, each with the frame nearest to its mean."""
+    """Returns the worst sequences by mIoU and those in the middle, each with the frame nearest to its mean."""
     order = sorted(errors, key=lambda own: (own.mean, own.name))
     middle = max((len(order) - _MEDIAN) // 2, _WORST)
     picked = [("worst", own) for own in order[:_WORST]] + [("median", own) for own in order[middle : middle + _MEDIAN]]
@@ -95,7 +96,7 @@ def _chosen(errors: Sequence[SequenceError]) -> list[tuple[str, SequenceError, i
 
 
 def _cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -> Cloud:
-    """A frame of a sequence, predicted parts renamed to the true ones they cover best; thinned evenly."""
+    """Returns a frame of a sequence, predicted parts renamed to the true ones they cover best; thinned evenly."""
     ours, theirs = own.row
     truth = paired.truth.read(theirs, fields=paired.fields)
     predicted = paired.predicted.read(ours, fields=("part",))
@@ -115,7 +116,7 @@ def _cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -
 
 
 def _renamed(truth: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """Predicted ids i (N) as the true ids that overlap them most, one to one; the others come after all true ids."""
+    """Returns predicted ids i (N) as the true ids that overlap them most, one to one; the others come after all true ids."""
     found = overlap(truth, part)
     rows, columns = hungarian_matching(found.shared / found.union)
     free = int(max(truth.max(initial=0), 0)) + 1
@@ -184,8 +185,11 @@ def _markup(title: str, own: SequenceError, frame: int, cloud: Cloud) -> str:
 
 
 def packed(cloud: Cloud) -> bytes:
-    """u16 x, y, z (3N) in a cube around the points, then u8 truth + 1, part + 1 (2N, 0 = none), u8 error (N, share of
-    the largest); little endian."""
+    """Returns a cloud as bytes for the page, little endian.
+
+    u16 x, y, z (3N) in a cube around the points, then u8 truth + 1, part + 1 (2N, 0 = none), u8 error (N, share of the
+    largest).
+    """
     low, high = cloud.points.min(axis=0), cloud.points.max(axis=0)
     side = max(float((high - low).max()), 1e-9)
     steps = np.rint(((cloud.points - (low + high) / 2) / side + 0.5) * _STEPS).clip(0, _STEPS)
@@ -196,5 +200,5 @@ def packed(cloud: Cloud) -> bytes:
 
 
 def palette_words() -> str:
-    """The colors of unknown points and of the parts, for the page's script."""
+    """Returns the colors of unknown points and of the parts, for the page's script."""
     return " ".join(f"{r},{g},{b}" for r, g, b in [UNKNOWN, *PALETTE.tolist()])

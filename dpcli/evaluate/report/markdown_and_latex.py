@@ -35,7 +35,7 @@ _MARKDOWN = "\\`*_[]<>|#"
 
 
 def report_markdown(report: Report) -> str:
-    """The summary, the thesis's rows beside ours, and each result's tables and notes."""
+    """Returns the summary, the thesis's rows beside ours, and each result's tables and notes."""
     lines = [
         f"# {_plain(report.title)}",
         _markdown_table(report.summary),
@@ -72,13 +72,13 @@ def _numeric(table: Table, place: int) -> bool:
 
 
 def _plain(text: str) -> str:
-    """Text that means nothing to markdown: on one line, its marks escaped."""
+    """Returns text that means nothing to markdown: on one line, its marks escaped."""
     flat = " ".join(text.split())
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in flat)
 
 
 def _code(text: str) -> str:
-    """Text between so many backticks that none in it ends it."""
+    """Returns text between so many backticks that none in it ends it."""
     fence = "`" * (1 + max((len(run) for run in _runs(text)), default=0))
     pad = " " if fence != "`" else ""
     return f"{fence}{pad}{' '.join(text.split())}{pad}{fence}"
@@ -89,7 +89,7 @@ def _runs(text: str) -> list[str]:
 
 
 def report_latex(report: Report) -> str:
-    """The summary, the thesis's rows beside ours, and each result's tables, as `table` environments with booktabs."""
+    """Returns the summary, the thesis's rows beside ours, and each result's tables, as `table` environments with booktabs."""
     lines = [r"% \usepackage{booktabs} \usepackage[T1]{fontenc}", _latex_table(report.summary, report.title)]
     lines += [_latex_table(own, own.title, own.note) for own in report.beside]
     for section in report.sections:
@@ -137,5 +137,5 @@ def _joined(cells: Sequence[str]) -> str:
 
 
 def latex(text: str) -> str:
-    """Text as LaTeX prints it: what it would take as a command is escaped."""
+    """Returns text as LaTeX prints it: what it would take as a command is escaped."""
     return "".join(_LATEX.get(letter, letter) for letter in text)

@@ -29,7 +29,7 @@ _LONGEST_CURVE = 400
 
 
 def headline(found: Mapping[str, Any]) -> Headline:
-    """The metric a result is known by: the first of the usual ones, else a difference or mean, else its first number."""
+    """Returns the metric a result is known by: the first of the usual ones, else a difference or mean, else its first number."""
     metrics, units, of = found.get("metrics", {}), found.get("units", {}), denominator(found)
     plain = {key: value for key, value in metrics.items() if is_number(value)}
     for key in (*_HEADLINES, *plain):
@@ -51,7 +51,11 @@ def headline(found: Mapping[str, Any]) -> Headline:
 
 
 def denominator(found: Mapping[str, Any]) -> str:
-    """`231 samples`: the first counts of the object, in words."""
+    """Returns the first counts of the object, in words.
+
+    >>> denominator({"denominators": {"samples": 231, "classes": 20}})
+    '231 samples'
+    """
     counts = found.get("denominators", {})
     for own in [own for own in counts.values() if isinstance(own, Mapping)]:  # of a comparison: by what is compared
         counts = own | counts
@@ -60,7 +64,7 @@ def denominator(found: Mapping[str, Any]) -> str:
 
 
 def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[list[Table | Figure], list[str]]:
-    """Tables and curves of all `metrics` but those to skip, and notes on what could not be shown."""
+    """Returns tables and curves of all `metrics` but those to skip, and notes on what could not be shown."""
     metrics, units = found.get("metrics", {}), found.get("units", {})
     intervals = intervals_of(found)
     grouped = _grouped(metrics)
@@ -92,13 +96,13 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
 
 
 def intervals_of(found: Mapping[str, Any]) -> Mapping[str, Any]:
-    """[low, high] by metric, which stand under `intervals`, or there under `metrics` beside how they were found."""
+    """Returns [low, high] by metric, which stand under `intervals`, or there under `metrics` beside how they were found."""
     own = found.get("intervals", {})
     return own["metrics"] if isinstance(own.get("metrics"), Mapping) else own
 
 
 def _how(found: Mapping[str, Any]) -> str:
-    """How the intervals were found, in a sentence; "" without any."""
+    """Returns how the intervals were found, in a sentence; "" without any."""
     own = found.get("intervals", {})
     if not own.get("resamples") or not is_number(own.get("confidence")):
         return ""
@@ -108,12 +112,12 @@ def _how(found: Mapping[str, Any]) -> str:
 
 
 def _grouped(metrics: Mapping[str, Any]) -> dict[str, Mapping]:
-    """Metrics that are records: differences of a comparison, means over runs."""
+    """Returns the metrics that are records: differences of a comparison, means over runs."""
     return {key: own for key, own in metrics.items() if isinstance(own, Mapping) and {"difference", "mean"} & set(own)}
 
 
 def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], units: Mapping) -> list[Table]:
-    """A row for each metric of a comparison or of runs; then the single runs, a test, and the samples that differ most."""
+    """Returns a row for each metric of a comparison or of runs; then the single runs, a test, and the samples that differ most."""
     if not grouped:
         return []
     records = _records(grouped)
@@ -150,7 +154,7 @@ def _is_scalar(value: Any) -> bool:
 
 
 def _records(value: Any) -> list[tuple[str, Mapping]] | None:
-    """(row name, record) of a list of records or of records by name; None for anything else, or without a column."""
+    """Returns (row name, record) of a list of records or of records by name; None for anything else, or without a column."""
     records: list[tuple[str, Mapping]] = []
     if isinstance(value, list) and all(isinstance(own, Mapping) for own in value):
         records = [("", own) for own in value]
@@ -187,7 +191,7 @@ def _record_cell(name: str, column: str, record: Mapping, units: Mapping) -> Cel
 
 
 def _flat(record: Mapping) -> dict[str, Any]:
-    """Scalars and intervals of a record, those of records in it under both names; longer lists are left out."""
+    """Returns scalars and intervals of a record, those of records in it under both names; longer lists are left out."""
     made: dict[str, Any] = {}
     for key, value in record.items():
         if isinstance(value, Mapping) and interval_of(value) is None:
@@ -198,7 +202,7 @@ def _flat(record: Mapping) -> dict[str, Any]:
 
 
 def _spreads(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> list[Figure]:
-    """How the metrics of single sequences or frames are spread, and curves of records that hold values by frame."""
+    """Returns how the metrics of single sequences or frames are spread, and curves of records that hold values by frame."""
     made = []
     if key in _SPREAD_OF:
         for column in [name for name in records[0][1] if name in units]:
@@ -214,7 +218,7 @@ def _spreads(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> li
 
 
 def _series(key: str, value: Any) -> dict[str, list[float | None]]:
-    """Name -> values, for lists of numbers; {} for anything else."""
+    """Returns values by name, for lists of numbers; {} for anything else."""
     named = value if isinstance(value, Mapping) else {title_of(key): value}
     good = {
         title_of(name): list(ys)
@@ -237,7 +241,7 @@ def _with_unit(key: str, unit: str) -> str:
 
 
 def detail_lists(found: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
-    """Protocol, units, denominators, notes, what was left out, and provenance, in words."""
+    """Returns protocol, units, denominators, notes, what was left out, and provenance, in words."""
     made = [
         (title, [(title_of(key), _words(value)) for key, value in found.get(name, {}).items()])
         for title, name in (("Protocol", "protocol"), ("Units", "units"), ("Denominators", "denominators"))

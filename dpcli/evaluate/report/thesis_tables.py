@@ -20,7 +20,7 @@ _WORDS = {"percent": "%", "1": "", "1/100 length unit": "\u00d7100"}
 
 @dataclass(frozen=True)
 class ThesisRow:
-    """One number of the thesis. own: of a method of the thesis, not of one it compares with."""
+    """Holds one number of the thesis. own: of a method of the thesis, not of one it compares with."""
 
     table: str
     method: str
@@ -33,7 +33,7 @@ class ThesisRow:
 
 @dataclass(frozen=True)
 class ThesisTable:
-    """A table of the thesis; `rows` as in the file: method, setting, values ("-" = not given), own."""
+    """Holds a table of the thesis; `rows` as in the file: method, setting, values ("-" = not given), own."""
 
     number: str
     title: str
@@ -50,10 +50,11 @@ class ThesisTable:
 
     @property
     def id(self) -> str:
+        """The name by which `--beside` asks for the table, such as table-3.4."""
         return f"table-{self.number}"
 
     def numbers(self) -> list[ThesisRow]:
-        """Every number of the table."""
+        """Returns every number of the table."""
         return [
             ThesisRow(self.number, row["method"], row["setting"], metric, float(value), unit, row.get("own", False))
             for row in self.rows
@@ -62,7 +63,7 @@ class ThesisTable:
         ]
 
     def knows(self, found: Mapping[str, Any]) -> bool:
-        """Whether a result is of this table's task and data: by a command of its provenance, or by its class names."""
+        """Returns whether a result is of this table's task and data: by a command of its provenance, or by its class names."""
         if found.get("task") != self.task:
             return False
         said = [str(entry.get("command", "")) for entry in found.get("provenance", [])]
@@ -75,7 +76,7 @@ class ThesisTable:
 
 @lru_cache(maxsize=1)
 def thesis_tables() -> tuple[ThesisTable, ...]:
-    """All tables, in the thesis's order."""
+    """Returns all tables, in the thesis's order."""
     with as_file(files(__package__).joinpath("thesis_tables.toml")) as path:
         tables = read_toml(path)["table"]
     made = []
@@ -89,7 +90,7 @@ def thesis_tables() -> tuple[ThesisTable, ...]:
 
 
 def chosen_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -> list[ThesisTable]:
-    """The tables asked for by id (`table-3.4`; `none` = no table), else those that know one of the results.
+    """Returns the tables asked for by id (`table-3.4`; `none` = no table), else those that know one of the results.
 
     Ablations only stand beside a result when they are asked for. UsageError for ids there aren't.
     """
@@ -105,8 +106,10 @@ def chosen_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -
 
 
 def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, Any]]], asked: bool = False) -> Table:
-    """(title, object) of ours that are of the table's data (of its task, when the table was asked for), then its rows:
-    the thesis's own methods before those it cites."""
+    """Returns a table of our results beside the thesis's rows, whose own methods stand before those it cites.
+
+    objects: (title, object) of ours; those of the table's data are shown (of its task, when the table was asked for).
+    """
     ours = [
         (title, found) for title, found in objects if thesis.knows(found) or asked and found.get("task") == thesis.task
     ]
@@ -160,13 +163,13 @@ def _own_rows(thesis: ThesisTable, title: str, found: Mapping[str, Any]) -> list
 
 
 def _at_tau(metrics: Mapping[str, Any], tau: float) -> dict[str, Any]:
-    """The shares at the thesis's threshold, which need not be the result's main one; None where it has no such."""
+    """Returns the shares at the thesis's threshold, which need not be the result's main one; None where it has no such."""
     same = [own for own in metrics.get("thresholds", []) if isinstance(own, Mapping) and own.get("tau") == tau]
     return {key: same[0].get(key) if same else None for key in ("accs", "accr", "outlier")}
 
 
 def _digits(thesis: ThesisTable, place: int) -> int:
-    """Decimals the thesis prints in a column, in which ours are shown too."""
+    """Returns how many decimals the thesis prints in a column, in which ours are shown too."""
     return max(
         (len(f"{row['values'][place]}".partition(".")[2]) for row in thesis.rows if is_number(row["values"][place])),
         default=2,

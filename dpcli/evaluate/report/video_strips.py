@@ -17,11 +17,11 @@ _INSTANTS, _MOST_VIEWS, _QUALITY = 6, 4, 82
 
 
 def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", background: str | None = None) -> Figure:
-    """Pictures of up to four views; reads, or renders, only the frames it shows. DataError as `evaluate_video`."""
+    """Returns pictures of up to four views; reads, or renders, only the frames it shows. DataError as `evaluate_video`."""
     from dpcli.evaluate.choices import BACKGROUNDS
     from dpcli.evaluate.video.difference_strip import DifferenceStrip
-    from dpcli.evaluate.video.open_source import open_source
     from dpcli.evaluate.video.protocol import video_protocol
+    from dpcli.evaluate.video.sources.open_source import open_source
     from dpcli.evaluate.video.view_pairing import match_views
 
     chosen = video_protocol(protocol, background)

@@ -18,7 +18,7 @@ def average_precision(
     the published code.
 
     >>> round(average_precision(np.array([0.9, 0.8, 0.7]), np.array([True, False, True]), 2), 4)
-    0.8350
+    0.835
     """
     ranked = RankedPredictions(confidence, matched, np.zeros(len(matched), np.int64), keep_order=keep_order)
     return float(ranked.average_precision(np.ones((1, 1)), np.array([float(truth_parts)]))[0])

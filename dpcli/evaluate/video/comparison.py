@@ -19,10 +19,10 @@ from dpcli.evaluate.results import LeftOut
 from dpcli.evaluate.video.frame_pass import FramePass, ViewScore, Watch
 from dpcli.evaluate.video.learned.base import LearnedScore
 from dpcli.evaluate.video.learned.loading import load_metrics
-from dpcli.evaluate.video.open_source import open_source
 from dpcli.evaluate.video.protocol import VideoProtocol, video_protocol
-from dpcli.evaluate.video.source import Source
-from dpcli.evaluate.video.stored_sources import SceneSource, ViewsSource
+from dpcli.evaluate.video.sources.open_source import open_source
+from dpcli.evaluate.video.sources.source import Source
+from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
 from dpcli.evaluate.video.view_pairing import match_views
 
 NO_INTERVALS = Resampling(0)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.source import Picture, View
+from dpcli.evaluate.video.sources.source import Picture, View
 
 _INSTANTS, _MOST_VIEWS = 6, 8
 _SIDE, _GAP, _TITLE = 160, 4, 18  # pixels

@@ -13,11 +13,11 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.results import LeftOut
-from dpcli.evaluate.video.image_metrics import PictureMetrics, PictureStatistics, picture_compute, picture_merge
 from dpcli.evaluate.video.learned.base import LearnedMetric
+from dpcli.evaluate.video.picture_statistics import PictureMetrics, PictureStatistics, picture_compute, picture_merge
 from dpcli.evaluate.video.protocol import VideoProtocol, check_size, scaled, score_frame
-from dpcli.evaluate.video.source import Picture, Source, View
-from dpcli.evaluate.video.stored_sources import SceneSource
+from dpcli.evaluate.video.sources.source import Picture, Source, View
+from dpcli.evaluate.video.sources.stored import SceneSource
 from dpcli.runtime.progress import Progress
 
 Watch = Callable[[View, int, int, Picture, Picture], None]

@@ -10,8 +10,9 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import BACKGROUNDS, FVD_VARIANTS, LPIPS_NETWORKS, PICTURE_METRICS
-from dpcli.evaluate.video.image_metrics import PSNR_CAP, PictureStatistics, picture_update
-from dpcli.evaluate.video.source import Picture
+from dpcli.evaluate.video.picture_statistics import PictureStatistics, picture_update
+from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.sources.source import Picture
 
 SMALLEST = {"ssim": 11, "ms_ssim": 176}  # pixels a side
 
@@ -37,7 +38,7 @@ class VideoProtocol:
     views: which of the truth's are compared, all | reference | test (all when there is no test view).
     size: side that both pictures are resized to by PIL's default (bicubic), None = as they are, and equal. eight_bit:
     colors are rounded to 0..255 after compositing. data_range: None = of each frame, as torchmetrics without one: the
-    truth's largest less smallest value for PSNR, the wider of both pictures' for SSIM. border: as `image_metrics.ssim`.
+    truth's largest less smallest value for PSNR, the wider of both pictures' for SSIM. border: as `ssim.ssim`.
     gray: SSIM of luminance instead of each color. networks: those of the learned metrics; learned_views: which of the
     truth's they compare, if others than `views`.
     """

@@ -13,11 +13,11 @@ from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import UNDEFINED, TextTable, four_digit_ends, four_digits, resampling_note
 from dpcli.evaluate.video.comparison import VideoReport, view_values
 from dpcli.evaluate.video.frame_pass import ViewScore
-from dpcli.evaluate.video.image_metrics import PSNR_CAP
 from dpcli.evaluate.video.learned.base import TITLES as LEARNED_TITLES
 from dpcli.evaluate.video.learned.base import LearnedScore
 from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
 from dpcli.evaluate.video.protocol import describe_protocol
+from dpcli.evaluate.video.psnr import PSNR_CAP
 
 TITLES = {"psnr": "PSNR (dB)", "psnr_foreground": "PSNR on object (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM"}
 UNITS = {"psnr": "dB", "psnr_foreground": "dB", "ssim": "1", "ms_ssim": "1"}

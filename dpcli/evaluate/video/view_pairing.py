@@ -7,8 +7,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.results import LeftOut, list_names
 from dpcli.evaluate.video.protocol import VideoProtocol
-from dpcli.evaluate.video.source import Source
-from dpcli.evaluate.video.stored_sources import SceneSource
+from dpcli.evaluate.video.sources.source import Source
+from dpcli.evaluate.video.sources.stored import SceneSource
 
 _SAME_CAMERA = 1e-4  # relative: cameras that went through float32 still are the same
 

@@ -14,9 +14,10 @@ from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.choices import parse_video_metrics
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
-from dpcli.evaluate.video.image_metrics import PSNR_CAP, psnr, ssim, ssim_reference
-from dpcli.evaluate.video.open_source import open_source
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
+from dpcli.evaluate.video.psnr import PSNR_CAP, psnr
+from dpcli.evaluate.video.sources.open_source import open_source
+from dpcli.evaluate.video.ssim import ssim, ssim_reference
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter

@@ -21,9 +21,9 @@ from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
 from dpcli.evaluate.video.frechet.distance import feature_update, frechet_distance
 from dpcli.evaluate.video.frechet.frame_inputs import prepare_frame
 from dpcli.evaluate.video.frechet.variants import feature_variant
-from dpcli.evaluate.video.image_metrics import ssim_reference
 from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
+from dpcli.evaluate.video.ssim import ssim_reference
 from tests.evaluate.video.test_comparison import FRAMES, clip, header, white, write
 
 ROLES = ("reference", "test", "test")

@@ -1,4 +1,4 @@
-"""How each published variant of FVD and FID-VID prepares a frame for its network."""
+"""Preparation of a frame for the network of each published variant of FVD and FID-VID."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a learned or temporal metric of videos is: it sees the frames of each view in order, and ends in a score.
+"""Learned and temporal metrics of videos: each sees the frames of every view in order, and ends in a score.
 
 LPIPS, CLIP scores, Frechet distances (FVD, FID-VID) and the warping error are each in a file of their own beside this
 one; `loading.py` makes them. They take one pass over the views that a protocol compares.

@@ -10,18 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video import image_metrics
-from dpcli.evaluate.video.image_metrics import (
-    PSNR_CAP,
-    ms_ssim,
-    picture_compute,
-    picture_merge,
-    picture_update,
-    planar,
-    psnr,
-    ssim,
-    ssim_reference,
-)
+from dpcli.evaluate.video import ssim as ssim_module
+from dpcli.evaluate.video.picture_statistics import picture_compute, picture_merge, picture_update
+from dpcli.evaluate.video.psnr import PSNR_CAP, planar, psnr
+from dpcli.evaluate.video.ssim import ms_ssim, ssim, ssim_reference
 
 
 def waves(side: int = 192) -> tuple[np.ndarray, np.ndarray]:
@@ -66,7 +58,7 @@ def test_psnr_of_eight_bit_pictures_is_exact() -> None:
 def test_ssim_of_flat_pictures_by_hand() -> None:
     a, b, c1 = 0.25, 0.75, 0.01**2
     expected = (2 * a * b + c1) / (a * a + b * b + c1)  # no variance: the contrast-structure factor is 1
-    for border in image_metrics.BORDERS:
+    for border in ssim_module.BORDERS:
         assert ssim(np.full((16, 20), a), np.full((16, 20), b), border=border) == pytest.approx(expected, abs=1e-7)
 
 
@@ -93,7 +85,7 @@ def test_equal_pictures_score_exactly_one() -> None:
     st.sampled_from([1, 3]),
     st.integers(0, 2**31),
     st.sampled_from([1.0, 255.0]),
-    st.sampled_from(image_metrics.BORDERS),
+    st.sampled_from(ssim_module.BORDERS),
     st.sampled_from(["noise", "flat", "binary", "faint"]),
 )
 def test_the_kernel_equals_the_reference(
@@ -117,7 +109,7 @@ def test_the_comparison_rejects_a_broken_twin(broken: str, monkeypatch: pytest.M
     predicted, truth = waves()
     expected = ssim(predicted, truth)
     if broken == "sigma":
-        monkeypatch.setattr(image_metrics, "SIGMA", 1.4)
+        monkeypatch.setattr(ssim_module, "SIGMA", 1.4)
     other = {"range": {"data_range": 1.05}, "border": {"border": "reflect"}}.get(broken, {})
     assert abs(ssim_reference(predicted, truth, **other) - expected) > 100 * SINGLE
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.source import Picture, Source, View
+from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.store.views import ViewsHeader, ViewsReader
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.source import Picture, Source, View
+from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.path_names import utf8_path
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")

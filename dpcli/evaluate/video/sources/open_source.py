@@ -1,13 +1,13 @@
-"""Which kind of video a path holds: a views file, a Gaussian scene, a folder of images, an array, or a video file."""
+"""Opens the video at a path, of any kind: a views file, a Gaussian scene, a folder of images, an array, or a video file."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.media_sources import VIDEO_SUFFIXES, ArraySource, FolderSource, VideoSource
-from dpcli.evaluate.video.source import Source
-from dpcli.evaluate.video.stored_sources import SceneSource, ViewsSource
+from dpcli.evaluate.video.sources.media import VIDEO_SUFFIXES, ArraySource, FolderSource, VideoSource
+from dpcli.evaluate.video.sources.source import Source
+from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
 from dpcli.store import file_kind
 
 _EXPECTED = "expected a views or gaussians file, a folder of images, an .npy array, or a video file"

@@ -1,4 +1,4 @@
-"""What a video to compare is made of: pictures of views, which a source reads one at a time."""
+"""Views and pictures of a video to compare, and the source that reads them one at a time."""
 
 from __future__ import annotations
 
