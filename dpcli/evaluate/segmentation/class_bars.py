@@ -1,4 +1,4 @@
-"""Segmentation and motion by class, as bars."""
+"""Draws segmentation and motion metrics by class, as bars."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from dpcli.evaluate.segmentation.tables import TITLES, class_rows
 _SHOWN = ("ap", "pq", "f1", "miou", "ri")
 
 
-def segmentation_picture(report: SegmentationReport, path: Path) -> None:
-    """Draw the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
+def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
+    """Draws the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
     rows = class_rows(report.main, report.classes, report.class_names)
     values = {TITLES[key]: [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
     bars = Bars([f"{title} ({own.objects})" for title, own in rows], values, "%", 100)
@@ -21,8 +21,8 @@ def segmentation_picture(report: SegmentationReport, path: Path) -> None:
     draw_panels([bars, spread], len(rows), f"Parts, protocol {report.protocol}, split {report.split}", path)
 
 
-def motion_picture(report: MotionReport, path: Path) -> None:
-    """Draw the end-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
+def draw_motion_bars(report: MotionReport, path: Path) -> None:
+    """Draws the end-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
     rows = class_rows(report.main, report.classes, report.class_names)
     titles = [f"{title} ({own.pairs})" for title, own in rows]
     errors = {"EPE3D": [own.epe3d for _, own in rows], "predicting no motion": [own.still for _, own in rows]}
