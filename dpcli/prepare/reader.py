@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,9 +12,6 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.store import CloudSequence
-
-# Which of so many points of a frame are kept, asked for each frame in order (`Thinning.blind`); None keeps all.
-Choose = Callable[[int], "np.ndarray | slice"] | None
 
 
 @dataclass(frozen=True)
@@ -63,10 +60,7 @@ class Reader(Protocol):
         ...
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """One sample, in a worker process; DataError on a bad one. ``rng`` belongs to this item alone.
-
-        A reader whose `read` also takes ``choose`` and sets ``chooses`` may be told so which points of a frame to make.
-        """
+        """One sample, in a worker process; DataError on a bad one. ``rng`` belongs to this item alone."""
         ...
 
     def summary(self, items: list[Item]) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,15 +46,6 @@ class Thinning:
 
     def _draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         return np.sort(rng.choice(count, self.points, replace=False))
-
-    def blind(self, rng: np.random.Generator) -> Callable[[int], np.ndarray | slice] | None:
-        """What `apply` keeps of a frame, from its number of points alone: for readers that can leave the rest unmade.
-
-        To be asked for every frame once, in order. None where the choice depends on where the points are.
-        """
-        if not self.points or self.sampling != "random":
-            return None
-        return lambda count: self._draw(count, rng) if count > self.points else slice(None)
 
     def apply(self, sequence: CloudSequence, rng: np.random.Generator) -> CloudSequence:
         """The sequence with each frame thinned; per-point fields follow their points."""

@@ -58,7 +58,7 @@ def test_any_executor_gives_the_same_bytes_with_few_in_flight(tmp_path, monkeypa
     take = pipeline._Run.take
     monkeypatch.setattr(pipeline._Run, "take", lambda *given: (waiting.__setitem__(0, waiting[0] - 1), take(*given)))
     with Counting(3) as executor:
-        report = convert(ToyReader(count=20, bad=(3,)), tmp_path / "a.h5", jobs=3, executor=executor)
+        report = convert(ToyReader(count=20, bad=(3,)), tmp_path / "a.h5", slots=3, executor=executor)
     assert digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5") and report.skipped == whole.skipped
     assert most[0] <= 6
 
@@ -95,7 +95,7 @@ def test_a_lost_worker_costs_only_time(cluster, tmp_path):
     thread.start()
     with cluster_executor(cluster.scheduler_address, 2) as (executor, slots):
         assert slots == 2
-        report = convert(reader, tmp_path / "a.h5", jobs=slots, executor=executor)
+        report = convert(reader, tmp_path / "a.h5", slots=slots, executor=executor)
     thread.join()
     assert lost and report.written == 40
     assert digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
@@ -111,7 +111,7 @@ def test_a_sample_that_kills_every_worker_ends_the_run_and_keeps_the_others(clus
         pytest.raises(DpcError, match="was lost with 4 workers"),
         cluster_executor(cluster.scheduler_address, 2) as (executor, n),
     ):
-        convert(reader, tmp_path / "a.h5", jobs=n, executor=executor)
+        convert(reader, tmp_path / "a.h5", slots=n, executor=executor)
     assert (tmp_path / ".a.h5.part").exists() and not (tmp_path / "a.h5").exists()
     convert(SlowReader(count=6, folder=str(tmp_path)), tmp_path / "a.h5")
     convert(SlowReader(count=6, folder=str(tmp_path)), tmp_path / "whole.h5")

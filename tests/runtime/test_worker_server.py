@@ -54,9 +54,9 @@ def test_a_signal_to_all_while_it_imports_reaches_the_command_only(tmp_path: Pat
 
 def test_ctrl_c_while_libraries_load_is_a_sentence() -> None:
     code = (
-        "import dpcli.__main__, dpcli.prepare.head_start as first\n"
-        "def interrupted(words): raise KeyboardInterrupt\n"
-        "first.head_start = interrupted\n"
+        "import dpcli.__main__, dpcli.standard_streams as first\n"
+        "def interrupted(): raise KeyboardInterrupt\n"
+        "first.ready_streams = interrupted\n"
         "dpcli.__main__.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -15,7 +15,7 @@ from dpcli.path_names import as_utf8
 from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, has_images, read_depth_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
 
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
@@ -55,7 +55,6 @@ class DepthVideos:
     stride: int = 1
     labels: Path | None = None
     label_from_folder: bool = False
-    chooses: ClassVar[bool] = True
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
@@ -103,16 +102,14 @@ class DepthVideos:
     def items(self) -> list[Item]:
         return self._table.apply(self._found) if self._table else self._found
 
-    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
         video = read_depth_video(item.path, self.stride)
         depth, unit = self._raw(video.frames, item.path)
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
-        points, counts = back_project(
-            depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far, choose=choose
-        )
+        points, counts = back_project(depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far)
         kept, notes = drop_empty_frames(str(item.path), counts)
         rate = (self.fps or video.fps or DEFAULT_FPS) / self.stride
         return Sample(

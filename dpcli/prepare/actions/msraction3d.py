@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
-from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
@@ -129,7 +129,6 @@ class MSRAction3D:
     focal: float = 280.0  # pixels; a guess of the MeteorNet authors, no calibration was published
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
-    chooses: ClassVar[bool] = True
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -174,14 +173,14 @@ class MSRAction3D:
             split="train" if subject in self.train_subjects else "test",
         )
 
-    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
         notes: dict[str, int] = {}
         if item.path.suffix.lower() == ".bin":
             depth, notes = read_bin(item.path)
         else:
             depth = read_mat(item.path)
         height, width = depth.shape[1:]
-        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2), choose=choose)
+        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
         kept, dropped = drop_empty_frames(str(item.path), counts)
         points *= np.float32(1 / self.scale)
         sequence = CloudSequence(item.name, points, offsets(counts[kept]), **describe(item))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -73,24 +72,17 @@ def _complex_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray
 
 
 def back_project(
-    depth: np.ndarray,
-    intrinsics: Intrinsics,
-    *,
-    unit: float = 1.0,
-    near: float = 0.0,
-    far: float = np.inf,
-    choose: Callable[[int], np.ndarray | slice] | None = None,
+    depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in near..far.
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
-    order within each frame, frames one after the other; counts i64 (T) of points per frame. `choose` says which of so
-    many points of a frame are made (`Thinning.blind`).
+    order within each frame, frames one after the other; counts i64 (T) of points per frame.
     """
     frames, height, width = depth.shape
     rays = _complex_rays(height, width, intrinsics)
     # what is not seen is dropped before anything is computed: most pixels of a cut-out person or hand
-    seen = [_seen(frame, np.float32(unit), near, far, choose) for frame in depth.reshape(frames, height * width)]
+    seen = [_seen(frame, np.float32(unit), near, far) for frame in depth.reshape(frames, height * width)]
     counts = np.array([len(pixels) for pixels, _ in seen], np.int64)
     points = np.empty((int(counts.sum()), 3), np.float32)
     start = 0
@@ -104,16 +96,12 @@ def back_project(
     return points, counts
 
 
-def _seen(
-    frame: np.ndarray, unit: np.float32, near: float, far: float, choose: Callable[[int], np.ndarray | slice] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels i64 (P) of a flat frame in which something was seen in near..far and chosen, and its depth f32 (P)."""
+def _seen(frame: np.ndarray, unit: np.float32, near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
     pixels = np.flatnonzero(frame > 0)
     if near > 0 or far < np.inf:
         z = _lengths(frame, pixels, unit)
         pixels = pixels[(z >= near) & (z <= far)]
-    if choose is not None:
-        pixels = pixels[choose(len(pixels))]
     return pixels, _lengths(frame, pixels, unit)
 
 

@@ -18,7 +18,7 @@ from dpcli.prepare.actions import ntu60
 from dpcli.prepare.actions.ntu60 import NTU60, named_intrinsics
 from dpcli.prepare.decode import zip_index
 from dpcli.prepare.decode.depth_png import decode_depth_png
-from dpcli.prepare.pipeline import convert
+from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.store import CloudsReader
 from tests.support.depth_png_helpers import ntu_files, person, png_bytes, write_files
 from tests.support.prepare_helpers import dpc
@@ -84,7 +84,7 @@ def test_a_zip_gives_what_its_folder_gives(tmp_path, method):
     folder = write_files(tmp_path / "folder", files)
     archive = write_zip(tmp_path / "zips" / "nturgbd_depth_masked_s001.zip", files, method)
     for source in (archive, archive.parent):
-        reports = [convert(NTU60((p,)), tmp_path / "out.h5", force=True) for p in (folder, source)]
+        reports = [convert(NTU60((p,)), tmp_path / "out.h5", Conversion(force=True)) for p in (folder, source)]
         assert [report.written for report in reports] == [2, 2] and not reports[1].skipped
     with CloudsReader(tmp_path / "out.h5") as reader:
         assert reader.names == [ONE, TWO]
@@ -187,13 +187,13 @@ def test_zips_cut_short_and_damaged(tmp_path):
     assert len(reader.items()) == 3
     for cut in (0, 10, len(whole) // 2, len(whole) - 30):
         path.write_bytes(whole[:cut])
-        report = convert(reader, tmp_path / "out.h5", force=True)
+        report = convert(reader, tmp_path / "out.h5", Conversion(force=True))
         assert report.written == 1
         assert [(n, "b.zip" in r and "cut short" in r) for n, r in report.skipped] == [(str(path), True)]
     broken = bytearray(whole)
     broken[len(whole) // 4] ^= 0xFF
     path.write_bytes(broken)
-    report = convert(reader, tmp_path / "out.h5", force=True)
+    report = convert(reader, tmp_path / "out.h5", Conversion(force=True))
     assert report.written == 2 and len(report.skipped) == 1 and "copy the archive again" in report.skipped[0][1]
 
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from dpcli.cli.prepare.animation import animation
+from dpcli.cli.prepare.views.animation import animation
+from dpcli.cli.prepare.views.filming import FilmingOptions
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import Material, Texture, bounding_sphere, normalized
@@ -380,8 +381,8 @@ def test_from_the_command_line(tmp_path, dpc):
     assert out.read_bytes() == again.read_bytes()  # whatever the number of processes
     listed = dpc("prepare", "animation", path, "--list", "--json")
     assert json.loads(listed.stdout) == {"clips": [{"name": "Rig|Bend", "seconds": 1.0}]}
-    with pytest.raises(UsageError, match="-o/--output is missing"):
-        animation({}, path)
+    with pytest.raises(UsageError, match="-o/--output FILE is missing"):
+        animation(path, options=FilmingOptions())
     path.write_bytes(path.read_bytes()[:-9])
     broken = dpc("prepare", "animation", path, "-o", tmp_path / "c.h5")
     assert broken.returncode == 3 and b"truncated" in broken.stderr and b"Traceback" not in broken.stderr

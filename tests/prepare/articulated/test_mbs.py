@@ -12,7 +12,7 @@ import pytest
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.articulated_sequence import random_rotation
-from dpcli.prepare.scans.mbs import MultiBodySync, read_views
+from dpcli.prepare.articulated.mbs import MultiBodySync, read_views
 from dpcli.store import CloudsReader
 from tests.support.prepare_helpers import dpc
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpcli.cli.prepare.scenes import _ogc
+from dpcli.cli.prepare.articulated.ogc import NewRoomOptions, RoomConversion, ogc_dr
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.articulated_sequence import random_rotation
+from dpcli.prepare.articulated.ogc import OgcRooms, read_room
 from dpcli.prepare.articulated.ogc_layout import GROUND, RoomMotion, box, draw_layout, overlaps, scale_range
 from dpcli.prepare.articulated.ogc_meshes import areas, find_meshes, load_shape
 from dpcli.prepare.articulated.ogc_rooms import GeneratedRooms, RoomOptions, seen_by_camera
 from dpcli.prepare.meshes.surface_points import choose_on_surface, points_on
-from dpcli.prepare.scans.ogc import OgcRooms, read_room
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudsReader
 from tests.support.prepare_helpers import dpc
@@ -303,15 +303,17 @@ def test_generate_command(meshes, tmp_path):
         (False, False, {}, "neither was given"),
         (True, True, {}, "both were given"),
         (False, True, {"objects": "9"}, "expected different numbers of 2 to 8"),
-        (False, True, {"objects": "a"}, "expected numbers"),
+        (False, True, {"objects": "a"}, "expected whole numbers"),
         (False, True, {"up": "x"}, "expected y or z"),
+        (False, True, {"fractions": "1,0"}, "expected three numbers"),
         (False, True, {"fractions": "1,1,1"}, "that sum to 1"),
     ],
 )
 def test_wrong_use(raw, generate, changed, complaint, tmp_path):
-    options = {"objects": "3", "rooms": 1, "frames": 1, "points": 0, "up": "y", "fractions": "1,0,0", **changed}
+    rooms = NewRoomOptions(**{"objects": "3", "rooms": 1, "frames": 1, "fractions": "1,0,0", **changed})
+    conversion = RoomConversion(output=str(tmp_path / "out.h5"))
     with pytest.raises(UsageError, match=complaint):
-        _ogc(tmp_path if raw else None, tmp_path if generate else None, 0, "full", options)
+        ogc_dr(tmp_path if raw else None, tmp_path if generate else None, rooms=rooms, conversion=conversion)
 
 
 def test_folders_without_meshes(tmp_path):
