@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode import zip_index
-from dpcli.prepare.decode.depth_png import decode_depth_png, folder_files, leads_out
+from dpcli.prepare.decode import zip_folders
+from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.store import CloudSequence
 
@@ -217,20 +218,20 @@ class NTU60:
 
     def _archive(self, path: Path) -> Iterator[Item]:
         try:
-            folders, shift = zip_index.folders(path)
+            folders = zip_folders.list_folders(path)
         except (DataError, OSError) as error:
             yield Item(str(path), path, problem=str(error))
             return
-        videos = {name: ranges for name, ranges in folders.items() if NAME.fullmatch(name.rpartition("/")[2])}
-        for name, ranges in videos.items():
-            yield video_item(name.rpartition("/")[2], path, self.protocol, ranges=ranges, shift=shift)
+        videos = {name: files for name, files in folders.items() if NAME.fullmatch(name.rpartition("/")[2])}
+        for name, files in videos.items():
+            yield video_item(name.rpartition("/")[2], path, self.protocol, files=files)
         if not videos:
             inside = ", ".join(sorted(folders)[:3])
             yield Item(
                 str(path), path, problem=f"{path}: no folder SsssCcccPpppRrrrAaaa in it; found {inside or 'none'}"
             )
         for name in sorted(folders.keys() - videos.keys()) if videos else ():
-            first = next((n for n in zip_index.file_names(path, folders[name]) if FRAME.fullmatch(n)), "")
+            first = next((n for n in folders[name].names if FRAME.fullmatch(n)), "")
             if first:
                 yield Item(f"{path}/{name}", path, problem=_strange_name(path / name, first))
 
@@ -260,7 +261,7 @@ class NTU60:
         if "root" in item.extra:
             files: Iterator = folder_files(item.path, item.extra["root"], ".png")
         else:
-            files = zip_index.read_files(item.path, item.extra["ranges"], item.extra["shift"])
+            files = zip_folders.read_files(item.path, item.extra["files"])
         others, empty = "", True
         for name, data in files:
             match = FRAME.fullmatch(name)

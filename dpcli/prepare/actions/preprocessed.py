@@ -15,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions import msraction3d, ntu60
 from dpcli.prepare.actions.pts_label import FILE as PTS_LABEL
 from dpcli.prepare.actions.pts_label import PtsLabel
-from dpcli.prepare.decode.depth_png import leads_out
+from dpcli.prepare.decode.folder_listing import leads_out
 from dpcli.prepare.decode.npz_frames import member_names, read_frames
 from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence

@@ -11,9 +11,10 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.shrec17_lists import PUBLISHED, find_lists, gesture_names, listed_items
-from dpcli.prepare.decode.depth_files import load_cv2
-from dpcli.prepare.decode.depth_png import decode_depth_png, folder_files, leads_out
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
 

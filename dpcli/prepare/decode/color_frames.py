@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.depth_files import load_cv2, open_video
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.depth_files import open_video
 from dpcli.prepare.reader import natural_key
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")

@@ -11,7 +11,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
-from dpcli.prepare.decode.gray_png import decode_gray_png
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.png import decode_gray_png
 from dpcli.prepare.reader import natural_key
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
@@ -29,16 +30,6 @@ class DepthVideo:
 
     frames: np.ndarray
     fps: float | None = None
-
-
-def load_cv2():  # -> module
-    """OpenCV without its own lines on stderr about damaged files: ours name the file and what to do."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    import cv2
-
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    cv2.setNumThreads(1)  # one process per core is the parallelizm
-    return cv2
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     IMAGE_SIZE,
@@ -16,7 +17,6 @@ from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
     oriented,
-    png_size,
     read_calibration,
     read_velodyne,
     require_files,

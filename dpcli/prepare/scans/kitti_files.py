@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode.depth_files import load_cv2
-from dpcli.prepare.decode.gray_png import decode_gray_png
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.png import decode_gray_png
 from dpcli.prepare.reader import require_folder
 
 COORDINATES = ("published", "camera")
@@ -104,15 +103,6 @@ def read_png(
         found = f"{image.shape[1]}x{image.shape[0]}"
         raise DataError(f"{path}: {found} pixels; the scene's other images have {size[1]}x{size[0]}")
     return image[..., ::-1] if image.ndim == 3 else image  # OpenCV turns the channels round
-
-
-def png_size(path: Path) -> tuple[int, int]:
-    """Width and height of a PNG from its first 24 bytes; nothing is decoded."""
-    with open(path, "rb") as file:
-        head = file.read(24)
-    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
-        raise DataError(f"{path}: not a PNG (empty, truncated, or of another kind); its size is needed for the crop")
-    return struct.unpack(">II", head[16:24])
 
 
 @dataclass(frozen=True)

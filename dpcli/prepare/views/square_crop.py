@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.prepare.decode.depth_files import load_cv2
+from dpcli.prepare.decode.cv2_import import load_cv2
 
 VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
 Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.scans.kitti_det import Box, KittiDetection, parts_of_boxes, read_boxes, read_lists
 from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     compressed,
-    png_size,
     read_calibration,
     read_png,
     read_velodyne,

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode import gray_png
+from dpcli.prepare.decode import png as png_module
 from dpcli.prepare.decode.depth_files import read_image
-from dpcli.prepare.decode.depth_png import decode_depth_png
-from dpcli.prepare.decode.gray_png import decode_gray_png
+from dpcli.prepare.decode.png import decode_depth_png, decode_gray_png
 
 FILTERS = {
     "none": cv2.IMWRITE_PNG_FILTER_NONE,
@@ -53,7 +52,7 @@ def interlaced(image: np.ndarray) -> bytes:
 
 
 def test_kornia_is_there():
-    assert set(gray_png._decoders()) == {8, 16}
+    assert set(png_module._decoders()) == {8, 16}
 
 
 @settings(max_examples=60, deadline=None)
@@ -136,9 +135,9 @@ def test_a_panic_is_no_reason_to_stop_but_ctrl_c_is(monkeypatch):
         return raising
 
     data = png(image_of((4, 4), np.uint16))
-    monkeypatch.setattr(gray_png, "_decoders", lambda: {16: decode(Panic)})
+    monkeypatch.setattr(png_module, "_decoders", lambda: {16: decode(Panic)})
     assert decode_gray_png(data) is None
-    monkeypatch.setattr(gray_png, "_decoders", lambda: {16: decode(KeyboardInterrupt)})
+    monkeypatch.setattr(png_module, "_decoders", lambda: {16: decode(KeyboardInterrupt)})
     with pytest.raises(KeyboardInterrupt):
         decode_gray_png(data)
 
@@ -153,7 +152,7 @@ def test_readers_give_the_same_without_kornia(tmp_path, monkeypatch, dtype):
         return read_image(path), decode_depth_png(path.read_bytes(), "x", (32, 24), bits=(8, 16))
 
     with_kornia = both()
-    monkeypatch.setattr(gray_png, "_decoders", dict)
+    monkeypatch.setattr(png_module, "_decoders", dict)
     for one, other in zip(with_kornia, both(), strict=True):
         assert one.dtype == other.dtype == dtype
         np.testing.assert_array_equal(one, image)
