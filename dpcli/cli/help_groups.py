@@ -17,7 +17,7 @@ class SectionedGroup(TyperGroup):
     """
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write one section for each heading, in the order in which the headings first appear."""
+        """Writes one section for each heading, in the order in which the headings first appear."""
         sections: dict[str, list[tuple[str, str]]] = {}
         for name in self.list_commands(ctx):
             command = self.get_command(ctx, name)
@@ -32,7 +32,7 @@ class SectionedGroup(TyperGroup):
 
 
 def first_paragraph(text: str) -> str:
-    r"""Return the text up to its first empty line, on one line.
+    r"""Returns the text up to its first empty line, on one line.
 
     >>> first_paragraph("Any depth video,\n  8 or 16 bits.\n\nMore about it.")
     'Any depth video, 8 or 16 bits.'

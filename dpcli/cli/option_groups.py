@@ -19,7 +19,7 @@ from typing import Any, get_type_hints
 
 
 def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the command with one option for each field of the dataclasses among its parameters.
+    """Returns the command with one option for each field of the dataclasses among its parameters.
 
     The command is called with instances of these dataclasses. Raises ValueError when two options have one name.
     """
@@ -46,7 +46,7 @@ def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _options_of(group: type) -> list[inspect.Parameter]:
-    """Return a keyword parameter for each field of a dataclass, with the field's annotation and default."""
+    """Returns a keyword parameter for each field of a dataclass, with the field's annotation and default."""
     hints = get_type_hints(group, include_extras=True)
     return [
         inspect.Parameter(one.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[one.name], default=one.default)

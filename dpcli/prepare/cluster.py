@@ -15,7 +15,7 @@ _TRIES = 3  # a sample whose worker is lost is read again elsewhere; one that ta
 
 @contextmanager
 def cluster_executor(address: str, jobs: int) -> Iterator[tuple[Executor, int]]:
-    """An executor on a Dask cluster and how many samples it reads at a time.
+    """Yields an executor on a Dask cluster and how many samples it reads at a time.
 
     address: `local` starts `jobs` processes on this machine, anything else is a running scheduler, `tcp://host:8786`.
     Its workers need the same dpc and see the raw data under the same path; they write nothing. A worker that is lost
@@ -57,7 +57,7 @@ def cluster_executor(address: str, jobs: int) -> Iterator[tuple[Executor, int]]:
 
 
 def _slots(client: object, address: str) -> int:
-    """Threads of all workers, once there is one."""
+    """Returns the threads of all workers, once there is one."""
     client.wait_for_workers(1, timeout=_CONNECT_SECONDS)  # type: ignore[attr-defined]
     threads = client.nthreads()  # type: ignore[attr-defined]
     slots = sum(threads.values())

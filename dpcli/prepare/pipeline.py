@@ -61,12 +61,12 @@ class Conversion:
 
     @property
     def thinning(self) -> Thinning:
-        """The rule by which frames lose points."""
+        """Returns the rule by which frames lose points."""
         return Thinning(self.points, self.sampling)
 
     @property
     def processes(self) -> int:
-        """How many processes read items at a time."""
+        """Returns how many processes read items at a time."""
         return self.jobs or cpu_count()
 
 
@@ -82,7 +82,7 @@ class Report:
     was_complete: bool = False
 
     def lines(self) -> list[str]:
-        """Return what was left out, in words; nothing goes unmentioned."""
+        """Returns what was left out, in words; nothing goes unmentioned."""
         lines = [f"{what}: {count}" for what, count in sorted(self.notes.items())]
         if self.skipped:
             lines.append(f"{len(self.skipped)} skipped:")
@@ -92,13 +92,13 @@ class Report:
         return lines
 
     def counts(self) -> str:
-        """Return what was written, in words."""
+        """Returns what was written, in words."""
         written = f"{self.written} sequences, {self.frames} frames, {self.points} points"
         return f"{written}, {len(self.skipped)} skipped"
 
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
-    """Return everything that decides the file's content, except the seed: equal ones may continue each other."""
+    """Returns everything that decides the file's content, except the seed: equal ones may continue each other."""
     digest, fingerprint = (
         hashlib.sha256("\n".join(reader.class_names).encode()),
         cache(_fingerprint),
@@ -114,7 +114,7 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
 
 
 def _fingerprint(path: Path) -> str:
-    """Return what tells an item's data from others of that name without reading them.
+    """Returns what tells an item's data from others of that name without reading them.
 
     That is a file's size, or a folder's list of names and the size of its last file: not its place or date, which copying
     changes, and not what we may be writing there.
@@ -140,7 +140,7 @@ def convert(
     slots: int = 0,
     resume: bool = True,
 ) -> Report:
-    """Convert every item of a reader into one clouds file; running again continues where a stopped or killed run ended.
+    """Converts every item of a reader into one clouds file; running again continues where a stopped or killed run ended.
 
     executor: where items are read, `slots` at a time, instead of processes on this machine; the file's bytes don't depend
     on it. resume: off where nobody could run it again (a pipe); saves the journal's disk space. Raises UsageError when
@@ -190,7 +190,7 @@ def _open_writer(
 
 
 class _Run:
-    """One pass over the items that are not written yet, in order, into the writer."""
+    """Passes once over the items that are not written yet, in order, into the writer."""
 
     def __init__(
         self, writer: CloudsWriter, report: Report, stop: StopRequest, conversion: Conversion, items: list[Item]
@@ -207,7 +207,7 @@ class _Run:
         writer.positions = self.places if conversion.shard else None
 
     def stream(self, work: Any, jobs: int, executor: Executor | None) -> None:
-        """Write every item's sample, or note why it has none; a stop or a failure leaves the file to be continued."""
+        """Writes every item's sample, or note why it has none; a stop or a failure leaves the file to be continued."""
         with Progress(self.conversion.task, total=len(self.items), unit="video") as bar:
             bar.skip(len(self.items) - len(self.todo))
             try:
@@ -228,11 +228,11 @@ class _Run:
             raise DataError(f"none of the {len(self.items)} samples is good; the first: {reason}")
 
     def kept(self) -> str:
-        """Return how many samples are kept, in words."""
+        """Returns how many samples are kept, in words."""
         return f"{len(self.writer)} of {len(self.items)} samples are kept"
 
     def take(self, indexed: tuple[int, Item], result: Any, bar: Progress) -> None:
-        """Write a sample, or note what was raised instead of one."""
+        """Writes a sample, or note what was raised instead of one."""
         (place, item) = indexed
         if isinstance(result, Sample) and place > self.last:
             with _interrupted_after():
@@ -249,7 +249,7 @@ class _Run:
 
 @contextmanager
 def _interrupted_after() -> Iterator[None]:
-    """Delay Ctrl-C until the block has ended, because a half-appended sample would be lost."""
+    """Delays Ctrl-C until the block has ended, because a half-appended sample would be lost."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -280,7 +280,10 @@ def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str)
 def already_complete(
     output: Path, provenance: dict[str, Any], open_reader: Callable[[Path], Any] = CloudsReader
 ) -> bool:
-    """Whether ``output`` exists and was made by this configuration and seed; UsageError when made by another."""
+    """Returns whether ``output`` exists and was made by this configuration and seed.
+
+    Raises UsageError when made by another.
+    """
     if not output.exists():
         return False
     try:
@@ -297,7 +300,7 @@ def already_complete(
 
 
 def count_samples(report: Report, output: Path) -> Report:
-    """What the finished file holds, whether this run wrote all of it or continued another."""
+    """Returns the report with what the finished file holds, whether this run wrote all of it or continued another."""
     with CloudsReader(output) as reader:
         report.written = len(reader)
         report.skipped = reader.skipped

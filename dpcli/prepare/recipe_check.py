@@ -37,7 +37,7 @@ _SHOWN = 10
 
 @dataclass(frozen=True)
 class Row:
-    """One `[[raw]]` table of a recipe."""
+    """Holds one `[[raw]]` table of a recipe."""
 
     paths: tuple[str, ...]
     what: str
@@ -49,7 +49,10 @@ class Row:
 
 
 def read_recipe(name: str) -> tuple[dict[str, Any], list[Row]]:
-    """A recipe and its rows; DataError when there is none, or when it says something that is not understood."""
+    """Reads a recipe and its rows.
+
+    Raises DataError when there is none, or when it says something that is not understood.
+    """
     path = RECIPES / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in RECIPES.glob("*.toml")))
@@ -82,7 +85,7 @@ def _span(value: int | list[int]) -> tuple[float, float]:
 
 
 def expand(pattern: str) -> list[str]:
-    """`a{00..02}/{x,y}` -> a00/x, a00/y, a01/x, ...; without braces the pattern itself."""
+    """Returns `a{00..02}/{x,y}` as a00/x, a00/y, a01/x, ...; without braces the pattern itself."""
     match = re.search(r"\{([^{}]*)\}", pattern)
     if not match:
         return [pattern]
@@ -96,19 +99,20 @@ def expand(pattern: str) -> list[str]:
 
 
 class Tree:
-    """The files below a folder (or one file), listed once: path -> size, -1 for links to nowhere."""
+    """Lists the files below a folder (or one file) once: path -> size, -1 for links to nowhere."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     @cached_property
     def files(self) -> dict[str, int]:
+        """Returns the size of every file by its path."""
         if self.folder.is_file():
             return {self.folder.name: self.folder.stat().st_size}
         return dict(_walk(self.folder, ""))
 
     def find(self, pattern: str) -> list[str]:
-        """Files that fit a pattern: * and ? within a name, ** over folders (none, too)."""
+        """Returns files that fit a pattern: * and ? within a name, ** over folders (none, too)."""
         if not any(sign in pattern for sign in "*?"):
             return [pattern] if pattern in self.files else []
         fits = re.compile(_expression(pattern)).fullmatch
@@ -116,7 +120,7 @@ class Tree:
 
 
 def _walk(folder: Path, prefix: str) -> Iterator[tuple[str, int]]:
-    """Follows links to folders, but none that lead back to where they came from."""
+    """Yields path and size of every file; follows links to folders, but none that lead back to where they came from."""
     stack = [(folder, prefix, (folder.resolve(),))]
     while stack:
         here, before, parents = stack.pop()
@@ -146,7 +150,9 @@ def _expression(pattern: str) -> str:
 
 
 def check_row(row: Row, tree: Tree) -> tuple[list[str], str, int]:
-    """(what is missing or wrong, what was found, how many files) of one row; of several paths the best of those there."""
+    """Returns (what is missing or wrong, what was found, how many files) of one row; of several paths the best of those
+    there.
+    """
     return min((_check_path(row, pattern, tree) for pattern in row.paths), key=lambda one: (one[2] == 0, len(one[0])))
 
 
@@ -177,7 +183,7 @@ def _words(span: tuple[float, float]) -> str:
 
 
 def check_rows(rows: list[Row], tree: Tree) -> tuple[list[str], list[str]]:
-    """(lines for the user, faults that are errors) of all rows."""
+    """Returns (lines for the user, faults that are errors) of all rows."""
     results = {row.what: (row, *check_row(row, tree)) for row in rows}
     replaced = {_worse(results[row.instead_of], results[row.what]) for row in rows if row.instead_of}
     lines, errors = [], []
@@ -196,16 +202,16 @@ def check_rows(rows: list[Row], tree: Tree) -> tuple[list[str], list[str]]:
 
 
 def _worse(one: tuple[Row, list[str], str, int], other: tuple[Row, list[str], str, int]) -> str:
-    """Which of two rows need not be told, as the other suffices or is nearer to what is there."""
+    """Returns the which of two rows need not be told, as the other suffices or is nearer to what is there."""
     return max(other, one, key=lambda it: (bool(it[1]), it[3] == 0, len(it[1])))[0].what
 
 
 def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *, file: bool = False) -> Iterator[str]:
-    """Lines that say what of recipe `name` is in `raw` and what is not, then what the reader's own index finds.
+    """Yields lines that say what of recipe `name` is in `raw` and what is not, then what the reader's own index finds.
 
     make_reader: anything with the `items` and `summary` of a Reader. file: `raw` may be a single file.
 
-    DataError, after the last line, when something is missing; DataError at once when there is no recipe or no folder.
+    DataError, after the last line, when something is missing. Raises DataError at once when there is no recipe or no folder.
     """
     recipe, rows = read_recipe(name)
     if raw is None:
@@ -230,7 +236,7 @@ def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *,
 
 
 def _index_lines(reader: Any, errors: list[str]) -> Iterator[str]:
-    """The index opens no data: it names list lines without a file, names that fit no pattern, labels out of range."""
+    """Yields what the index finds without opening data: list lines without a file, strange names, labels out of range."""
     items = reader.items()
     bad = [item for item in items if item.problem]
     for line in reader.summary(items):

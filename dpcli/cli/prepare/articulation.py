@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ArticulatedConversion(ConversionOptions):
-    """The options of every conversion; points are drawn on surfaces here, not chosen among those of a frame."""
+    """Holds the options of every conversion; points are drawn on surfaces here, not chosen among those of a frame."""
 
     points: Annotated[int, typer.Option("--points", min=1, help="Points per frame.")] = 512
     sampling: Annotated[
@@ -28,7 +28,7 @@ class ArticulatedConversion(ConversionOptions):
 
 @dataclass(frozen=True)
 class ArticulationOptions:
-    """The options that say how an articulated object moves and how it is seen."""
+    """Holds the options that say how an articulated object moves and how it is seen."""
 
     frames: Annotated[int, typer.Option("--frames", min=1, help="Frames per sequence.")] = 4
     view: Annotated[
@@ -68,14 +68,14 @@ class ArticulationOptions:
     ] = False
 
     def articulation(self, conversion: ConversionOptions) -> Articulation:
-        """Return these options, with the number of points, as the room takes them."""
+        """Returns these options, with the number of points, as the room takes them."""
         from dpcli.prepare.articulated.articulated_sequence import Articulation
 
         return Articulation(points_per_frame=conversion.points, sampling=conversion.sampling, **vars(self))
 
 
 def split_rule(test: str, validation: str, fractions: str) -> SplitRule:
-    """Return the rule that the options --test-categories, --validation-categories and --fractions make."""
+    """Returns the rule that the options --test-categories, --validation-categories and --fractions make."""
     from dpcli.prepare.articulated.object_splits import SplitRule
 
     return SplitRule(words(test), words(validation), three_shares(fractions) if words(fractions) else ())

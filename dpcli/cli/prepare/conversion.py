@@ -16,7 +16,7 @@ from dpcli.errors import UsageError
 
 @dataclass(frozen=True)
 class ConversionOptions:
-    """The options that every conversion has, whatever it reads."""
+    """Holds the options that every conversion has, whatever it reads."""
 
     output: FileOrPipe = ""
     points: PointsAtMost = 0
@@ -43,7 +43,7 @@ class ConversionOptions:
 
 @dataclass(frozen=True)
 class PublishedConversion(ConversionOptions):
-    """The same options with the number of points that the published scenes have."""
+    """Holds the same options with the number of points that the published scenes have."""
 
     points: PointsAtMost = 8192
     sampling: Sampling = "fps"
@@ -52,7 +52,7 @@ class PublishedConversion(ConversionOptions):
 def run_conversion(
     name: str, make_reader: Callable[[], Any], options: ConversionOptions, raw: Path | None = None
 ) -> None:
-    """Convert what the reader reads and print what was written, or print what is missing with `--check`.
+    """Converts what the reader reads and print what was written, or print what is missing with `--check`.
 
     name: the command's, which is also its recipe's. raw: the folder that `--check` compares with the recipe.
     """
@@ -86,13 +86,13 @@ def run_conversion(
 
 
 def require_output(output: str) -> None:
-    """Raise UsageError when no output was named; `--check` needs none, so the parser can't ask for it."""
+    """Raises UsageError when no output was named; `--check` needs none, so the parser can't ask for it."""
     if not output:
         raise UsageError("-o/--output FILE is missing: the file to write, or - for a pipe")
 
 
 def print_check(name: str, raw: Path | None, make_index: Callable[[], Any], *, file: bool = False) -> None:
-    """Print what of the recipe is in the folder and what is missing."""
+    """Prints what of the recipe is in the folder and what is missing."""
     from dpcli.prepare.recipe_check import check_folder
 
     for line in check_folder(name, raw, make_index, file=file):

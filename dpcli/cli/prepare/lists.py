@@ -6,7 +6,7 @@ from dpcli.errors import UsageError
 
 
 def words(text: str) -> tuple[str, ...]:
-    """Return the words of a list, without the spaces around them and without empty ones.
+    """Returns the words of a list, without the spaces around them and without empty ones.
 
     >>> words("car, truck,")
     ('car', 'truck')
@@ -15,7 +15,7 @@ def words(text: str) -> tuple[str, ...]:
 
 
 def whole_numbers(text: str, option: str) -> tuple[int, ...]:
-    """Return the numbers of a list. Raises UsageError, which names the option, for anything else.
+    """Returns the numbers of a list. Raises UsageError, which names the option, for anything else.
 
     >>> whole_numbers("1,3,5", "--train-subjects")
     (1, 3, 5)
@@ -27,7 +27,7 @@ def whole_numbers(text: str, option: str) -> tuple[int, ...]:
 
 
 def degrees(text: str, option: str) -> tuple[float, ...]:
-    """Return the angles of a list, in degrees. Raises UsageError, which names the option, for anything else."""
+    """Returns the angles of a list, in degrees. Raises UsageError, which names the option, for anything else."""
     try:
         return tuple(float(word) for word in words(text))
     except ValueError:
@@ -35,7 +35,9 @@ def degrees(text: str, option: str) -> tuple[float, ...]:
 
 
 def three_shares(text: str) -> tuple[float, float, float]:
-    """Return the shares of train, validation and test that `--fractions` names. Raises UsageError unless they are three.
+    """Returns the shares of train, validation and test that `--fractions` names.
+
+    Raises UsageError unless they are three.
 
     >>> three_shares("0.8,0.1,0.1")
     (0.8, 0.1, 0.1)

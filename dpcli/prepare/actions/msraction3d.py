@@ -53,7 +53,7 @@ def published() -> list[str]:
 
 
 def read_bin(path: Path) -> tuple[np.ndarray, dict[str, int]]:
-    """Official binary -> depth uint32 (T,H,W) in raw units, 0 = background.
+    """Reads the official binary form: depth uint32 (T,H,W) in raw units, 0 = background, and notes.
 
     Little-endian uint32: number of frames, width, height, then frames x height x width depths, row by row.
     """
@@ -73,7 +73,7 @@ def read_bin(path: Path) -> tuple[np.ndarray, dict[str, int]]:
 
 
 def read_mat(path: Path) -> np.ndarray:
-    """MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3 -> depth (T,H,W), C order."""
+    """Reads a MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3, as depth (T,H,W), C order."""
     with path.open("rb") as file:
         is_hdf5 = b"MATLAB 7.3" in file.read(20)
     depth = _read_mat73(path) if is_hdf5 else _read_mat5(path)
@@ -114,7 +114,7 @@ def _read_mat73(path: Path) -> np.ndarray:
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:
-    """DataError unless there is at least one frame of a believable size (a wrong header shows itself here)."""
+    """Raises DataError unless there is at least one frame of a believable size (a wrong header shows itself here)."""
     if frames == 0:
         raise DataError(f"{path}: an empty video: 0 frames; expected at least 1")
     if not (0 < height <= 8192 and 0 < width <= 8192):
@@ -123,7 +123,7 @@ def check_shape(path: Path, frames: int, height: int, width: int) -> None:
 
 @dataclass(frozen=True)
 class MSRAction3D:
-    """Options of the reader; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
+    """Reads MSR-Action3D; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
 
     raw: Path
     focal: float = 280.0  # pixels; a guess of the MeteorNet authors, no calibration was published
@@ -137,17 +137,21 @@ class MSRAction3D:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         return f"{self.scale:g} raw depth units" if self.scale != 1 else "raw depth unit"
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k != "raw"}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "MSR-Action3D files named aAA_sSS_eEE_sdepth.bin or .mat"
         folder = require_folder(self.raw, expected)
         found: dict[str, Item] = {}
@@ -174,6 +178,7 @@ class MSRAction3D:
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         notes: dict[str, int] = {}
         if item.path.suffix.lower() == ".bin":
             depth, notes = read_bin(item.path)
@@ -187,6 +192,7 @@ class MSRAction3D:
         return Sample(sequence, {**notes, **dropped})
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         expected, names = published(), {item.name for item in items}
         lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
         train = {name for name in expected if int(name[5:7]) in self.train_subjects}

@@ -98,7 +98,7 @@ _RANGES = {"setup": (1, 17), "camera": (1, 3), "person": (1, 40), "repetition": 
 
 
 def named_intrinsics(text: str) -> Intrinsics:
-    """``peers``, ``kinect2``, or the name of a JSON file with fx fy cx cy."""
+    """Returns the intrinsics called ``peers`` or ``kinect2``, or those of a JSON file with fx fy cx cy."""
     if text in INTRINSICS:
         return INTRINSICS[text]
     if not Path(text).suffix:
@@ -107,13 +107,13 @@ def named_intrinsics(text: str) -> Intrinsics:
 
 
 def split_of(protocol: str, subject: int, camera: int) -> str:
-    """``train`` or ``test`` under cross-subject (xsub) or cross-view (xview)."""
+    """Returns ``train`` or ``test`` under cross-subject (xsub) or cross-view (xview)."""
     train = subject in TRAIN_SUBJECTS if protocol == "xsub" else camera in TRAIN_CAMERAS
     return "train" if train else "test"
 
 
 def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
-    """The item of a video called SsssCcccPpppRrrrAaaa; a number out of range is its problem."""
+    """Returns the item of a video called SsssCcccPpppRrrrAaaa; a number out of range becomes its problem."""
     numbers = [int(v) for v in NAME.fullmatch(name).groups()]
     wrong = [
         f"{what} {number} in the name is out of range; NTU RGB+D 60 has {low} to {high}"
@@ -135,7 +135,7 @@ def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
 
 @dataclass(frozen=True)
 class NTU60:
-    """Options of the reader; defaults are the published point-cloud preprocessing. ``scale``: mm per unit of length."""
+    """Reads NTU RGB+D 60; defaults are the published point-cloud preprocessing. ``scale``: mm per unit of length."""
 
     inputs: tuple[Path, ...]
     protocol: str = "xsub"
@@ -151,17 +151,21 @@ class NTU60:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         return {1.0: "mm", 1000.0: "m"}.get(self.scale, f"{self.scale:g} mm")
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k != "inputs"}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found: dict[str, Item] = {}
         for given in self.inputs:
             for item in self._search(given):
@@ -188,7 +192,9 @@ class NTU60:
             raise DataError(f"{given}: does not exist; expected a folder of nturgb+d_depth_masked, or its ZIPs")
 
     def _folder(self, folder: Path, root: Path) -> Iterator[Item]:
-        """The videos below a folder, without a look into them: 56,880 folders take a second, their frames minutes."""
+        """Yields the videos below a folder, without a look into them: 56,880 folders take a second, their frames
+        minutes.
+        """
         with os.scandir(folder) as entries:
             ordered = sorted(entries, key=lambda entry: entry.name)
         strange = ""
@@ -236,6 +242,7 @@ class NTU60:
                 yield Item(f"{path}/{name}", path, problem=_strange_name(path / name, first))
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         where = item.path if "root" in item.extra else item.path / item.name
         frames = sorted(self._frames(item, where))
         numbers = np.array([number for number, _ in frames])
@@ -257,7 +264,7 @@ class NTU60:
         return Sample(CloudSequence(item.name, points, offsets(counts[kept]), time=time, **describe(item)), notes)
 
     def _frames(self, item: Item, where: Path) -> Iterator[tuple[int, Path | bytes]]:
-        """(number, file or content) of the frames of a video, unsorted."""
+        """Yields (number, file or content) of the frames of a video, unsorted."""
         if "root" in item.extra:
             files: Iterator = folder_files(item.path, item.extra["root"], ".png")
         else:
@@ -275,6 +282,7 @@ class NTU60:
             raise DataError(f"{where}: no MDepth-00000001.png ...; {found}")
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         good = [item for item in items if not item.problem]
         setups, splits = Counter(item.name[:4] for item in good), Counter(item.split for item in good)
         lines = [f"{len(good)} of the {VIDEOS} published videos found, {len(items) - len(good)} entries unusable"]

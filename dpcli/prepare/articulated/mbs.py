@@ -22,7 +22,7 @@ _RIGID = 1e-3  # how far R^T R of a stored matrix may be from the identity
 
 @lru_cache(maxsize=4)
 def read_meta(raw: Path) -> dict[str, list[int]]:
-    """meta.json: the numbers of the samples of each split. DataError when it is not that."""
+    """Reads the numbers of the samples of each split from meta.json. Raises DataError when it is not that."""
     path = require_folder(raw, "meta.json and data/000000.npz ... as the authors distribute it") / "meta.json"
     try:
         meta = json.loads(path.read_text())
@@ -39,7 +39,7 @@ def read_meta(raw: Path) -> dict[str, list[int]]:
 
 @lru_cache(maxsize=4)
 def most_parts(raw: Path) -> int:
-    """The largest part id of all samples, which every pose is padded to."""
+    """Returns the largest part id of all samples, which every pose is padded to."""
     most = 1
     for numbers in read_meta(raw).values():
         for number in numbers:
@@ -56,7 +56,7 @@ def _segmentation(path: Path) -> np.ndarray:
 
 
 def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One sample -> points f32 (V,N,3), part ids i16 (V,N) from 0, poses f64 (V,parts,4,4).
+    """Reads one sample: points f32 (V,N,3), part ids i16 (V,N) from 0, poses f64 (V,parts,4,4).
 
     The file has for every view v its camera pose C_v and the pose T_s,v of every part s, so a point of part s goes
     from view i to j by C_j^-1 T_s,j T_s,i^-1 C_i; the pose of a part in the points of view v is C_v^-1 T_s,v.
@@ -109,7 +109,7 @@ def _matrices(path: Path, trans: dict, key: str | int, views: int) -> np.ndarray
 
 @dataclass(frozen=True)
 class MultiBodySync:
-    """Reader of a folder of meta.json and data/%06d.npz."""
+    """Reads a folder of meta.json and data/%06d.npz."""
 
     raw: Path
     class_names: ClassVar[tuple[str, ...]] = ()
@@ -118,9 +118,11 @@ class MultiBodySync:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         meta, parts = read_meta(self.raw), most_parts(self.raw)
         items = []
         for split in (s for s in _SPLITS if s in meta):
@@ -135,6 +137,7 @@ class MultiBodySync:
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         points, part, poses = read_views(item.path)
         missing = item.extra["parts"] - poses.shape[1]
         padding = np.tile(np.eye(4), (len(poses), missing, 1, 1))
@@ -144,5 +147,6 @@ class MultiBodySync:
         return Sample(sequence)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         counts = {split: sum(item.split == split for item in items) for split in _SPLITS.values()}
         return [f"{len(items)} samples ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]

@@ -22,7 +22,10 @@ _CLOUD = re.compile(r"pc_(\d+)\.npy")
 
 
 def read_array(path: Path, kind: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """A .npy of numbers of this kind ("f", "iu") and shape (None: any length); pickles are refused. DataError."""
+    """Reads a .npy of numbers of this kind ("f", "iu") and shape (None: any length).
+
+    Raises DataError; pickles are refused.
+    """
     try:
         array = np.load(path, allow_pickle=False)
     except FileNotFoundError:
@@ -38,7 +41,7 @@ def read_array(path: Path, kind: str, shape: tuple[int | None, ...]) -> np.ndarr
 
 
 def read_poses(path: Path) -> np.ndarray:
-    """pose_%02d.npy -> f64 (objects,4,4); DataError unless every matrix is a rotation and a shift."""
+    """Reads pose_%02d.npy as f64 (objects,4,4). Raises DataError unless every matrix is a rotation and a shift."""
     pose = read_array(path, "f", (None, 4, 4)).astype(np.float64)
     rotation = pose[:, :3, :3]
     good = np.isfinite(pose).all((1, 2)) & (np.abs(pose[:, 3] - [0, 0, 0, 1]).max(1) < _RIGID)
@@ -53,7 +56,7 @@ def read_poses(path: Path) -> np.ndarray:
 
 
 def read_segmentation(path: Path, objects: int, points: int | None = None) -> np.ndarray:
-    """segm_%02d.npy -> part i16 (N): object s (from 1) is s - 1, background (0, if there is any) is ``objects``."""
+    """Reads segm_%02d.npy as part i16 (N): object s (from 1) is s - 1, background (0, if there is any) is ``objects``."""
     segm = read_array(path, "iu", (points,))
     if segm.min() < 0 or segm.max() > objects:
         raise DataError(f"{path}: holds ids from {segm.min()} to {segm.max()}; expected 1 to {objects}, 0 = background")
@@ -61,7 +64,7 @@ def read_segmentation(path: Path, objects: int, points: int | None = None) -> np
 
 
 def read_room(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray], np.ndarray]:
-    """Frames f32 (N,3), parts i16 (N), poses f64 (T,objects+1,4,4), the last the background, which stands still."""
+    """Reads frames f32 (N,3), parts i16 (N), poses f64 (T,objects+1,4,4), the last the background, which stands still."""
     numbers = sorted(int(m[1]) for path in folder.iterdir() if (m := _CLOUD.fullmatch(path.name)))
     if not numbers or numbers != list(range(len(numbers))):
         raise DataError(f"{folder}: frames {numbers or 'none'}; expected pc_00.npy, pc_01.npy, ... without gaps")
@@ -82,7 +85,10 @@ def read_room(folder: Path) -> tuple[list[np.ndarray], list[np.ndarray], np.ndar
 
 @lru_cache(maxsize=4)
 def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
-    """(room, split) of data/{train,val,test}.lst, in their order; DataError when none is there or a room comes twice."""
+    """Reads (room, split) from data/{train,val,test}.lst, in their order.
+
+    Raises DataError when none is there or a room repeats.
+    """
     data = require_folder(raw, "data/ of rooms and train.lst, val.lst, test.lst") / "data"
     rooms = [
         (name, split)
@@ -102,7 +108,9 @@ def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
 
 @lru_cache(maxsize=4)
 def most_parts(raw: Path) -> int:
-    """Parts that every pose is padded to: the most objects of a room, and one more if its first frame has background."""
+    """Returns how many parts every pose is padded to: the most objects of a room, one more if its first frame has
+    background.
+    """
     most = 1
     for name, _ in read_lists(raw):
         folder = raw / "data" / name
@@ -116,7 +124,7 @@ def most_parts(raw: Path) -> int:
 
 @dataclass(frozen=True)
 class OgcRooms:
-    """Reader of the released arrays, of OGC-DR and OGC-DRSV alike."""
+    """Reads the released arrays, of OGC-DR and OGC-DRSV alike."""
 
     raw: Path
     class_names: ClassVar[tuple[str, ...]] = ()
@@ -125,9 +133,11 @@ class OgcRooms:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         rooms, parts = read_lists(self.raw), most_parts(self.raw)
         items = []
         for name, split in rooms:
@@ -139,6 +149,7 @@ class OgcRooms:
         return items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         clouds, parts, poses = read_room(item.path)
         used, padded = 1 + max(int(part.max()) for part in parts), item.extra["parts"]
         if used > padded:
@@ -149,6 +160,7 @@ class OgcRooms:
         return Sample(CloudSequence.from_frames(item.name, clouds, part=parts, pose=pose, **describe(item)))
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         counts = Counter(item.split for item in items)
         lines = [f"{len(items)} rooms ({', '.join(f'{counts[split]} {split}' for split in _SPLITS.values())})"]
         if len(items) != ROOMS:

@@ -9,7 +9,7 @@ from dpcli.store.pipes import output_file
 
 
 def convert_raw_data(reader: Reader, output: str, conversion: Conversion, dask: str = "") -> Report:
-    """Convert every item of a reader and return what was done; see `pipeline.convert` for errors.
+    """Converts every item of a reader and return what was done; see `pipeline.convert` for errors.
 
     output: a path, or - for a pipe. dask: the address of a cluster's scheduler, `local` for one of its own, or "" for
     processes of this machine.

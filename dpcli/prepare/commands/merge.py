@@ -26,7 +26,7 @@ _OPEN = 64  # files held open at a time; shards are read in turn, and there may 
 
 @dataclass
 class Source:
-    """What the index of one file says; its points stay on the disk."""
+    """Holds what the index of one file says; its points stay on the disk."""
 
     path: Path
     class_names: list[str]
@@ -43,11 +43,12 @@ class Source:
     prefix: str = ""  # what goes before its samples' names
 
     def sample_name(self, index: int) -> str:
+        """Returns the sample's name in the joined file."""
         return self.prefix + self.names[index]
 
 
 def read_source(path: Path) -> Source:
-    """The index of a clouds file; DataError when it is none."""
+    """Returns the index of a clouds file. Raises DataError when it is none."""
     if file_kind(path) != "clouds":
         raise DataError(
             f"{path}: holds {file_kind(path)}; merge and split take clouds files, as dpc prepare makes them"
@@ -72,12 +73,13 @@ def read_source(path: Path) -> Source:
 
 
 class OpenFiles:
-    """Readers by path, only the latest used of them open."""
+    """Keeps readers by path, only the latest used of them open."""
 
     def __init__(self) -> None:
         self._readers: OrderedDict[Path, CloudsReader] = OrderedDict()
 
     def read(self, path: Path, index: int) -> CloudSequence:
+        """Returns one sequence of a file, which is opened when it isn't."""
         if path not in self._readers:
             self._readers[path] = CloudsReader(path)
         self._readers.move_to_end(path)
@@ -87,6 +89,7 @@ class OpenFiles:
         return sequence
 
     def close(self) -> None:
+        """Closes all files."""
         for reader in self._readers.values():
             reader.close()
 
@@ -101,7 +104,7 @@ def merge(
     force: bool = False,
     resume: bool = True,
 ) -> Report:
-    """Join clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
+    """Joins clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
 
     All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
     whole's. Other files follow one another as given; their class lists must agree unless `labels` maps them.
@@ -147,7 +150,7 @@ def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool
 
 
 def _whole_entry(sources: list[Source]) -> dict[str, Any]:
-    """The provenance that all shards share but for which they are; UsageError unless they are the pieces of one whole."""
+    """Returns the provenance that all shards share. Raises UsageError unless they are the pieces of one whole."""
     entries = [shard_of(source.provenance[-1])[1] for source in sources]  # type: ignore[index]
     first = sources[0]
     for source, entry in zip(sources, entries):
@@ -237,7 +240,7 @@ def _write(
     force: bool,
     resume: bool,
 ) -> Report:
-    """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
+    """Copies (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
     report = Report(skipped=skipped)
     if not force and already_complete(output, entry):
         sweep(output)
@@ -276,7 +279,10 @@ def _write(
 
 
 def copied_before(writer: CloudsWriter, names: list[str]) -> int:
-    """How many of the samples, from the first on, a stopped run left; UsageError when it left others, which stay."""
+    """Returns how many samples, from the first on, a stopped run left.
+
+    Raises UsageError when it left others, which stay.
+    """
     done = len(writer.written_names)
     if writer.written_names != names[:done]:
         writer.keep = True
@@ -290,7 +296,7 @@ def copied_before(writer: CloudsWriter, names: list[str]) -> int:
 
 
 def _relabeled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
-    """The sample as the joined file has it: its label, its name, and no field that others lack."""
+    """Returns the sample as the joined file has it: its label, its name, and no field that others lack."""
     if label is not None:
         sequence.label = label
     sequence.name = source.prefix + sequence.name

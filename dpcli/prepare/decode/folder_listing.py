@@ -10,14 +10,14 @@ from dpcli.errors import DataError
 
 
 def leads_out(path: Path, root: Path) -> str:
-    """Return where a link takes ``path`` outside ``root``, "" when it stays inside or is no link at all."""
+    """Returns where a link takes ``path`` outside ``root``, "" when it stays inside or is no link at all."""
     target = os.path.realpath(path)
     inside = os.path.realpath(root)
     return "" if target == inside or target.startswith(inside.rstrip(os.sep) + os.sep) else target
 
 
 def folder_files(folder: Path, root: Path, suffix: str) -> Iterator[tuple[str, Path]]:
-    """Yield (name, path) of the files in a folder that end in ``suffix``, in no order.
+    """Yields (name, path) of the files in a folder that end in ``suffix``, in no order.
 
     Raises DataError at a link out of ``root``.
     """

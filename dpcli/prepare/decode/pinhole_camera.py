@@ -15,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Focal lengths and principal point, in pixels; pixel (0, 0) is the center of the top-left one."""
+    """Holds focal lengths and principal point, in pixels; pixel (0, 0) is the center of the top-left one."""
 
     fx: float
     fy: float
@@ -28,7 +28,7 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
-        """Square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view."""
+        """Returns a camera of square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view."""
         if not 0 < degrees < 180:
             raise UsageError(f"a field of view lies between 0 and 180 degrees, found {degrees:g}")
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
@@ -36,7 +36,7 @@ class Intrinsics:
 
     @classmethod
     def from_json(cls, path: Path) -> Intrinsics:
-        """``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-major]}``."""
+        """Reads ``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-major]}``."""
         try:
             data = json.loads(path.read_text())
         except OSError as error:
@@ -54,7 +54,7 @@ class Intrinsics:
 
 @lru_cache(maxsize=8)
 def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
-    """Rays through every pixel at unit depth, f32 (H*W, 3) in raster order; z is 1. Camera axes OpenCV."""
+    """Returns rays through every pixel at unit depth, f32 (H*W, 3) in raster order; z is 1. Camera axes OpenCV."""
     x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(height) - intrinsics.cy) / intrinsics.fy
     rays = np.ones((height, width, 3), np.float32)
@@ -66,7 +66,7 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _complex_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
-    """x + iy of `pixel_rays`, complex64 (H*W): one number is taken three times as fast as a row."""
+    """Returns x + iy of `pixel_rays`, complex64 (H*W): one number is taken three times as fast as a row."""
     rays = np.ascontiguousarray(pixel_rays(height, width, intrinsics)[:, :2])
     return rays.view(np.complex64).reshape(-1)
 
@@ -74,7 +74,8 @@ def _complex_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray
 def back_project(
     depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in near..far.
+    """Turns depth frames into points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in
+    near..far.
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
     order within each frame, frames one after the other; counts i64 (T) of points per frame.
@@ -97,7 +98,7 @@ def back_project(
 
 
 def _seen(frame: np.ndarray, unit: np.float32, near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
+    """Returns pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
     pixels = np.flatnonzero(frame > 0)
     if near > 0 or far < np.inf:
         z = _lengths(frame, pixels, unit)

@@ -23,7 +23,7 @@ _MOST_DEFLATED = 1032  # bytes that one byte of a deflate stream can stand for
 
 @dataclass(frozen=True)
 class PngHeader:
-    """The first chunk of a PNG: size in pixels, bits per channel, color type (0 is gray) and the chunk's checksum."""
+    """Holds the first chunk of a PNG: size in pixels, bits per channel, color type (0 is gray) and the chunk's checksum."""
 
     width: int
     height: int
@@ -33,7 +33,7 @@ class PngHeader:
 
 
 def read_header(data: bytes) -> PngHeader | None:
-    """Return the header of a PNG's bytes, of which 33 suffice; None when they are no PNG."""
+    """Returns the header of a PNG's bytes, of which 33 suffice; None when they are no PNG."""
     if len(data) < _HEADER.size:
         return None
     signature, kind, *numbers = _HEADER.unpack_from(data)
@@ -41,7 +41,7 @@ def read_header(data: bytes) -> PngHeader | None:
 
 
 def png_size(path: Path) -> tuple[int, int]:
-    """Return width and height of a PNG file, of which nothing is decoded. Raises DataError when it is none."""
+    """Returns width and height of a PNG file, of which nothing is decoded. Raises DataError when it is none."""
     with open(path, "rb") as file:
         header = read_header(file.read(_HEADER.size))
     if header is None:
@@ -51,7 +51,7 @@ def png_size(path: Path) -> tuple[int, int]:
 
 @cache
 def _decoders() -> dict[int, Callable]:
-    """Return bits -> function of (bytes, (height, width), mode); none where kornia-rs is missing or of another kind."""
+    """Returns bits -> function of (bytes, (height, width), mode); none where kornia-rs is missing or of another kind."""
     try:
         from kornia_rs import io
 
@@ -61,7 +61,7 @@ def _decoders() -> dict[int, Callable]:
 
 
 def decode_gray_png(data: bytes) -> np.ndarray | None:
-    """Decode the bytes of a whole gray PNG to u8 or u16 (H,W).
+    """Decodes the bytes of a whole gray PNG to u8 or u16 (H,W).
 
     Returns None for all else (another kind of file, a damaged one, no kornia-rs): OpenCV decodes that, or the caller says
     what is wrong with it.
@@ -83,7 +83,7 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
 
 
 def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple[int, ...] = (16,)) -> np.ndarray:
-    """Decode the bytes of a gray PNG to depth u8 or u16 (H,W). size: (width, height) expected; bits: allowed per pixel.
+    """Decodes the bytes of a gray PNG to depth u8 or u16 (H,W). size: (width, height) expected; bits: allowed per pixel.
 
     Everything is checked before libpng sees it, because it fills in what a damaged file lacks, or complains on stderr
     without a name. Raises DataError that says what was found at ``where``.
@@ -109,7 +109,7 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
 
 
 def _check_chunks(data: bytes, where: str) -> None:
-    """Raise DataError unless every chunk is there with its right checksum, the last one being IEND."""
+    """Raises DataError unless every chunk is there with its right checksum, the last one being IEND."""
     position, view = len(_SIGNATURE), memoryview(data)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")

@@ -26,7 +26,7 @@ _MOST_BYTES = 1 << 26  # of one unpacked file; a depth frame takes half a megaby
 
 @dataclass(frozen=True)
 class ZipFolder:
-    """The files that lie directly in one folder of an archive: their base names, and where and how each is stored.
+    """Holds the files directly in one folder of an archive: their base names, and where and how each is stored.
 
     It is small and pickles, so that a worker process reads the folder without opening the archive's directory.
     """
@@ -36,7 +36,7 @@ class ZipFolder:
 
 
 def list_folders(path: Path) -> dict[str, ZipFolder]:
-    """Return every folder of an archive that directly holds files, by its name with forward slashes, "" for the top.
+    """Returns every folder of an archive that directly holds files, by its name with forward slashes, "" for the top.
 
     Raises DataError when the archive is no ZIP, cut short or damaged.
     """
@@ -59,7 +59,7 @@ def _folder(infos: list[zipfile.ZipInfo]) -> ZipFolder:
 
 
 def read_files(path: Path, folder: ZipFolder) -> Iterator[tuple[str, bytes]]:
-    """Yield (base name, content) of the folder's files, in the order of the archive's directory.
+    """Yields (base name, content) of the folder's files, in the order of the archive's directory.
 
     Raises DataError when a file is damaged, encrypted, or packed by a method other than stored or deflated.
     """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DepthCamera:
-    """The options that say which camera filmed."""
+    """Holds the options that say which camera filmed."""
 
     intrinsics: Annotated[Path | None, typer.Option("--intrinsics", help="JSON file with fx fy cx cy, pixels.")] = None
     fx: Annotated[float | None, typer.Option("--fx", help="Focal length, pixels; needs --cx and --cy, too.")] = None
@@ -28,7 +28,7 @@ class DepthCamera:
     fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view, degrees. Default: 60.")] = None
 
     def read_intrinsics(self) -> Intrinsics | None:
-        """Return the intrinsics that were given, None when they follow from `--fov`. Raises UsageError on a mixture."""
+        """Returns the intrinsics that were given, None when they follow from `--fov`. Raises UsageError on a mixture."""
         from dpcli.prepare.decode.pinhole_camera import Intrinsics
 
         pixels = (self.fx, self.fx if self.fy is None else self.fy, self.cx, self.cy)
@@ -45,7 +45,7 @@ class DepthCamera:
 
 @dataclass(frozen=True)
 class DepthPixels:
-    """The options that say what a pixel of a depth video means, and which pixels are kept."""
+    """Holds the options that say what a pixel of a depth video means, and which pixels are kept."""
 
     depth_scale: Annotated[
         float | None,
@@ -84,7 +84,7 @@ def depth(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Any depth video, 8 or 16 bits, to points in meters.
+    """Returns any depth video, 8 or 16 bits, to points in meters.
 
     For example: dpc prepare depth my_videos --label-from-folder --fov 70 -o own.h5
     """

@@ -23,7 +23,7 @@ _Meshes = Annotated[
 
 @dataclass(frozen=True)
 class RoomConversion(ConversionOptions):
-    """The options of every conversion, with the number of points that the published rooms have."""
+    """Holds the options of every conversion, with the number of points that the published rooms have."""
 
     points: Annotated[
         int, typer.Option("--points", min=0, help="Points per frame. Default: all of the released, 2048 of new rooms.")
@@ -36,7 +36,7 @@ class RoomConversion(ConversionOptions):
 
 @dataclass(frozen=True)
 class NewRoomOptions:
-    """The options that new rooms have and released ones ignore."""
+    """Holds the options that new rooms have and released ones ignore."""
 
     objects: Annotated[str, typer.Option("--objects", help="Numbers of objects in new rooms, each from 2 to 8.")] = (
         "8,7,6,5,4"
@@ -52,12 +52,12 @@ class NewRoomOptions:
 
 
 def ogc_dr(raw: _Raw = None, generate: _Meshes = None, *, rooms: NewRoomOptions, conversion: RoomConversion) -> None:
-    """OGC-DR: rooms of 4 to 8 objects, each moving rigidly over 4 frames; as released, or new from any meshes."""
+    """Returns OGC-DR: rooms of 4 to 8 objects, each moving rigidly over 4 frames; as released, or new from any meshes."""
     _convert_rooms("ogc-dr", raw, generate, rooms, conversion, "full")
 
 
 def ogc_drsv(raw: _Raw = None, generate: _Meshes = None, *, rooms: NewRoomOptions, conversion: RoomConversion) -> None:
-    """OGC-DRSV: OGC-DR's rooms as one depth camera sees them; as released, or new from any meshes."""
+    """Returns OGC-DRSV: OGC-DR's rooms as one depth camera sees them; as released, or new from any meshes."""
     _convert_rooms("ogc-drsv", raw, generate, rooms, conversion, "single")
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SplitOptions:
-    """The options that say how samples are divided; at most one of the three ways, else the splits of the file."""
+    """Holds the options that say how samples are divided; at most one of the three ways, else the splits of the file."""
 
     listed: Annotated[Path | None, typer.Option("--list", help="CSV: name,split. Samples not listed are left out.")] = (
         None
@@ -39,7 +39,7 @@ class SplitOptions:
     seed: Seed = 0
 
     def choice(self) -> SplitChoice:
-        """Return these options as the room takes them."""
+        """Returns these options as the room takes them."""
         from dpcli.prepare.commands.split import SplitChoice
 
         named = {

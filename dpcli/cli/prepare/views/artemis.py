@@ -17,7 +17,7 @@ from dpcli.cli.prepare.views.writing import write_views
 
 @dataclass(frozen=True)
 class AnimalOptions:
-    """The options that say which frames, cameras and points are taken of an animal."""
+    """Holds the options that say which frames, cameras and points are taken of an animal."""
 
     motion: Annotated[str, typer.Option("--motion", help="Name of the motion; without it the motions are listed.")] = ""
     frames: FramesAtMost = 32
@@ -46,7 +46,7 @@ def artemis(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """ARTEMIS (DFA): animals filmed by 36 cameras, with bones and skinned voxels as ground truth."""
+    """Returns ARTEMIS (DFA): animals filmed by 36 cameras, with bones and skinned voxels as ground truth."""
     if check:
         from dpcli.prepare.views.views_check import ArtemisIndex
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FilmingOptions:
-    """The options that say how an animated mesh is filmed."""
+    """Holds the options that say how an animated mesh is filmed."""
 
     output: FileOrPipe = ""
     size: PictureSize = 512
@@ -52,7 +52,7 @@ class FilmingOptions:
     seed: Seed = 0
 
     def filming(self, yaw: float) -> Filming:
-        """Return these options as the room takes them. yaw: the angle, degrees, where none was given.
+        """Returns these options as the room takes them. yaw: the angle, degrees, where none was given.
 
         Raises UsageError when no output was named.
         """

@@ -16,7 +16,7 @@ from dpcli.cli.prepare.views.writing import write_views
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """The options that say which frames are read and how each becomes a square picture."""
+    """Holds the options that say which frames are read and how each becomes a square picture."""
 
     frames: FramesAtMost = 32
     size: PictureSize = 512
@@ -31,7 +31,7 @@ class PictureOptions:
 
 @dataclass(frozen=True)
 class CutOutOptions:
-    """The options that tell the object from its background."""
+    """Holds the options that tell the object from its background."""
 
     background: Annotated[
         str,
@@ -54,7 +54,7 @@ class CutOutOptions:
 
 @dataclass(frozen=True)
 class OrbitOptions:
-    """The options of the filming camera and of further views."""
+    """Holds the options of the filming camera and of further views."""
 
     elevation: Annotated[float, typer.Option("--elevation", help="Elevation of the camera, degrees, up = +.")] = 0.0
     radius: Annotated[float, typer.Option("--radius", help="Distance of the cameras from the object's middle.")] = 2.0
@@ -79,7 +79,7 @@ def video(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """A clip of one object: frames with alpha, masks or a plain background; optionally further views.
+    """Returns a clip of one object: frames with alpha, masks or a plain background; optionally further views.
 
     For example: dpc prepare video fox.mp4 --background white -o fox.h5
     """
