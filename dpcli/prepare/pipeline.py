@@ -33,7 +33,7 @@ from dpcli.store.journal import sweep
 _LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Conversion:
     """Says how raw data become a file, whatever reads them; none of `jobs`, `force` and `task` changes the bytes.
 

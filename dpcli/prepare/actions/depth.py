@@ -38,7 +38,7 @@ def background_depth(depth: np.ndarray, kind: str) -> np.ndarray:
     return np.take_along_axis(ordered, np.minimum(middle, len(some) - 1)[None], axis=0)[0]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthVideos:
     """Reads anybody's depth videos.
 

@@ -35,7 +35,7 @@ _GLUED = 0.25  # of min_part: a part with fewer expected points is glued to its 
 _STUDY_KEY = 1 << 29  # keeps the generator that studies an object apart from those of items
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Articulation:
     """Says how sequences are drawn from an object; see `dpc prepare sapien --help`.
 

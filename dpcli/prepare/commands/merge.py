@@ -24,23 +24,27 @@ from dpcli.store.pipes import refuse_repeats
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Source:
-    """Holds what the index of one file says; its points stay on the disk."""
+    """Holds what the index of one file says; its points stay on the disk.
+
+    made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped, where
+    the file is a shard. prefix: what goes before its samples' names in the joined file.
+    """
 
     path: Path
     class_names: list[str]
     length_unit: str
-    seed: int
-    made_by: str
-    names: list[str]
-    labels: list[int]
-    fields: tuple[str, ...]
-    provenance: list[dict[str, Any]]
-    skipped: list[tuple[str, str]]
-    positions: tuple[list[int], list[int]] | None
-    shard: Shard | None = field(default=None)
-    prefix: str = ""  # what goes before its samples' names
+    seed: int = 0
+    made_by: str = ""
+    names: list[str] = field(default_factory=list)
+    labels: list[int] = field(default_factory=list)
+    fields: tuple[str, ...] = ()
+    provenance: list[dict[str, Any]] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    positions: tuple[list[int], list[int]] | None = None
+    shard: Shard | None = None
+    prefix: str = ""
 
     def sample_name(self, index: int) -> str:
         """Returns the sample's name in the joined file."""
@@ -57,18 +61,18 @@ def read_source(path: Path) -> Source:
         root = reader.attributes
         found = shard_of(reader.provenance[-1]) if reader.provenance else None
         return Source(
-            path,
-            reader.class_names,
-            reader.length_unit,
-            int(root.get("seed", 0)),
-            str(root.get("source", "")),
-            list(reader.names),
-            reader.labels.tolist(),
-            reader.fields,
-            reader.provenance,
-            reader.skipped,
-            read_positions(reader.file),
-            found[0] if found else None,
+            path=path,
+            class_names=reader.class_names,
+            length_unit=reader.length_unit,
+            seed=int(root.get("seed", 0)),
+            made_by=str(root.get("source", "")),
+            names=list(reader.names),
+            labels=reader.labels.tolist(),
+            fields=reader.fields,
+            provenance=reader.provenance,
+            skipped=reader.skipped,
+            positions=read_positions(reader.file),
+            shard=found[0] if found else None,
         )
 
 
@@ -212,7 +216,8 @@ def _merge_unlike(
         "sources": [source.provenance for source in sources],
     }
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
-    pattern = Source(output, class_names, sources[0].length_unit, 0, "merge", [], [], fields, [], [], None)
+    unit = sources[0].length_unit
+    pattern = Source(path=output, class_names=class_names, length_unit=unit, made_by="merge", fields=fields)
     return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
 
 

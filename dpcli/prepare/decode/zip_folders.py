@@ -17,10 +17,9 @@ from dpcli.errors import DataError
 _LOCAL = struct.Struct(
     "<4s22x2H"
 )  # the header in front of a file's own bytes: signature, lengths of name and extra field
-_ENTRY = np.dtype(
-    [("offset", "i8"), ("packed", "i8"), ("size", "i8"), ("crc", "u4"), ("method", "u2"), ("flags", "u2")]
-)
-_ENCRYPTED = 1  # bit of the flags
+_COLUMNS = {"offset": "i8", "packed": "i8", "size": "i8", "crc": "u4", "method": "u2", "flags": "u2", "name": "u2"}
+_ENTRY = np.dtype(list(_COLUMNS.items()))  # of each file; name is the length of its whole name, bytes
+_ENCRYPTED, _UTF8 = 1, 0x800  # bits of the flags
 _MOST_BYTES = 1 << 26  # of one unpacked file; a depth frame takes half a megabyte
 
 
@@ -54,8 +53,15 @@ def list_folders(path: Path) -> dict[str, ZipFolder]:
 
 
 def _folder(infos: list[zipfile.ZipInfo]) -> ZipFolder:
-    rows = [(i.header_offset, i.compress_size, i.file_size, i.CRC, i.compress_type, i.flag_bits) for i in infos]
+    rows = [
+        (i.header_offset, i.compress_size, i.file_size, i.CRC, i.compress_type, i.flag_bits, _name_length(i))
+        for i in infos
+    ]
     return ZipFolder(tuple(info.filename.rpartition("/")[2] for info in infos), np.array(rows, _ENTRY))
+
+
+def _name_length(info: zipfile.ZipInfo) -> int:
+    return len(info.orig_filename.encode("utf-8" if info.flag_bits & _UTF8 else "cp437"))
 
 
 def read_files(path: Path, folder: ZipFolder) -> Iterator[tuple[str, bytes]]:
@@ -69,7 +75,7 @@ def read_files(path: Path, folder: ZipFolder) -> Iterator[tuple[str, bytes]]:
 
 
 def _content(
-    file: BinaryIO, where: str, offset: int, packed: int, size: int, crc: int, method: int, flags: int
+    file: BinaryIO, where: str, offset: int, packed: int, size: int, crc: int, method: int, flags: int, name: int
 ) -> bytes:
     if flags & _ENCRYPTED:
         raise DataError(f"{where}: encrypted; unpack the archive with its password first")
@@ -81,7 +87,7 @@ def _content(
         raise DataError(f"{where}: takes {max(size, packed)} bytes; expected less than {_MOST_BYTES}")
     file.seek(max(offset, 0))
     header = file.read(_LOCAL.size)
-    if offset < 0 or len(header) < _LOCAL.size or not header.startswith(b"PK\x03\x04"):
+    if offset < 0 or len(header) < _LOCAL.size or header[:4] != b"PK\x03\x04" or _LOCAL.unpack(header)[1] != name:
         raise DataError(f"{where}: its data are not where the ZIP's directory says; the archive is damaged")
     file.seek(sum(_LOCAL.unpack(header)[1:]), 1)
     data = file.read(packed)

@@ -26,7 +26,7 @@ _CHUNK = 4  # frames that a worker gets at a time: the mesh travels with them
 _STILL = 1e-3  # of the object's radius: what moves less than this is no motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Filming:
     """Says how an animated mesh is filmed. Angles in degrees; the reference camera stands at azimuth 0.
 

@@ -36,7 +36,7 @@ TEST_AZIMUTHS = (15.0, -75.0, 105.0, 195.0)  # of the usual video-to-4D benchmar
 _INSIDE = 0.7  # of the true tracks have to fall on the object; else cameras and bones disagree
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ArtemisOptions:
     """Says what is taken of an animal. Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number."""
 

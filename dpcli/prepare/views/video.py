@@ -25,7 +25,7 @@ _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen th
 _NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class VideoOptions:
     """Says how a clip is read. Angles in degrees here, as typed; `frames` 0 keeps all; `views` is a multi-view folder."""
 

@@ -138,14 +138,6 @@ def test_the_index_agrees_with_zipfile(tmp_path, names, stored, folders_listed, 
     assert contents == expected
 
 
-def test_a_comment_that_looks_like_a_directory(tmp_path):
-    path = write_zip(tmp_path / "a.zip", ntu_files(ONE, person(0)))
-    whole = path.read_bytes()
-    comment = b"PK\x05\x06" + bytes(26)
-    path.write_bytes(whole[:-2] + len(comment).to_bytes(2, "little") + comment)
-    assert only(NTU60((path,))).sequence.num_frames == 2
-
-
 def test_zip64_archives(tmp_path, monkeypatch):
     monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
     monkeypatch.setattr(zipfile, "ZIP_FILECOUNT_LIMIT", 2)
@@ -201,12 +193,12 @@ def test_directory_bytes_that_lie_are_refused(tmp_path):
     whole = bytearray(write_zip(tmp_path / "a.zip", ntu_files(ONE, person(0))).read_bytes())
     directory = whole.index(b"PK\x01\x02")
     second = whole.index(b"PK\x01\x02", directory + 4)
-    for at, value, message in ((second, 0, "directory is damaged"), (second + 28, 0xFF, "damaged|ends in the middle")):
+    for at, value, message in ((second, 0, "directory is damaged"), (second + 28, 0xFF, "the archive is damaged")):
         broken = bytearray(whole)
         broken[at] = value
         (tmp_path / "a.zip").write_bytes(broken)
         with pytest.raises(DataError, match=message):
-            NTU60((tmp_path / "a.zip",)).items()
+            only(NTU60((tmp_path / "a.zip",)))
     broken = bytearray(whole)
     broken[directory + 8] |= 1
     (tmp_path / "a.zip").write_bytes(broken)
