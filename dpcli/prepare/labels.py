@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.object_splits import SPLIT_FOLDERS
-from dpcli.prepare.reader import Item
+from dpcli.prepare.reader import SPLIT_FOLDERS, Item
 
 _COLUMNS = ("name", "label", "subject", "split")
 

@@ -13,6 +13,9 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.store import CloudSequence
 
+SPLITS = ("train", "validation", "test")
+SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # split of a folder that people call so
+
 
 @dataclass(frozen=True)
 class Item:

@@ -70,21 +70,21 @@ def _row(table: dict[str, Any], path: Path) -> Row:
     paths = tuple(table["path"]) if isinstance(table["path"], list) else (table["path"],)
     each = table.get("each")
     if each is not None:
-        wanted = len(expand(paths[0]))
+        wanted = len(expand_braces(paths[0]))
         each = tuple(each) if isinstance(each, list) else (each,) * wanted
         if len(each) != wanted:
             raise DataError(f"{path}: each has {len(each)} numbers, but {paths[0]} names {wanted} paths")
-    count = _span(table["count"]) if "count" in table else None
-    size = _span(table["bytes"]) if "bytes" in table else (1, float("inf"))
+    count = _bounds(table["count"]) if "count" in table else None
+    size = _bounds(table["bytes"]) if "bytes" in table else (1, float("inf"))
     optional, instead_of = bool(table.get("optional", False)), table.get("instead_of", "")
     return Row(paths, table.get("what", paths[0]), count, each, size, optional, instead_of)
 
 
-def _span(value: int | list[int]) -> tuple[float, float]:
+def _bounds(value: int | list[int]) -> tuple[float, float]:
     return (value[0], value[1]) if isinstance(value, list) else (value, value)
 
 
-def expand(pattern: str) -> list[str]:
+def expand_braces(pattern: str) -> list[str]:
     """Returns `a{00..02}/{x,y}` as a00/x, a00/y, a01/x, ...; without braces the pattern itself."""
     match = re.search(r"\{([^{}]*)\}", pattern)
     if not match:
@@ -95,7 +95,7 @@ def expand(pattern: str) -> list[str]:
         words = [f"{n:0{width}}" for n in range(int(numbers[1]), int(numbers[2]) + 1)]
     else:
         words = match[1].split(",")
-    return [one for word in words for one in expand(pattern[: match.start()] + word + pattern[match.end() :])]
+    return [one for word in words for one in expand_braces(pattern[: match.start()] + word + pattern[match.end() :])]
 
 
 class Tree:
@@ -115,7 +115,7 @@ class Tree:
         """Returns files that fit a pattern: * and ? within a name, ** over folders (none, too)."""
         if not any(sign in pattern for sign in "*?"):
             return [pattern] if pattern in self.files else []
-        fits = re.compile(_expression(pattern)).fullmatch
+        fits = re.compile(_pattern_to_regex(pattern)).fullmatch
         return sorted(name for name in self.files if fits(name))
 
 
@@ -138,7 +138,7 @@ def _walk(folder: Path, prefix: str) -> Iterator[tuple[str, int]]:
                     yield name, -1
 
 
-def _expression(pattern: str) -> str:
+def _pattern_to_regex(pattern: str) -> str:
     pieces = []
     for piece in pattern.split("/"):
         if piece == "**":
@@ -158,7 +158,7 @@ def check_row(row: Row, tree: Tree) -> tuple[list[str], str, int]:
 
 def _check_path(row: Row, pattern: str, tree: Tree) -> tuple[list[str], str, int]:
     faults, total, wrong = [], 0, []
-    paths = expand(pattern)
+    paths = expand_braces(pattern)
     for number, path in enumerate(paths):
         names = tree.find(path)
         total += len(names)
@@ -168,14 +168,14 @@ def _check_path(row: Row, pattern: str, tree: Tree) -> tuple[list[str], str, int
         elif not names and row.count is None:
             faults.append(f"{path}: missing")
     if row.count is not None and not row.count[0] <= total <= row.count[1]:
-        faults.append(f"{pattern}: {total} files, expected {_words(row.count)}")
+        faults.append(f"{pattern}: {total} files, expected {_bounds_in_words(row.count)}")
     for name in wrong:
         size = "a link to nowhere" if tree.files[name] < 0 else f"{tree.files[name]} bytes"
-        faults.append(f"{name}: {size}, expected {_words(row.bytes)} bytes")
+        faults.append(f"{name}: {size}, expected {_bounds_in_words(row.bytes)} bytes")
     return faults, f"{total} files {pattern}", total
 
 
-def _words(span: tuple[float, float]) -> str:
+def _bounds_in_words(span: tuple[float, float]) -> str:
     low, high = span
     if low == high:
         return f"{low:.0f}"
@@ -185,7 +185,7 @@ def _words(span: tuple[float, float]) -> str:
 def check_rows(rows: list[Row], tree: Tree) -> tuple[list[str], list[str]]:
     """Returns (lines for the user, faults that are errors) of all rows."""
     results = {row.what: (row, *check_row(row, tree)) for row in rows}
-    replaced = {_worse(results[row.instead_of], results[row.what]) for row in rows if row.instead_of}
+    replaced = {_name_of_less_useful(results[row.instead_of], results[row.what]) for row in rows if row.instead_of}
     lines, errors = [], []
     for what, (row, faults, found, _) in results.items():
         if not faults:
@@ -201,7 +201,7 @@ def check_rows(rows: list[Row], tree: Tree) -> tuple[list[str], list[str]]:
     return lines, errors
 
 
-def _worse(one: tuple[Row, list[str], str, int], other: tuple[Row, list[str], str, int]) -> str:
+def _name_of_less_useful(one: tuple[Row, list[str], str, int], other: tuple[Row, list[str], str, int]) -> str:
     """Returns the which of two rows need not be told, as the other suffices or is nearer to what is there."""
     return max(other, one, key=lambda it: (bool(it[1]), it[3] == 0, len(it[1])))[0].what
 

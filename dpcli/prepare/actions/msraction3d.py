@@ -46,7 +46,7 @@ ABSENT = (
 )
 
 
-def published() -> list[str]:
+def published_names() -> list[str]:
     """Names ``aAA_sSS_eEE`` of the 567 videos that the authors published (of 20 x 10 x 3 recorded)."""
     every = [(a, s, e) for a in range(1, 21) for s in range(1, 11) for e in range(1, 4)]
     return [f"a{a:02}_s{s:02}_e{e:02}" for a, s, e in every if not {(a, s, e), (a, s, 0)} & set(ABSENT)]
@@ -193,7 +193,7 @@ class MSRAction3D:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        expected, names = published(), {item.name for item in items}
+        expected, names = published_names(), {item.name for item in items}
         lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
         train = {name for name in expected if int(name[5:7]) in self.train_subjects}
         for split, wanted in (("train", train), ("test", set(expected) - train)):

@@ -106,10 +106,22 @@ def named_intrinsics(text: str) -> Intrinsics:
     return Intrinsics.from_json(Path(text))
 
 
-def split_of(protocol: str, subject: int, camera: int) -> str:
-    """Returns ``train`` or ``test`` under cross-subject (xsub) or cross-view (xview)."""
-    train = subject in TRAIN_SUBJECTS if protocol == "xsub" else camera in TRAIN_CAMERAS
-    return "train" if train else "test"
+def cross_subject_split(subject: int) -> str:
+    """Returns ``train`` or ``test`` of a video under the cross-subject protocol (xsub): 20 of the 40 subjects train.
+
+    >>> cross_subject_split(1), cross_subject_split(3)
+    ('train', 'test')
+    """
+    return "train" if subject in TRAIN_SUBJECTS else "test"
+
+
+def cross_view_split(camera: int) -> str:
+    """Returns ``train`` or ``test`` of a video under the cross-view protocol (xview): cameras 2 and 3 train.
+
+    >>> [cross_view_split(camera) for camera in (1, 2, 3)]
+    ['test', 'train', 'train']
+    """
+    return "train" if camera in TRAIN_CAMERAS else "test"
 
 
 def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
@@ -124,7 +136,7 @@ def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
     return Item(
         name,
         path,
-        split_of(protocol, subject, camera),
+        split=cross_subject_split(subject) if protocol == "xsub" else cross_view_split(camera),
         label=action - 1,
         subject=subject,
         camera=camera,

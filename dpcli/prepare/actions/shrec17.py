@@ -53,7 +53,7 @@ def largest_component(mask: np.ndarray) -> np.ndarray:
     return mask if len(areas) < 2 else (labels == areas.argmax()).astype(np.uint8)
 
 
-def hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.ndarray:
+def keep_only_hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.ndarray:
     """Returns a cropped depth frame (H,W) u8 or u16 with all but the hand set to 0 (PointLSTM's preprocessing).
 
     Median blur; depth > 0 closed by a ``close`` x ``close`` square; of that the largest component; of that the pixels
@@ -111,7 +111,9 @@ class Shrec17:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         lists = find_lists(self.raw)
         root = lists[0].path.parent
-        items = {item.name: item if item.problem else _checked(item) for item in listed_items(lists, self.labels)}
+        items = {
+            item.name: item if item.problem else _with_folder_problem(item) for item in listed_items(lists, self.labels)
+        }
         listed = {item.path for item in items.values()}
         for folder in sorted(root.glob("gesture_*/finger_*/subject_*/essai_*")):
             if folder not in listed:
@@ -126,14 +128,14 @@ class Shrec17:
         clouds, cut = [], 0
         for k, path in enumerate(frames):
             depth = decode_depth_png(path.read_bytes(), str(path), (WIDTH, HEIGHT), bits=(8, 16))
-            x, y, right, bottom = _inside(regions[k]) if self.bbox else (0, 0, WIDTH, HEIGHT)
+            x, y, right, bottom = _clip_to_image(regions[k]) if self.bbox else (0, 0, WIDTH, HEIGHT)
             cut += bool(self.bbox and [x, y, right - x, bottom - y] != regions[k].tolist())
             clouds.append(self._points(depth, x, y, right, bottom))
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
         kept, dropped = drop_empty_frames(str(item.path), counts)
         if cut:
             notes["hand regions cut at the edge of the image"] = cut
-        seconds = _seconds(ticks, len(frames))
+        seconds = _frame_seconds(ticks, len(frames))
         if seconds is None:
             seconds = np.arange(len(frames)) / FPS
             notes["sequences without usable timestamps (30 frames/s assumed)"] = 1
@@ -170,7 +172,7 @@ class Shrec17:
             return np.zeros((0, 3), np.float32)
         region = np.ascontiguousarray(depth[y:bottom, x:right])
         if self.foreground == "component":
-            region = hand(region, self.median, self.close)
+            region = keep_only_hand(region, self.median, self.close)
         elif self.median:
             region = load_cv2().medianBlur(region, self.median)
         if self.coordinates == "camera":
@@ -188,7 +190,7 @@ class Shrec17:
         ]
 
 
-def _checked(item: Item) -> Item:
+def _with_folder_problem(item: Item) -> Item:
     """Returns the item, with a problem when its folder is missing or a link out of the data."""
     root, problem = item.extra["root"], ""
     if not item.path.is_dir():
@@ -198,13 +200,13 @@ def _checked(item: Item) -> Item:
     return replace(item, problem=problem) if problem else item
 
 
-def _inside(region: np.ndarray) -> tuple[int, int, int, int]:
+def _clip_to_image(region: np.ndarray) -> tuple[int, int, int, int]:
     """Returns left, top, right, bottom of what lies in the image of x, y, width, height; nothing when right <= left."""
     x, y, width, height = (int(v) for v in region)
     return max(x, 0), max(y, 0), min(x + width, WIDTH), min(y + height, HEIGHT)
 
 
-def _seconds(ticks: np.ndarray, frames: int) -> np.ndarray | None:
+def _frame_seconds(ticks: np.ndarray, frames: int) -> np.ndarray | None:
     """Returns timestamps of the frames as seconds from the first; None where they are too few or don't rise."""
     if len(ticks) < frames or (np.diff(ticks[:frames]) <= 0).any():
         return None

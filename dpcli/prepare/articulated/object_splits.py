@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dpcli.errors import UsageError
+from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.seeds import generator
 
-SPLITS = ("train", "validation", "test")
-SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # what people call them
 _SPLIT_KEY = 1 << 28  # keeps the generator of the splits apart from those of items
 
 

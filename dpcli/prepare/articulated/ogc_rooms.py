@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.ogc_layout import RoomMotion, draw_layout
 from dpcli.prepare.articulated.ogc_meshes import Shape, areas, find_meshes, load_shape
 from dpcli.prepare.decode.open3d_import import load_open3d
 from dpcli.prepare.meshes.raycast import pixel_rays
 from dpcli.prepare.meshes.surface_points import SurfacePoints, choose_on_surface, points_on
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe
 from dpcli.store import CloudSequence
 
 POINTS = 2048
@@ -160,7 +160,7 @@ def seen_by_camera(triangles: np.ndarray) -> SurfacePoints:
 
 def _first_hits(triangles: np.ndarray, rays: np.ndarray) -> SurfacePoints:
     open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelizm
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
     corners = open3d.core.Tensor(triangles.reshape(-1, 3).astype(np.float32))
     scene.add_triangles(corners, open3d.core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)))
     hits = scene.cast_rays(open3d.core.Tensor(rays))

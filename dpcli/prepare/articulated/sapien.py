@@ -14,9 +14,9 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
-from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
-from dpcli.prepare.reader import Item, Sample, describe, natural_key
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe, natural_key
 
 _EXPECTED = "a .urdf file, or a folder of objects, each a folder with a mobility.urdf or another .urdf"
 

@@ -13,10 +13,10 @@ import numpy as np
 from dpcli.errors import UsageError
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
-from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.procedural_kinds import KINDS
 from dpcli.prepare.articulated.solids import Builder
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe
 from dpcli.runtime.seeds import generator
 
 _OBJECT_KEY = 1 << 30  # keeps the generators of objects apart from those of items

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dpcli.prepare.cluster import cluster_executor
+from dpcli.prepare.dask_cluster import cluster_executor
 from dpcli.prepare.pipeline import Conversion, Report, convert
 from dpcli.prepare.reader import Reader
 from dpcli.store.pipes import output_file

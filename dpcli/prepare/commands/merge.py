@@ -150,7 +150,7 @@ def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool
     first = next(source for source in sources if source.names)
     samples = [(*places[place], None) for place in sorted(places)]
     skipped, compression = [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none"))
-    return _write(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
+    return _copy_samples(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
 
 
 def _whole_entry(sources: list[Source]) -> dict[str, Any]:
@@ -160,7 +160,7 @@ def _whole_entry(sources: list[Source]) -> dict[str, Any]:
     for source, entry in zip(sources, entries):
         different = [key for key in ("config", "seed", "version") if entry.get(key) != entries[0].get(key)]
         if different or source.shard.count != first.shard.count:  # type: ignore[union-attr]
-            what = _difference(entries[0], entry) if different else f"{first.shard} and {source.shard}"
+            what = _differing_facts(entries[0], entry) if different else f"{first.shard} and {source.shard}"
             raise UsageError(f"{source.path}: is a shard of another conversion than {first.path} ({what})")
     count, seen = first.shard.count, {}  # type: ignore[union-attr]
     for source in sources:
@@ -177,7 +177,7 @@ def _whole_entry(sources: list[Source]) -> dict[str, Any]:
     return entries[0]
 
 
-def _difference(one: dict[str, Any], other: dict[str, Any]) -> str:
+def _differing_facts(one: dict[str, Any], other: dict[str, Any]) -> str:
     flat = [
         {**entry.get("config", {}), "seed": entry.get("seed"), "version": entry.get("version")}
         for entry in (one, other)
@@ -218,7 +218,7 @@ def _merge_unlike(
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
     unit = sources[0].length_unit
     pattern = Source(path=output, class_names=class_names, length_unit=unit, made_by="merge", fields=fields)
-    return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
+    return _copy_samples(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
 
 
 def _refuse_equal_names(sources: list[Source]) -> None:
@@ -234,7 +234,7 @@ def _refuse_equal_names(sources: list[Source]) -> None:
             seen[own] = source.path
 
 
-def _write(
+def _copy_samples(
     output: Path,
     entry: dict[str, Any],
     pattern: Source,
@@ -273,7 +273,7 @@ def _write(
             done = copied_before(writer, [source.sample_name(index) for source, index, _ in samples])
             bar.skip(done)
             for source, index, label in samples[done:]:
-                sequence = _relabeled(files.read(source.path, index), source, pattern, label)
+                sequence = _relabel(files.read(source.path, index), source, pattern, label)
                 writer.write(sequence)
                 bar.advance(1, frames=sequence.num_frames)
                 stop.check(f"{len(writer)} of {len(samples)} samples are kept")
@@ -300,7 +300,7 @@ def copied_before(writer: CloudsWriter, names: list[str]) -> int:
     return done
 
 
-def _relabeled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
+def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
     """Returns the sample as the joined file has it: its label, its name, and no field that others lack."""
     if label is not None:
         sequence.label = label

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.articulated.object_splits import SPLITS
 from dpcli.prepare.commands.merge import Source, copied_before, read_source
 from dpcli.prepare.pipeline import already_complete
+from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import generator
@@ -56,21 +56,21 @@ class SplitChoice:
         Raises DataError when the file lacks what is asked for.
         """
         if self.listed is not None:
-            return by_list(source, self.listed)
+            return splits_by_list(source, self.listed)
         if self.subjects is not None:
-            return by_subject(source, subjects, self.subjects)
+            return splits_by_subject(source, subjects, self.subjects)
         if self.fractions is not None:
             if self.by_subject and min(subjects) < 0:
                 raise DataError(f"{source.path}: subjects are not known of all samples; leave --by-subject out")
             groups = list(subjects) if self.by_subject else list(range(len(splits)))
             strata = source.labels if self.stratify and not self.by_subject else [0] * len(splits)
-            return by_fraction(groups, strata, self.fractions, self.seed)
+            return draw_splits(groups, strata, self.fractions, self.seed)
         if not any(splits):
             raise DataError(f"{source.path}: tells no splits; choose --list, --subjects or --fractions")
         return list(splits)
 
 
-def by_list(source: Source, path: Path) -> list[str]:
+def splits_by_list(source: Source, path: Path) -> list[str]:
     """Returns splits from a CSV of name,split, with or without that header; names of samples that are not there are an
     error.
     """
@@ -93,7 +93,7 @@ def by_list(source: Source, path: Path) -> list[str]:
     return [chosen.get(name, "") for name in source.names]
 
 
-def by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[int, ...]]) -> list[str]:
+def splits_by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[int, ...]]) -> list[str]:
     """Returns the named subjects' splits, test for the others.
 
     Raises DataError for an unknown subject, UsageError for two splits.
@@ -111,7 +111,7 @@ def by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[
     return [where.get(subject, "test") for subject in subjects]
 
 
-def by_fraction(
+def draw_splits(
     groups: Sequence[int], strata: Sequence[int], fractions: tuple[float, float, float], seed: int
 ) -> list[str]:
     """Draws a split per sample: equal `groups` stay together, each of `strata` is divided in these fractions.

@@ -15,7 +15,7 @@ def choose_points(mesh: AnimatedMesh, count: int, rng: np.random.Generator) -> S
     return choose_on_surface(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, count, rng)
 
 
-def carry(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
+def track_points(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
     """Returns where the points are at every frame, f32 (T,M,3): on the very triangles that are drawn."""
     corners = mesh.triangles[points.triangle]
     return np.einsum("mk,tmka->tma", points.weights, mesh.positions[:, corners]).astype(np.float32)
@@ -55,7 +55,7 @@ def rigid_parts(
         if not len(points):
             group[index] = above
             continue
-        gaps = [gap(motion[:, index], motion[:, other], points) for other in found]
+        gaps = [motion_distance(motion[:, index], motion[:, other], points) for other in found]
         near = found[int(np.argmin(gaps))] if gaps and min(gaps) <= tolerance else index
         group[index] = above if above >= 0 and gaps[found.index(above)] <= tolerance else near
         found += [index] if group[index] == index else []
@@ -66,11 +66,11 @@ def rigid_parts(
             return np.searchsorted(ids, part).astype(np.int16)
         least = ids[counts.argmin()]
         points, rest = first[part == least], [other for other in ids if other != least]
-        gaps = [gap(motion[:, least], motion[:, other], points) for other in rest]
+        gaps = [motion_distance(motion[:, least], motion[:, other], points) for other in rest]
         part[part == least] = rest[int(np.argmin(gaps))]
 
 
-def gap(one: np.ndarray, other: np.ndarray, points: np.ndarray) -> float:
+def motion_distance(one: np.ndarray, other: np.ndarray, points: np.ndarray) -> float:
     """Returns how far apart two motions (T,4,4) carry points (N,3): root mean square over the points, largest over time."""
     difference = one - other
     apart = points @ difference[:, :3, :3].transpose(0, 2, 1) + difference[:, None, :3, 3]

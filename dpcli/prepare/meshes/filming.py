@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
-from dpcli.prepare.meshes.bone_parts import carry, choose_points, heaviest_bones, rigid_parts
+from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, rigid_parts, track_points
 from dpcli.prepare.meshes.raycast import FrameCaster
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
@@ -103,7 +103,7 @@ def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | Non
     if not filming.tracks:
         return None, None
     points = choose_points(mesh, filming.tracks, generator(filming.seed))
-    track, bone = carry(mesh, points), heaviest_bones(mesh, points)
+    track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
     smallest = int(np.ceil(filming.min_part * filming.tracks))
     tolerance = filming.part_tolerance * OBJECT_RADIUS
     part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(np.float64), tolerance, smallest)

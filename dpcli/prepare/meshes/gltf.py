@@ -1,6 +1,7 @@
 """The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and 4).
 
-The container is JSON beside a block of bytes, so the standard library reads it; see `gltf_scene` for what it means.
+The container is JSON beside a block of bytes, so the standard library reads it; `gltf_nodes` and
+`gltf_mesh` say what it means.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ class FrameCaster:
         self.positions, self.normals = mesh.positions[frame], mesh.normals[frame]
         open3d = load_open3d()
         self._tensor = open3d.core.Tensor
-        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelizm
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
         self._scene.add_triangles(
             self._tensor(np.ascontiguousarray(self.positions, np.float32)),
             self._tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),

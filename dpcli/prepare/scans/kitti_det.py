@@ -16,10 +16,10 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
-    oriented,
+    missing_files_problem,
+    orient_points,
     read_calibration,
     read_velodyne,
-    require_files,
     training_folder,
 )
 from dpcli.store import CloudSequence
@@ -141,7 +141,7 @@ class KittiDetection:
                 name,
                 folder,
                 split=split.get(name, ""),
-                problem=require_files([folder / key / f"{name}{end}" for key, end in _FILES.items()])
+                problem=missing_files_problem([folder / key / f"{name}{end}" for key, end in _FILES.items()])
                 if name in present
                 else f"{folder / 'velodyne' / name}.bin: listed ({split[name]}), but not there",
             )
@@ -179,7 +179,7 @@ class KittiDetection:
             "scans without an object": int(not part.any()),
             "boxes without a point": len(boxes) - len(np.unique(part[part > 0])),
         }
-        cloud = oriented(points, self.coordinates)
+        cloud = orient_points(points, self.coordinates)
         sequence = CloudSequence.from_frames(item.name, [cloud], part=[part], **describe(item))
         return Sample(sequence, {what: count for what, count in notes.items() if count})
 

@@ -22,7 +22,7 @@ def check_coordinates(name: str) -> None:
         raise UsageError(f"--coordinates {name}: expected {' or '.join(COORDINATES)}")
 
 
-def oriented(points: np.ndarray, coordinates: str) -> np.ndarray:
+def orient_points(points: np.ndarray, coordinates: str) -> np.ndarray:
     """Returns camera points (N,3) (x right, y down, z forward) as f32; ``published``: x left, y up, z forward, a half
     turn.
     """
@@ -41,7 +41,7 @@ def training_folder(raw: Path, holds: str) -> Path:
     raise DataError(f"{raw}: no training/{holds}/ in it; expected the folders of KITTI's archives, unpacked together")
 
 
-def require_files(paths: list[Path]) -> str:
+def missing_files_problem(paths: list[Path]) -> str:
     """Returns the problem of an item whose files are not all there; "" when they are."""
     missing = [path for path in paths if not path.is_file()]
     more = f" and {len(missing) - 1} more files of this scene" if len(missing) > 1 else ""
@@ -146,7 +146,7 @@ class View:
         return points[inside], ahead[inside]
 
 
-def compressed(ids: np.ndarray) -> np.ndarray:
+def renumber_objects(ids: np.ndarray) -> np.ndarray:
     """Renumbers object ids (N), 0 = background, as i16 (N): 0 stays, the others become 1, 2, ... in rising order."""
     known = np.unique(ids[ids > 0])
     return np.where(ids > 0, np.searchsorted(known, ids) + 1, 0).astype(np.int16)

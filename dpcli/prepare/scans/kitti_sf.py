@@ -13,11 +13,11 @@ from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
-    compressed,
-    oriented,
+    missing_files_problem,
+    orient_points,
     read_calibration,
     read_png,
-    require_files,
+    renumber_objects,
     training_folder,
 )
 from dpcli.store import CloudSequence
@@ -134,7 +134,7 @@ class KittiSceneFlow:
                 name,
                 folder,
                 split="train" if int(name) < TRAIN_SCENES else "test",
-                problem=require_files(list(self._files(folder, name).values())),
+                problem=missing_files_problem(list(self._files(folder, name).values())),
             )
             for name in names
         ]
@@ -162,7 +162,7 @@ class KittiSceneFlow:
         if not len(pair.pixel):
             raise DataError(f"{files['flow_occ']}: no pixel has flow and both disparities nearer than {self.far} m")
         part = self._parts(files[self.labels], size, pair.pixel)
-        first, second = (oriented(points, self.coordinates) for points in (pair.first, pair.second))
+        first, second = (orient_points(points, self.coordinates) for points in (pair.first, pair.second))
         flows = [second - first, first - second]
         sequence = CloudSequence.from_frames(
             item.name, [first, second], part=[part, part], scene_flow=flows, **describe(item)
@@ -174,7 +174,7 @@ class KittiSceneFlow:
         ids = read_png(path, 1, size, bits=(8, 16))[pixel[:, 0], pixel[:, 1]].astype(np.int64)
         if self.labels == "instance":
             ids[~np.isin(ids // 256, class_numbers(self.objects))] = 0
-        return compressed(ids)
+        return renumber_objects(ids)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

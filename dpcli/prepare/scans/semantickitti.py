@@ -16,10 +16,10 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
-    compressed,
-    oriented,
+    orient_points,
     read_calibration,
     read_velodyne,
+    renumber_objects,
 )
 from dpcli.store import CloudSequence
 
@@ -149,11 +149,11 @@ class SemanticKitti:
         kept = [self._scan(item.path, name, to_camera, projection) for name in item.extra["scans"]]
         motions = self._alignment(item)
         clouds = [
-            oriented(points @ m[:3, :3].T + m[:3, 3], self.coordinates)
+            orient_points(points @ m[:3, :3].T + m[:3, 3], self.coordinates)
             for (points, _), m in zip(kept, motions, strict=True)
         ]
         sizes = np.cumsum([len(ids) for _, ids in kept])[:-1]
-        part = compressed(np.concatenate([ids for _, ids in kept]))  # over all frames: an object keeps its number
+        part = renumber_objects(np.concatenate([ids for _, ids in kept]))  # over all frames: an object keeps its number
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))

@@ -53,7 +53,7 @@ def shape_distance(points: np.ndarray, shape: Shape) -> np.ndarray:
     return gap * shape.flat
 
 
-def field(points: np.ndarray, shapes: list[Shape]) -> np.ndarray:
+def smooth_union(points: np.ndarray, shapes: list[Shape]) -> np.ndarray:
     """Returns the smooth union of shapes, -k log sum exp(-d / k); negative inside."""
     total = sum(np.exp(-np.maximum(shape_distance(points, shape), -0.3) / _SMOOTH) for shape in shapes)
     return -_SMOOTH * np.log(np.maximum(total, 1e-300))
@@ -130,7 +130,7 @@ def _eye(animal: Creature, bone: int, center: np.ndarray, direction: np.ndarray,
     """Returns a dark ball with a glint, half sunk into the head where the direction leaves it."""
     direction = direction / np.linalg.norm(direction)
     along = np.linspace(0, 0.3, 301)
-    inside = field(center + along[:, None] * direction, animal.shapes) < 0
+    inside = smooth_union(center + along[:, None] * direction, animal.shapes) < 0
     place = center + (along[int(np.argmin(inside))] - 0.3 * radius) * direction
     side = np.stack(np.meshgrid(*[np.linspace(-1.3, 1.3, 14)] * 3, indexing="ij"), axis=-1)
     unit, triangles = surface_nets(np.linalg.norm(side, axis=-1) - 1)

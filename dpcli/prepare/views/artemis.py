@@ -23,10 +23,10 @@ from dpcli.prepare.views.artemis_files import (
     read_poses,
     read_skin,
 )
-from dpcli.prepare.views.matting import clean, read_mask
+from dpcli.prepare.views.matting import clear_invisible, read_mask
 from dpcli.prepare.views.orbit_world import bounding_sphere, into_orbit, sphere_of_silhouettes, up_direction
 from dpcli.prepare.views.square_crop import Box, crop_around, touches_border, union, visible_box
-from dpcli.prepare.views.video import spread
+from dpcli.prepare.views.video import spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
@@ -98,7 +98,7 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
         log.warn(
             f"{animal}: {len(motion.folders)} of the {declared} frames of {motion.name} are there; is the copy whole?"
         )
-    frames = [list(motion.folders)[row] for row in spread(len(motion.folders), options.frames)]
+    frames = [list(motion.folders)[row] for row in spread_frames(len(motion.folders), options.frames)]
     reference = _pick_reference(motion, frames[0], rig, options.reference)
     skin = _sampled_skin(animal, options) if options.tracks and has_skin(animal) else None
     track = None if skin is None else _tracks(animal, motion, frames, skin)
@@ -110,7 +110,7 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
     test = _choose(motion, frames[0], poses, reference, options)
     roles = ["reference", *["test"] * len(test), *["train"] * len(options.train_cameras)]
     views = [reference, *test, *options.train_cameras]
-    frames, boxes = _survey(motion, frames, views, options.on_error)
+    frames, boxes = _plan_clip(motion, frames, views, options.on_error)
     crops = [crop_around(box, options.border) for box in boxes]
     if track is not None:
         track = _tracks(animal, motion, frames, skin)
@@ -248,10 +248,10 @@ def _picture(motion: Motion, frame: int, camera: int) -> np.ndarray:
     if color.shape[:2] != alpha.shape:
         here, there = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, color.shape))
         raise DataError(f"{motion.alpha(frame, camera)}: {here}, its picture is {there}; expected the same size")
-    return clean(np.dstack([color[..., :3], alpha]))
+    return clear_invisible(np.dstack([color[..., :3], alpha]))
 
 
-def _survey(motion: Motion, frames: list[int], views: list[int], on_error: str) -> tuple[list[int], list[Box]]:
+def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: str) -> tuple[list[int], list[Box]]:
     """Returns frames that are whole in all chosen cameras, and the object's box over them in each."""
     good, boxes, cut_off = [], [], []
     for frame in frames:

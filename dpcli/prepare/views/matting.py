@@ -129,7 +129,7 @@ def key_out(
     alpha, color = inside.astype(np.float32), rgb.copy()
     if core.any() and rim.any():
         _soften(alpha, color, core, rim, np.asarray(background, np.float32), 255 * tolerance)
-    return clean(np.dstack([color, np.round(255 * alpha).astype(np.uint8)])), int(gaps.sum())
+    return clear_invisible(np.dstack([color, np.round(255 * alpha).astype(np.uint8)])), int(gaps.sum())
 
 
 def _difference(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -201,12 +201,12 @@ def cut_alone(rgba: np.ndarray, name: str, background: str, tolerance: float, ho
     if background == "keep":
         return opaque(rgba)
     if (rgba[..., 3] < 255).any():
-        return clean(rgba)
+        return clear_invisible(rgba)
     color = background_color([border_pixels(rgba[..., :3])], [name], background, tolerance)
     return key_out(rgba[..., :3], color, tolerance, holes)[0]
 
 
-def clean(rgba: np.ndarray) -> np.ndarray:
+def clear_invisible(rgba: np.ndarray) -> np.ndarray:
     """Clears faint alpha to 0, and the color nobody sees to black: equal objects give equal bytes."""
     return rgba * (rgba[..., 3:] >= FAINT)
 
@@ -223,7 +223,7 @@ def with_mask(rgba: np.ndarray, mask: Path, name: str) -> np.ndarray:
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     if (border > 127).mean() > 0.9 and (alpha <= 127).any():
         raise DataError(f"{mask}: the mask covers the whole border: inverted? White (255) has to be the object")
-    return clean(np.dstack([rgba[..., :3], alpha]))
+    return clear_invisible(np.dstack([rgba[..., :3], alpha]))
 
 
 def read_mask(path: Path) -> np.ndarray:

@@ -17,7 +17,7 @@ from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes
 from dpcli.prepare.views.square_crop import Box, union, visible_box, whole_picture
-from dpcli.prepare.views.video import VideoOptions, spread
+from dpcli.prepare.views.video import VideoOptions, spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
@@ -67,7 +67,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     """
     _check(options)
     views, times = _grid(path)
-    seconds, chosen = _seconds(times, options.fps), spread(len(times), options.frames)
+    seconds, chosen = _seconds(times, options.fps), spread_frames(len(times), options.frames)
     times = [times[index] for index in chosen]
     boxes, sizes = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([_intrinsics(view, *size) for view, size in zip(views, sizes, strict=True)])

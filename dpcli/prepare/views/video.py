@@ -80,7 +80,7 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     """
     options.check()
     frames = open_frames(path)
-    cutter, wanted, crop, size = _survey(frames, options)
+    cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
     header = ViewsHeader(
@@ -150,12 +150,12 @@ class Cutter:
             elif self.mode == "keep":
                 yield matting.opaque(frame)
             else:
-                yield matting.clean(frame)
+                yield matting.clear_invisible(frame)
 
 
-def _survey(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
+def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
     """Returns how to cut, which frames, the one crop of them all, and the (width, height) of the source."""
-    wanted = _readable(frames, spread(len(frames), options.frames), options.on_error)
+    wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
     warn_gaps(frames, wanted)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
     boxes, cut_off, good, empty = [], [], [], []
@@ -192,7 +192,7 @@ def _how(cutter: Cutter) -> str:
     return {"alpha": "the frames' alpha", "mask": "masks", "keep": "nothing: the background is kept"}[cutter.mode]
 
 
-def spread(total: int, count: int) -> list[int]:
+def spread_frames(total: int, count: int) -> list[int]:
     """Returns at most `count` of `total` indices, evenly spread from the first to the last; all for 0."""
     if count == 0 or count >= total:
         return list(range(total))

@@ -13,7 +13,7 @@ from dpcli.prepare.decode.color_frames import Frames, open_frames
 from dpcli.prepare.reader import Item, require_folder
 from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_intrinsics, read_poses
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_config
-from dpcli.prepare.views.video import VideoOptions, clip_name, find_given_views, find_masks, spread, warn_gaps
+from dpcli.prepare.views.video import VideoOptions, clip_name, find_given_views, find_masks, spread_frames, warn_gaps
 
 _PICTURE = re.compile(r"img_(\d{4})(_alpha)?\.(jpg|png)")
 
@@ -96,7 +96,7 @@ class ClipIndex:
         frames = open_frames(self.clip)
         if self.options.mask:
             find_masks(frames, self.options.mask)
-        find_given_views(frames, spread(len(frames), self.options.frames), self.options)
+        find_given_views(frames, spread_frames(len(frames), self.options.frames), self.options)
         warn_gaps(frames, list(range(len(frames))))
         if not self.clip.is_dir():
             return [Item(name, self.clip) for name in frames.names]

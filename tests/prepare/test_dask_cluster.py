@@ -73,7 +73,7 @@ def cluster():
 
 
 def test_a_lost_worker_costs_only_time(cluster, tmp_path):
-    from dpcli.prepare.cluster import cluster_executor
+    from dpcli.prepare.dask_cluster import cluster_executor
 
     reader = SlowReader(count=40, folder=str(tmp_path))
     convert(SlowReader(count=40, folder=str(tmp_path)), tmp_path / "whole.h5")
@@ -104,7 +104,7 @@ def test_a_lost_worker_costs_only_time(cluster, tmp_path):
 
 
 def test_a_sample_that_kills_every_worker_ends_the_run_and_keeps_the_others(cluster, tmp_path):
-    from dpcli.prepare.cluster import cluster_executor
+    from dpcli.prepare.dask_cluster import cluster_executor
 
     reader = SlowReader(count=6, folder=str(tmp_path), deadly=4)
     with (
@@ -128,7 +128,7 @@ def test_the_command_on_a_local_cluster(tmp_path):
 
 
 def test_addresses_that_are_none():
-    from dpcli.prepare.cluster import cluster_executor
+    from dpcli.prepare.dask_cluster import cluster_executor
 
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
     with pytest.raises(UsageError, match="--dask node1:8786: expected local"), cluster_executor("node1:8786", 2):
