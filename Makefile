@@ -25,8 +25,8 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
-	@echo "make test                     the whole test suite"
-	@echo "make lint                     ruff over everything"
+	@echo "make test                     lint, the examples in docstrings, the whole test suite"
+	@echo "make lint                     ruff over everything: faults and format"
 	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
 	@echo "make table-3.1 NVGESTURE=folder [MODELNET=folder]  ablations of Kinet; or MSRACTION=folder"
 	@echo "make table-3.2 NVGESTURE=folder, table-3.3 SHREC17=folder, table-3.5 NTU60=folder  accuracy"
@@ -70,7 +70,7 @@ demo: $(READY)
 	@echo "The 4D scene: open demo/scene.html in a browser, or demo/scene.mp4."
 	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png, demo/parts.gif and demo/scene.png."
 
-test: $(READY)
+test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 # Chapter 3 and appendix A (docs/reproduce.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
@@ -190,7 +190,8 @@ bench: $(READY)
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
 
 lint: $(READY)
-	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff check --quiet .
+	$(BIN)/python -m ruff format --quiet --check . || { echo "make: some files are not formatted; ruff format . does it" >&2; exit 1; }
 
 clean:
 	rm -rf $(VENV) demo table fuzz build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import errno
 import functools
 import math
 import os
@@ -19,11 +18,9 @@ import typer
 from dpcli import __version__
 from dpcli.cli.help_groups import SectionedGroup
 from dpcli.errors import DpcError, UsageError
+from dpcli.runtime.tuning import tune_environment
 
-# Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores, and a large
-# tensor in pages of 4 kB takes longer to get from the system than to fill.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+tune_environment()  # before torch and numba load
 
 # Options are many and take long to set up: only the room that is asked for is loaded, and of it only the command that is
 # asked for is set up; `dpc --help` loads none.
@@ -33,17 +30,12 @@ ROOMS = {
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
     "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.",
+    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.",
 }
 
-_WRITTEN = ("output", "picture", "animation", "ply", "turntable")  # options that name what a command writes
+_WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
-_FULL = {
-    errno.ENOSPC: "no space left on the device",
-    errno.EDQUOT: "disk quota exceeded",
-    errno.EFBIG: "file too large",
-}
 
 
 def _version(wanted: bool) -> None:
@@ -139,6 +131,7 @@ def _global_flags(argv: list[str]) -> list[str]:
 def _explain(error: BaseException) -> int:
     """Print a message for a person and return the exit code."""
     from dpcli.runtime.progress import log
+    from dpcli.runtime.whole_file import disk_full
 
     if isinstance(error, BrokenPipeError):
         os.dup2(
@@ -156,9 +149,10 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return 2
-    if isinstance(error, OSError) and error.errno in _FULL:
-        log.error(f"{_FULL[error.errno]} while writing {error.filename or 'the output'}; free some and run again")
-        return 1
+    full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None
+    if full is not None:
+        log.error(str(full))
+        return full.exit_code
     if _out_of_memory(error):
         log.error(
             f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"

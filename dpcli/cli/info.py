@@ -27,18 +27,32 @@ def info(
     ],
     as_object: Json = False,
     picture: Picture = None,
-    samples: Annotated[int, typer.Option("--samples", min=1, max=100, help="Rows of the picture.")] = 8,
+    samples: Annotated[
+        int, typer.Option("--samples", min=1, max=100, help="Rows of the picture; sequences on the page.")
+    ] = 8,
     frames: Annotated[int, typer.Option("--frames", min=1, max=60, help="Columns of the picture: moments.")] = 8,
     view: Annotated[
         str | None,
         typer.Option("--view", help="Axes that point right, down and away in the picture, such as xyz or x-zy (z up)."),
     ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--page", help="Write one HTML page (.html) that shows the file in any browser, without a network."
+        ),
+    ] = None,
+    sequence: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sequence", help="On the page only this sequence: its name or its number from 0; may be repeated."
+        ),
+    ] = None,
 ) -> None:
-    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.
+    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights_lookup import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary
     from dpcli.store import input_file
     from dpcli.store.summary import summary
 
@@ -48,13 +62,28 @@ def info(
             raise UsageError(
                 f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png"
             )
+        if page is not None:
+            raise UsageError(f"--page shows data files, {model} holds weights; without --page you see what is in it")
         _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
         return
+    if sequence and page is None:
+        raise UsageError("--sequence chooses what --page shows; give --page FILE.html, too")
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
         if picture is not None:
             _draw(path, found["kind"], picture, samples=samples, frames=frames, view=view)
+        if page is not None:
+            _write_page(path, found, page, samples=samples, chosen=sequence or [], view=view)
     _tell(found, as_object, _show)
+
+
+def _write_page(path: Path, found: dict[str, Any], page: Path, **choice: Any) -> None:
+    from dpcli.cli.info_page import write_info_page
+    from dpcli.runtime.progress import log
+
+    title = "standard input" if found["file"] == "-" else Path(found["file"]).name
+    left_out = write_info_page(path, page, title=title, kind=found["kind"], rows=_lines(found), **choice)
+    log.info(" ".join([f"{page}: {page.stat().st_size / 1e6:.2g} MB.", *left_out]))
 
 
 def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]], None]) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,7 +27,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
-from dpcli.store.journal import sweep
+from dpcli.store.writing.already_made import already_made
 
 _LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
 
@@ -154,21 +153,15 @@ def convert(
     config = configuration(reader, conversion.thinning, items, conversion.compression)
     provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()
-    if not conversion.force and already_complete(output, provenance):
-        sweep(output)
+    if not conversion.force and already_made(output, provenance, CloudsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
         return count_samples(report, output)
     work = partial(convert_item, reader, conversion.thinning, conversion.seed)
-    try:
-        with stop_requested() as stop, _open_writer(output, reader, conversion, provenance, resume) as writer:
-            run = _Run(writer, report, stop, conversion, items)
-            run.stream(work, slots or conversion.processes, executor)
-            writer.skipped = report.skipped
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        raise DpcError(f"{output}: no space left on the device; nothing was left under this name") from None
+    with stop_requested() as stop, _open_writer(output, reader, conversion, provenance, resume) as writer:
+        run = _Run(writer, report, stop, conversion, items)
+        run.stream(work, slots or conversion.processes, executor)
+        writer.skipped = report.skipped
     return count_samples(report, output)
 
 
@@ -275,28 +268,6 @@ def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str)
     report.skipped.append((item.name, str(result)))
     log.detail(f"skipped {item.name}: {result}")
     bar.advance(1)
-
-
-def already_complete(
-    output: Path, provenance: dict[str, Any], open_reader: Callable[[Path], Any] = CloudsReader
-) -> bool:
-    """Returns whether ``output`` exists and was made by this configuration and seed.
-
-    Raises UsageError when made by another.
-    """
-    if not output.exists():
-        return False
-    try:
-        with open_reader(output) as reader:
-            before = reader.provenance[-1] if reader.provenance else {}
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    old, new = (({**entry.get("config", {}), "seed": entry.get("seed")}) for entry in (before, provenance))
-    if old == new:
-        return True
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    different = ", ".join(f"{key} {old.get(key)} (now {new.get(key)})" for key in keys[:4])
-    raise UsageError(f"{output}: exists, made with {different}; write to another file, or --force to replace it")
 
 
 def count_samples(report: Report, output: Path) -> Report:

@@ -28,12 +28,12 @@ from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import FIGURES, PICTURES, check_target
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.embedding import StreamEmbedding, write_embedding
-from dpcli.store.pipes import FIGURES, PICTURES, check_target
 
 
 def run_pac(
@@ -61,7 +61,8 @@ def run_pac(
         raise UsageError("--class: the rule activation (thesis A.1.4) knows no class; add --rule gradient")
     _check_targets(output, force, (picture, "--picture", PICTURES), (animation, "--animation", ANIMATIONS))
     chosen = choose_device(device)
-    model, info = load_model(model_name, backbone)
+    weights = find_model(model_name)
+    model, info = load_model(weights, backbone)
     streams = _streams(stream, info)
     question = Question(rule, None if stage is None else stage - 1, _target(target, info.class_names))
     with input_file(data) as path, output_file(output) as place:
@@ -78,7 +79,7 @@ def run_pac(
             "stage": stage,
             "samples": samples,
             "split": split,
-            "weights": provenance.file_digest(find_model(model_name)),
+            "weights": provenance.file_digest(weights),
             "model": info.notes,
         }
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
@@ -203,7 +204,8 @@ def run_tsne(
     """`dpc classify explain tsne`."""
     _check_targets(output, force, (picture, "--picture", FIGURES))
     chosen = choose_device(device)
-    model, info = load_model(model_name, backbone)
+    weights = find_model(model_name)
+    model, info = load_model(weights, backbone)
     streams = _streams(stream, info)
     with input_file(data) as path, output_file(output) as place:
         reader = CloudsReader(path)
@@ -225,7 +227,7 @@ def run_tsne(
             "split": split,
             "perplexity": width,
             "clips_per_video": clips_per_video,
-            "weights": provenance.file_digest(find_model(model_name)),
+            "weights": provenance.file_digest(weights),
             "model": info.notes,
         }
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]

@@ -14,14 +14,16 @@ from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import find_model, load_model
 from dpcli.classify.settings import network_config
 from dpcli.classify.video_scores import predict_videos
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
-from dpcli.store.journal import sweep
+from dpcli.store.writing.already_made import WORK, already_made
+
+OTHER_SCORES = "holds scores of another model, data or choice; use another -o, or --force to replace it"
 
 
 def run_prediction(
@@ -40,7 +42,8 @@ def run_prediction(
 ) -> None:
     """`dpc classify predict`."""
     chosen = choose_device(device)
-    model, info = load_model(model_name, backbone)
+    weights = find_model(model_name)
+    model, info = load_model(weights, backbone)
     streams = tuple(info.notes.get("streams", STREAMS))
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
@@ -54,7 +57,7 @@ def run_prediction(
             "drop_short": drop_short,
             "dropped": source.dropped,
             "model": info.notes,
-            "weights": provenance.file_digest(find_model(model_name)),
+            "weights": provenance.file_digest(weights),
             "fusion": info.config.fusion,
         }
         history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
@@ -90,18 +93,9 @@ def run_prediction(
 
 
 def _already_scored(target: Path, entry: dict) -> bool:
-    """Whether `target` holds the scores of this very work; UsageError when it holds something else."""
-    if not target.exists():
+    """Returns whether `target` holds the scores of this very work, and says so; UsageError when it holds something else."""
+    if not already_made(target, entry, ScoresReader, OTHER_SCORES, WORK):
         return False
-    try:
-        before = ScoresReader(target).provenance[-1:]
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(
-            f"{target}: holds scores of another model, data or choice; use another -o, or --force to replace it"
-        )
-    sweep(target)
     log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
     print(f"{target}: complete")
     return True

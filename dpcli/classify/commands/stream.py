@@ -19,9 +19,9 @@ from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.errors import DataError, DpcError, Stopped
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.signals import StopRequest, stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.standard_streams import printable
 from dpcli.store import ScoresWriter
 
@@ -111,7 +111,8 @@ def run_stream(
     backbone: str | None = None,
 ) -> None:
     """Predict until the stream ends, a frame is bad or a signal comes; what was predicted is kept and summed up each time."""
-    model, info = load_model(model_name, backbone)
+    weights = find_model(model_name)
+    model, info = load_model(weights, backbone)
     predictor = StreamPredictor(model, info, window=window, hop=hop, seed=seed, device=choose_device(device))
     frames = open_frames(data, follow, files)
     source = "stdin" if data == "-" else Path(data).name
@@ -132,7 +133,7 @@ def run_stream(
                 "window": predictor.window.size,
                 "frames": predictor.window.count,
                 "model": info.notes,
-                "weights": provenance.file_digest(find_model(model_name)),
+                "weights": provenance.file_digest(weights),
                 "fusion": info.config.fusion,
             }
             target.provenance.append(provenance.record(config, seed))

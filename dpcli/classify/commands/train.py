@@ -25,10 +25,10 @@ from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.distributed import Processes, from_environment, process_group
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudsReader, input_file
 
 # A single cloud a video: what a static stream learns shapes from.
@@ -169,8 +169,9 @@ def _new_model(
     for name, option, mine in ((static_from, "--static-from", model.static), (init, "--init", model)):
         if not name:
             continue
-        folder.refuse_inside(option, find_model(name, option))
-        other, _ = load_model(name, backbone, option)
+        weights = find_model(name, option)
+        folder.refuse_inside(option, weights)
+        other, _ = load_model(weights, backbone)
         theirs = other.static if option == "--static-from" else other
         _copy_fitting(mine, theirs, f"{option} {name}")
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:

@@ -10,7 +10,7 @@ import numpy as np
 from dpcli.classify.data.augment import NONE, Augmentation
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
 
 
@@ -88,7 +88,7 @@ class ClipSource:
 
     def epoch(self, number: int, per_video: int | None) -> list[Clip]:
         """The clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
-        rng = generator(self.seed, 1, number)
+        rng = generator(self.seed, ClassifyStream.CLIPS, number)
         if per_video is None and self.timing == "clips":
             clips = self.clips(None)
         else:
@@ -108,7 +108,7 @@ class ClipSource:
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:
         """The clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
-        rng = generator(self.seed, 2, *key)
+        rng = generator(self.seed, ClassifyStream.POINTS, *key)
         sequence = self.reader.read(clip.sequence, clip.frames, fields=())
         points = np.stack(
             [sample_points(sequence.frame(t), self.config.points_per_frame, rng) for t in range(len(clip.frames))]

@@ -25,7 +25,7 @@ from dpcli.errors import DpcError
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator, torch_seed
 from dpcli.runtime.signals import StopRequest
 
 
@@ -120,7 +120,7 @@ class Trainer:
         (self.model.static if self.stage == 0 else self.model.dynamic).train()
         started = time.monotonic()
         turn = self.epoch % self._draws() if self._draws() else self.epoch
-        draw = self.stage * 100_000 + turn
+        draw = self.stage * DRAWS_PER_STAGE + turn
         clips = self.training.epoch(draw, self.schedule.clips_per_video)
         per_epoch = self._per_epoch(clips)
         loader = _Loader(self.training, clips, draw, turn * len(clips))
@@ -144,15 +144,13 @@ class Trainer:
         """In which order an epoch takes its draw's clips: as drawn, or, of a draw that comes back, in another one each time."""
         if not self._draws():
             return list(range(clips))
-        return generator(self.training.seed, 5, self.epoch).permutation(clips).tolist()
+        return generator(self.training.seed, ClassifyStream.DRAW_ORDER, self.epoch).permutation(clips).tolist()
 
     def _take(self, points: torch.Tensor, labels: torch.Tensor, clips: torch.Tensor, rate: float) -> bool:
         """One step of all processes together; whether one of them was asked to stop."""
         assert self.optimize is not None
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
-        torch.manual_seed(
-            int(np.random.SeedSequence(where).generate_state(1)[0])
-        )  # dropout, whenever the run was begun
+        torch.manual_seed(torch_seed(*where))  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate, clips)
         shares = (loss, float(correct), float(len(labels)), float(self.stop.requested))
         loss, correct, count, stopping = self.processes.sums(shares, self.device)
