@@ -14,15 +14,16 @@ import pytest
 # A module that takes long to import says so first; the pool must work all the same, whatever came meanwhile.
 SLOW = "import pathlib, time\npathlib.Path('importing').touch()\ntime.sleep(1.5)\n"
 PROGRAM = """
-import signal, sys, time
+import multiprocessing, signal, sys, time
 from dpcli.runtime.pool import ordered_map
-from dpcli.runtime.worker_server import start_early
+from dpcli.runtime.worker_server import ensure_server
 
 if __name__ == "__main__":
     seen = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: seen.append(number))
-    start_early(["slow_import"])
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["slow_import"])
+    ensure_server()
     while not seen:
         time.sleep(0.01)
     print([result for _, result in ordered_map(abs, [-1, 2], 2)], *map(int, seen))

@@ -18,7 +18,6 @@ from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
-from dpcli.runtime.worker_server import start_early
 from dpcli.store.views import ViewsHeader
 
 OBJECT_RADIUS = 0.75  # of the ball around the object; the default camera sees 0.83 whole
@@ -117,8 +116,6 @@ def _pictures(
     starts = range(0, mesh.num_frames, _CHUNK)
     pieces = ((start, mesh.frames(start, start + _CHUNK)) for start in starts)
     jobs = min(jobs, len(starts))
-    if jobs > 1:
-        start_early([__name__])
     work = partial(draw_frames, header.intrinsics, header.world_to_camera, header.size, filming)
     for (start, _), result in ordered_map(work, pieces, jobs):
         if isinstance(result, Exception):
