@@ -88,7 +88,11 @@ def describe(item: Item) -> dict[str, Any]:
 
 
 def natural_key(path: Path | str) -> list[tuple[int, int, str]]:
-    """Returns sort key under which ``frame2`` comes before ``frame10``; equal numbers fall back to the spelling."""
+    """Returns sort key under which ``frame2`` comes before ``frame10``; equal numbers fall back to the spelling.
+
+    >>> sorted(["frame10.png", "frame2.png", "frame1.png"], key=natural_key)
+    ['frame1.png', 'frame2.png', 'frame10.png']
+    """
     text = path.name if isinstance(path, Path) else path
     parts = re.split(r"(\d+)", text)
     return [(0, int(p), p) if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts if p]
@@ -118,5 +122,9 @@ def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[s
 
 
 def offsets(counts: np.ndarray) -> np.ndarray:
-    """Returns offsets i64 (T+1) that start with 0, of counts i64 (T)."""
+    """Returns offsets i64 (T+1) that start with 0, of counts i64 (T).
+
+    >>> offsets(np.array([2, 0, 3])).tolist()
+    [0, 2, 2, 5]
+    """
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)

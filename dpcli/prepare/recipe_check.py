@@ -85,7 +85,11 @@ def _bounds(value: int | list[int]) -> tuple[float, float]:
 
 
 def expand_braces(pattern: str) -> list[str]:
-    """Returns `a{00..02}/{x,y}` as a00/x, a00/y, a01/x, ...; without braces the pattern itself."""
+    """Returns `a{00..02}/{x,y}` as a00/x, a00/y, a01/x, ...; without braces the pattern itself.
+
+    >>> expand_braces("s{08..10}/{a,b}")
+    ['s08/a', 's08/b', 's09/a', 's09/b', 's10/a', 's10/b']
+    """
     match = re.search(r"\{([^{}]*)\}", pattern)
     if not match:
         return [pattern]

@@ -28,7 +28,11 @@ class Shard:
         return cls(int(match[1]), int(match[2]))
 
     def places(self, total: int) -> range:
-        """Returns which of `total` samples are its own."""
+        """Returns which of `total` samples are its own.
+
+        >>> list(Shard.parse("1/3").places(8))
+        [1, 4, 7]
+        """
         return range(self.index, total, self.count)
 
     def __str__(self) -> str:

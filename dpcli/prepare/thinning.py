@@ -70,6 +70,10 @@ def voxel_representatives(cloud: np.ndarray, points: int) -> np.ndarray:
     """Returns one point per occupied cube of the coarsest grid found that still has at least ``points`` occupied cubes.
 
     cloud: f32 (N,3), N >= points -> sorted indices i64 (M), points <= M <= N; the first point of a cube stands for it.
+
+    >>> cloud = np.array([[0, 0, 0], [0.1, 0, 0], [1, 0, 0], [1.1, 0, 0]], np.float32)
+    >>> voxel_representatives(cloud, 2).tolist()
+    [0, 2]
     """
     shifted = cloud - cloud.min(0)
     extent = float(shifted.max())

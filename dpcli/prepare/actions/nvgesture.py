@@ -38,7 +38,11 @@ class ListEntry:
 
 
 def parse_line(line: str) -> ListEntry:
-    """Returns the parts of a line of a list file. Raises ValueError, which says what is wrong with it."""
+    """Returns the parts of a line of a list file. Raises ValueError, which says what is wrong with it.
+
+    >>> parse_line("path:./Video_data/class_01/subject3_r0 depth:sk_depth:146:226 color:sk_color:146:226 label:1")
+    ListEntry(path='./Video_data/class_01/subject3_r0', stream='sk_depth', start=146, stop=226, label=1)
+    """
     match = LINE.fullmatch(line.strip())
     if not match:
         raise ValueError("expected 'path:FOLDER depth:NAME:START:STOP ... label:N'")

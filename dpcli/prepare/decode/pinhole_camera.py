@@ -28,7 +28,11 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
-        """Returns a camera of square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view."""
+        """Returns a camera of square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view.
+
+        >>> round(Intrinsics.from_field_of_view(90, 640, 480).fx, 6)
+        320.0
+        """
         if not 0 < degrees < 180:
             raise UsageError(f"a field of view lies between 0 and 180 degrees, found {degrees:g}")
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
@@ -79,6 +83,11 @@ def back_project(
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
     order within each frame, frames one after the other; counts i64 (T) of points per frame.
+
+    >>> depth = np.array([[[0, 0, 0], [0, 0, 2000]]], np.uint16)  # one pixel of a 3 x 2 picture sees something, in mm
+    >>> points, counts = back_project(depth, Intrinsics(8, 8, 1, 0.5), unit=0.001)
+    >>> points.tolist(), counts.tolist()
+    ([[0.25, 0.125, 2.0]], [1])
     """
     frames, height, width = depth.shape
     rays = _complex_rays(height, width, intrinsics)

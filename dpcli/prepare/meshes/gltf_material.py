@@ -14,7 +14,11 @@ _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
 def to_linear(color: np.ndarray) -> np.ndarray:
-    """Converts sRGB in 0..1 to linear light (IEC 61966-2-1)."""
+    """Converts sRGB in 0..1 to linear light (IEC 61966-2-1).
+
+    >>> to_linear(np.array([0.0, 0.5, 1.0])).round(4).tolist()
+    [0.0, 0.214, 1.0]
+    """
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 

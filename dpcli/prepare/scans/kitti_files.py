@@ -147,6 +147,10 @@ class View:
 
 
 def renumber_objects(ids: np.ndarray) -> np.ndarray:
-    """Renumbers object ids (N), 0 = background, as i16 (N): 0 stays, the others become 1, 2, ... in rising order."""
+    """Renumbers object ids (N), 0 = background, as i16 (N): 0 stays, the others become 1, 2, ... in rising order.
+
+    >>> renumber_objects(np.array([0, 7, 3, 7])).tolist()
+    [0, 2, 1, 2]
+    """
     known = np.unique(ids[ids > 0])
     return np.where(ids > 0, np.searchsorted(known, ids) + 1, 0).astype(np.int16)

@@ -193,7 +193,11 @@ def _how(cutter: Cutter) -> str:
 
 
 def spread_frames(total: int, count: int) -> list[int]:
-    """Returns at most `count` of `total` indices, evenly spread from the first to the last; all for 0."""
+    """Returns at most `count` of `total` indices, evenly spread from the first to the last; all for 0.
+
+    >>> spread_frames(10, 4)
+    [0, 3, 6, 9]
+    """
     if count == 0 or count >= total:
         return list(range(total))
     return np.linspace(0, total - 1, count).round().astype(int).tolist()
