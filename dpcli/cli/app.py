@@ -16,6 +16,7 @@ from typing import Any
 import typer
 
 from dpcli import __version__
+from dpcli.cli.help_groups import SectionedGroup
 from dpcli.errors import DpcError, UsageError
 from dpcli.runtime.tuning import tune_environment
 
@@ -53,6 +54,7 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
     """`dpc` with the one command that the words name set up and the other rooms by name only; with all of it for None."""
     dpc = typer.Typer(
         name="dpc",
+        cls=SectionedGroup,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
