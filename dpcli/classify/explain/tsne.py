@@ -48,7 +48,7 @@ def video_features(
     return {stream: (total / counts[:, None]).astype(np.float32) for stream, total in sums.items()}
 
 
-def joined(features: dict[str, np.ndarray]) -> np.ndarray:
+def joined_features(features: dict[str, np.ndarray]) -> np.ndarray:
     """Both streams' vectors, each of unit length, side by side: f32 (S,D1+D2)."""
     norms = [np.maximum(np.linalg.norm(features[s], axis=1, keepdims=True), 1e-12) for s in ("static", "dynamic")]
     return np.concatenate([features[s] / n for s, n in zip(("static", "dynamic"), norms)], axis=1).astype(np.float32)

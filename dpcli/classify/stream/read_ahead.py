@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.runtime.signals import StopRequest
 
 
-class Feed:
+class ReadAhead:
     """Reads frames in a thread of its own, at most `room` ahead; then the writer is held back. Nothing is dropped."""
 
     def __init__(self, frames: Iterator[np.ndarray], room: int) -> None:

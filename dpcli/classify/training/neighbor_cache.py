@@ -1,7 +1,7 @@
 """Neighborhoods of clips that training comes back to: searched once, then read from a nameless file of the run folder.
 
 A static network is frozen while the dynamic stream learns, and what it groups follows from a clip's points alone. Where an
-epoch shows one of a few fixed draws of every clip (`train --draws`), its neighborhoods are those of the draw's first time.
+epoch shows one of a few fixed draws of every clip (the setting `draws`), its neighborhoods are those of the draw's first time.
 """
 
 from __future__ import annotations
@@ -95,8 +95,8 @@ def _sources(cloud: tuple[Tensor, Tensor], groups: list[Grouping]) -> list[_Sour
         own, centers = (group.points, group.times), (group.centers, group.center_times)
         if not (_same(own, cloud) or (before is not None and _same(own, before))):
             raise UsageError(
-                "--draws: this backbone groups points that are neither the clip's nor the centroids of the stage before,"
-                " so its neighborhoods can't be kept; leave out --draws"
+                "draws: this backbone groups points that are neither the clip's nor the centroids of the stage before,"
+                " so its neighborhoods can't be kept; leave it out"
             )
         found.append(_Source(_same(own, cloud), _same(centers, own)))
         before = centers

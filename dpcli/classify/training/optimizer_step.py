@@ -16,7 +16,7 @@ from dpcli.classify.network.sync_norm import synchronize_norms
 from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
-from dpcli.runtime.mixed_precision import reduced_products
+from dpcli.runtime.mixed_precision import reduced_products, wanted
 
 _PATIENCE = 5  # steps without a finite loss or gradient before a run counts as lost
 _RUNAWAY = 10  # times the loss of guessing
@@ -70,7 +70,7 @@ class StageStep:
         neighbors: NeighborCache | None = None,
     ) -> None:
         self.schedule, self.device, self.processes = schedule, device, processes
-        self.neighbors = neighbors
+        self.amp, self.neighbors = wanted(schedule.amp, device), neighbors
         module = _Logits(model, stage)
         if processes.count > 1:
             synchronize_norms(module)
@@ -107,7 +107,7 @@ class StageStep:
 
     def _backward(self, points: Tensor, labels: Tensor, which: list[Tensor], clips: int) -> tuple[float, int]:
         groups = [self.neighbors(points, *which)] if self.neighbors is not None and which else []
-        with reduced_products(self.device, self.schedule.amp):
+        with reduced_products(self.device, self.amp):
             logits = self.module(points, *groups).float()
         loss = nn.functional.cross_entropy(
             logits, labels, label_smoothing=self.schedule.label_smoothing, reduction="sum"
