@@ -23,6 +23,7 @@ from dpcli.reproduce.runs import (
     dpc,
     markdown,
     numbers,
+    override,
     samples,
     shares,
     some,
@@ -34,7 +35,9 @@ from dpcli.reproduce.runs import (
 from dpcli.store import CloudsReader
 
 STREAMS = ("static", "dynamic", "fused")
-MORE = "--epochs 15 --epochs-dynamic 40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
+MORE = (
+    "--epochs 15 --set epochs_dynamic=40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
+)
 EVERY_START = ("thesis", "release")  # presets that score every clip of a video by default; the others 8 spread over it
 
 
@@ -62,7 +65,7 @@ class Experiment:
     first: str = ""  # the setting whose network the others go on from, where a setting only differs in length
 
 
-_GESTURES = ("--frames", "32", "--timing", "uniform", "--normalize", "image")  # facts of the peers' loaders
+_GESTURES = ("--frames", "32", "--timing", "uniform", "--set", "normalize=image")  # facts of the peers' loaders
 _NTU = ("--frames", "24")
 EXPERIMENTS = {
     "3.2": Experiment(
@@ -132,8 +135,8 @@ class Plan:
         name, budget = f"{self.preset}-{setting.key}", self.budget
         if self.first and setting.key != self.first:
             start = folder / f"{self.preset}-{self.first}-seed{seed}" / "model"
-            name, budget = f"{name}-from{self.first}", (*budget, "--init", str(start), *self.more)
-        train = ("--preset", self.preset, "--validation", "none", *budget, *setting.words, "--seed", seed)
+            name, budget = f"{name}-from{self.first}", tuple(override(budget, ("--init", str(start), *self.more)))
+        train = ("--preset", self.preset, "--validation", "none", *override(budget, setting.words), "--seed", seed)
         return Cell(folder / f"{name}-seed{seed}", clouds, train, ("--clips-per-video", self.clips, "--seed", seed))
 
     def __str__(self) -> str:

@@ -104,16 +104,16 @@ class Network:
         return self.folder / self.backbone
 
     def cell(self, name: str, clouds: Path, *words: str):
-        setting = Setting(name, "", "", ("--backbone", self.backbone, "--frames", "16", *words), "")
+        setting = Setting(name, "", "", ("--set", f"backbone={self.backbone}", "--frames", "16", *words), "")
         cell = self.plan.cell(setting, self.seed, clouds, self.place)
         cell.scores = cell.folder / f"{name}.h5"
         return cell
 
     def static(self):
-        return self.cell("static", self.clouds, "--epochs-dynamic", "0")
+        return self.cell("static", self.clouds, "--set", "epochs_dynamic=0")
 
     def kinet(self):
-        return self.cell("kinet", self.clouds, "--epochs", "0", "--static-from", str(self.static().model))
+        return self.cell("kinet", self.clouds, "--epochs", "0", "--set", f"static_from={self.static().model}")
 
     @property
     def fused(self) -> Path:
@@ -132,7 +132,7 @@ class Network:
         )
         if why:
             return why
-        moving = self.cell("flow", clouds, "--epochs-dynamic", "0")
+        moving = self.cell("flow", clouds, "--set", "epochs_dynamic=0")
         why = attempt(lambda: moving.run(run), "training or predicting on flow")
         if why:
             return why

@@ -161,6 +161,23 @@ class Cell:
         return counted(run, self.scores)
 
 
+def override(words: Sequence[str], more: Sequence[str]) -> list[str]:
+    """Returns the words of `dpc classify train` followed by `more`, without a `--set` that `more` gives again.
+
+    >>> override(["--set", "draws=8", "--lr", "0.1"], ["--set", "draws=0"])
+    ['--lr', '0.1', '--set', 'draws=0']
+    """
+    again = {name for name, _ in _settings(more)}
+    left_out = {at + step for name, at in _settings(words) if name in again for step in (0, 1)}
+    return [str(word) for at, word in enumerate(words) if at not in left_out] + [str(word) for word in more]
+
+
+def _settings(words: Sequence[str]) -> list[tuple[str, int]]:
+    """Returns the name of each setting that follows a `--set`, and the place of that `--set`."""
+    pairs = enumerate(zip(words, words[1:]))
+    return [(str(value).partition("=")[0], at) for at, (word, value) in pairs if word == "--set"]
+
+
 def cut(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
     """A program's own words, and those after `--`, which go to `dpc classify train`."""
     words = list(sys.argv[1:] if argv is None else argv)

@@ -36,7 +36,7 @@ DATA = {
     "nvgesture": (EXPERIMENTS["3.2"], EXPERIMENTS["3.2"].settings[0]),
     "msraction3d": (EXPERIMENTS["3.4"], next(one for one in EXPERIMENTS["3.4"].settings if one.key == "16")),
 }
-_SWITCH = {"normals": ("--no-normals",), "weights": ("--no-weights",)}
+_SWITCH = {"normals": ("--set", "normals=false"), "weights": ("--set", "weighting=none")}
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ def network(plan: Plan, setting: Setting, name: str, seed: int, clouds: Path, fo
     words = list(setting.words)
     if switch:
         trained = network(plan, setting, base, seed, clouds, folder, start)
-        words += ["--epochs", "0", "--static-from", str(trained.model), *_SWITCH[switch]]
+        words += ["--epochs", "0", "--set", f"static_from={trained.model}", *_SWITCH[switch]]
     elif base == "pretrained":
-        words += ["--static-from", str(start)]
+        words += ["--set", f"static_from={start}"]
     return plan.cell(Setting(name, "", setting.data, tuple(words), ""), seed, clouds, folder)
 
 
@@ -82,7 +82,20 @@ def pretrained(modelnet: str, folder: Path, preset: str, words: Sequence[str], r
     shapes, out = folder / "modelnet40.h5", folder / f"{preset}-modelnet40"
     folder.mkdir(parents=True, exist_ok=True)
     run("prepare", "modelnet40", modelnet, "-o", shapes)
-    run("classify", "train", shapes, "-o", out, "--preset", preset, "--validation", "none", "--pretrain", *words)
+    run(
+        "classify",
+        "train",
+        shapes,
+        "-o",
+        out,
+        "--preset",
+        preset,
+        "--validation",
+        "none",
+        "--set",
+        "pretrain=true",
+        *words,
+    )
     return out
 
 

@@ -36,7 +36,7 @@ LEFT_OUT = ("--help", "--output", "--force", "--json")
 DATA = """
 prepare synthetic gestures -o gestures.h5 --videos-per-class 2 --subjects 2 --frames 18 --points 200
 prepare synthetic articulated -o objects.h5 --objects 2 --sequences-per-object 1
-classify train gestures.h5 -o model --preset tiny --epochs 1 --epochs-dynamic 1
+classify train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
 segment predict objects.h5 -o parts.h5 --flow nearest --split all
 generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --dense-steps 1 --sparse-steps 1
@@ -50,7 +50,7 @@ prepare depth depth.npy -o out/d.h5 --fov 60 --jobs 1
 prepare clouds clouds -o out/c.h5 --jobs 1
 prepare split gestures.h5 -o out/s.h5
 prepare merge gestures.h5 -o out/m.h5
-classify train gestures.h5 -o out/model --preset tiny --epochs 1 --epochs-dynamic 1
+classify train gestures.h5 -o out/model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o out/p.h5 --clips-per-video 1
 classify fuse scores.h5 -o out/f.h5
 classify profile --preset tiny

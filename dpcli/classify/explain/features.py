@@ -51,7 +51,7 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
     count = len(stages)
     chosen = count - 1 if stage is None else stage
     if not 0 <= chosen < count:
-        raise UsageError(f"--stage {chosen + 1}: this network has {count} stages, expected 1..{count}")
+        raise UsageError(f"stage = {chosen + 1}: this network has {count} stages, expected 1..{count}")
     grouping = stages[chosen].grouping
     where = grouping.centers[0].detach(), grouping.center_times[0].detach()
     if stream == "static" and target is None:
@@ -65,7 +65,7 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
     else:
         if chosen < count - 1 and sizes[chosen] in sizes[chosen + 1 :]:
             raise UsageError(
-                f"--stage {chosen + 1}: later stages have as many centroids; only --stage {count} can be told"
+                f"stage = {chosen + 1}: later stages have as many centroids; only stage = {count} can be told"
             )
         values, gradient = _seen(_last_call(getattr(model, stream), run, sizes[chosen]), run, target)
     shape = (sizes[chosen], -1)
@@ -121,7 +121,7 @@ def _merged(
         return _seen(_Call(merge.norms[level], 0), run, target, lambda output: output.clamp(min=_TINY))
     if target is not None or not hasattr(merge, "current"):
         raise UsageError(
-            f"--stage {stage + 1}: the dynamic stream of this network can be explained at its last stage only"
+            f"stage = {stage + 1}: the dynamic stream of this network can be explained at its last stage only"
         )
     current, last = (_seen(_Call(m, 0), run, None)[0] for m in (merge.current[-1][stage], merge.last[stage]))
     return torch.relu(current) + torch.relu(last), None

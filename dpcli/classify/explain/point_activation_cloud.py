@@ -38,7 +38,7 @@ class Question:
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
-            raise UsageError(f"--rule {self.rule}: expected {' or '.join(RULES)}")
+            raise UsageError(f"rule = {self.rule}: expected {' or '.join(RULES)}")
 
 
 @dataclass
@@ -114,7 +114,7 @@ def _target(wanted: str | int, predicted: int, sequence: CloudSequence) -> int:
         return predicted
     if wanted == "label":
         if sequence.label < 0:
-            raise DataError(f"sample {sequence.name!r} has no label; --class predicted explains what the network sees")
+            raise DataError(f"sample {sequence.name!r} has no label; class = predicted explains what the network sees")
         return sequence.label
     return int(wanted)
 
