@@ -1,4 +1,4 @@
-"""What a Kinet costs: parameters and multiply-adds as they are, the papers' ways of counting beside them, time and memory."""
+"""The cost of a Kinet: parameters and multiply-adds as they are, the papers' ways of counting beside them, time and memory."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _STARTS = 5  # the argument of the backward kernels that says where each row's p
 
 
 def count_parameters(module: nn.Module) -> int:
-    """Every trainable number, batch norm's included."""
+    """Returns the count of all trainable numbers, batch norm's included."""
     return sum(p.numel() for p in module.parameters())
 
 
 def paper_parameters(module: nn.Module) -> float:
-    """Millions as the thesis's table A.1 counts: weights, both Adam moments and batch norm's moving statistics, over 2^20."""
+    """Returns millions as the thesis's table A.1 counts: weights, both Adam moments and batch norm's moving statistics, over 2^20."""
     moving = sum(b.numel() for name, b in module.named_buffers() if "running" in name)
     return (3 * count_parameters(module) + moving) / 2**20
 
 
 def _paper_total(model: Kinet) -> float:
-    """Both streams counted that way: a frozen static stream has no moments, and is counted once."""
+    """Returns both streams counted that way: a frozen static stream has no moments, and is counted once."""
     frozen = count_parameters(model.static) + sum(
         b.numel() for name, b in model.static.named_buffers() if "running" in name
     )
@@ -43,7 +43,7 @@ def _paper_total(model: Kinet) -> float:
 
 
 def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
-    """Multiply-adds of the matrix products of one clip (B=1), by stream, and of the fits (counted by hand).
+    """Returns multiply-adds of the matrix products of one clip (B=1), by stream, and of the fits (counted by hand).
 
     Neighbor search, batch norm, activations and the small inverses are not in it; each is named in `uncounted`.
     """
@@ -59,7 +59,7 @@ def macs(model: Kinet, points: torch.Tensor) -> dict[str, int]:
 
 
 def _linear_macs(dynamic: Kinematics, stages: list[Stage]) -> int:
-    """Multiply-adds of the dynamic stream's linear layers that are called as such: all but the units' reductions."""
+    """Returns multiply-adds of the dynamic stream's linear layers that are called as such: all but the units' reductions."""
     counts: list[int] = []
 
     def count(layer: nn.Linear, _: tuple, out: torch.Tensor) -> None:
@@ -76,7 +76,8 @@ def _linear_macs(dynamic: Kinematics, stages: list[Stage]) -> int:
 
 
 def _fit_macs(model: Kinet, stages: list[Stage]) -> int:
-    """Reduction, normal matrix, right side, solution and deviations of every fit, which `_linear_macs` doesn't see."""
+    """Returns the multiply-adds of every fit, which `_linear_macs` doesn't see: reduction, normal matrix, right side, solution and
+    deviations."""
     config, size, total = model.config, model.config.group_size + 1, 0
     shapes = [activation.shape[1:3] for stage in stages for activation in stage.activations]
     for number, (unit, (centroids, neighbors)) in enumerate(zip(model.dynamic.units, shapes), 1):
@@ -88,7 +89,7 @@ def _fit_macs(model: Kinet, stages: list[Stage]) -> int:
 
 
 def latency(model: Kinet, points: torch.Tensor, device: torch.device, repeats: int = 5) -> dict[str, float]:
-    """Milliseconds of one clip (B=1): neighbor search, both streams, all; medians."""
+    """Returns the milliseconds of one clip (B=1): neighbor search, both streams, all; medians."""
     rows = []
     with torch.inference_mode():
         for _ in range(repeats + 1):
@@ -111,7 +112,7 @@ def _now(device: torch.device) -> float:
 
 
 def measure(model: Kinet, device: torch.device, with_steps: bool = False) -> dict[str, Any]:
-    """Everything `dpc classify profile` prints, as one object."""
+    """Returns everything that `dpc classify profile` prints, as one object."""
     config = model.config
     torch.manual_seed(0)
     points = body_like_clip(config.num_frames, config.points_per_frame).to(device)
@@ -161,7 +162,7 @@ def _peak(device: torch.device, before: int) -> float:
 
 
 def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
-    """A made-up clip (batch,T,P,3) of the size of a person in MSR-Action3D's units: an upright ellipsoid that sways."""
+    """Returns a made-up clip (batch,T,P,3) of the size of a person in MSR-Action3D's units: an upright ellipsoid that sways."""
     generator = torch.Generator().manual_seed(0)
     shape = torch.randn(batch, frames, points, 3, generator=generator)
     shape = torch.nn.functional.normalize(shape, dim=-1) * torch.tensor([0.2, 0.55, 0.15])
@@ -169,7 +170,7 @@ def body_like_clip(frames: int, points: int, batch: int = 1) -> torch.Tensor:
 
 
 def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[str, Any]]:
-    """Where a training step of each stream (grouping, forward, loss, backward) and inference of both spend their time.
+    """Returns where a training step of each stream (grouping, forward, loss, backward) and inference of both spend their time.
 
     On a CPU the parts are those of one thread: threads share the layers' work in whole pieces, products and all. `seconds`
     is the step with every thread. Matrix products are the calls of BLAS as torch's profiler sees them in that same step;
@@ -212,7 +213,7 @@ def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[
 
 
 def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool = False) -> dict[str, Any]:
-    """One of `steps`, from a function that does it and returns the seconds of its grouping and of all."""
+    """Returns one of `steps`, from a function that does it and returns the seconds of its grouping and of all."""
     threads = torch.get_num_threads()
     seconds = min(step()[1] for _ in range(_STEPS))
     try:
@@ -235,7 +236,7 @@ def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool 
 
 
 def _profiled(step: Callable[[], tuple[float, float]]) -> tuple[tuple[float, float], float]:
-    """What a step returns, and the seconds that it spends in matrix products."""
+    """Returns what a step returns, and the seconds that it spends in matrix products."""
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # its start and stop are nobody's news
     from torch.profiler import ProfilerActivity, profile
 
@@ -246,7 +247,7 @@ def _profiled(step: Callable[[], tuple[float, float]]) -> tuple[tuple[float, flo
 
 
 def _sparse_products(step: Callable[[], Any]) -> float:
-    """Seconds of a step in products with a sparse matrix: the gradient of max pooling, one entry a centroid and channel,
+    """Returns the seconds of a step in products with a sparse matrix: the gradient of max pooling, one entry a centroid and channel,
     times the second layer's weights, and times its inputs. Plain torch multiplies with the same matrix, zeros and all.
 
     They are a part of the CPU's backward kernels, which run twice here, first without those entries: the difference is
@@ -280,7 +281,7 @@ def _sparse_products(step: Callable[[], Any]) -> float:
 
 
 def render(result: dict[str, Any]) -> str:
-    """The object of `measure` as lines for a person."""
+    """Returns the object of `measure` as lines for a person."""
     lines = [
         f"Kinet on {result['backbone']}, {result['variant']} variant, {result['classes']} classes,"
         f" clip {result['clip'][0]} x {result['clip'][1]} points"

@@ -1,4 +1,4 @@
-"""From a preset and a user's choices over it to the settings of a network and of a training run.
+"""The settings of a network and of a training run, made from a preset and a user's choices over it.
 
 Each choice is a field of a dataclass: `network/config.py`, `training/schedule.py`, `data/augment.py`, `training/run_settings.py`.
 """

@@ -48,13 +48,21 @@ def info(
             raise UsageError(
                 f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png"
             )
-        _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
+        _tell({"file": str(model), **weights_summary(model), **_settings_beside(model)}, as_object, _show_model)
         return
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
         if picture is not None:
             _draw(path, found["kind"], picture, samples=samples, frames=frames, view=view)
     _tell(found, as_object, _show)
+
+
+def _settings_beside(model: Path) -> dict[str, Any]:
+    """Returns the settings of the run that made the weights, by group, where its folder holds them."""
+    from dpcli.runtime.toml_file import read_toml
+
+    file = model.parent / "settings.toml"
+    return {"settings": read_toml(file)} if file.is_file() else {}
 
 
 def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]], None]) -> None:
@@ -120,7 +128,7 @@ def _show_model(told: dict[str, Any]) -> None:
     ]
     if told["card"]:
         lines.append(("card", told["card"]))
-    for key, value in told["header"].items():
+    for key, value in (told["header"] | told.get("settings", {})).items():
         within = value.items() if isinstance(value, dict) else [("", value)]
         lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
     for name, value in lines:

@@ -60,7 +60,7 @@ SWEEPS = {
 
 @dataclass(frozen=True)
 class Point:
-    """One choice of the four settings, in the order of SWEEPS."""
+    """Holds one choice of the four settings, in the order of SWEEPS."""
 
     values: tuple[float, ...]
 
@@ -82,12 +82,12 @@ def _written(name: str, value: float) -> str:
 
 
 def point(changed: str = "", value: float = 0) -> Point:
-    """The thesis's choice, with one setting changed."""
+    """Returns the thesis's choice, with one setting changed."""
     return Point(tuple(value if key == changed else sweep.chosen for key, sweep in SWEEPS.items()))
 
 
 def last_accuracy(folder: Path, stage: str) -> dict:
-    """Validation accuracy of a training folder's stage after its last epoch, and the best of all epochs."""
+    """Returns the validation accuracy of a training folder's stage after its last epoch, and the best of all epochs."""
     rows = [row for row in json.loads((folder / "log.json").read_text()) if row["stage"] == stage]
     known = [row["validation_accuracy"] for row in rows if row["validation_accuracy"] is not None]
     return {"last": known[-1], "best": max(known), "epochs": len(rows)}
@@ -104,6 +104,7 @@ class Fold:
     words: tuple[str, ...]  # preset, budget, clips
 
     def train(self, run: Dpc, out: Path, *words: str) -> None:
+        """Trains a network of the fold by the words after the common ones."""
         run(
             "classify",
             "train",
@@ -127,7 +128,7 @@ class Fold:
         return once(out / "result.json", self._key(words), work)
 
     def _places(self, at: Point) -> tuple[Path, Path, list[str]]:
-        """Folders of the static and of the dynamic stream, and the latter's words."""
+        """Returns the folders of the static and of the dynamic stream, and the latter's words."""
         place = self.folder / f"fold{self.which}-of-{self.of}"
         static = place / f"static-{at.name(static=True)}"
         return (
@@ -137,19 +138,23 @@ class Fold:
         )
 
     def known(self, at: Point) -> dict | None:
-        """What `accuracy` found before, without doing anything."""
+        """Returns what `accuracy` found before, without doing anything."""
         _, out, words = self._places(at)
         return kept(out / "result.json", self._key(words))
 
     def accuracy(self, run: Dpc, at: Point) -> dict:
-        """Of the dynamic stream at one choice of settings, trained where it isn't, on the fold's static stream."""
+        """Returns the dynamic stream's accuracy at one choice of settings, trained where it isn't, on the fold's static stream."""
         static, out, words = self._places(at)
         self._once(run, static, "static", *at.words(static=True), "--set", "epochs_dynamic=0")
         return self._once(run, out, "dynamic", *words)
 
 
 def quartiles(values: Sequence[float]) -> list[float]:
-    """Lowest, first quartile, median, third quartile, highest."""
+    """Returns lowest, first quartile, median, third quartile, highest.
+
+    >>> quartiles([3, 1, 2, 5, 4])
+    [1.0, 2.0, 3.0, 4.0, 5.0]
+    """
     return np.percentile(values, (0, 25, 50, 75, 100)).tolist()
 
 
@@ -157,7 +162,7 @@ Found = Mapping[str, Mapping[float, Sequence[float]]]  # sweep -> value -> perce
 
 
 def table(found: Found, about: str) -> str:
-    """Markdown: the boxes of the figure as numbers."""
+    """Returns markdown: the boxes of the figure as numbers."""
     header = (
         "setting",
         "value",
@@ -181,7 +186,7 @@ def table(found: Found, about: str) -> str:
 
 
 def picture(found: Found, path: Path) -> None:
-    """Four panels of boxes over folds, the thesis's choice filled."""
+    """Draws four panels of boxes over folds, the thesis's choice filled."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 7), layout="constrained")
@@ -211,7 +216,7 @@ def make(
     run: Dpc = dpc,
     note: str = "",
 ) -> dict[str, dict[float, list[float]]]:
-    """Every value of the folds `only`, a fold after the other; a table after each network.
+    """Trains every value of the folds `only`, a fold after the other; writes a table after each network.
 
     words: preset, budget. Shown and returned are the other folds' networks, too, as far as another job has finished them.
     """
@@ -240,7 +245,7 @@ def make(
 
 
 def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    """Values of each sweep: `group_size=2,4` replaces a sweep's own, `group_size=` leaves it out."""
+    """Returns the values of each sweep: `group_size=2,4` replaces a sweep's own, `group_size=` leaves it out."""
     values = {key: sweep.values for key, sweep in SWEEPS.items()}
     for option in options:
         key, _, text = option.partition("=")
@@ -257,7 +262,7 @@ def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
 
 
 def possible(values: Mapping[str, Sequence[float]], preset: str) -> tuple[dict[str, tuple[float, ...]], str]:
-    """The values that a preset's network can have, and a sentence about those left out."""
+    """Returns the values that a preset's network can have, and a sentence about those left out."""
     config = PRESETS[preset]["network"]
     if not config.xyz_group:
         return dict(values), ""
@@ -268,6 +273,7 @@ def possible(values: Mapping[str, Sequence[float]], preset: str) -> tuple[dict[s
 
 
 def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
+    """Runs the program by its words; `run` does the commands."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", choices=list(DATA))

@@ -1,4 +1,4 @@
-"""What both explanations check before they work: which streams are asked for, and whether their files may be written."""
+"""The checks that both explanations make before they work: of the streams asked for, and of the files to write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every command that applies a trained model is told."""
+"""The options that every command that applies a trained model has."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Training:
 
 @dataclass(frozen=True)
 class _Videos:
-    """The training and validation clips of a file, and what the run's records say of it."""
+    """Holds the training and validation clips of a file, and what the run's records say of it."""
 
     training: ClipSource
     validation: ClipSource | None

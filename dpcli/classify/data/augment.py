@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -97,9 +97,9 @@ class Augmentation:
         return np.take_along_axis(points, source[..., None], 1)
 
 
-NONE = Augmentation(0, False, 0, 0, 0, 0, 0, 0)
-PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0, 0, origin=True)
-RELEASE = Augmentation(0.1, False, 0, 0.06, 0, 0, 0.2, 0)
+NONE = Augmentation(0.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+PEERS = replace(NONE, scale=0.1, per_axis=True, origin=True)
+RELEASE = replace(NONE, scale=0.1, tilt=0.06, dropout=0.2)
 AUGMENTATIONS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
 
 

@@ -21,7 +21,7 @@ _RATE = 6  # images per second of an animation
 
 
 def view_axes(text: str | None, length_unit: str) -> np.ndarray:
-    """Rows f32 (3,3): the axes that point right, down and away, from names such as `xyz` or `x-zy`.
+    """Returns rows f32 (3,3): the axes that point right, down and away, from names such as `xyz` or `x-zy`.
 
     Without a text: camera axes, or those of image coordinates where the unit says row and column.
     """
@@ -35,7 +35,7 @@ def view_axes(text: str | None, length_unit: str) -> np.ndarray:
 def activation_sheet(
     path: Path, clouds: Sequence[ActivationCloud], class_names: Sequence[str], axes: np.ndarray, frames: int = 8
 ) -> None:
-    """A row per sample and stream (streams one under another), at most `frames` frames as columns; red acts most, blue least."""
+    """Draws a row per sample and stream (streams one under another), at most `frames` frames as columns; red acts most, blue least."""
     blocks = []
     for cloud in clouds:
         shown = np.unique(np.linspace(0, cloud.sequence.num_frames - 1, frames).round().astype(int)).tolist()
@@ -48,7 +48,7 @@ def activation_sheet(
 def activation_animation(
     path: Path, clouds: Sequence[ActivationCloud], class_names: Sequence[str], axes: np.ndarray
 ) -> None:
-    """The clips' frames one after another, six a second: a row per sample, streams side by side."""
+    """Draws the clips' frames one after another, six a second: a row per sample, streams side by side."""
     drawers = [_drawer(cloud, axes) for cloud in clouds]
     images = []
     for t in range(max(cloud.sequence.num_frames for cloud in clouds)):
@@ -63,7 +63,7 @@ def activation_animation(
 
 
 def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
-    """Who it is, what it is, what the network says, and which class is explained."""
+    """Returns the words above a sample: its name, its class, what the network says, and which class is explained."""
 
     def name(label: int) -> str:
         return class_names[label] if 0 <= label < len(class_names) else str(label)
@@ -78,7 +78,7 @@ def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
 
 
 def heat(values: np.ndarray) -> np.ndarray:
-    """Colors u8 (P,3) of values 0..1, blue to red."""
+    """Returns colors u8 (P,3) of values 0..1, blue to red."""
     from matplotlib import colormaps
 
     table = (colormaps["turbo"](np.linspace(0.06, 0.94, 256))[:, :3] * 255).astype(np.uint8)
@@ -155,7 +155,7 @@ def _font(size: int) -> Any:
 
 
 def _save_gif(path: Path, images: list[np.ndarray]) -> None:
-    """All images with one table of colors, so that nothing flickers."""
+    """Returns all images with one table of colors, so that nothing flickers."""
     from PIL import Image
 
     table = Image.fromarray(np.concatenate(images[:: max(1, len(images) // 4)], axis=1)).quantize(255)
@@ -185,7 +185,7 @@ def _save_mp4(path: Path, images: list[np.ndarray]) -> None:
 
 
 def write_whole(path: Path, save: Callable[[Path], None]) -> None:
-    """Write beside the target and rename when whole. DataError when it can't be written."""
+    """Writes beside the target and renames when whole. Raises DataError when it can't be written."""
     part = path.with_name(f".{path.stem}.part{path.suffix}")
     try:
         save(part)
@@ -203,7 +203,7 @@ def plane_picture(
     class_names: Sequence[str],
     captions: dict[str, str],
 ) -> None:
-    """A panel per stream with a dot per video (S,2), colored by class, gray where there is no label; one legend."""
+    """Draws a panel per stream with a dot per video (S,2), colored by class, gray where there is no label; one legend."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -237,7 +237,7 @@ def plane_picture(
 
 
 def _style(place: int, count: int) -> tuple[tuple[float, ...], str]:
-    """Ten hues a marker (twenty classes: circles and squares), so that neighbors in the legend differ."""
+    """Returns color and marker of a class, ten hues a marker (20 classes: circles, squares), so that neighbors differ."""
     from matplotlib import colormaps
 
     return colormaps["tab10"](place % 10)[:3], _MARKERS[place // 10 % len(_MARKERS)]

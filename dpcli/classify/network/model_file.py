@@ -17,7 +17,7 @@ from dpcli.runtime.safetensors_file import find_weights, load_state, load_weight
 
 @dataclass
 class ModelInfo:
-    """What a model file says of itself beside the weights."""
+    """Holds what a model file says of itself beside the weights."""
 
     config: KinetConfig
     class_names: list[str]
@@ -30,7 +30,7 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
-    """Weights as float32; configuration, class names and notes in the header."""
+    """Writes the weights as float32; configuration, class names and notes in the header."""
     header = {
         "format": _FORMAT,
         "config": info.config.to_json(),
@@ -42,12 +42,12 @@ def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
 
 
 def find_model(name: str, option: str = "--model") -> Path:
-    """A model's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
+    """Returns a model's file: a path, `best.safetensors` of a training folder, or a shipped name. Raises UsageError when there is none."""
     return find_weights(name, SHIPPED, _MAKER, option)
 
 
 def load_model(name: str, backbone: str | None = None, option: str = "--model") -> tuple[Kinet, ModelInfo]:
-    """A Kinet in eval mode. DataError when the file is not one of ours or its weights don't fit its configuration.
+    """Returns a Kinet in eval mode. Raises DataError when the file is not one of ours or its weights don't fit its configuration.
 
     A model on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
     """

@@ -43,7 +43,7 @@ class ReadAhead:
         return self._queue.qsize()
 
     def frames(self, stop: StopRequest) -> Iterator[tuple[np.ndarray, float]]:
-        """(points, time.monotonic() at arrival) until the stream ends or a stop is asked for."""
+        """Yields (points, time.monotonic() at arrival) until the stream ends or a stop is asked for."""
         while not stop.requested:
             try:
                 item = self._queue.get(timeout=0.1)
@@ -56,4 +56,5 @@ class ReadAhead:
             yield item
 
     def close(self) -> None:
+        """Ends the thread once it looks up; what it has read is dropped."""
         self._closed.set()

@@ -17,7 +17,7 @@ _STAGE_DRAWS = 100_000  # numbers of draws that each stage has for itself
 
 
 class _ClipDataset(torch.utils.data.Dataset):
-    """One draw's clips as arrays, for a DataLoader: points, label, and the clip's number among all draws."""
+    """Gives one draw's clips as arrays, for a DataLoader: points, label, and the clip's number among all draws."""
 
     def __init__(self, source: ClipSource, clips: list[Clip], draw: int, first: int) -> None:
         self.source, self.clips, self.draw, self.first = source, clips, draw, first

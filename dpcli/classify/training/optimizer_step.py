@@ -1,4 +1,4 @@
-"""One optimizer step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
+"""An optimizer step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _RUNAWAY = 10  # times the loss of guessing
 
 
 class _Logits(nn.Module):
-    """The branch that a stage trains, as one module whose parameters are that branch's alone."""
+    """Computes the logits of the branch that a stage trains, as one module whose parameters are that branch's alone."""
 
     def __init__(self, model: Kinet, stage: int) -> None:
         super().__init__()
@@ -31,6 +31,7 @@ class _Logits(nn.Module):
         self._logits = [model.static_logits if stage == 0 else model.dynamic_logits]  # in a list: not a submodule
 
     def forward(self, points: Tensor, *groups: list[Grouping]) -> Tensor:
+        """Returns the logits (b,C) of points (b,T,P,3), by groups where they are known."""
         return self._logits[0](points, *groups)
 
 
@@ -43,7 +44,7 @@ class LossWatch:
     mean: float = field(default=math.nan)
 
     def see(self, loss: float, stepped: bool) -> str | None:
-        """After each step; a sentence once it is time to stop. stepped: the gradient was finite."""
+        """Takes the loss after each step; returns a sentence once it is time to stop. stepped: the gradient was finite."""
         self.lost = 0 if stepped and math.isfinite(loss) else self.lost + 1
         if self.lost >= _PATIENCE:
             return f"no finite loss or gradient in {_PATIENCE} steps on end"
@@ -58,7 +59,7 @@ class LossWatch:
 
 
 class StageStep:
-    """Optimizer and forward pass of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
+    """Takes optimizer steps of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
 
     def __init__(
         self,
@@ -83,7 +84,8 @@ class StageStep:
     def __call__(
         self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None
     ) -> tuple[float, int, bool]:
-        """points (b,T,P,3), labels (b), learning rate -> (sum of losses, rightly classified, whether weights were changed).
+        """Takes a step on points (b,T,P,3) with labels (b) at a learning rate; returns the sum of losses, how many are rightly
+        classified, and whether weights were changed.
 
         clips i64 (b): numbers by which `neighbors` knows them.
         """
@@ -116,12 +118,12 @@ class StageStep:
         return float(loss.detach()), int((logits.argmax(-1) == labels).sum())
 
     def _without_exchange(self, on: bool) -> contextlib.AbstractContextManager:
-        """Gradients are exchanged once a step: not after its earlier parts."""
+        """Keeps gradients to the process: they are exchanged once a step, not after its earlier parts."""
         return self.module.no_sync() if on and self.processes.count > 1 else contextlib.nullcontext()
 
 
 def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -> nn.Module:
-    """The module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
+    """Returns the module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
     config = model.config  # some switches leave parameters without a gradient
     unused = (stage == 1 and (config.merge == "cross" or not config.normals)) or config.backbone not in BACKBONES
     where = [device.index] if device.type == "cuda" else None

@@ -1,4 +1,4 @@
-"""How well the streams of a network in training classify the validation videos."""
+"""The accuracy of the streams of a network in training on the validation videos."""
 
 from __future__ import annotations
 
