@@ -153,8 +153,7 @@ def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, t
             device,
             "--split",
             "all",
-            "--set",
-            "amp=false",
+            "--no-amp",
         )
         assert done.returncode == 0, done.stderr
         with PartsReader(found) as reader:

@@ -34,7 +34,7 @@ def fit_surface(
     (repeated points, dead features), and solves by elimination. `weights=None` means 1.
 
     >>> plane = torch.tensor([[0.0], [1.0], [2.0], [4.0]])  # n = 4 neighbors, one group of d = 1 feature
-    >>> fit_surface(plane[:, None], 3 * plane[:, 0] + 1)  # t = 3 f + 1
+    >>> fit_surface(plane[:, None], 3 * plane[:, 0] + 1).round(decimals=3)  # t = 3 f + 1
     tensor([[3., 1.]])
     """
     design = torch.cat([features, torch.ones_like(features[..., :1])], -1).transpose(-3, -2)

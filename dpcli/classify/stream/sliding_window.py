@@ -62,7 +62,7 @@ class Prediction:
 
 
 def window_size(info: ModelInfo, window: int | None) -> int:
-    """Returns the number of frames looked back at: a clip for a model of consecutive frames, else `window`, over which its frames are spread.
+    """Returns how many frames to look back at: a clip for a model of consecutive frames, else `window`, over which its frames spread.
 
     Raises UsageError for a window that the model can't use.
     """

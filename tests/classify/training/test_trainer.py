@@ -21,6 +21,7 @@ from dpcli.classify.settings import network_config
 from dpcli.classify.training.optimizer_step import LossWatch, StageStep
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
+from dpcli.reproduce.runs import override
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.settings.catalog import Given
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
@@ -110,11 +111,7 @@ def test_two_processes_follow_the_loss_curve_of_one(data, alone, together, tmp_p
             data,
             "-o",
             tmp_path / "halves",
-            *SHORT,
-            "--set",
-            "epochs_dynamic=0",
-            "--set",
-            "accumulate=2",
+            *override(SHORT, ("--set", "epochs_dynamic=0", "--set", "accumulate=2")),
         )
         == 0
     )
@@ -268,11 +265,7 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
             data,
             "-o",
             tmp_path / "six",
-            *longer,
-            "--epochs",
-            0,
-            "--set",
-            "epochs_dynamic=0",
+            *override(longer, ("--epochs", "0", "--set", "epochs_dynamic=0")),
             "--init",
             alone,
             "--set",
@@ -283,15 +276,15 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
         == 0
     )
     told = capfd.readouterr().err
-    assert "tensors taken" in told and "--static-temporal-radius" not in told
+    assert "tensors taken" in told and "static_temporal_radius" not in told
     ours, theirs = load_model(str(tmp_path / "six")), load_model(str(alone))
     config = ours[1].config
     assert (config.num_frames, config.centroids, config.neighbors) == (6, (48, 24), 9)
     for key, value in theirs[0].state_dict().items():
         assert torch.equal(ours[0].state_dict()[key], value), key
-    within = (*SHORT, "--epochs", 0, "--set", "epochs_dynamic=0", "--set", "static_temporal_radius=0")
+    within = override(SHORT, ("--epochs", "0", "--set", "epochs_dynamic=0", "--set", "static_temporal_radius=0"))
     assert dpc("classify", "train", data, "-o", tmp_path / "within", *within, "--init", alone) == 0
-    assert "--static-temporal-radius 1 goes on as it was" in capfd.readouterr().err
+    assert "--set static_temporal_radius=1 goes on as it was" in capfd.readouterr().err
     assert (
         dpc("classify", "train", data, "-o", tmp_path / "q", "--preset", "quick", "--frames", 4, "--init", alone) == 2
     )
@@ -347,13 +340,9 @@ def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, cap
             data,
             "-o",
             tmp_path / "r",
-            *SHORT,
-            "--epochs",
-            0,
+            *override(SHORT, ("--epochs", "0", "--set", "epochs_dynamic=0")),
             "--set",
             f"static_from={tmp_path / 'pre'}",
-            "--set",
-            "epochs_dynamic=0",
         )
         == 0
     )
