@@ -25,15 +25,15 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
-	@echo "make test                     the whole test suite"
-	@echo "make lint                     ruff over everything"
+	@echo "make test                     lint, the examples in docstrings, the whole test suite"
+	@echo "make lint                     ruff over everything: faults and format"
 	@echo "make bench [MSRACTION=folder] speed of ours against the reference and against what one would take instead"
 	@echo "make table-3.1 NVGESTURE=folder [MODELNET=folder]  ablations of Kinet; or MSRACTION=folder"
 	@echo "make table-3.2 NVGESTURE=folder, table-3.3 SHREC17=folder, table-3.5 NTU60=folder  accuracy"
 	@echo "make table-3.4 MSRACTION=folder accuracy on 4 to 24 frames, three seeds; over an hour on 2 cores"
 	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; days"
 	@echo "make figure-3.8 MSRACTION=folder parameters, FLOPs, accuracy of three backbones (= table-A.1)"
-	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/tables.md says more of all of these"
+	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/reproduce.md says more of all of these"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
@@ -70,10 +70,10 @@ demo: $(READY)
 	@echo "The 4D scene: open demo/scene.html in a browser, or demo/scene.mp4."
 	@echo "The pictures are $(DEMO)/clouds.png, $(DEMO)/confusion.png, demo/parts.png, demo/parts.gif and demo/scene.png."
 
-test: $(READY)
+test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
-# Chapter 3 and appendix A (docs/tables.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
+# Chapter 3 and appendix A (docs/reproduce.md). Stopped, each goes on where it was; results in table/NUMBER/table.md.
 # PRESET quick or thesis; SEEDS; BUDGET: words for `dpc classify train`, such as "--epochs 40 --batch 16"; CLIPS per video
 # at prediction; PREPARE: words for `dpc prepare`. Table 3.4: the other lengths go on from the network of FROM frames (none:
 # each on its own), by MORE, words for `dpc classify train`.
@@ -190,7 +190,8 @@ bench: $(READY)
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
 
 lint: $(READY)
-	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff check --quiet .
+	$(BIN)/python -m ruff format --quiet --check . || { echo "make: some files are not formatted; ruff format . does it" >&2; exit 1; }
 
 clean:
 	rm -rf $(VENV) demo table fuzz build dist *.egg-info .pytest_cache .ruff_cache .hypothesis

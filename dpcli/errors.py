@@ -2,15 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-
-# Why a write fails for want of room, by the system's number.
-NO_ROOM = {
-    errno.ENOSPC: "no space left on the device",
-    errno.EFBIG: "the file size limit is reached",
-    errno.EDQUOT: "the disk quota is used up",
-}
-
 
 class DpcError(Exception):
     """The work failed (exit code 1)."""

@@ -13,8 +13,8 @@ PACKAGE = ROOT / "dpcli"
 COMMON = {"config_diff", "errors", "file_lock", "path_names", "standard_streams"}  # files that every room may import
 GROUND = {"store", "ops", "runtime", "draw"}
 ALLOWED = {
-    "store": set(),
-    "ops": set(),
+    "store": {"runtime"},
+    "ops": {"runtime"},
     "runtime": set(),
     "draw": {"ops", "runtime"},
     "prepare": GROUND,

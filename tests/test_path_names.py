@@ -11,7 +11,7 @@ import torch
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8, utf8_path
 from dpcli.prepare.articulated.urdf import read_skeleton
-from dpcli.runtime.safetensors_file import load_weights, save_weights
+from dpcli.runtime.weights import load_weights, save_weights
 from dpcli.store import CloudsReader
 
 

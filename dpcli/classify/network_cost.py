@@ -17,7 +17,8 @@ from dpcli.classify.network.backbones.interface import Grouping, Stage
 from dpcli.classify.network.kinematic import Kinematics
 from dpcli.classify.network.kinet import Kinet, fuse
 from dpcli.ops.backend import reference_only
-from dpcli.runtime.memory import peak_memory
+from dpcli.runtime.device import peak_memory
+from dpcli.runtime.tuning import torch_threads
 
 _STEPS = 4  # of each kind that are timed
 _STARTS = 5  # the argument of the backward kernels that says where each row's pooled entries are
@@ -177,7 +178,7 @@ def steps(model: Kinet, device: torch.device, batch: int = 8) -> dict[str, dict[
     sparse products, which lie inside other kernels of the static stream: see `_sparse_products`. The fastest of _STEPS
     steps, because other programs only ever add time, and to the parts unequally.
     """
-    from dpcli.runtime.memory import keep_freed_memory
+    from dpcli.runtime.tuning import keep_freed_memory
 
     keep_freed_memory()
     config = model.config
@@ -216,12 +217,9 @@ def _measured(step: Callable[[], tuple[float, float]], batch: int, sparse: bool 
     """Returns one of `steps`, from a function that does it and returns the seconds of its grouping and of all."""
     threads = torch.get_num_threads()
     seconds = min(step()[1] for _ in range(_STEPS))
-    try:
-        torch.set_num_threads(1)
+    with torch_threads(1):
         (grouping, alone), inside = min((_profiled(step) for _ in range(_STEPS)), key=lambda found: found[0][1])
         thin = min(_sparse_products(step) for _ in range(_STEPS)) if sparse else 0.0
-    finally:
-        torch.set_num_threads(threads)
     parts = {"matrix_products": inside, "sparse_products": thin, "neighbors": grouping}
     parts["other"] = alone - sum(parts.values())
     return {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import errno
 import functools
 import math
 import os
@@ -18,11 +17,9 @@ import typer
 
 from dpcli import __version__
 from dpcli.errors import DpcError, UsageError
+from dpcli.runtime.tuning import tune_environment
 
-# Before torch and numba load: threads that wait by spinning keep the other library's threads off the cores, and a large
-# tensor in pages of 4 kB takes longer to get from the system than to fill.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+tune_environment()  # before torch and numba load
 
 # Options are many and take long to set up: only the room that is asked for is loaded, and of it only the command that is
 # asked for is set up; `dpc --help` loads none.
@@ -38,11 +35,6 @@ ROOMS = {
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
-_FULL = {
-    errno.ENOSPC: "no space left on the device",
-    errno.EDQUOT: "disk quota exceeded",
-    errno.EFBIG: "file too large",
-}
 
 
 def _version(wanted: bool) -> None:
@@ -62,7 +54,6 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
     dpc = typer.Typer(
         name="dpc",
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
         context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
@@ -81,6 +72,14 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
             room = import_module(f"dpcli.cli.{name}.app").app
             dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about)
     return dpc
+
+
+def _words_to_complete() -> list[str] | None:
+    """Returns the words after `dpc` that a shell wants completed, or None where this is an ordinary run."""
+    if "_DPC_COMPLETE" not in os.environ:
+        return None
+    words = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")  # bash; zsh and fish
+    return words.split()[1:]
 
 
 def _narrowed(group: typer.Typer, path: Sequence[str]) -> typer.Typer:
@@ -130,6 +129,7 @@ def _global_flags(argv: list[str]) -> list[str]:
 def _explain(error: BaseException) -> int:
     """Print a message for a person and return the exit code."""
     from dpcli.runtime.progress import log
+    from dpcli.runtime.whole_file import disk_full
 
     if isinstance(error, BrokenPipeError):
         os.dup2(
@@ -147,9 +147,10 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return 2
-    if isinstance(error, OSError) and error.errno in _FULL:
-        log.error(f"{_FULL[error.errno]} while writing {error.filename or 'the output'}; free some and run again")
-        return 1
+    full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None
+    if full is not None:
+        log.error(str(full))
+        return full.exit_code
     if _out_of_memory(error):
         log.error(
             f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"
@@ -236,7 +237,7 @@ def _keeping_inputs(command: Any) -> Any:
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(arguments))))
+    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(_words_to_complete() or arguments))))
     from dpcli.runtime.progress import log
 
     try:

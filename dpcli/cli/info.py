@@ -38,7 +38,7 @@ def info(
 
     Of a model: its classes, configuration and training.
     """
-    from dpcli.runtime.weights_lookup import SUFFIX, locate_weights, weights_summary
+    from dpcli.runtime.weights import SUFFIX, locate_weights, weights_summary
     from dpcli.store import input_file
     from dpcli.store.summary import summary
 

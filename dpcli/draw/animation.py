@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,7 +11,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.progress import log
-from dpcli.store.pipes import check_replaced
+from dpcli.runtime.whole_file import check_replaced, whole_file
 
 KINDS = (".mp4", ".gif", ".png")
 _QUALITY = 18  # x264's constant rate factor: visually lossless
@@ -39,17 +36,11 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, fo
     check_replaced(path, ("[0-9]*.png",))
     if not path.parent.is_dir():
         raise DataError(f"{path}: the folder {path.parent} does not exist; create it first")
-    hidden = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.parent))
-    part = hidden / f"whole{kind}"
     try:
-        {".mp4": _mp4, ".gif": _gif, ".png": _png, "": _folder}[kind](part, pictures, fps)
-        if path.is_dir():
-            shutil.rmtree(path)
-        os.replace(part, path)
+        with whole_file(path) as part:
+            {".mp4": _mp4, ".gif": _gif, ".png": _png, "": _folder}[kind](part, pictures, fps)
     except OSError as error:
         raise DpcError(f"{path}: cannot be written ({error})") from None
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:

@@ -25,6 +25,7 @@ from dpcli.generate4d.scene.model import Instant, Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.runtime.progress import Progress
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.seeds import Generate4DStream, torch_seed
 from dpcli.runtime.signals import StopRequest
 
 COLUMNS = ("step", "stage", "loss", "psnr", "gaussians", "seconds")
@@ -78,9 +79,9 @@ class Fit:
         return self.model
 
     def _start(self) -> None:
-        rng = np.random.default_rng(np.random.SeedSequence([self.seed, 4001]))
+        rng = np.random.default_rng(np.random.SeedSequence([self.seed, int(Generate4DStream.FIRST_POINTS)]))
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(int(np.random.SeedSequence([self.seed, 4002]).generate_state(1)[0]))
+            torch.manual_seed(torch_seed(self.seed, Generate4DStream.FIRST_WEIGHTS))
             mean, color = self._first_points(rng)
             sphere = self._start_kind() == "sphere"
             gaussians = CanonicalGaussians(mean, color, opacity=0.05 if sphere else 0.5)
@@ -149,8 +150,7 @@ class Fit:
             self._densify(rng)
 
     def _draws(self) -> torch.Generator:
-        number = np.random.SeedSequence([self.seed, 4003, self.step]).generate_state(1)[0]
-        return torch.Generator().manual_seed(int(number))
+        return torch.Generator().manual_seed(torch_seed(self.seed, Generate4DStream.STEP, self.step))
 
     def _pick(self, rng: torch.Generator) -> tuple[list[int], list[int]]:
         """(view, frame) of the step's pictures: every second one the reference, the others from the given views.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from dpcli.ops.gather import gather_points
-from dpcli.ops.knn import knn
+from dpcli.ops.nearest_neighbors import knn
 
 _LEAST = 1e-10  # squared distances are clamped to this, so that a coincident point takes all the weight
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
@@ -10,7 +9,7 @@ import signal
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,7 +28,7 @@ from dpcli.runtime.provenance import record
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.runtime.worker_server import start_early
 from dpcli.store import CloudsReader, CloudsWriter
-from dpcli.store.journal import sweep
+from dpcli.store.writing.already_made import already_made
 
 _LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
 
@@ -121,35 +120,29 @@ def convert(
     items = items[:limit]
     provenance = describe_shard(record(configuration(reader, thinning, items, compression), seed), shard)
     report = Report()
-    if not force and already_complete(output, provenance):
-        sweep(output)
+    if not force and already_made(output, provenance, CloudsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
         return count_samples(report, output)
     work = partial(convert_item, reader, thinning, seed)
-    try:
-        with (
-            stop_requested() as stop,
-            CloudsWriter(
-                output,
-                class_names=reader.class_names,
-                length_unit=reader.length_unit,
-                source=type(reader).__name__,
-                seed=seed,
-                fields=reader.fields,
-                compression=compression,
-                provenance=provenance,
-                force=force,
-                resume=resume,
-            ) as writer,
-        ):
-            run = _Run(writer, report, stop, on_error, items, shard)
-            run.stream(work, jobs, executor, task)
-            writer.skipped = report.skipped
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        raise DpcError(f"{output}: no space left on the device; nothing was left under this name") from None
+    with (
+        stop_requested() as stop,
+        CloudsWriter(
+            output,
+            class_names=reader.class_names,
+            length_unit=reader.length_unit,
+            source=type(reader).__name__,
+            seed=seed,
+            fields=reader.fields,
+            compression=compression,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        ) as writer,
+    ):
+        run = _Run(writer, report, stop, on_error, items, shard)
+        run.stream(work, jobs, executor, task)
+        writer.skipped = report.skipped
     return count_samples(report, output)
 
 
@@ -249,25 +242,6 @@ def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str)
     report.skipped.append((item.name, str(result)))
     log.detail(f"skipped {item.name}: {result}")
     bar.advance(1)
-
-
-def already_complete(
-    output: Path, provenance: dict[str, Any], open_reader: Callable[[Path], Any] = CloudsReader
-) -> bool:
-    """Whether ``output`` exists and was made by this configuration and seed; UsageError when made by another."""
-    if not output.exists():
-        return False
-    try:
-        with open_reader(output) as reader:
-            before = reader.provenance[-1] if reader.provenance else {}
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    old, new = (({**entry.get("config", {}), "seed": entry.get("seed")}) for entry in (before, provenance))
-    if old == new:
-        return True
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    different = ", ".join(f"{key} {old.get(key)} (now {new.get(key)})" for key in keys[:4])
-    raise UsageError(f"{output}: exists, made with {different}; write to another file, or --force to replace it")
 
 
 def count_samples(report: Report, output: Path) -> Report:

@@ -20,6 +20,7 @@ from statistics import mean, stdev
 
 from dpcli.evaluate.report.thesis import thesis_tables
 from dpcli.runtime.provenance import file_digest
+from dpcli.runtime.whole_file import write_whole
 
 Dpc = Callable[..., str]
 STOPPED = (75, 130, 143)  # exit codes of a command that was asked to stop
@@ -68,11 +69,9 @@ def attempt(work: Callable[[], object], what: str) -> str:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file that is whole once it is there, also when two jobs write it."""
+    """Writes a text file whole, in a folder that is made if need be; two jobs may write it at once."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    part.write_text(text)
-    os.replace(part, path)
+    write_whole(path, text.encode(), many_writers=True)
 
 
 def write_json(path: Path, value: object) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 
 from dpcli.errors import UsageError
-from dpcli.runtime.matrix_products import choose_products
+from dpcli.runtime.tuning import choose_products
 
 
 def cpu_count() -> int:
@@ -21,7 +22,7 @@ def cpu_count() -> int:
 def choose_device(name: str = "auto"):
     """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError for any other, and when a CUDA device is asked for and absent.
 
-    For a CPU it also chooses the library that multiplies matrices (`products`).
+    For a CPU it also chooses the library that multiplies matrices (`tuning.choose_products`).
     """
     import torch
 
@@ -38,3 +39,11 @@ def choose_device(name: str = "auto"):
     if device.type == "cpu":
         choose_products()
     return device
+
+
+def peak_memory() -> int:
+    """Returns the peak resident memory of this process so far, in bytes."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -16,7 +16,7 @@ from typing import Any
 
 from dpcli.errors import DpcError
 from dpcli.runtime import shared_memory as handover
-from dpcli.runtime.memory import keep_freed_memory
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 
 _MOST = 1024  # processes; with far more, the counters of a pool's queue overflow

@@ -1,34 +1,53 @@
-"""Files of a training run: each is whole or not there, and a disk that is full ends with a sentence."""
+"""Writing a file whole or not at all: whether its name may be written, the file beside it, and what a full disk says."""
 
 from __future__ import annotations
 
 import errno
 import os
 import re
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 
-from dpcli.errors import NO_ROOM, DpcError
+from dpcli.errors import DataError, DpcError, UsageError
+
+PICTURES = (".png", ".jpg", ".jpeg")
+FIGURES = (*PICTURES, ".pdf", ".svg")
+_NO_ROOM = {
+    errno.ENOSPC: "no space left on the device",
+    errno.EFBIG: "the file size limit is reached",
+    errno.EDQUOT: "the disk quota is used up",
+}  # why a write fails for want of room, by the system's number
+_IN_TEXT = re.compile(r"os error (\d+)|errno = (\d+)", re.IGNORECASE)  # safetensors and HDF5 say it in words only
 
 
 class DiskFull(DpcError):
     """A file could not be written for want of room."""
 
 
-def disk_full(path: Path, error: BaseException | None) -> DiskFull | None:
-    """What a failed write to `path` says when there was no room for it; None for any other error."""
+def disk_full(
+    path: str | Path, error: BaseException | None, advice: str = "make room, then run the same command again"
+) -> DiskFull | None:
+    """Returns the error that a failed write to `path` ends with when there was no room for it, None for any other failure.
+
+    `error` is what the write raised; what it was raised from is looked at, too. `advice` ends the sentence.
+    """
     while error is not None:
-        said = re.search(r"\(os error (\d+)\)", str(error))  # safetensors has the number in its text only
-        number = int(said[1]) if said else getattr(error, "errno", None)
-        if number in NO_ROOM:
-            return DiskFull(f"{path}: {NO_ROOM[number]}; make room, then run the same command again")
+        told = _IN_TEXT.search(str(error))
+        number = int(told[1] or told[2]) if told else getattr(error, "errno", None)
+        if number in _NO_ROOM:
+            return DiskFull(f"{path}: {_NO_ROOM[number]}; {advice}")
         error = error.__context__  # torch.save hides it behind an error of its own
     return None
 
 
 def reserve(file: int, size: int) -> None:
-    """Take the room of an open file (descriptor, bytes) now: a mapped page that finds none later ends the process by SIGBUS, unheard."""
+    """Takes `size` bytes of room for an open file (its descriptor) now.
+
+    A mapped page that finds no room later ends the process by SIGBUS, without a word. OSError: there is no room.
+    """
     if not hasattr(os, "posix_fallocate"):  # macOS, Windows
         return
     try:
@@ -38,16 +57,87 @@ def reserve(file: int, size: int) -> None:
             raise
 
 
+def put_in_place(part: Path, path: Path) -> None:
+    """Brings `part`, a finished file or folder, to the disk and renames it to `path`, which it replaces. OSError: it can't."""
+    if part.is_dir():
+        if path.is_dir():
+            shutil.rmtree(path)
+    else:
+        with open(part, "rb") as whole:
+            os.fsync(whole.fileno())
+    os.replace(part, path)
+
+
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """The file to write instead, beside `path` and renamed to it at the end of the block; removed when that fails."""
-    part = path.with_name(f".{path.name}.part")
+def whole_file(path: Path, *, many_writers: bool = False) -> Iterator[Path]:
+    """Yields the name to write to instead of `path`: beside it, hidden, with its suffix; renamed to it when the block ends.
+
+    The block may make a folder of that name. When it fails, nothing of it stays, and what was under `path` does.
+    many_writers: other processes may write `path` at the same time; the last one wins. Raises DiskFull where there was no room.
+    """
+    own = f".{os.getpid()}" if many_writers else ""
+    part = path.with_name(f".{path.name}{own}.part{path.suffix}")
+    _remove(part)  # a killed run may have left it
     try:
         yield part
-        os.replace(part, path)
+        put_in_place(part, path)
     except BaseException as error:
-        part.unlink(missing_ok=True)
+        _remove(part)
         full = disk_full(path, error)
         if full is None:
             raise
         raise full from None
+
+
+def write_whole(path: Path, content: bytes, *, many_writers: bool = False) -> None:
+    """Writes a file through `whole_file`. DataError when it can't be written, DiskFull where there was no room."""
+    try:
+        with whole_file(path, many_writers=many_writers) as part:
+            part.write_bytes(content)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+
+
+def _remove(part: Path) -> None:
+    if part.is_dir() and not part.is_symlink():
+        shutil.rmtree(part, ignore_errors=True)
+    elif part.exists():
+        part.unlink(missing_ok=True)
+
+
+def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
+    """Raises, before the work, where no file of one of these kinds (`.png` ...) can be written: UsageError, DataError."""
+    if path.suffix.lower() not in kinds:
+        raise UsageError(f"{option} {path}: unknown kind {path.suffix!r}; expected {', '.join(kinds)}")
+    if not path.absolute().parent.is_dir():
+        raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
+    if path.is_dir():
+        raise DataError(f"{option} {path}: is a folder; name a file in it")
+
+
+def check_regular(path: Path, option: str = "-o") -> None:
+    """Raises UsageError where a device, pipe or socket is, or a handle such as /dev/stdout."""
+    target = os.readlink(path) if path.is_symlink() else ""
+    handle = target.startswith("/proc/") or os.path.realpath(path.parent).startswith("/proc/")
+    if handle or (path.exists() and not path.is_file() and not path.is_dir()):
+        raise UsageError(f"{option} {path}: is not a regular file; to write into a pipe use `-o - | ...`")
+
+
+def refuse_pipe(path: Path) -> None:
+    """Raises UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise UsageError(
+            f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -"
+        )
+
+
+def check_replaced(folder: Path, own: Sequence[str]) -> None:
+    """Raises UsageError where a folder that --force replaces whole holds what no name pattern of the command's own covers."""
+    if folder.is_dir():
+        others = [
+            one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)
+        ]
+        if others:
+            raise UsageError(
+                f"{folder}: holds other things, too, such as {min(others)}; name another folder, or empty it yourself"
+            )

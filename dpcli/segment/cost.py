@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory, peak_memory
+from dpcli.runtime.device import choose_device, peak_memory
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.network.config import PartConfig, find_config
 from dpcli.segment.network.icosahedron import GROUPS
 from dpcli.segment.network.kernel_points import kernel_points

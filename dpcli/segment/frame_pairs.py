@@ -8,11 +8,10 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.runtime.progress import log
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.store import CloudSequence, CloudsReader
 
 MOTION_FIELDS = ("pose", "scene_flow")  # what may tell the true motion, the better one first
-_FRAME_KEY = 7001  # keeps these generators apart from those of epochs
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class PairSource:
         sample = self.reader.read(pair.sequence, frames, self.fields)
         clouds = [sample.frame(t) for t in range(2)]
         picks = [
-            choose_points(len(c), self.points, generator(self.seed, _FRAME_KEY, pair.sequence, f))
+            choose_points(len(c), self.points, generator(self.seed, SegmentStream.FRAME_POINTS, pair.sequence, f))
             for c, f in zip(clouds, frames)
         ]
         parts = np.stack([frame_parts(sample, t)[pick] for t, pick in enumerate(picks)])
@@ -122,5 +121,5 @@ def true_flow(points: np.ndarray, part: np.ndarray, source: np.ndarray, target: 
 
 def epoch_order(source: PairSource, epoch: int, most: int | None) -> list[Pair]:
     """The epoch's pairs, shuffled; at most `most`, another draw each epoch."""
-    order = generator(source.seed, 7002, epoch).permutation(len(source.pairs))
+    order = generator(source.seed, SegmentStream.PAIR_ORDER, epoch).permutation(len(source.pairs))
     return [source.pairs[i] for i in order[:most]]

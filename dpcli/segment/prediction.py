@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +13,7 @@ from torch import Tensor
 from dpcli.ops import fps, knn, three_nn_interpolate, weighted_kabsch
 from dpcli.ops.rigid import rigid_flow, to_matrix
 from dpcli.runtime.seeds import generator
+from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.flow.object_icp import object_icp
 from dpcli.segment.frame_pairs import choose_points, sequence_scale
 from dpcli.segment.network.part_network import PartNetwork
@@ -94,7 +94,7 @@ def predict_parts(
     chain = [(t, t + 1) for t in range(len(thin) - 1)]
     flows, masks = _flows_and_masks(thin, [*pairs, *chain], estimate, segmenter)
     if options.split and len(thin) > 1:
-        with _threads_for(thin):
+        with torch_threads(_threads_for(thin)):
             masks = [
                 split_by_motion(cloud, flows[t, t + 1 if t + 1 < len(thin) else t - 1], mask)
                 for t, (cloud, mask) in enumerate(zip(thin, masks))
@@ -144,7 +144,7 @@ def _flows_and_masks(
     """
     both = sorted({(min(pair), max(pair)) for pair in pairs})
     workers = min(2, torch.get_num_threads())  # one of torch's threads in each: what is set now holds for new ones
-    with _threads_for(frames), ThreadPoolExecutor(workers) as pool:
+    with torch_threads(_threads_for(frames)), ThreadPoolExecutor(workers) as pool:
         early = pool.submit(segmenter, frames, {}) if isinstance(segmenter, _NetworkSegmenter) else None
         found = list(pool.map(lambda pair: estimate(frames[pair[0]], frames[pair[1]]), both))
         flows = dict(zip(both, (forth for forth, _ in found)))
@@ -206,7 +206,7 @@ def _motions(
     slots = masks[0].shape[1]
     motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
     middle = torch.from_numpy(center)
-    with _threads_for(thin):
+    with torch_threads(_threads_for(thin)):
         fitted = _fitted(thin, masks, flows, pairs, options.icp)
     for q, ((i, _), (rotation, shift)) in enumerate(zip(pairs, fitted)):
         flow.append((rigid_flow(whole[i][None], full[i][None], rotation[None], shift[None])[0] / scale).numpy())
@@ -216,15 +216,9 @@ def _motions(
     return motion, flow
 
 
-@contextmanager
-def _threads_for(frames: list[Tensor]) -> Iterator[None]:
-    """One thread of torch's for many small operations: two gain nothing, and wait for one another on a busy machine."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1 if max(len(frame) for frame in frames) <= _SMALL else threads)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+def _threads_for(frames: list[Tensor]) -> int:
+    """Returns how many of torch's threads to use: one for small frames, of whose operations two threads gain nothing."""
+    return 1 if max(len(frame) for frame in frames) <= _SMALL else torch.get_num_threads()
 
 
 def _fitted(

@@ -11,10 +11,10 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import STRING, write_positions, write_skipped
-from dpcli.store.journal import Placed
-from dpcli.store.resumable_writer import ResumableWriter
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
-from dpcli.store.whole_chunks import WholeChunks
+from dpcli.store.writing.journal import Placed
+from dpcli.store.writing.resumable_writer import ResumableWriter
+from dpcli.store.writing.whole_chunks import WholeChunks
 
 COMPRESSIONS = ("none", "lzf", "gzip")
 POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence

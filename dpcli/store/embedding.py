@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.writing.atomic_file import AtomicFile
 
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
@@ -40,9 +41,7 @@ def write_embedding(
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
     _check(str(path), names, labels, splits, streams)
-    atomic = AtomicFile(path)
-    try:
-        file = atomic.file
+    with AtomicFile(path) as file:
         write_root(
             file, "embedding", length_unit="", source=source, seed=seed, class_names=class_names, provenance=provenance
         )
@@ -52,10 +51,6 @@ def write_embedding(
         for stream, said in streams.items():
             file.create_dataset(f"features/{stream}", data=said.features)
             file.create_dataset(f"coordinates/{stream}", data=said.coordinates).attrs.update(said.values)
-    except BaseException as error:
-        atomic.failed(type(error), error, None)
-        raise
-    atomic.commit()
 
 
 def _check(

@@ -6,13 +6,14 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import AtomicFile, open_store, read_provenance, root_attributes, write_root
+from dpcli.store.file import open_store, read_provenance, root_attributes, write_root
+from dpcli.store.writing.atomic_file import AtomicFile
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _TOLERANCE = 1e-3  # of float32 unit quaternions, probabilities and rotations
@@ -235,22 +236,11 @@ def write_scene(
         raise UsageError(f"{path}: exists already; --force replaces it")
     scene.validate(f"{path}")
     history = [provenance] if isinstance(provenance, dict) else list(provenance or [])
-    atomic = AtomicFile(path)
-    try:
+    with AtomicFile(path) as file:
         write_root(
-            atomic.file,
-            "gaussians",
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            class_names=[],
-            provenance=history,
+            file, "gaussians", length_unit=length_unit, source=source, seed=seed, class_names=[], provenance=history
         )
-        _write_arrays(atomic.file, scene)
-    except BaseException as error:
-        atomic.failed(type(error), error, None)
-        raise
-    atomic.commit()
+        _write_arrays(file, scene)
 
 
 def _write_arrays(file: h5py.File, scene: GaussianScene) -> None:
@@ -280,7 +270,14 @@ def read_scene(path: str | Path) -> GaussianScene:
     return scene
 
 
-def scene_origin(path: str | Path) -> tuple[dict[str, Any], list[dict]]:
-    """Where a scene comes from: the file's root attributes, and the commands that led to it, oldest first."""
+class SceneOrigin(NamedTuple):
+    """Says where a scene comes from: the file's root attributes, and the commands that led to it, oldest first."""
+
+    attributes: dict[str, Any]
+    provenance: list[dict]
+
+
+def scene_origin(path: str | Path) -> SceneOrigin:
+    """Reads where a scene comes from, and nothing of the scene itself. DataError as `open_store`."""
     with open_store(path, ["gaussians"]) as file:
-        return root_attributes(file), read_provenance(file)
+        return SceneOrigin(root_attributes(file), read_provenance(file))

@@ -7,17 +7,15 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.whole_file import check_regular, refuse_pipe
 
 _PAGES = (".html", ".htm", ".md", ".tex")
-PICTURES = (".png", ".jpg", ".jpeg")
-FIGURES = (*PICTURES, ".pdf", ".svg")
 _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
 
 
@@ -59,24 +57,6 @@ def standard_input() -> BinaryIO:
     return sys.stdin.buffer
 
 
-def refuse_pipe(path: Path) -> None:
-    """UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise UsageError(
-            f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -"
-        )
-
-
-def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
-    """Say before the work that no file of one of these kinds (`.png` ...) can be written there: UsageError, DataError."""
-    if path.suffix.lower() not in kinds:
-        raise UsageError(f"{option} {path}: unknown kind {path.suffix!r}; expected {', '.join(kinds)}")
-    if not path.absolute().parent.is_dir():
-        raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
-    if path.is_dir():
-        raise DataError(f"{option} {path}: is a folder; name a file in it")
-
-
 def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
     """Say before anything is opened that what is there must not be replaced, --force or not: UsageError.
 
@@ -96,14 +76,6 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
             raise UsageError(f"{option} {path}: belongs to the input {given}, and would be replaced; name another file")
 
 
-def check_regular(path: Path, option: str = "-o") -> None:
-    """UsageError where a device, pipe or socket is, or a handle such as /dev/stdout."""
-    target = os.readlink(path) if path.is_symlink() else ""
-    handle = target.startswith("/proc/") or os.path.realpath(path.parent).startswith("/proc/")
-    if handle or (path.exists() and not path.is_file() and not path.is_dir()):
-        raise UsageError(f"{option} {path}: is not a regular file; to write into a pipe use `-o - | ...`")
-
-
 def refuse_repeats(names: Iterable[str | Path]) -> None:
     """UsageError where two of the names, inputs and the output, are of one file."""
     seen: list[Path] = []
@@ -117,25 +89,13 @@ def refuse_repeats(names: Iterable[str | Path]) -> None:
 
 
 def _is_result(path: Path) -> bool:
-    """Whether a command of dpc's may have written it as its -o."""
-    from dpcli.store.file import file_kind
+    """Returns whether a command of dpc's may have written the file as its -o."""
+    from dpcli.store.file import file_kind  # h5py, which most checks of an output don't need
 
     try:
         return path.suffix.lower() in _PAGES or bool(file_kind(path))
     except DataError:
         return False
-
-
-def check_replaced(folder: Path, own: Sequence[str]) -> None:
-    """Before --force replaces a folder whole: UsageError where it holds what no name pattern of the command's own covers."""
-    if folder.is_dir():
-        others = [
-            one.name for one in folder.iterdir() if one.is_dir() or not any(fnmatch(one.name, name) for name in own)
-        ]
-        if others:
-            raise UsageError(
-                f"{folder}: holds other things, too, such as {min(others)}; name another folder, or empty it yourself"
-            )
 
 
 def _regular_file(stream: BinaryIO) -> Path | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes
-from dpcli.store.resumable_writer import ResumableWriter
+from dpcli.store.writing.resumable_writer import ResumableWriter
 
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 

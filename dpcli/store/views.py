@@ -11,7 +11,8 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING, AtomicFile, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.writing.atomic_file import AtomicFile
 
 ROLES = ("reference", "train", "test")
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}

@@ -202,7 +202,7 @@ def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
 
 
 @pytest.mark.parametrize(
-    "number, said", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "disk quota"), (errno.EFBIG, "too large")]
+    "number, said", [(errno.ENOSPC, "no space left"), (errno.EDQUOT, "disk quota"), (errno.EFBIG, "size limit")]
 )
 def test_a_full_disk_is_no_bug(number, said, capsys):
     assert cli._explain(OSError(number, "of the system")) == 1 and said in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -140,3 +141,9 @@ def test_keys_sort_as_distance_then_index() -> None:
     assert key_indices(order).tolist() == [1, 4, 0, 3, 5, 2]
     assert torch.equal(key_distances(order), distances[key_indices(order)])
     assert np.isinf(key_distances(order)[-1].item())
+
+
+def test_no_module_hides_a_function_of_the_package():
+    """A submodule of the same name would take the function's place as soon as anything imports it."""
+    modules = {path.stem for path in Path(dpcli.ops.__file__).parent.iterdir()}
+    assert not modules & set(dpcli.ops.__all__)

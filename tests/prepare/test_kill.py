@@ -21,7 +21,7 @@ from dpcli.prepare.pipeline import convert, convert_item
 from dpcli.runtime import pool
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store import clouds_writer as writer_module
-from dpcli.store.journal import Journal
+from dpcli.store.writing.journal import Journal
 from tests.support.prepare_helpers import DPC, ROOT, ToyReader, dpc
 
 SYNTHETIC = ("prepare", "synthetic", "gestures", "--frames", "8", "--size", "64", "--videos-per-class", "6")

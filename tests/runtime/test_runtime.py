@@ -18,9 +18,9 @@ import torch
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.runtime import device, progress, provenance
 from dpcli.runtime.pool import ordered_map
-from dpcli.runtime.safetensors_file import load_weights, save_weights
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.weights import load_weights, save_weights
 
 
 def square(x: int) -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 from dpcli.classify.network.kinet import STREAMS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.errors import UsageError
-from dpcli.store.pipes import check_target
+from dpcli.runtime.whole_file import check_target
 
 
 def chosen_streams(text: str | None, info: ModelInfo) -> tuple[str, ...]:

@@ -25,8 +25,8 @@ from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import Progress
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.whole_file import PICTURES
 from dpcli.store import CloudsReader, CloudsWriter, input_file, output_file
-from dpcli.store.pipes import PICTURES
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
     pictures = ((request.picture, "--picture", PICTURES), (request.animation, "--animation", ANIMATIONS))
     check_targets(str(task.output), task.force, *pictures)
     device = choose_device(task.device)
-    model, info = load_model(task.model, task.backbone)
+    weights = find_model(task.model)
+    model, info = load_model(weights, task.backbone)
     streams = chosen_streams(request.stream, info)
     stage = None if settings.stage is None else settings.stage - 1
     question = Question(settings.rule, stage, _target(settings.target, info.class_names))
@@ -74,7 +75,7 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
         sequences = chosen_samples(reader, request.samples, pool)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=task.seed)
         report_short(source, info.config.num_frames)
-        entry = provenance.record(_record(task, request, streams, info), task.seed, {"clouds": path})
+        entry = provenance.record(_record(task, weights, request, streams, info), task.seed, {"clouds": path})
         clouds = _explain(model.to(device), source, streams, question, device)
         write_clouds(
             place,
@@ -95,7 +96,9 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
     return Explained(points, len(clouds), info.config.num_frames)
 
 
-def _record(task: ModelTask, request: PacRequest, streams: Sequence[str], info: ModelInfo) -> dict[str, Any]:
+def _record(
+    task: ModelTask, weights: Path, request: PacRequest, streams: Sequence[str], info: ModelInfo
+) -> dict[str, Any]:
     """Returns what shapes the activations, for the file's provenance."""
     return {
         "streams": list(streams),
@@ -104,7 +107,7 @@ def _record(task: ModelTask, request: PacRequest, streams: Sequence[str], info: 
         "stage": request.settings.stage,
         "samples": request.samples,
         "split": task.split,
-        "weights": provenance.file_digest(find_model(task.model)),
+        "weights": provenance.file_digest(weights),
         "model": info.notes,
     }
 

@@ -25,11 +25,11 @@ from dpcli.classify.explain.tsne import (
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import FIGURES
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.embedding import StreamEmbedding, write_embedding
-from dpcli.store.pipes import FIGURES
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,8 @@ def explain_tsne(task: ModelTask, request: TsneRequest) -> Embedding:
     """
     check_targets(str(task.output), task.force, (request.picture, "--picture", FIGURES))
     device = choose_device(task.device)
-    model, info = load_model(task.model, task.backbone)
+    weights = find_model(task.model)
+    model, info = load_model(weights, task.backbone)
     streams = chosen_streams(request.stream, info)
     with input_file(task.data) as path, output_file(task.output) as place:
         reader = CloudsReader(path)
@@ -103,7 +104,9 @@ def explain_tsne(task: ModelTask, request: TsneRequest) -> Embedding:
         labels = reader.labels[kept]
         _tell_what_is_missing(labels)
         embeddings = {s: _embedding(features[s], labels, perplexity, task.seed) for s in streams}
-        entry = provenance.record(_record(task, request, streams, perplexity, info), task.seed, {"clouds": path})
+        entry = provenance.record(
+            _record(task, weights, request, streams, perplexity, info), task.seed, {"clouds": path}
+        )
         write_embedding(
             place,
             [reader.names[i] for i in kept],
@@ -124,7 +127,7 @@ def explain_tsne(task: ModelTask, request: TsneRequest) -> Embedding:
 
 
 def _record(
-    task: ModelTask, request: TsneRequest, streams: tuple[str, ...], perplexity: float, info: ModelInfo
+    task: ModelTask, weights: Path, request: TsneRequest, streams: tuple[str, ...], perplexity: float, info: ModelInfo
 ) -> dict[str, Any]:
     """Returns what shapes the map, for the file's provenance."""
     return {
@@ -132,7 +135,7 @@ def _record(
         "split": task.split,
         "perplexity": perplexity,
         "clips_per_video": request.clips_per_video,
-        "weights": provenance.file_digest(find_model(task.model)),
+        "weights": provenance.file_digest(weights),
         "model": info.notes,
     }
 

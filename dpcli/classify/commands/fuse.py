@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.fusion import MEANS, geometric_weights, likelihood_weights, mean_scores, parse_weights
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import short_names
@@ -65,7 +66,7 @@ def fuse(
         config = _record(streams, mean, shares, readers, judges)
         entry = provenance.record(config, 0, dict(zip(stream_names(short_names(called)), paths)))
         fusion = Fusion(len(sources[0].names), dict(zip(streams, shares.tolist())))
-        if not force and _already_there(target, entry):
+        if not force and already_scored(target, entry):
             return Fusion(fusion.videos, fusion.weights, complete=True)
         with ScoresWriter(
             target,
@@ -250,14 +251,6 @@ def _same_truth(
                 f"{other}: {one.names[row]!r} is of split {b!r}, in {first} of {a!r}; "
                 "these are scores of different data"
             )
-
-
-def _already_there(target: Path, entry: dict) -> bool:
-    if not target.exists():
-        return False
-    from dpcli.classify.commands.predict import already_scored  # imports torch, which nothing else here needs
-
-    return already_scored(target, entry)
 
 
 def _write(

@@ -9,19 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.classify.commands.model_task import ModelTask
+from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.videos import check_classes, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.video_scores import VideoScores, predict_videos
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
-from dpcli.store import CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
-from dpcli.store.journal import sweep
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,15 @@ def predict(
     else, DataError when data and model don't fit.
     """
     device = choose_device(task.device)
-    model, info = load_model(task.model, task.backbone)
+    weights = find_model(task.model)
+    model, info = load_model(weights, task.backbone)
     with input_file(task.data) as path, output_file(task.output) as target:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
         sequences = select_videos(reader, task.split, info, task.model)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
         report_short(source, info.config.num_frames)
-        config = _record(task, info, source, clips_per_video, drop_short)
+        config = _record(task, weights, info, source, clips_per_video)
         history = [*reader.provenance, provenance.record(config, task.seed, {"clouds": path})]
         if not task.force and already_scored(target, history[-1]):
             return Prediction(len(source.sequences), len(info.class_names), complete=True)
@@ -62,16 +63,16 @@ def predict(
 
 
 def _record(
-    task: ModelTask, info: ModelInfo, source: ClipSource, clips_per_video: int | None, drop_short: bool
+    task: ModelTask, weights: Path, info: ModelInfo, source: ClipSource, clips_per_video: int | None
 ) -> dict[str, Any]:
     """Returns what shapes the scores, for the file's provenance."""
     return {
         "split": task.split,
         "clips_per_video": clips_per_video,
-        "drop_short": drop_short,
+        "drop_short": source.drop_short,
         "dropped": source.dropped,
         "model": info.notes,
-        "weights": provenance.file_digest(find_model(task.model)),
+        "weights": provenance.file_digest(weights),
         "fusion": info.config.fusion,
     }
 
@@ -95,23 +96,6 @@ def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict])
         except Exception as error:
             writer.keep = not isinstance(error, DataError)
             raise
-
-
-def already_scored(target: Path, entry: dict) -> bool:
-    """Returns whether `target` holds the scores of this very work. Raises UsageError when it holds something else."""
-    if not target.exists():
-        return False
-    try:
-        before = ScoresReader(target).provenance[-1:]
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(
-            f"{target}: holds scores of another model, data or choice; use another -o, or --force to replace it"
-        )
-    sweep(target)
-    log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
-    return True
 
 
 def _done(source: ClipSource, writer: ScoresWriter) -> set[int]:

@@ -21,9 +21,9 @@ from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.errors import DataError, DpcError, Stopped
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.signals import StopRequest, stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import ScoresWriter
 
 _CTRL_C = "SIGINT"
@@ -61,7 +61,8 @@ def predict_stream(
     new_listener: makes, from class names and streams, the one who takes the predictions. Returns the number of frames.
     Raises what ended the stream early.
     """
-    model, info = load_model(task.model, task.backbone)
+    weights = find_model(task.model)
+    model, info = load_model(weights, task.backbone)
     device = choose_device(task.device)
     predictor = StreamPredictor(model, info, window=options.window, hop=options.hop, seed=task.seed, device=device)
     frames = open_frames(task.data, options.follow, options.files)
@@ -72,7 +73,7 @@ def predict_stream(
         if not predictor.clips:
             raise problem or DataError(f"{task.source}: not one frame came; the program before the pipe wrote nothing")
         if target is not None:
-            target.provenance.append(provenance.record(_record(task, options, info, predictor), task.seed))
+            target.provenance.append(provenance.record(_record(weights, options, info, predictor), task.seed))
             fused, *single = predictor.mean
             target.write(Path(task.source).stem, fused, streams=dict(zip(predictor.streams, single)))
     if task.output:
@@ -93,7 +94,7 @@ def _writer(task: ModelTask, info: ModelInfo, predictor: StreamPredictor) -> Sco
     )
 
 
-def _record(task: ModelTask, options: StreamOptions, info: ModelInfo, predictor: StreamPredictor) -> dict[str, Any]:
+def _record(weights: Path, options: StreamOptions, info: ModelInfo, predictor: StreamPredictor) -> dict[str, Any]:
     """Returns what shapes the scores, for the file's provenance."""
     return {
         "stream": True,
@@ -101,7 +102,7 @@ def _record(task: ModelTask, options: StreamOptions, info: ModelInfo, predictor:
         "window": predictor.window.size,
         "frames": predictor.window.count,
         "model": info.notes,
-        "weights": provenance.file_digest(find_model(task.model)),
+        "weights": provenance.file_digest(weights),
         "fusion": info.config.fusion,
     }
 

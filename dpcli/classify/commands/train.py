@@ -24,13 +24,13 @@ from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
 from dpcli.runtime.distributed import Processes, from_environment, process_group
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.settings.catalog import Given
 from dpcli.runtime.signals import stop_requested
-from dpcli.runtime.whole_file import whole_file
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import write_whole
 from dpcli.store import CloudsReader, input_file
 
 SETTINGS_FILE = "settings.toml"
@@ -99,8 +99,7 @@ def _train(
         stop_requested() as stop,
     ):  # last: --force deletes an earlier model
         if processes.first:
-            with whole_file(folder.file(SETTINGS_FILE)) as part:
-                part.write_text(settings.to_toml(f"classify train --seed {seed}"), "utf-8")
+            write_whole(folder.file(SETTINGS_FILE), settings.to_toml(f"classify train --seed {seed}").encode())
         processes.wait()  # the others find the folder as it is to be
         trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
         trainer.run()
@@ -193,8 +192,9 @@ def _new_model(settings: TrainingSettings, folder: RunFolder) -> Kinet:
     for name, option, mine in ((run.static_from, "static_from =", model.static), (run.init, "--init", model)):
         if not name:
             continue
-        folder.refuse_inside(option, find_model(name, option))
-        other, _ = load_model(name, config.backbone, option)
+        weights = find_model(name, option)
+        folder.refuse_inside(option, weights)
+        other, _ = load_model(weights, config.backbone)
         theirs = other.static if mine is model.static else other
         _copy_fitting(mine, theirs, f"{option} {name}")
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:

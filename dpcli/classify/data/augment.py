@@ -14,7 +14,7 @@ class Augmentation:
     """Holds the ranges of the random changes, 0 switches one off; called with a clip, changes it. One draw a clip, so that
     motion within it stays as it is.
 
-    The defaults are ours (chosen on a validation subject: docs/experiments.md). `PEERS` scales the axes only, from the
+    The defaults are ours (chosen on a validation subject: docs/experiments/classify.md). `PEERS` scales the axes only, from the
     camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does. Raises UsageError for
     values out of range.
     """

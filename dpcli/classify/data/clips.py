@@ -10,7 +10,7 @@ import numpy as np
 from dpcli.classify.data.augment import NONE, Augmentation
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
 
 
@@ -76,7 +76,7 @@ class ClipSource:
         seed: int = 0,
     ) -> None:
         self.reader, self.config, self.timing = reader, config, timing
-        self.augmentation, self.seed = augmentation, seed
+        self.augmentation, self.drop_short, self.seed = augmentation, drop_short, seed
         lengths = reader.frame_counts
         short = [s for s in sequences if lengths[s] < config.num_frames]
         self.dropped = [reader.names[s] for s in short] if drop_short else []
@@ -99,7 +99,7 @@ class ClipSource:
 
     def epoch(self, number: int, per_video: int | None) -> list[Clip]:
         """Returns the clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
-        rng = generator(self.seed, 1, number)
+        rng = generator(self.seed, ClassifyStream.CLIPS, number)
         if per_video is None and self.timing == "clips":
             clips = self.clips(None)
         else:
@@ -119,7 +119,7 @@ class ClipSource:
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:
         """Returns the clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
-        rng = generator(self.seed, 2, *key)
+        rng = generator(self.seed, ClassifyStream.POINTS, *key)
         sequence = self.reader.read(clip.sequence, clip.frames, fields=())
         points = np.stack(
             [sample_points(sequence.frame(t), self.config.points_per_frame, rng) for t in range(len(clip.frames))]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
 
 
@@ -77,7 +77,10 @@ def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int
     for label in sorted({int(reader.labels[i]) for i in chosen}):
         members = [i for i in chosen if reader.labels[i] == label]
         count = min(round(share * len(members)), len(members) - 1)
-        held.update(int(members[k]) for k in generator(seed, 3, label).permutation(len(members))[:count])
+        held.update(
+            int(members[k])
+            for k in generator(seed, ClassifyStream.HELD_OUT_SAMPLES, label).permutation(len(members))[:count]
+        )
     return [i for i in chosen if i not in held], sorted(held)
 
 
@@ -91,11 +94,13 @@ def folds(labels: np.ndarray, subjects: np.ndarray, count: int, seed: int) -> np
     people = np.unique(subjects)
     fold = np.empty(len(labels), np.int64)
     if len(people) >= count and people[0] >= 0:
-        for place, k in enumerate(generator(seed, 4).permutation(len(people))):
+        for place, k in enumerate(generator(seed, ClassifyStream.HELD_OUT_PEOPLE).permutation(len(people))):
             fold[subjects == people[k]] = place % count
         return fold
     members = [np.flatnonzero(labels == label) for label in np.unique(labels)]
-    shuffled = [own[generator(seed, 4, k).permutation(len(own))] for k, own in enumerate(members)]
+    shuffled = [
+        own[generator(seed, ClassifyStream.HELD_OUT_PEOPLE, k).permutation(len(own))] for k, own in enumerate(members)
+    ]
     fold[np.concatenate(shuffled)] = np.arange(len(labels)) % count
     return fold
 

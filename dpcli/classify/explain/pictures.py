@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.whole_file import whole_file
 
 ANIMATIONS = (".gif", ".mp4")
 _CELL, _GAP, _TITLE, _MARGIN = 132, 3, 20, 58  # pixels: of a cell, between cells, of a title's line, left of the rows
@@ -42,7 +42,7 @@ def activation_sheet(
         draw = _drawer(cloud, axes)
         rows = {stream: [draw(stream, t) for t in shown] for stream in cloud.activation}
         blocks.append((title(cloud, class_names), [f"{cloud.frames[t]}" for t in shown], rows))
-    write_whole(path, lambda part: _sheet(blocks).save(part))
+    _save_whole(path, lambda part: _sheet(blocks).save(part))
 
 
 def activation_animation(
@@ -59,7 +59,7 @@ def activation_animation(
             blocks.append((title(cloud, class_names), list(cloud.activation), {f"{cloud.frames[here]}": cells}))
         images.append(np.asarray(_sheet(blocks)))
     save = _save_mp4 if path.suffix.lower() == ".mp4" else _save_gif
-    write_whole(path, lambda part: save(part, images))
+    _save_whole(path, lambda part: save(part, images))
 
 
 def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
@@ -184,16 +184,13 @@ def _save_mp4(path: Path, images: list[np.ndarray]) -> None:
     writer.close()
 
 
-def write_whole(path: Path, save: Callable[[Path], None]) -> None:
-    """Writes beside the target and renames when whole. Raises DataError when it can't be written."""
-    part = path.with_name(f".{path.stem}.part{path.suffix}")
+def _save_whole(path: Path, save: Callable[[Path], None]) -> None:
+    """Saves a picture through `whole_file`. Raises DataError when it can't be written."""
     try:
-        save(part)
-        os.replace(part, path)
+        with whole_file(path) as part:
+            save(part)
     except (ValueError, OSError) as error:
         raise DataError(f"{path}: cannot be written ({error})") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def plane_picture(
@@ -233,7 +230,7 @@ def plane_picture(
             spine.set_color("0.8")
     handles, names = panels[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside right upper", ncols=columns, fontsize=7.5, frameon=False)
-    write_whole(path, lambda part: figure.savefig(part, dpi=130))
+    _save_whole(path, lambda part: figure.savefig(part, dpi=130))
 
 
 def _style(place: int, count: int) -> tuple[tuple[float, ...], str]:

@@ -12,7 +12,7 @@ from dpcli.classify.network.backbones.interface import BACKBONES
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.errors import UsageError
-from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 
 
 @dataclass
@@ -41,17 +41,19 @@ def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def find_model(name: str, option: str = "--model") -> Path:
+def find_model(name: str | Path, option: str = "--model") -> Path:
     """Returns a model's file: a path, `best.safetensors` of a training folder, or a shipped name. Raises UsageError when there is none."""
     return find_weights(name, SHIPPED, _MAKER, option)
 
 
-def load_model(name: str, backbone: str | None = None, option: str = "--model") -> tuple[Kinet, ModelInfo]:
-    """Returns a Kinet in eval mode. Raises DataError when the file is not one of ours or its weights don't fit its configuration.
+def load_model(name: str | Path, backbone: str | None = None) -> tuple[Kinet, ModelInfo]:
+    """Returns a Kinet in eval mode; name: what `find_model` found or takes.
+
+    Raises DataError when the file is not one of ours or its weights don't fit its configuration.
 
     A model on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
     """
-    path = find_model(name, option)
+    path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     config = KinetConfig.from_json(header["config"])
     if config.backbone not in BACKBONES and config.backbone != backbone:

@@ -10,10 +10,9 @@ import torch
 from dpcli.classify.data.clips import Clip, ClipSource
 from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator
 
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # points (b,T,P,3), labels (b), numbers of the clips (b)
-_STAGE_DRAWS = 100_000  # numbers of draws that each stage has for itself
 
 
 class _ClipDataset(torch.utils.data.Dataset):
@@ -54,7 +53,7 @@ class EpochBatches:
         Raises RuntimeError of torch when a process that loads clips ends.
         """
         turn = epoch % self.draws if self.draws else epoch
-        number = self.stage * _STAGE_DRAWS + turn
+        number = self.stage * DRAWS_PER_STAGE + turn
         clips = self._draw(number)
         order = self._order(epoch, len(clips))[: self.count * self.schedule.batch]
         starts = range(first * self.schedule.batch + self.processes.rank * self.share, len(order), self.schedule.batch)
@@ -71,4 +70,4 @@ class EpochBatches:
         """Returns the order in which an epoch takes its clips: as drawn, or, where draws come back, another one each time."""
         if not self.draws:
             return list(range(clips))
-        return generator(self.source.seed, 5, epoch).permutation(clips).tolist()
+        return generator(self.source.seed, ClassifyStream.DRAW_ORDER, epoch).permutation(clips).tolist()

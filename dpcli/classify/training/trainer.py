@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import torch
 
 from dpcli.classify.data.clips import ClipSource
@@ -27,6 +26,7 @@ from dpcli.errors import DpcError
 from dpcli.runtime.distributed import Processes
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.seeds import torch_seed
 from dpcli.runtime.signals import StopRequest
 
 
@@ -140,9 +140,7 @@ class Trainer:
         """Takes one step of all processes together; returns whether one of them was asked to stop."""
         assert self.optimize is not None
         where = (self.training.seed, self.stage, self.epoch, self.step, self.processes.rank)
-        torch.manual_seed(
-            int(np.random.SeedSequence(where).generate_state(1)[0])
-        )  # dropout, whenever the run was begun
+        torch.manual_seed(torch_seed(*where))  # dropout, whenever the run was begun
         loss, correct, stepped = self.optimize(points, labels, rate, clips)
         shares = (loss, float(correct), float(len(labels)), float(self.stop.requested))
         loss, correct, count, stopping = self.processes.sums(shares, self.device)

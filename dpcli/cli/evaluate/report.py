@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -49,6 +48,7 @@ def report(
     from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
     from dpcli.evaluate.report.thesis import chosen_tables
     from dpcli.runtime.progress import log
+    from dpcli.runtime.whole_file import write_whole
 
     chosen_tables(beside or [], [])  # a wrong name is said before the work
     collected = collect(results, truth, split=split, pictures=pictures and form == "html")
@@ -59,7 +59,7 @@ def report(
     if output in (None, "-"):
         typer.echo(text, nl=False)
     else:
-        _write(Path(output), text)
+        write_whole(Path(output), text.encode("utf-8"))
         log.info(f"wrote {output}: {len(made.sections)} results, {len(text.encode()) / 1e6:.2f} MB")
 
 
@@ -84,14 +84,3 @@ def _check_output(output: str | None, force: bool) -> None:
         raise UsageError(f"{output}: exists already; --force replaces it")
     if not Path(output).absolute().parent.is_dir():
         raise DataError(f"-o {output}: the folder {Path(output).parent} does not exist; create it first")
-
-
-def _write(path: Path, text: str) -> None:
-    """Beside its target first, so that a page that exists is whole."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text, "utf-8")
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None

@@ -9,7 +9,7 @@ import numpy as np
 from dpcli.evaluate.classification.protocol import ClassificationReport
 from dpcli.evaluate.classification.tables import percent
 from dpcli.evaluate.proportions import divide
-from dpcli.store.pipes import FIGURES, check_target
+from dpcli.runtime.whole_file import FIGURES, check_target
 
 _INCH_PER_CLASS = 0.30  # a cell holds three digits at this size
 _SMALLEST = 3.2  # inches of matrix, however few the classes

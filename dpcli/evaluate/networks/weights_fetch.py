@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import os
 from pathlib import Path
 from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
@@ -11,6 +10,7 @@ from urllib.request import Request, urlopen
 from dpcli.errors import DataError, DpcError
 from dpcli.evaluate.networks.weights import Checked, Weights, check
 from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.whole_file import whole_file
 
 _BLOCK = 1 << 18  # bytes
 _TIMEOUT = 30.0  # seconds without a byte
@@ -37,13 +37,9 @@ def _fetch_file(weights: Weights, path: Path) -> None:
             f"by hand and put it at {path}"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.part")
-    try:
+    with whole_file(path) as part:
         _download(weights, part)
         log.info(f"{path}: {_checked(weights, part).said}")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _download(weights: Weights, part: Path) -> None:

@@ -21,13 +21,14 @@ from dpcli.generate4d.targets import Targets, load_targets
 from dpcli.ops.cameras import orbit_of
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.store import input_file, output_file
 from dpcli.store.gaussians import read_scene, scene_origin, write_scene
-from dpcli.store.pipes import PICTURES, check_target
+from dpcli.store.writing.already_made import already_made
 
 
 def run_fit(
@@ -63,8 +64,10 @@ def run_fit(
             "data": provenance.file_digest(path),
         }
         roles = ("train",) if prior == "views" else ()
-        if output != "-" and Path(output).exists() and not force:
-            _finished_before(Path(output), record)
+        refusal = "exists already and is no scene of this fit; --force replaces it"
+        done = output != "-" and not force
+        if done and already_made(Path(output), {"config": record}, scene_origin, refusal, ["config"]):
+            log.info(f"{output}: this fit is finished; --force fits again")
             if picture is not None:
                 write_preview(read_scene(Path(output)), load_targets(path, config.size, roles), picture)
             return
@@ -103,17 +106,6 @@ def run_fit(
         f"reference view {scene.metrics['psnr_reference']:.2f} dB PSNR, {scene.metrics['gaussians']} Gaussians,"
         f" {scene.metrics['seconds']:.0f} s"
     )
-
-
-def _finished_before(output: Path, record: dict) -> None:
-    """Nothing to fit when the file there is this very fit; UsageError when it is anything else."""
-    try:
-        history = scene_origin(output)[1]
-    except DataError:
-        history = []
-    if not history or history[-1].get("config") != record:
-        raise UsageError(f"{output}: exists already and is no scene of this fit; --force replaces it")
-    log.info(f"{output}: this fit is finished; --force fits again")
 
 
 def _run_folder(output: str, run: str | None) -> Path:

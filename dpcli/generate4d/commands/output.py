@@ -27,9 +27,9 @@ from dpcli.generate4d.viewer import write_page
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.seeds import generator
+from dpcli.runtime.whole_file import check_target
 from dpcli.store import ViewsReader, input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
-from dpcli.store.pipes import check_target
 
 _SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
 _SHEET_SIDE = 160  # pixels of its pictures

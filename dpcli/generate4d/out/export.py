@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply, write_whole
+from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
+from dpcli.runtime.whole_file import check_replaced, whole_file, write_whole
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
-from dpcli.store.pipes import check_replaced
 
 FORMATS = ("ply", "ply-sequence", "splat", "splat-sequence", "clouds", "cameras", "metrics")
 AXES = ("player", "keep")
@@ -73,23 +71,22 @@ def export_sequence(
     width = max(4, len(str(len(times))))
     names = [f"frame{number:0{width}d}.{form}" for number in range(1, len(times) + 1)]
     try:
-        part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made ({error.strerror}); create {folder.parent} first") from None
-    try:
-        for name, time in zip(names, times, strict=True):
-            export_file(scene, part / name, form, time=time, axes=axes)
-        write_json(part / "cameras.json", camera_list(scene, axes))
-        write_json(part / "metrics.json", scene.metrics)
-        part.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        part.rename(folder)
+        with whole_file(folder) as part:
+            _make_folder(part, folder)
+            for name, time in zip(names, times, strict=True):
+                export_file(scene, part / name, form, time=time, axes=axes)
+            write_json(part / "cameras.json", camera_list(scene, axes))
+            write_json(part / "metrics.json", scene.metrics)
     except OSError as error:
         raise DpcError(f"{folder}: cannot be written ({error.strerror})") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
     return [folder / name for name in names]
+
+
+def _make_folder(part: Path, folder: Path) -> None:
+    try:
+        part.mkdir()
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made ({error.strerror}); create {folder.parent} first") from None
 
 
 def write_json(path: Path, content: Any) -> None:

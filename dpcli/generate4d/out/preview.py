@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting.rasterization import rasterization
+from dpcli.runtime.whole_file import whole_file
 from dpcli.store.gaussians import SH_C0, GaussianScene
 
 
@@ -106,6 +106,5 @@ def write_preview(
         draw(own_color, aside),
     ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
-    part = path.with_name(f".{path.stem}.part.png")
-    imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().cpu().numpy())
-    os.replace(part, path)
+    with whole_file(path) as part:
+        imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().cpu().numpy())

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import DataError
-from dpcli.runtime.whole_file import whole_file
+from dpcli.runtime.whole_file import write_whole
 from dpcli.store.gaussians import GaussianScene, color_of, opacity_of
 
 # Half a turn about x: our world (y up, the reference camera at +z) to the players' (x right, y down, z forward)
@@ -113,12 +112,3 @@ def camera_list(scene: GaussianScene, axes: str = "player") -> list[dict[str, An
             }
         )
     return cameras
-
-
-def write_whole(path: Path, content: bytes) -> None:
-    """The file, whole or not at all. DataError when it can't be written."""
-    try:
-        with whole_file(path) as part:
-            part.write_bytes(content)
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None

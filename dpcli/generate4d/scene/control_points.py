@@ -9,7 +9,7 @@ from torch.nn.functional import embedding_bag
 from dpcli.generate4d.scene.motion import Motion
 from dpcli.generate4d.scene.quaternion import multiply, normalize, to_matrix
 from dpcli.ops.farthest_point_sampling import fps
-from dpcli.ops.knn import knn
+from dpcli.ops.nearest_neighbors import knn
 
 
 class ControlPoints(nn.Module):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpcli.ops.knn import knn
+from dpcli.ops.nearest_neighbors import knn
 from dpcli.ops.rigid import rigid_flow, weighted_kabsch
 
 

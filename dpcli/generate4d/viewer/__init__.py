@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 import zlib
 from collections.abc import Sequence
 from importlib.resources import files
@@ -16,10 +15,10 @@ import numpy as np
 
 from dpcli import __version__
 from dpcli.draw.palette import part_colors
-from dpcli.errors import DataError
 from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
 from dpcli.generate4d.out.picture_colors import WEIGHTS
 from dpcli.ops.cameras import orbit_of
+from dpcli.runtime.whole_file import write_whole
 from dpcli.store.gaussians import GaussianScene
 
 SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")
@@ -39,13 +38,7 @@ def write_page(
     blob = b"".join(values.tobytes() for values in arrays.values())
     header = describe(scene, arrays, title=title, history=history, fps=fps or clip_rate(scene))
     page = _filled(title, header, base64.b64encode(zlib.compress(blob, 9)).decode("ascii")).encode("utf-8")
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_bytes(page)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+    write_whole(path, page)
     return len(page)
 
 

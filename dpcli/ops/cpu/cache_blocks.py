@@ -8,6 +8,7 @@ from typing import TypeVar
 import torch
 
 from dpcli.ops.backend import run_in_threads
+from dpcli.runtime.tuning import torch_threads
 
 Task, Room = TypeVar("Task"), TypeVar("Room")
 
@@ -43,7 +44,5 @@ def share_tasks(tasks: Sequence[Task], make_room: Callable[[], Room], work: Call
             for number, task in waiting:
                 work(number, task, room)
 
-    try:
+    with torch_threads(threads):  # the caller works, too, and gets its threads back
         run_in_threads(run, (), min(threads, len(tasks)), item_ns=1e9)
-    finally:
-        torch.set_num_threads(threads)

@@ -2,28 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Callable
 
 import numba
 
+from dpcli.runtime.tuning import load_numba_without_blas
 
-def _skip_blas() -> None:
-    """Import numba's array functions, as its first kernel will, without their look for scipy's BLAS: 0.3 s of a process.
-
-    What needs it looks again (np.dot), but for numba's np.cov and np.corrcoef, which no kernel here uses.
-    """
-    name = "scipy.linalg.cython_blas"
-    if name not in sys.modules and "numba.np.arraymath" not in sys.modules:
-        sys.modules[name] = None  # type: ignore[assignment]  # an import of it fails at once
-        try:
-            importlib.import_module("numba.np.arraymath")
-        finally:
-            del sys.modules[name]
-
-
-_skip_blas()
+load_numba_without_blas()
 
 # No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorize. Nothing that changes
 # a value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.

@@ -25,14 +25,13 @@ from dpcli.prepare.articulated.articulated_object import (
 )
 from dpcli.prepare.meshes.surface_points import Camera, choose_on_surface, choose_visible, points_on
 from dpcli.prepare.reader import Sample
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.store import CloudSequence
 
 VIEWS = ("full", "single")
 ORIENTATIONS = ("random", "upright")
 _DENSER = 4  # so many times more points are sampled when --sampling fps or voxel will choose among them
 _GLUED = 0.25  # of min_part: a part with fewer expected points is glued to its parent
-_STUDY_KEY = 1 << 29  # keeps the generator that studies an object apart from those of items
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ def study(obj: ArticulatedObject, options: Articulation) -> Study:
     largest moving part, stay in any case, unless nothing moves ``visible_only``.
     """
     obj = finite_limits(require_surface(obj))
-    idle = idle_joints(obj, options.min_motion, options.visible_only, generator(0, _STUDY_KEY))
+    idle = idle_joints(obj, options.min_motion, options.visible_only, generator(0, PrepareStream.OBJECT_STUDY))
     if parts(obj, idle).max() < 1:
         raise DataError(
             f"{obj.name}: one rigid part only; none of its {len(obj.joints)} joints moves its part "

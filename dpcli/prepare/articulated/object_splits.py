@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from dpcli.errors import UsageError
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import PrepareStream, generator
 
 SPLITS = ("train", "validation", "test")
 SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # what people call them
-_SPLIT_KEY = 1 << 28  # keeps the generator of the splits apart from those of items
 
 
 @dataclass(frozen=True)
@@ -46,6 +45,6 @@ class SplitRule:
         rest = [index for index, split in enumerate(splits) if not split]
         fractions = self.fractions or ((1.0, 0.0, 0.0) if by_category else (0.8, 0.1, 0.1))
         ends = [round(len(rest) * sum(fractions[: k + 1])) for k in range(3)]
-        for place, which in enumerate(generator(seed, _SPLIT_KEY).permutation(len(rest))):
+        for place, which in enumerate(generator(seed, PrepareStream.OBJECT_SPLIT).permutation(len(rest))):
             splits[rest[which]] = SPLITS[next(k for k, end in enumerate(ends) if place < end)]
         return splits

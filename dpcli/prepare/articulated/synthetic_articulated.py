@@ -17,16 +17,14 @@ from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
 from dpcli.prepare.articulated.procedural_kinds import KINDS
 from dpcli.prepare.articulated.solids import Builder
 from dpcli.prepare.reader import Item, Sample, describe
-from dpcli.runtime.seeds import generator
-
-_OBJECT_KEY = 1 << 30  # keeps the generators of objects apart from those of items
+from dpcli.runtime.seeds import PrepareStream, generator
 
 
 def build_object(seed: int, number: int, kinds: tuple[str, ...]) -> ArticulatedObject:
     """Object ``number`` of a seed; its kind is the next in the circle of ``kinds``, its shape is drawn."""
     kind = kinds[number % len(kinds)]
     builder = Builder()
-    KINDS[kind](builder, generator(seed, _OBJECT_KEY, number))
+    KINDS[kind](builder, generator(seed, PrepareStream.MADE, number))
     return builder.build(f"{kind} {number}")
 
 

@@ -11,15 +11,15 @@ from typing import Any
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import short_names
 from dpcli.prepare.label_map import LabelMap
-from dpcli.prepare.pipeline import Report, already_complete, count_samples
+from dpcli.prepare.pipeline import Report, count_samples
 from dpcli.prepare.shards import Shard, shard_of
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.file import file_kind, read_positions
-from dpcli.store.journal import sweep
 from dpcli.store.pipes import refuse_repeats
+from dpcli.store.writing.already_made import already_made
 
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
 
@@ -239,8 +239,7 @@ def _write(
 ) -> Report:
     """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
     report = Report(skipped=skipped)
-    if not force and already_complete(output, entry):
-        sweep(output)
+    if not force and already_made(output, entry, CloudsReader):
         log.info(f"{output}: already complete, made of the same files (--force makes it again)")
         report.was_complete = True
         return count_samples(report, output)

@@ -13,16 +13,13 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.object_splits import SPLITS
 from dpcli.prepare.commands.merge import Source, copied_before, read_source
-from dpcli.prepare.pipeline import already_complete
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.runtime.signals import stop_requested
 from dpcli.store import CloudsReader, CloudsWriter
-from dpcli.store.journal import sweep
 from dpcli.store.pipes import check_output
-
-_DRAW = 5005  # the key of this draw among all that a seed gives
+from dpcli.store.writing.already_made import already_made
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ def by_fraction(
             lag = np.where(share > 0, share * (given.sum() + len(own)) - given - sizes, -np.inf)
             sizes[int(lag.argmax())] += 1
         given += sizes
-        order = generator(seed, _DRAW, stratum + 1).permutation(len(own))
+        order = generator(seed, PrepareStream.SPLIT, stratum + 1).permutation(len(own))
         for name, places in zip(SPLITS, np.split(order, np.cumsum(sizes)[:2])):
             where |= {own[k]: name for k in places}
     return [where[group] for group in groups]
@@ -172,8 +169,7 @@ def _copy(
 ) -> None:
     check_output(output, "-o", [source.path])
     history = [*source.provenance, entry]
-    if not force and already_complete(output, entry):
-        sweep(output)
+    if not force and already_made(output, entry, CloudsReader):
         log.info(f"{output}: already complete (--force makes it again)")
         return
     chosen = [index for index, name in enumerate(splits) if name in wanted]

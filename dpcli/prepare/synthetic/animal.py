@@ -14,9 +14,8 @@ from dpcli.prepare.synthetic import creature
 from dpcli.prepare.synthetic.creature_mesh import make_skin
 from dpcli.prepare.synthetic.gait import MOTIONS, bone_motion, turn_bones
 from dpcli.prepare.views.views_pipeline import Clip
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import PrepareStream, generator
 
-_SHAPE_KEY, _COAT_KEY = 1, 2  # so that another way to paint doesn't change the shape
 _CELLS = 120  # along the longest side of the grid that the skin is cut from
 
 
@@ -30,8 +29,8 @@ def make_animal(motion: str, frames: int, cycles: float = 0.0, seed: int = 0, ce
     if not 0 <= cycles <= 100:
         raise UsageError(f"--cycles {cycles:g}: expected 0 (the motion's own) to 100")
     kind, cycles = MOTIONS[motion], cycles or MOTIONS[motion].cycles
-    animal = getattr(creature, kind.kind)(generator(seed, _SHAPE_KEY))
-    body = make_skin(animal, generator(seed, _COAT_KEY), cells)
+    animal = getattr(creature, kind.kind)(generator(seed, PrepareStream.ANIMAL_SHAPE))
+    body = make_skin(animal, generator(seed, PrepareStream.ANIMAL_COAT), cells)
     phase = cycles * np.arange(frames) / frames
     turned = bone_motion(animal, *turn_bones(animal, motion, phase))
     normals = vertex_normals(body.vertices, body.triangles)

@@ -17,7 +17,7 @@ from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.synthetic.human_figure import Figure, capsules
 from dpcli.prepare.synthetic.virtual_depth_camera import add_noise, render
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
@@ -34,7 +34,6 @@ CLASS_NAMES = (
 )
 FRAME_RATE = 15.0  # frames per second
 _FIELD_OF_VIEW = 57.0  # degrees, horizontal: Kinect v1
-_SUBJECT_KEY = 1 << 30  # keeps the generators of subjects apart from those of items
 
 
 def wrist_path(movement: int, s: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
@@ -81,7 +80,7 @@ class _Subject:
 
 def draw_subject(seed: int, subject: int) -> _Subject:
     """The person of this number; the same in every video and every run with the seed."""
-    rng = generator(seed, _SUBJECT_KEY, subject)
+    rng = generator(seed, PrepareStream.MADE, subject)
     figure = Figure(rng.uniform(1.5, 1.95), rng.uniform(0.85, 1.2), rng.uniform(0.31, 0.35), rng.uniform(0.095, 0.115))
     return _Subject(
         figure, rng.uniform(0.05, 0.3), rng.uniform(-0.4, 0.4), rng.uniform(2.2, 2.9), rng.uniform(0.8, 1.3)

@@ -29,7 +29,7 @@ from dpcli.prepare.views.square_crop import Box, crop_around, touches_border, un
 from dpcli.prepare.views.video import spread
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.store.views import ViewsHeader
 
 TEST_AZIMUTHS = (15.0, -75.0, 105.0, 195.0)  # of the usual video-to-4D benchmark, relative to the input view
@@ -205,7 +205,7 @@ def _sampled_skin(animal: Path, options: ArtemisOptions) -> Skin:
     skin = read_skin(animal, bones)
     shell = outer_shell(skin.points)
     if len(shell) > options.tracks:
-        shell = np.sort(generator(options.seed, 0).choice(shell, options.tracks, replace=False))
+        shell = np.sort(generator(options.seed, PrepareStream.TRACKS).choice(shell, options.tracks, replace=False))
     return skin.choose(shell)
 
 

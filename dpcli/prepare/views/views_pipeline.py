@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.prepare.pipeline import already_complete
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import file_digest, record
 from dpcli.runtime.signals import stop_requested
 from dpcli.store.views import ViewsHeader, ViewsReader, ViewsWriter
+from dpcli.store.writing.already_made import already_made
 
 
 @dataclass
@@ -47,7 +47,7 @@ def convert_clip(
     another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
     """
     provenance = record(json.loads(json.dumps({"reader": source, **config})), seed)
-    if not force and already_complete(output, provenance, ViewsReader):
+    if not force and already_made(output, provenance, ViewsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         with ViewsReader(output) as reader:
             return reader.header

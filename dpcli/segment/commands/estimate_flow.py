@@ -13,17 +13,17 @@ import torch
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.flow.estimate import METHODS, estimate_flow
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.sequence import POINT_FIELDS
+from dpcli.store.writing.already_made import WORK, already_made
 
 REACH = 99  # percentile of norms that stands for the largest: a few wrong matches must not decide the scale
-_KEY = 7006  # of the random draws of points
 _NO_MOTION = 1e-9  # of the cloud's reach: below this flow is rounding, and no factor makes it a cloud
 _WORTH_WORKERS = 200  # frames; fewer are done by one process before a second has started
 
@@ -47,7 +47,7 @@ class FlowOfSequence:
     def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
         """The sequence of that number in its file: some points of each frame, and their flow."""
         index, sequence = numbered
-        drawn = draw_points(sequence, self.points, generator(self.seed, _KEY, index))
+        drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS, index))
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
         drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
         if self.as_points:
@@ -141,7 +141,7 @@ def run_flow_estimate(
         inputs = {"clouds": path} | ({"flow": weights} if weights else {})
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
         device = str(choose_device(device)) if weights else "cpu"
-        work = FlowOfSequence(flow, points, as_points, seed, device)
+        work = FlowOfSequence(str(weights or flow), points, as_points, seed, device)
         if force or not _already_there(target, history[-1]):
             keep_freed_memory()
             with CloudsWriter(
@@ -162,16 +162,16 @@ def run_flow_estimate(
 
 
 def flow_weights(flow: str) -> Path | None:
-    """The file of a trained estimator, checked before any work; None for a method that needs none."""
+    """Returns the file of a trained estimator, checked before any work; None for a method that needs none."""
     if flow in METHODS:
         return None
     if not Path(flow).exists():
         raise UsageError(f"--flow {flow}: expected {', '.join(METHODS)}, or a trained estimator's file or folder")
-    from dpcli.runtime.safetensors_file import find_weights
-    from dpcli.segment.flow.model_file import load_flow_model
+    from dpcli.segment.flow.model_file import find_flow_model, load_flow_model
 
-    load_flow_model(flow)
-    return find_weights(flow, Path(__file__).parents[1] / "flow" / "weights", "dpc segment flow", "--flow")
+    path = find_flow_model(flow)
+    load_flow_model(path)
+    return path
 
 
 def _processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
@@ -182,18 +182,12 @@ def _processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
 
 
 def _already_there(target: Path, entry: dict) -> bool:
-    """Whether `target` holds the flow of this very work; UsageError when it holds something else."""
-    if not target.exists():
-        return False
-    try:
-        with CloudsReader(target) as reader:
-            before = reader.provenance[-1:]
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(f"{target}: holds the flow of other data or choices; use another -o, or --force to replace it")
-    log.info(f"{target}: already complete, made from the same data (--force makes it again)")
-    return True
+    """Returns whether `target` holds the flow of this very work, and says so; UsageError when it holds something else."""
+    refusal = "holds the flow of other data or choices; use another -o, or --force to replace it"
+    made = already_made(target, entry, CloudsReader, refusal, WORK)
+    if made:
+        log.info(f"{target}: already complete, made from the same data (--force makes it again)")
+    return made
 
 
 def _estimate_all(

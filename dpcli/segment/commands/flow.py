@@ -8,10 +8,10 @@ from pathlib import Path
 
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.flow.config import find_flow_config
 from dpcli.segment.flow.trainer import COLUMNS, train_flow
 from dpcli.store import CloudsReader, input_file

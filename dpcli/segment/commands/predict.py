@@ -14,12 +14,13 @@ import torch
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
-from dpcli.runtime.memory import keep_freed_memory
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.baselines.classical import classical_labels, classical_options
 from dpcli.segment.commands.estimate_flow import flow_weights
 from dpcli.segment.flow.pair_flow import pair_flow
@@ -34,7 +35,7 @@ from dpcli.segment.training.objective import Objective
 from dpcli.segment.training.trainer import Schedule, Trainer
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
-from dpcli.store.pipes import PICTURES, check_target
+from dpcli.store.writing.already_made import WORK, already_made
 
 _SHOWN = 8  # sequences in a picture
 CLASSICAL = ("dbscan", "ward", "ssc", "trajaffn")
@@ -76,10 +77,9 @@ def run_training(
             "seed": seed,
             "data": provenance.file_digest(path),
         }
-        used = {
-            "flow_weights": None if aims.supervised else flow_weights(flow),
-            "start_weights": find_model(start_from, "--start-from") if start_from else None,
-        }
+        estimator = None if aims.supervised else flow_weights(flow)
+        start = find_model(start_from, "--start-from") if start_from else None
+        used = {"flow_weights": estimator, "start_weights": start}
         record |= {
             role: provenance.file_digest(file) for role, file in used.items() if file
         }  # what a path leads to may change
@@ -87,10 +87,10 @@ def run_training(
         record |= {"amp": True} if mixed else {}
         folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
         training = PairSource(reader, train_part, shape.points, seed)
-        _check_flows(flow, flows_of, record, folder, training, aims.supervised)
+        _check_flows(estimator, flows_of, record, folder, training)
         checking = PairSource(reader, held, shape.points, seed) if held else None
         torch.manual_seed(seed)
-        model = _new_model(shape, start_from, folder).to(chosen)
+        model = _new_model(shape, start, folder).to(chosen)
         model.mixed = mixed
         notes = {
             "command": provenance.command_line(),
@@ -106,19 +106,21 @@ def run_training(
         keep_freed_memory()
         with folder, stop_requested() as stop:  # last: with --force this deletes an earlier model
             estimate = (
-                None if aims.supervised else partial(pair_flow, method=flow)
+                None if aims.supervised else partial(pair_flow, method=str(estimator or flow))
             )  # supervised: the true flow is at hand
             Trainer(model, folder, plan, aims, training, checking, estimate, notes, chosen, stop, seed, flows_of).run()
     print(folder.file("best.safetensors"))
 
 
 def _check_flows(
-    flow: str, folder: Path | None, record: dict, run: RunFolder, training: PairSource, supervised: bool
+    estimator: Path | None, folder: Path | None, record: dict, run: RunFolder, training: PairSource
 ) -> None:
-    """The estimator is there; another run's flows are of the same pairs, which only the same data, seed, ... give."""
-    weights = None if supervised else flow_weights(flow)
-    if weights is not None:
-        run.refuse_inside("--flow", weights)
+    """Raises UsageError where the estimator's file is one that the run replaces, or another run's flows are of other pairs.
+
+    Only the same data, seed, ... give the same pairs.
+    """
+    if estimator is not None:
+        run.refuse_inside("--flow", estimator)
     if folder is None:
         return
     run.refuse_inside("--flows-of", folder / "flows_first.npy")
@@ -139,14 +141,14 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in options.items() if value is not None}
 
 
-def _new_model(shape: PartConfig, start_from: str | None, folder: RunFolder) -> PartNetwork:
+def _new_model(shape: PartConfig, start: Path | None, folder: RunFolder) -> PartNetwork:
     model = PartNetwork(shape)
-    if start_from:
-        folder.refuse_inside("--start-from", find_model(start_from, "--start-from"))
-        other, _ = load_model(start_from, "--start-from")
+    if start is not None:
+        folder.refuse_inside("--start-from", start)
+        other, _ = load_model(start)
         if other.config != shape:
             raise UsageError(
-                f"--start-from {start_from}: its network has another configuration; give the same --config and switches"
+                f"--start-from {start}: its network has another configuration; give the same --config and switches"
             )
         model.load_state_dict(other.state_dict())
     return model
@@ -183,7 +185,7 @@ def split_sequences(reader: CloudsReader, validation: str | None, seed: int) -> 
     else:
         if not 0 < share < 1:
             raise UsageError(f"--validation {validation}: expected none, a fraction below 1, or class names")
-        order = generator(seed, 7004).permutation(len(train))
+        order = generator(seed, SegmentStream.VALIDATION).permutation(len(train))
         count = max(1, round(share * len(train)))
         left, held = [train[i] for i in sorted(order[count:])], [train[i] for i in sorted(order[:count])]
     if not left:
@@ -255,7 +257,14 @@ def run_prediction(
                 resume=True,
             ) as writer:
                 _predict_all(
-                    reader, sequences, segmenter, partial(pair_flow, method=flow), options, seed, writer, fields
+                    reader,
+                    sequences,
+                    segmenter,
+                    partial(pair_flow, method=str(estimator or flow)),
+                    options,
+                    seed,
+                    writer,
+                    fields,
                 )
         _show(target, picture, ply, turntable)
     if output != "-":
@@ -273,9 +282,10 @@ def _segmenter(
     points: int = Refinement.points,
 ) -> tuple[Segmenter, int, dict[str, Any]]:
     if method is None:
-        model, notes = load_model(model_name)
+        file = find_model(model_name)
+        model, notes = load_model(file)
         model.mixed = mixed
-        weights = provenance.file_digest(find_model(model_name))
+        weights = provenance.file_digest(file)
         said = {"model": notes, "weights": weights, **({"amp": True} if mixed else {})}
         return network_segmenter(model.to(device), device), model.config.slots, said
     if method not in CLASSICAL:
@@ -296,7 +306,12 @@ def _classical_segmenter(
     def segment(frames: list[torch.Tensor], flows: dict[tuple[int, int], torch.Tensor]) -> list[torch.Tensor]:
         arrays = {pair: flow.numpy() for pair, flow in flows.items()}
         labels = classical_labels(
-            [f.numpy() for f in frames], arrays, method, num_parts, options=options, rng=generator(seed, 7005)
+            [f.numpy() for f in frames],
+            arrays,
+            method,
+            num_parts,
+            options=options,
+            rng=generator(seed, SegmentStream.CLASSICAL),
         )
         return [torch.nn.functional.one_hot(torch.from_numpy(np.int64(own)), slots).float() for own in labels]
 
@@ -311,19 +326,12 @@ def _select(reader: CloudsReader, split: str) -> list[int]:
 
 
 def _already_there(target: Path, entry: dict) -> bool:
-    """Whether `target` holds the parts of this very work; UsageError when it holds something else."""
-    if not target.exists():
-        return False
-    try:
-        before = PartsReader(target).provenance[-1:]
-    except DataError as error:
-        raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
-    if not before or any(before[0].get(key) != entry[key] for key in ("config", "seed", "inputs", "version")):
-        raise UsageError(
-            f"{target}: holds parts of another model, data or choice; use another -o, or --force to replace it"
-        )
-    log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
-    return True
+    """Returns whether `target` holds the parts of this very work, and says so; UsageError when it holds something else."""
+    refusal = "holds parts of another model, data or choice; use another -o, or --force to replace it"
+    made = already_made(target, entry, PartsReader, refusal, WORK)
+    if made:
+        log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
+    return made
 
 
 def _predict_all(
@@ -375,7 +383,7 @@ def _show(target: Path, picture: Path | None, ply: Path | None, turntable: Path 
 
 def default_model() -> str:
     """The shipped model used when none is named. UsageError when this installation has none."""
-    from dpcli.runtime.weights_lookup import shipped_models
+    from dpcli.runtime.weights import shipped_models
 
     names = shipped_models(SHIPPED)
     if not names:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.flow.config import FlowConfig
 from dpcli.segment.flow.flow_network import FlowNetwork
 
@@ -25,9 +25,17 @@ def save_flow_model(path: Path, model: FlowNetwork, notes: dict) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def load_flow_model(name: str) -> tuple[FlowNetwork, dict]:
-    """A flow network in eval mode and its notes; name: a path or a training folder. DataError when it is damaged."""
-    path = find_weights(name, Path(__file__).parent / "weights", _MAKER, "--flow")
+def find_flow_model(name: str | Path) -> Path:
+    """Returns the file of a trained estimator, as `find_weights`; none comes with the package. UsageError if there is none."""
+    return find_weights(name, None, _MAKER, "--flow")
+
+
+def load_flow_model(name: str | Path) -> tuple[FlowNetwork, dict]:
+    """Returns a flow network in eval mode and its notes; name: what `find_flow_model` found or takes.
+
+    DataError when the file is damaged. The last two are kept until their files change.
+    """
+    path = find_flow_model(name)
     return _loaded(path, path.stat().st_mtime_ns)
 
 

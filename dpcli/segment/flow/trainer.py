@@ -15,7 +15,7 @@ from torch import Tensor
 from dpcli.ops import gather_points, knn
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
-from dpcli.runtime.seeds import generator
+from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.config import find_flow_config
 from dpcli.segment.flow.flow_network import FlowNetwork
@@ -25,7 +25,6 @@ from dpcli.segment.training.losses import smoothness_loss, smoothness_neighbors
 from dpcli.store import CloudsReader
 
 COLUMNS = ("step", "loss", "chamfer", "validation_loss", "validation_epe", "learning_rate", "seconds")
-_KEY = 7101  # keeps these generators apart from those of other trainings
 _FIRST, _LATER = 0.5, 0.3  # weights of the iterations' losses
 
 
@@ -108,7 +107,7 @@ class _Trainer:
         held = [i for i in by_split.get("validation", []) if i in set(long)]
         self.source = PairSource(reader, train, points, seed)
         self.held = PairSource(reader, held, points, seed) if held else None
-        torch.manual_seed(int(generator(seed, _KEY, 0).integers(2**31)))
+        torch.manual_seed(int(generator(seed, SegmentStream.FLOW_TRAINING, 0).integers(2**31)))
         self.model = FlowNetwork(find_flow_config(config)).to(device)
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=1e-3)
         self.step, self.best, self.sums, self.spent = 0, float("inf"), [0.0, 0.0, 0], 0.0
@@ -141,7 +140,7 @@ class _Trainer:
     def _one_step(self) -> None:
         for group in self.optimizer.param_groups:
             group["lr"] = self._rate()
-        rng = generator(self.seed, _KEY, 1, self.step)
+        rng = generator(self.seed, SegmentStream.FLOW_TRAINING, 1, self.step)
         pairs = []
         for number in rng.integers(len(self.source.pairs), size=self.batch):
             points = self.source.load(self.source.pairs[number]).points

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from dpcli.runtime.safetensors_file import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.part_network import PartNetwork
 
@@ -19,14 +19,14 @@ def save_model(path: Path, model: PartNetwork, notes: dict) -> None:
     save_weights(path, model.state_dict(), header)
 
 
-def find_model(name: str, option: str = "--model") -> Path:
-    """A network's file: a path, `best.safetensors` of a training folder, or a shipped name. UsageError when there is none."""
+def find_model(name: str | Path, option: str = "--model") -> Path:
+    """Returns a network's file, as `find_weights`: of a path, a training folder or a shipped name. UsageError if there is none."""
     return find_weights(name, SHIPPED, _MAKER, option)
 
 
-def load_model(name: str, option: str = "--model") -> tuple[PartNetwork, dict]:
-    """A part network in eval mode and its notes; name: a path, a training folder or a shipped model."""
-    path = find_model(name, option)
+def load_model(name: str | Path) -> tuple[PartNetwork, dict]:
+    """Returns a part network in eval mode and its notes; name: what `find_model` found or takes."""
+    path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = PartNetwork(PartConfig.from_json(header["config"]))
     load_state(model, tensors, path)

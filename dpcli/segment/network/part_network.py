@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor, nn
 
 from dpcli.ops.gather import gather_points
-from dpcli.ops.knn import knn
+from dpcli.ops.nearest_neighbors import knn
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.encoder import Encoder, Level

@@ -19,6 +19,7 @@ import torch
 from dpcli.errors import UsageError
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.seeds import SegmentStream, torch_seed
 from dpcli.runtime.signals import StopRequest
 from dpcli.segment.flow.rigid_groups import rigid_groups
 from dpcli.segment.frame_pairs import LoadedPair, Pair, PairSource, epoch_order
@@ -151,9 +152,7 @@ class Trainer:
         batch = self._batch(pairs, loaded)
         rotation = None
         if self.schedule.augment:
-            rng = torch.Generator().manual_seed(
-                int(np.random.SeedSequence([self.seed, 7003, step]).generate_state(1)[0])
-            )
+            rng = torch.Generator().manual_seed(torch_seed(self.seed, SegmentStream.TURN, step))
             batch.points, rotation = turn_randomly(batch.points, rng)
             batch.flow = batch.flow @ rotation.mT
         rate = self.schedule.rate(step, steps)

@@ -249,7 +249,7 @@ def test_the_second_stage_takes_the_first_centroids_as_farthest_points():
 
 def test_shipped_models_load_and_have_a_card():
     from dpcli.classify.network.model_file import SHIPPED, load_model
-    from dpcli.runtime.weights_lookup import shipped_models
+    from dpcli.runtime.weights import shipped_models
 
     names = shipped_models(SHIPPED)
     assert names

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dpcli.runtime import matrix_products as products
+from dpcli.runtime import tuning as products
 
 
 @pytest.fixture(autouse=True)

@@ -15,8 +15,9 @@ from typing import Any
 
 from dpcli.config_diff import differences
 from dpcli.errors import DpcError, Stopped, UsageError
-from dpcli.store.file import AtomicFile, write_root
-from dpcli.store.journal import Journal, Placed, data_suffix, journal_path, second_path
+from dpcli.store.file import write_root
+from dpcli.store.writing.atomic_file import AtomicFile
+from dpcli.store.writing.journal import Journal, Placed, data_suffix, journal_path, second_path
 
 
 class ResumableWriter(ABC):

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from dpcli.store.whole_chunks import WholeChunks
+from dpcli.store.writing.whole_chunks import WholeChunks
 
 
 def chunk_places(data: h5py.Dataset) -> list[int]:

@@ -1,0 +1,134 @@
+"""An HDF5 file that is whole or not there, also when the disk is full."""
+
+from __future__ import annotations
+
+import errno
+import os
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+
+from dpcli.errors import DataError, DpcError
+from dpcli.runtime.whole_file import check_regular, disk_full, put_in_place
+
+
+class _HeldOpen(h5py.File):
+    """Keeps every data set that it made open until it is closed.
+
+    HDF5 writes what it buffers when the last reference to a data set goes, where h5py can't raise: a full disk would then
+    be a trace on stderr and a crash as the process ends. With all of them open, `flush` writes it and raises.
+    """
+
+    def create_dataset(self, *args: Any, **options: Any) -> h5py.Dataset:
+        made = super().create_dataset(*args, **options)
+        self.__dict__.setdefault("made", []).append(made)
+        return made
+
+
+class AtomicFile:
+    """An HDF5 file written beside its target (`.NAME.part`, or another suffix) and renamed when whole.
+
+    A file under the final name is therefore always complete. `commit` closes, syncs and renames; `discard` removes.
+    Write errors become DpcError with the reason in words. As a context manager it gives the open HDF5 file, and commits
+    it at the end of the block, or discards it when the block fails.
+    """
+
+    def __init__(self, target: str | Path, mode: str = "w", suffix: str = ".part") -> None:
+        self.target = Path(target)
+        self.part = self.target.with_name(f".{self.target.name}{suffix}")
+        if not self.target.parent.is_dir():
+            raise DataError(f"{self.target}: the folder {self.target.parent} does not exist; create it first")
+        if self.target.is_dir():
+            raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
+        check_regular(self.target)
+        try:
+            self.file = _HeldOpen(self.part, mode)
+            self.handle, self._written_out = self.file.id.get_vfd_handle(), 0
+        except OSError as error:
+            busy = getattr(error, "errno", None) in (errno.EAGAIN, errno.EACCES) and self.part.exists()
+            if not busy:
+                with suppress(OSError):  # the first byte did not fit: an empty file would stay
+                    self.part.unlink(missing_ok=True)
+            why = "another dpc is writing it" if busy else str(error).splitlines()[0]
+            raise DpcError(f"{self.target}: cannot write ({why})") from None
+
+    def __enter__(self) -> h5py.File:
+        return self.file
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.commit()
+        else:
+            self.failed(kind, error, trace)
+
+    def problem(self, error: BaseException) -> DpcError | None:
+        """Returns a DpcError for a write that found no room, None when `error` is something else."""
+        return disk_full(self.target, error, "nothing was left under that name. Free space, then run again")
+
+    def flush(self) -> None:
+        """Hand everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
+        self.file.flush()
+        if hasattr(os, "posix_fadvise"):
+            size = os.fstat(self.handle).st_size
+            # What it says is that the pages won't be needed; as they are new, Linux begins to write them and keeps them.
+            with suppress(OSError):  # a file system that takes no advice
+                os.posix_fadvise(self.handle, self._written_out, size - self._written_out, os.POSIX_FADV_DONTNEED)
+            self._written_out = size
+
+    def commit(self) -> None:
+        """Close, flush to the disk, rename."""
+        try:
+            self.file.flush()
+            self.file.close()
+            put_in_place(self.part, self.target)
+        except (OSError, RuntimeError) as error:
+            worded = self.problem(error)
+            if worded is not None:
+                self._let_go()
+            self.discard()
+            raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
+
+    def discard(self) -> None:
+        self._close()
+        self.part.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        try:
+            self.file.close()
+        except (OSError, RuntimeError):  # closing flushes, which fails again on a full disk
+            pass
+
+    def failed(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+        keep: bool = False,
+    ) -> None:
+        """Discard after an exception, or `keep` the part unfinished; re-raise a failed write in words."""
+        worded = self.problem(error) if error is not None else None
+        if worded is not None:
+            self._let_go()
+        if keep:
+            self._close()
+        else:
+            self.discard()
+        if worded is not None:
+            raise worded from None
+
+    def _let_go(self) -> None:
+        """After a failed write: what HDF5 still holds goes to the null device instead of to the full disk.
+
+        It would try again on every close, complain each time, and crash as the process ends.
+        """
+        try:
+            elsewhere = os.open(os.devnull, os.O_RDWR)
+            os.dup2(elsewhere, self.handle, inheritable=False)
+            os.close(elsewhere)
+        except OSError:  # closed already
+            pass
