@@ -340,6 +340,25 @@ def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, d
     assert b"(schedule.learning_rate 0.002, now 0.5)" in other.stderr
 
 
+def test_the_settings_are_kept_read_back_and_shown(data, run_folder, dpc_here):
+    """Read back over another preset they are the same run, which is finished; with one changed they are another."""
+    saved = run_folder / "settings.toml"
+    words = ("classify", "train", data, "-o", run_folder, "--preset", "thesis", "--config", saved, "--seed", 3)
+    before = saved.read_bytes()
+    again = dpc_here(*words)
+    assert again.returncode == 0 and b"is finished already" in again.stderr and saved.read_bytes() == before
+    other = dpc_here(*words, "--set", "dropout=0.5")
+    assert other.returncode == 2 and b"(network.dropout 0.0, now 0.5)" in other.stderr and saved.read_bytes() == before
+    shown = json.loads(dpc_here("info", run_folder, "--json").stdout)["settings"]
+    assert (shown["network"]["points"], shown["schedule"]["epochs_dynamic"], shown["run"]["validation"]) == (
+        64,
+        2,
+        "0.34",
+    )
+    text = dpc_here("info", run_folder / "last.safetensors").stdout.decode()
+    assert "schedule epochs dynamic" in text and "run validation" in text
+
+
 def test_a_random_speed_is_for_random_clips_of_consecutive_frames(data, tmp_path, dpc_here):
     words = ("classify", "train", data, "-o", tmp_path / "run", *TRAIN, "--set", "augment_speed=0.3")
     for more in (("--timing", "uniform"), ("--set", "clips_per_video=0")):
