@@ -81,6 +81,7 @@ def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
     true = logits[:, np.arange(len(labels)), labels]  # (K,S)
 
     def loss(powers: np.ndarray) -> tuple[float, np.ndarray]:
+        """Returns the mean negative log-likelihood of the powers, and its gradient."""
         mixed = np.tensordot(powers, logits, 1)
         expected = np.einsum("ksc,sc->ks", logits, softmax(mixed, -1))
         return float((logsumexp(mixed, -1) - powers @ true).mean()), (expected - true).mean(1)

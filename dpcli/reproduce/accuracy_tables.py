@@ -239,6 +239,7 @@ def make(
     cells: dict[str, dict[int, dict]] = {one.key: {} for one in experiment.settings}
 
     def look(setting: Setting, seed: int, train: bool) -> None:
+        """Notes what a setting and a seed say, trained first if need be."""
         found = score(run, plan, experiment, (setting, seed, clouds[setting.data], folder), train)
         if found is not None:
             cells[setting.key][seed] = found

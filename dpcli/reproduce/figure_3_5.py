@@ -121,6 +121,7 @@ class Fold:
 
     def _once(self, run: Dpc, out: Path, stage: str, *words: str) -> dict:
         def work() -> dict:
+            """Trains the network; returns its accuracy."""
             print(f"figure 3.5: {out}", file=sys.stderr)
             self.train(run, out, *words)
             return last_accuracy(out, stage)
@@ -224,6 +225,7 @@ def make(
     about = f"Ours: `dpc classify train {' '.join(words)}`, {folds} folds of the training videos, one seed, the last epoch.{note}"
 
     def look() -> dict[str, dict[float, list[float]]]:
+        """Returns what is known so far, in percent by sweep and value."""
         known = {
             key: {one: [fold.known(point(key, one)) for fold in everyone] for one in own} for key, own in values.items()
         }

@@ -249,6 +249,7 @@ def make(
     reasons: dict[str, str] = {}
 
     def tell() -> None:
+        """Writes what is known so far."""
         about = _about(plan, flow, reasons)
         write_json(
             folder / "results.json",

@@ -135,7 +135,7 @@ class Cell:
 
     @property
     def key(self) -> list:
-        """What must be equal for a result to stand: data and words."""
+        """The data and the words, which must be equal for a result to stand."""
         return [digest(self.clouds), self.train, self.predict]
 
     def known(self) -> dict | None:

@@ -115,6 +115,7 @@ def _interrupt_asks(stop: StopRequest) -> Iterator[None]:
         return
 
     def handle(number: int, frame: object) -> None:
+        """Asks for a stop at the first signal, and interrupts at the second."""
         if stop.requested:
             raise KeyboardInterrupt
         stop.requested, stop.name = True, _CTRL_C

@@ -78,6 +78,7 @@ def _last_call(network: nn.Module, run: Callable[[], Tensor], rows: int) -> _Cal
     found: dict[int, _Call] = {}
 
     def note(module: nn.Module, _: object, output: object) -> None:
+        """Notes each call whose output has the wanted shape."""
         calls[module] = calls.get(module, -1) + 1
         if isinstance(output, Tensor) and output.is_floating_point() and output.shape[:-1] in ((1, rows), (rows,)):
             found[output.dim()] = _Call(module, calls[module])
@@ -97,6 +98,7 @@ def _seen(
     count = -1
 
     def note(_: nn.Module, __: object, output: Tensor) -> Tensor | None:
+        """Replaces the output of the wanted call by a copy that gradients reach."""
         nonlocal count
         count += 1
         if count != call.number:
@@ -148,6 +150,7 @@ class ClipVectors:
         candidates: list[tuple[nn.Module, Tensor]] = []
 
         def note(module: nn.Module, inputs: tuple, output: object) -> None:
+            """Notes each call that has one tensor for input and one for output."""
             if isinstance(output, Tensor) and len(inputs) == 1 and isinstance(inputs[0], Tensor):
                 candidates.append((module, output))
 
@@ -169,6 +172,7 @@ class ClipVectors:
         seen: dict[nn.Module, Tensor] = {}
 
         def note(module: nn.Module, inputs: tuple, _: Tensor) -> None:
+            """Notes what the last layer reads."""
             seen[module] = inputs[0].flatten(1)
 
         with _hooked(set(self.layers.values()), note):

@@ -66,6 +66,7 @@ def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
     """Returns the words above a sample: its name, its class, what the network says, and which class is explained."""
 
     def name(label: int) -> str:
+        """Returns the name of a class, or its number where it has none."""
         return class_names[label] if 0 <= label < len(class_names) else str(label)
 
     parts = [cloud.sequence.name]
@@ -94,6 +95,7 @@ def _drawer(cloud: ActivationCloud, axes: np.ndarray) -> Callable[[str, int], np
     offsets = cloud.sequence.frame_offsets
 
     def draw(stream: str, t: int) -> np.ndarray:
+        """Returns the cell of a stream and a frame."""
         span = slice(int(offsets[t]), int(offsets[t + 1]))
         return _dots(places[span], seen[span, 2], heat(cloud.activation[stream][span]))
 

@@ -224,6 +224,7 @@ class _SurfaceFit(torch.autograd.Function):
         kept = case.made(case.count) if any(ctx.needs_input_grad) else None
 
         def work(_: int, piece: tuple[int, int], room: tuple[Tensor, Tensor, Tensor] | None) -> None:
+            """Goes through a piece of the centroids in a thread."""
             made = case.parts(room or kept, *((0, piece[1] - piece[0]) if room else piece))
             case.begin(*piece, made)
             found, rows = _flat(planes[slice(*piece)]), case.rows(*piece)
@@ -252,6 +253,7 @@ class _SurfaceFit(torch.autograd.Function):
         sums = [(torch.zeros_like(tensors[1]), torch.zeros(1, layout.width)) for _ in tasks]
 
         def work(number: int, task: tuple[int, int], room: _Gradients) -> None:
+            """Goes through a piece of the centroids in a thread."""
             to_weight, to_bias = sums[number]
             for low, high in steps(*task, case.step):
                 rows, (some, weight, moment) = case.rows(low, high), map(_flat, case.parts(made, low, high))

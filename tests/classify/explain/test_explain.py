@@ -34,7 +34,7 @@ from dpcli.classify.explain.tsne import chosen_perplexity, neighbor_accuracy, pl
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, save_model
-from dpcli.classify.network_cost import body_like_clip
+from dpcli.classify.network_speed import body_like_clip
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.embedding import EmbeddingReader

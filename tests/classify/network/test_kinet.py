@@ -12,7 +12,8 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinematic import KinematicUnit
 from dpcli.classify.network.kinet import Kinet, fuse
 from dpcli.classify.network.layers import GlobalHead, he_init
-from dpcli.classify.network_cost import body_like_clip, count_parameters, macs, measure, paper_parameters, render
+from dpcli.classify.network_cost import count_parameters, macs, measure, paper_parameters, render
+from dpcli.classify.network_speed import body_like_clip
 from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
 from dpcli.ops import fps

@@ -19,7 +19,8 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.network.sync_norm import synchronize_norms
-from dpcli.classify.network_cost import body_like_clip, count_parameters, paper_parameters
+from dpcli.classify.network_cost import count_parameters, paper_parameters
+from dpcli.classify.network_speed import body_like_clip
 from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, backbone_changes
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.mixed_precision import reduced_products
