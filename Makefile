@@ -117,7 +117,7 @@ table-3.5: $(READY)
 	$(call needs,NTU60,the folder of nturgb+d_depth_masked or of its ZIPs)
 	$(TABLES).accuracy_tables 3.5 "$(NTU60)" table/3.5 $(PLAN) -- $(BUDGET)
 
-# SWEEPS: "group-size=2,4 radius=0.25,0.5" replaces the values of these; "radius=" leaves one out. ONLY=0,1: these folds.
+# SWEEPS: "group_size=2,4 radius=0.25,0.5" replaces the values of these; "radius=" leaves one out. ONLY=0,1: these folds.
 figure-3.5: $(READY)
 	$(call needs_either)
 	$(TABLES).figure_3_5 $(EITHER) table/figure-3.5 --preset $(PRESET) --folds $(FOLDS) --only "$(ONLY)" \
