@@ -14,6 +14,7 @@ _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
 _COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
 _BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
+_TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
 _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coordinates
 
 
@@ -88,15 +89,21 @@ def guess_bin_columns(paths: Sequence[Path]) -> tuple[int, bool]:
     possible = [c for c in _COLUMNS if all(size % (4 * c) == 0 for size in sizes)]
     if not possible:
         return 4, True  # reading says what is wrong
-    values = [np.fromfile(path, "<f4", 1 << 16).astype(np.float64) for path in paths]
-    costs = {c: float(np.mean([_cost(one, c) for one in values])) for c in possible}
-    best = min(costs.values())
-    near = [c for c in possible if costs[c] <= best + _BY_CHANCE]
+    values = [np.fromfile(path, "<f4", _FLOATS).astype(np.float64) for path in paths]
+    near = _likely(values, possible)
     if 4 in near and all(_is_reflectance(one[: len(one) // 4 * 4].reshape(-1, 4)[:, 3]) for one in values):
         return 4, True
-    others = [c for c in near if c != 4] or [4]
-    chosen = min(others)
-    return chosen, len(near) == 1 or all(c % chosen == 0 for c in near)
+    chosen = min(c for c in near if c != 4 or near == [4])
+    return chosen, len(near) == 1
+
+
+def _likely(values: list[np.ndarray], possible: list[int]) -> list[int]:
+    """Returns the numbers of columns that explain the values about as well as the best one, without their multiples."""
+    near = sorted(c for c in possible if c <= 6) or possible
+    if sum(map(len, values)) >= _TELLING:
+        costs = {c: float(np.mean([_cost(one, c) for one in values])) for c in possible}
+        near = sorted(c for c in possible if costs[c] <= min(costs.values()) + _BY_CHANCE)
+    return [c for c in near if not any(c > other and c % other == 0 for other in near)]
 
 
 def _cost(values: np.ndarray, columns: int) -> float:

@@ -17,13 +17,15 @@ class Cloud:
     """Holds points f32 or f64 (N,3) as stored, NaN where the file has it.
 
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
-    coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each.
+    coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
+    names of those that points and colors came from.
     """
 
     points: np.ndarray
     color: np.ndarray | None = None
     unit: str = ""
     extra: dict[str, np.ndarray] = field(default_factory=dict)
+    columns: tuple[str, ...] = ()
 
     def keep(self, rows: np.ndarray) -> None:
         """Keeps only some points: a mask bool (N), or indices."""
@@ -48,7 +50,8 @@ def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequen
         color = np.stack([columns[names[place]] for place in colors], axis=1)
     elif colors:
         color = unpack_rgb(columns[names[colors[0]]])
-    return Cloud(points, color, axes[1], kept_columns(path, columns, keep))
+    used = tuple(names[place] for place in (*axes[0], *colors))
+    return Cloud(points, color, axes[1], kept_columns(path, columns, keep), used)
 
 
 def named_axes(path: Path, names: Sequence[str]) -> tuple[list[int], str] | None:
