@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +13,9 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.decode.cloud_files import SUFFIXES, Cloud, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.prepare.scans.cloud_series import find_sequences
+from dpcli.prepare.series import Series, about_series
 from dpcli.store import CloudSequence
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
@@ -32,6 +33,7 @@ class CloudFolders:
     stride: int = 1
     label_from_folder: bool = False
     labels: Path | None = None
+    pattern: str = ""
 
     def __post_init__(self) -> None:
         if self.labels and self.label_from_folder:
@@ -54,12 +56,13 @@ class CloudFolders:
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
-        return (("time",) if self.fps else ()) + (("color",) if self._has_color else ())
+        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ())
 
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+        left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
+        return {k: v for k, v in asdict(self).items() if k not in left_out}
 
     @cached_property
     def _table(self) -> LabelTable | None:
@@ -68,27 +71,27 @@ class CloudFolders:
         return read_labels(self.labels) if self.labels else None
 
     @cached_property
-    def _relative(self) -> list[Path]:
-        expected = f"point clouds ({', '.join(SUFFIXES)}), or folders of them"
-        root = require_folder(self.raw, expected)
-        table = self.labels.resolve() if self.labels else None  # a .csv that is no cloud may lie among the data
-        folders = [
-            Path(f)
-            for f, _, names in os.walk(root)
-            if any(is_cloud(n) and (Path(f) / n).resolve() != table for n in names)
-        ]
-        if not folders:
-            raise DataError(f"{root}: no {expected}")
-        relative = sorted((f.relative_to(root) for f in folders), key=lambda p: natural_key(p.as_posix()))
-        if self.label_from_folder and any(not path.parts for path in relative):
+    def _series(self) -> list[Series]:
+        root = require_folder(self.raw, f"point clouds ({', '.join(SUFFIXES)}), or folders of them")
+        found = find_sequences(root, SUFFIXES, pattern=self.pattern, table=self.labels)
+        if self.label_from_folder and any(one.folder == root for one in found):
             raise DataError(f"{root}: holds clouds itself; --label-from-folder expects CLASS/SEQUENCE/frames below it")
-        return relative
+        return found
+
+    @property
+    def _relative(self) -> list[Path]:
+        return [one.folder.relative_to(self.raw) for one in self._series]
+
+    @cached_property
+    def _timed(self) -> bool:
+        """Returns whether the time of every frame is known: by ``fps``, or because all names are times."""
+        return all(one.frame_times(self.fps) is not None for one in self._series)
 
     @cached_property
     def _has_color(self) -> bool:
-        for relative in self._relative:
+        for one in self._series:
             try:
-                return read_cloud(frame_paths(self.raw / relative)[0], self.bin_columns).color is not None
+                return read_cloud(one.paths[0], self.bin_columns).color is not None
             except DataError:
                 continue  # a bad sample: the next one tells
         return False
@@ -96,14 +99,15 @@ class CloudFolders:
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
-        for relative in self._relative:
+        for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
-            items.append(Item(name, self.raw / relative, extra={"color": self._has_color}))
+            items.append(Item(name, series.folder, extra={"color": self._has_color, "series": series}))
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        paths = frame_paths(item.path)[:: self.stride]
+        series = item.extra["series"]
+        paths = series.paths[:: self.stride]
         clouds = [read_cloud(path, self.bin_columns) for path in paths]
         notes = {"points with NaN or infinity dropped": sum(drop_invalid(cloud) for cloud in clouds)}
         counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
@@ -116,7 +120,7 @@ class CloudFolders:
             points = points - np.floor(points[: counts[kept[0]]].min(0))
             notes["sequences shifted to their first frame's corner for precision"] = 1
         color = self._colors(item, paths, clouds) if item.extra["color"] else None
-        time = kept * self.stride / self.fps if self.fps else None
+        time = series.frame_times(self.fps)[:: self.stride][kept] if self._timed else None
         return Sample(
             CloudSequence(
                 item.name, points.astype(np.float32), offsets(counts[kept]), time=time, color=color, **describe(item)
@@ -134,18 +138,11 @@ class CloudFolders:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        frames = sum(len(frame_paths(item.path)) for item in items)
-        return [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
-
-
-def is_cloud(name: str) -> bool:
-    """Returns whether a file name looks like a point cloud."""
-    return name.lower().endswith(SUFFIXES) and not name.startswith(".")
-
-
-def frame_paths(folder: Path) -> list[Path]:
-    """Returns the point clouds directly in a folder, in natural order."""
-    return sorted((p for p in folder.iterdir() if is_cloud(p.name) and p.is_file()), key=natural_key)
+        frames = sum(len(item.extra["series"].names) for item in items)
+        lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
+        if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
+            lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
+        return lines + about_series([(item.name, item.extra["series"]) for item in items])
 
 
 def drop_invalid(cloud: Cloud) -> int:

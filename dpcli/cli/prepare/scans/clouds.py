@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
-from dpcli.cli.prepare.options import LabelTable, Stride
+from dpcli.cli.prepare.options import LabelTable, Pattern, Stride
 
 
 def clouds(
@@ -25,6 +25,7 @@ def clouds(
         float | None, typer.Option("--fps", help="Frames per second; writes the time of every frame.")
     ] = None,
     stride: Stride = 1,
+    pattern: Pattern = "",
     label_from_folder: Annotated[
         bool,
         typer.Option(
@@ -52,6 +53,7 @@ def clouds(
             stride=stride,
             label_from_folder=label_from_folder,
             labels=labels,
+            pattern=pattern,
         ),
         conversion,
         raw,
