@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +15,10 @@ from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, natural_key, require_folder
+from dpcli.prepare.reader import Item, Sample, require_folder
 from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.cloud_series import find_sequences
+from dpcli.prepare.series import Series, about_series
 from dpcli.store.schema import KEPT
 
 _LOOKED_AT = 5  # frames that tell how many columns a .bin has
@@ -36,6 +37,7 @@ class CloudFolders:
     label_from_folder: bool = False
     labels: Path | None = None
     keep: tuple[str, ...] = ()
+    pattern: str = ""
 
     def __post_init__(self) -> None:
         if self.labels and self.label_from_folder:
@@ -60,12 +62,13 @@ class CloudFolders:
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
         kept = tuple(f"{KEPT}{name}" for name in self.keep)
-        return (("time",) if self.fps else ()) + (("color",) if self._has_color else ()) + kept
+        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ()) + kept
 
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+        left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
+        return {k: v for k, v in asdict(self).items() if k not in left_out}
 
     @cached_property
     def _table(self) -> LabelTable | None:
@@ -74,27 +77,27 @@ class CloudFolders:
         return read_labels(self.labels) if self.labels else None
 
     @cached_property
-    def _relative(self) -> list[Path]:
-        expected = f"point clouds ({', '.join(SUFFIXES)}), or folders of them"
-        root = require_folder(self.raw, expected)
-        table = self.labels.resolve() if self.labels else None  # a .csv that is no cloud may lie among the data
-        folders = [
-            Path(f)
-            for f, _, names in os.walk(root)
-            if any(is_cloud(n) and (Path(f) / n).resolve() != table for n in names)
-        ]
-        if not folders:
-            raise DataError(f"{root}: no {expected}")
-        relative = sorted((f.relative_to(root) for f in folders), key=lambda p: natural_key(p.as_posix()))
-        if self.label_from_folder and any(not path.parts for path in relative):
+    def _series(self) -> list[Series]:
+        root = require_folder(self.raw, f"point clouds ({', '.join(SUFFIXES)}), or folders of them")
+        found = find_sequences(root, SUFFIXES, pattern=self.pattern, table=self.labels)
+        if self.label_from_folder and any(one.folder == root for one in found):
             raise DataError(f"{root}: holds clouds itself; --label-from-folder expects CLASS/SEQUENCE/frames below it")
-        return relative
+        return found
+
+    @property
+    def _relative(self) -> list[Path]:
+        return [one.folder.relative_to(self.raw) for one in self._series]
+
+    @cached_property
+    def _timed(self) -> bool:
+        """Returns whether the time of every frame is known: by ``fps``, or because all names are times."""
+        return all(one.frame_times(self.fps) is not None for one in self._series)
 
     @cached_property
     def _has_color(self) -> bool:
-        for relative in self._relative:
+        for one in self._series:
             try:
-                return read_cloud(frame_paths(self.raw / relative)[0], self.bin_columns).color is not None
+                return read_cloud(one.paths[0], self.bin_columns).color is not None
             except DataError:
                 continue  # a bad sample: the next one tells
         return False
@@ -102,19 +105,20 @@ class CloudFolders:
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
-        for relative in self._relative:
+        for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
-            items.append(Item(name, self.raw / relative, extra={"color": self._has_color}))
+            items.append(Item(name, series.folder, extra={"color": self._has_color, "series": series}))
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        paths = frame_paths(item.path)[:: self.stride]
+        series = item.extra["series"]
+        paths = series.paths[:: self.stride]
         columns, notes = self._bin_columns(paths)
         clouds = [read_cloud(path, columns, self.keep) for path in paths]
         if item.extra["color"]:
             _require_colors(paths, clouds)
-        time = np.arange(len(paths)) * self.stride / self.fps if self.fps else None
+        time = series.frame_times(self.fps)[:: self.stride] if self._timed else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= notes
         return sample
@@ -131,8 +135,11 @@ class CloudFolders:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        frames = sum(len(frame_paths(item.path)) for item in items)
-        return [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
+        frames = sum(len(item.extra["series"].names) for item in items)
+        lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
+        if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
+            lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
+        return lines + about_series([(item.name, item.extra["series"]) for item in items])
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:
@@ -141,13 +148,3 @@ def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:
         raise DataError(
             f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"
         )
-
-
-def is_cloud(name: str) -> bool:
-    """Returns whether a file name looks like a point cloud."""
-    return name.lower().endswith(SUFFIXES) and not name.startswith(".")
-
-
-def frame_paths(folder: Path) -> list[Path]:
-    """Returns the point clouds directly in a folder, in natural order."""
-    return sorted((p for p in folder.iterdir() if is_cloud(p.name) and p.is_file()), key=natural_key)

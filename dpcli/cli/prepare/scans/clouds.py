@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
-from dpcli.cli.prepare.options import LabelTable, Stride
+from dpcli.cli.prepare.options import LabelTable, Pattern, Stride
 
 if TYPE_CHECKING:
     from dpcli.prepare.scans.clouds import CloudFolders
@@ -66,6 +66,7 @@ def clouds(
         float | None, typer.Option("--fps", help="Frames per second; writes the time of every frame.")
     ] = None,
     stride: Stride = 1,
+    pattern: Pattern = "",
     label_from_folder: Annotated[
         bool,
         typer.Option(
@@ -89,11 +90,11 @@ def clouds(
         "label_from_folder": label_from_folder,
         "labels": labels,
     }
-    run_conversion("clouds", lambda: _make_reader(raw, units, table, shared), conversion, raw)
+    run_conversion("clouds", lambda: _make_reader(raw, units, table, pattern, shared), conversion, raw)
 
 
 def _make_reader(
-    raw: Path, units: CloudUnits, table: TableColumns, shared: dict[str, Any]
+    raw: Path, units: CloudUnits, table: TableColumns, pattern: str, shared: dict[str, Any]
 ) -> CloudFolders | TableSequences:
     """Returns the reader of a table, or of folders of tables where an option says so, else of folders of frames."""
     from dpcli.prepare.scans.clouds import CloudFolders
@@ -101,4 +102,4 @@ def _make_reader(
 
     if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():
         return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
-    return CloudFolders(raw, bin_columns=units.bin_columns, **shared)
+    return CloudFolders(raw, bin_columns=units.bin_columns, pattern=pattern, **shared)
