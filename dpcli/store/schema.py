@@ -190,6 +190,15 @@ def fields_of(kind: str) -> dict[str, Field]:
     return {field.name: field for field in (*EVERYWHERE, *base, *TABLES[kind])}
 
 
+def kept_name(column: str) -> str:
+    """Returns the name of the data set of a column that was kept; a slash would make a group of it.
+
+    >>> kept_name("v [m/s]")
+    'field_v [m_s]'
+    """
+    return KEPT + column.replace("/", "_")
+
+
 def find_field(known: dict[str, Field], name: str) -> Field | None:
     """Returns what a kind, whose fields are `known`, says of a data set of that name; None where it says nothing."""
     return known.get(f"{KEPT}NAME" if name.startswith(KEPT) else name)

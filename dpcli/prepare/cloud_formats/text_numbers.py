@@ -24,6 +24,7 @@ _MARKS = (
 )
 _COMMENT = ("#", "//", "%")
 _MISSING = frozenset(("", "nan", "-nan", "+nan", "na", "n/a", "null", "none", "nil", "-", "nan(ind)", "-nan(ind)"))
+_NOT_A_NUMBER = re.compile(r"[-+]?1[.,]#(qnan|snan|ind|inf)\w*", re.IGNORECASE)  # as Windows writes it
 _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
 _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns hold
@@ -108,7 +109,9 @@ class TextTable:
                 value = _number(row[place], decimal)
                 if value is None:
                     name = f"column {self.names[place]!r}" if self.names else f"column {place + 1}"
-                    raise DataError(f"{self.path}:{number}: {name} holds {row[place]!r:.60}; expected numbers in columns")
+                    raise DataError(
+                        f"{self.path}:{number}: {name} holds {row[place]!r:.60}; expected numbers in columns"
+                    )
                 values[k, column] = value
         return values
 
@@ -138,7 +141,7 @@ def _trimmed(cells: list[str], width: int = 0) -> list[str]:
 
 def _number(cell: str, decimal: str) -> float | None:
     """Returns the number in a cell, NaN of an empty one, None of other words."""
-    if cell.lower() in _MISSING:
+    if cell.lower() in _MISSING or _NOT_A_NUMBER.fullmatch(cell):
         return float("nan")
     grouped = _GROUPED.fullmatch(cell)
     if grouped and grouped[1] != decimal:
@@ -160,8 +163,6 @@ def read_text_table(path: Path) -> TextTable:
     delimiter = None
     if re.fullmatch(r"sep=.", numbered[0][1], re.IGNORECASE):  # as Excel tells itself
         delimiter = numbered.pop(0)[1][-1]
-    if "\t" in "".join(line for _, line in numbered[:2]):
-        numbered = [(k, line) for k, line in numbered]
     header, names = _find_header(path, numbered, delimiter)
     rows = [(k, line) for k, line in numbered[header:] if not line.startswith(_COMMENT)]
     rows = _without_count(path, rows)
@@ -198,7 +199,9 @@ def _find_header(path: Path, numbered: list[tuple[int, str]], delimiter: str | N
     place, (number, line) = next(
         ((place, one) for place, one in enumerate(numbered) if not one[1].startswith(_COMMENT)), (0, numbered[0])
     )
-    if not all(re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)):
+    if not all(
+        re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)
+    ):
         words = ", ".join(_names(line, delimiter) or line.split())[:80]
         raise DataError(f"{path}:{number}: columns {words}; expected x, y and z among them, or numbers only")
     return place, []
@@ -209,7 +212,7 @@ def _names(line: str, delimiter: str | None) -> list[str]:
     line = re.sub(r"^(#|//|%)+\s*", "", line)
     sign = delimiter or next((d for d in "\t;,|" if d in line), None)
     if sign is None:
-        return [cell.strip('"\'') for cell in line.split()]
+        return [cell.strip("\"'") for cell in line.split()]
     cells = next(csv.reader([line], delimiter=sign, skipinitialspace=True))
     return [cell.strip().strip("'\"").strip() for cell in _trimmed([cell.strip() for cell in cells])]
 
@@ -235,7 +238,9 @@ def _without_count(path: Path, rows: list[tuple[int, str]]) -> list[tuple[int, s
         return rows
     count, rest = int(rows[0][1]), rows[1:]
     if len(rest) != count:
-        raise DataError(f"{path}: says {count} points in line {rows[0][0]}, holds {len(rest)}; truncated, or two clouds")
+        raise DataError(
+            f"{path}: says {count} points in line {rows[0][0]}, holds {len(rest)}; truncated, or two clouds"
+        )
     return rest
 
 

@@ -14,7 +14,7 @@ from dpcli.prepare.cloud_formats.column_names import UNITS
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.prepare.scans.cleaning import clean
 from dpcli.store import CloudSequence
-from dpcli.store.schema import KEPT
+from dpcli.store.schema import kept_name
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
@@ -47,12 +47,7 @@ class Lengths:
 
 
 def assemble(
-    item: Item,
-    clouds: list[Cloud],
-    lengths: Lengths,
-    *,
-    color: bool = False,
-    time: np.ndarray | None = None,
+    item: Item, clouds: list[Cloud], lengths: Lengths, *, color: bool = False, time: np.ndarray | None = None
 ) -> Sample:
     """Returns the sample of frames that were read, in their order. Raises DataError where no point is left.
 
@@ -71,7 +66,7 @@ def assemble(
         notes[SHIFTED] = 1
     if lengths.unit == "m":
         notes |= _doubts(points, shift)
-    extra = {f"{KEPT}{name}": np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
+    extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
     sequence = CloudSequence(
         item.name,
         points.astype(np.float32, copy=False),

@@ -80,7 +80,10 @@ def frame_column(table: Table, wanted: str) -> str:
         raise DataError(f"{table.path}: --frame-column {wanted}: no such column; found {known}")
     found = wanted or find_frame_column(table.names)
     if not found:
-        raise DataError(f"{table.path}: which column numbers the frames? --frame-column NAME says it; found {known}")
+        raise DataError(
+            f"{table.path}: which column numbers the frames? --frame-column NAME says it; found {known}."
+            " A table of one frame goes into a folder of frames"
+        )
     return found
 
 
