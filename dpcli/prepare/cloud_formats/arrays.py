@@ -21,9 +21,11 @@ _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coord
 def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads an array of rows, x y z first, or a structured one with fields of these names."""
     try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # a shape that the file has no room for fails at once
+    except Exception as error:  # ValueError, EOFError, tokenize.TokenError, SyntaxError of damaged headers
         raise DataError(f"{path}: not a readable .npy array ({error})") from None
+    if not isinstance(array, np.ndarray):
+        raise DataError(f"{path}: not a readable .npy array (an archive)")
     return _cloud_of_array(path, array, keep)
 
 
@@ -32,6 +34,7 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {key: archive[key] for key in archive.files}
+            arrays = {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # or bare bytes
     except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
         raise DataError(f"{path}: not a readable .npz archive ({error})") from None
     key = next((k for k in _POINT_KEYS if k in arrays), None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns
 
 _COLORS = ("red", "green", "blue")
 _UNIT_KEY = 3076  # of GeoTIFF: linear units of a projected system
+_SIZES = struct.Struct("<HII")  # at byte 94: of the header, where the points begin, how many records lie between
+_RECORD, _LATE_RECORD = 54, 60  # bytes at least of a record before the points, and of one behind them
 _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 
 
@@ -21,6 +24,7 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the points, with colors as stored: 16 bits, some of which hold bytes. Raises DataError when damaged."""
     import laspy
 
+    _check_sizes(path)
     try:
         las = laspy.read(path)
     except Exception as error:  # laspy.errors.LaspyException, struct.error, ValueError, lazrs.LazrsError
@@ -34,6 +38,22 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
         color = None  # the point format has room for colors that nobody filled in
     extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if not keep or name in keep}, keep)
     return Cloud(np.asarray(las.xyz, np.float64), color, _unit(las), extra)
+
+
+def _check_sizes(path: Path) -> None:
+    """Raises DataError where the header counts more records than the file has room for: laspy would read on and on."""
+    with path.open("rb") as file:
+        head = file.read(375)
+    size = path.stat().st_size
+    if head[:4] != b"LASF" or len(head) < 227:
+        raise DataError(f"{path}: not a readable {path.suffix[1:].upper()} file, perhaps truncated (no header)")
+    header, start, records = _SIZES.unpack_from(head, 94)
+    late_start, late = struct.unpack_from("<QI", head, 235) if head[25] >= 4 and len(head) >= 247 else (0, 0)
+    if header + records * _RECORD > start or start > size or (late and late_start + late * _LATE_RECORD > size):
+        raise DataError(
+            f"{path}: truncated or damaged: its header says {records + late} records and points from byte {start} on, of"
+            f" {size}"
+        )
 
 
 def _unit(las: Any) -> str:

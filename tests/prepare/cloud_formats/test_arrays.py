@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -109,3 +111,21 @@ def test_a_bin_of_another_type_is_refused(tmp_path):
     np.random.default_rng(0).normal(size=(60, 4)).astype("<f8").tofile(tmp_path / "0.bin")
     with pytest.raises(DataError, match="no coordinates in float32"):
         read_bin(tmp_path / "0.bin", 4)
+
+
+def test_damaged_arrays_are_named(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.ones((4, 3), np.float32))
+    whole = path.read_bytes()
+    for old, new in ((b"(4, 3)", b"(9**9,"), (b"(4, 3), }", b"(4, 3)   "), (b"(4, 3)", b"(9999999999, 3)")):
+        path.write_bytes(whole.replace(old, new))
+        with pytest.raises(DataError, match="a.npy: not a readable .npy"):
+            read_npy(path)
+    np.savez(tmp_path / "b.npz", other=np.ones(3))
+    path.write_bytes((tmp_path / "b.npz").read_bytes())
+    with pytest.raises(DataError, match="a.npy: not a readable .npy"):
+        read_npy(path)
+    with zipfile.ZipFile(tmp_path / "c.npz", "w") as archive:
+        archive.writestr("points", b"no array")
+    with pytest.raises(DataError, match="expected one called points"):
+        read_npz(tmp_path / "c.npz")

@@ -95,3 +95,15 @@ def test_a_damaged_laz_is_named(tmp_path):
     (tmp_path / "a.laz").write_bytes(whole[:-200])
     with pytest.raises(DataError, match="a.laz: (not a readable LAZ|truncated)"):
         read_las(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize(("place", "value"), [(100, 0xFFFFFFFF), (96, 0xFFFFFF), (94, 0xFFFF)])
+def test_a_header_that_counts_what_is_not_there_is_refused_at_once(tmp_path, place, value):
+    """laspy reads records as long as the header says, into all memory."""
+    path = tmp_path / "a.las"
+    make(3, np.ones((9, 3))).write(str(path))
+    data = bytearray(path.read_bytes())
+    data[place : place + (2 if place == 94 else 4)] = value.to_bytes(2 if place == 94 else 4, "little")
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="truncated or damaged: its header says"):
+        read_las(path)
