@@ -214,7 +214,7 @@ class _Run:
         with Progress(self.conversion.task, total=len(self.items), unit="video") as bar:
             bar.skip(len(self.items) - len(self.todo))
             try:
-                for indexed, result in ordered_map(work, self.todo, jobs, executor):
+                for indexed, result in ordered_map(work, self.todo, min(jobs, len(self.todo)), executor):
                     self.take(indexed, result, bar)
                     self.stop.check(self.kept())
             except KeyboardInterrupt:

@@ -36,7 +36,7 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     color = np.stack([np.asarray(las[name]) for name in _COLORS], axis=1) if set(_COLORS) <= set(names) else None
     if color is not None and not color.any():
         color = None  # the point format has room for colors that nobody filled in
-    extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if not keep or name in keep}, keep)
+    extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if name in keep}, keep) if keep else {}
     return Cloud(np.asarray(las.xyz, np.float64), color, _unit(las), extra)
 
 

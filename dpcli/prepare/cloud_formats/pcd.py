@@ -96,12 +96,10 @@ def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:
 
 def _read_text(path: Path, body: bytes, header: Header) -> dict[str, np.ndarray]:
     names = header.kind.names or ()
-    lines = [(k, line) for k, line in enumerate(body.decode("latin-1").splitlines(), header.lines + 1) if line.strip()]
-    if len(lines) < header.points:
-        raise _truncated(path, header.points, len(lines))
-    lines = lines[: header.points]
-    table = TextTable(path, tuple(names), [line for _, line in lines], [k for k, _ in lines], None)
+    table = TextTable(path, tuple(names), _lines(body), header.lines + 1, limit=header.points)
     values = table.columns(range(len(names)))
+    if len(values) < header.points:
+        raise _truncated(path, header.points, len(values))
     columns = {}
     for k, name in enumerate(names):
         kind, column = header.kind[name], values[:, k]
@@ -111,6 +109,10 @@ def _read_text(path: Path, body: bytes, header: Header) -> dict[str, np.ndarray]
         )  # whole numbers, as some write them
         columns[name] = column if packed or not whole else column.astype(kind)
     return columns
+
+
+def _lines(body: bytes) -> str:
+    return body.decode("latin-1").replace("\r\n", "\n")
 
 
 def _read_compressed(path: Path, body: memoryview, header: Header) -> dict[str, np.ndarray]:

@@ -100,16 +100,18 @@ def _read_binary(
 def _read_text(path: Path, file: BinaryIO, vertex: Element, before: list[Element]) -> dict[str, np.ndarray]:
     names = _unique_names(path, vertex)
     head = file.tell()
-    body = file.read().decode("latin-1")
+    body = file.read().decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
     file.seek(0)
-    first = file.read(head).count(b"\n") + 1
-    lines = [(k, line) for k, line in enumerate(body.splitlines(), first) if line.strip()]
-    lines = lines[sum(element.count for element in before) :][: vertex.count]
-    _require_all(path, vertex.count, len(lines))
+    first = len(file.read(head).splitlines()) + 1
+    skipped = sum(element.count for element in before)
+    if skipped:
+        rows = [(k, line) for k, line in enumerate(body.split("\n")) if line.strip()][skipped : skipped + 1]
+        body = body.split("\n", rows[0][0])[-1] if rows else ""
+        first += rows[0][0] if rows else 0
     if vertex.has_lists:
         raise DataError(f"{path}: its vertices hold lists; expected one number for each property")
-    table = TextTable(path, tuple(names), [line for _, line in lines], [k for k, _ in lines], None)
-    values = table.columns(range(len(names)))
+    values = TextTable(path, tuple(names), body, first, limit=vertex.count).columns(range(len(names)))
+    _require_all(path, vertex.count, len(values))
     return {
         name: _typed(path, name, values[:, k], np.dtype(kind))
         for k, (name, (_, kind)) in enumerate(zip(names, vertex.properties))

@@ -27,7 +27,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
             raise DataError(f"{table.path}: --keep-fields {keep[0]}: its columns have no names")
         if table.width < 3:
             raise DataError(
-                f"{table.path}: array of shape {(len(table.lines), table.width)}; expected numbers (points, 3 or more)"
+                f"{table.path}: array of shape {(len(table.numbered), table.width)}; expected numbers (points, 3 or more)"
             )
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
         return Cloud(values[:, :3])

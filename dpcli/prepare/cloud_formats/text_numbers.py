@@ -6,14 +6,16 @@ import codecs
 import csv
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
+from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
@@ -27,6 +29,8 @@ _MISSING = frozenset(("", "nan", "-nan", "+nan", "na", "n/a", "null", "none", "n
 _NOT_A_NUMBER = re.compile(r"[-+]?1[.,]#(qnan|snan|ind|inf)\w*", re.IGNORECASE)  # as Windows writes it
 _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
+_EDGES = " \r\n\x00"  # no tabs: they may stand for empty cells
+_HEAD = 200  # lines among which the header is looked for
 _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns hold
 
 
@@ -34,19 +38,33 @@ _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns
 class TextTable:
     """Holds the rows of a text, not yet taken for numbers. names: of the columns, none where the file names none.
 
-    lines: the rows; numbers: which line of the file each is, from 1. delimiter: None for blanks.
+    body: the text from the first row on; first_line: which line of the file that is, from 1. delimiter: None for blanks.
+    limit: rows that count, None for all.
     """
 
     path: Path
     names: tuple[str, ...]
-    lines: list[str]
-    line_numbers: list[int]
-    delimiter: str | None
+    body: str
+    first_line: int = 1
+    delimiter: str | None = None
+    limit: int | None = None
+
+    @cached_property
+    def numbered(self) -> list[tuple[int, str]]:
+        """Returns the rows with the number of their line; no empty ones, no comments."""
+        lines = enumerate(self.body.split("\n"), self.first_line)
+        rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip() and not line.lstrip().startswith(_COMMENT))
+        return list(islice(rows, self.limit))
 
     @cached_property
     def width(self) -> int:
         """Returns the number of columns."""
-        return len(self.names) or len(_trimmed(self.cells(self.lines[0])))
+        return len(self.names) or len(_trimmed(self.cells(self.first_rows(1)[0][1])))
+
+    def first_rows(self, count: int) -> list[tuple[int, str]]:
+        """Returns the first rows with the numbers of their lines, without looking at the others."""
+        head = replace(self, body="\n".join(self.body.split("\n", 4 * count + 100)[: 4 * count + 100]))
+        return head.numbered[:count]
 
     def cells(self, line: str) -> list[str]:
         """Returns the cells of a row, without quotes and blanks around them."""
@@ -59,29 +77,27 @@ class TextTable:
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty. Raises DataError that names the line."""
-        if not self.lines:
-            return np.zeros((0, len(places)))
+        plain = parse_plain(self.body, self.width, self.delimiter, self.limit) if self.width else None
+        if plain is not None:
+            return plain[:, list(places)]
         fast = self._read_fast(list(places))
         return self._read_any(list(places)) if fast is None else fast
 
     def words(self, place: int) -> list[str]:
         """Returns the cells of a column as they are written."""
-        return [self._row(line, number)[place] for line, number in zip(self.lines, self.line_numbers)]
+        return [self._row(line, number)[place] for number, line in self.numbered]
 
     def _read_fast(self, places: list[int]) -> np.ndarray | None:
-        """Returns what NumPy reads; None where the text is none that it reads right."""
-        body = "\n".join(self.lines)
+        """Returns what NumPy reads where some columns hold words; None where the text is none that it reads right."""
+        lines = [line for _, line in self.numbered]
+        body = "\n".join(lines)
         if '"' in body or "'" in body or (self.delimiter != "," and "," in body and "." in body):
             return None
-        if self.delimiter not in (None, ","):
-            widths = {line.count(self.delimiter) + 1 for line in self.lines}
-        elif self.delimiter == ",":
-            widths = {line.count(",") + 1 for line in self.lines}
-        else:
-            widths = {self.width} if len(places) == self.width else {len(line.split()) for line in self.lines}
+        widths = {len(line.split(self.delimiter)) for line in lines}
         if widths != {self.width}:
             return None
-        lines = self.lines if self.delimiter == "," or "," not in body else body.replace(",", ".").split("\n")
+        if self.delimiter != "," and "," in body:
+            lines = body.replace(",", ".").split("\n")
         try:
             return np.loadtxt(lines, delimiter=self.delimiter, usecols=places, ndmin=2, comments=None)
         except ValueError:
@@ -101,10 +117,10 @@ class TextTable:
         return cells
 
     def _read_any(self, places: list[int]) -> np.ndarray:
-        rows = [self._row(line, number) for line, number in zip(self.lines, self.line_numbers)]
+        rows = [self._row(line, number) for number, line in self.numbered]
         decimal = self._decimal(rows, places)
         values = np.empty((len(rows), len(places)))
-        for k, (row, number) in enumerate(zip(rows, self.line_numbers)):
+        for k, (row, (number, _)) in enumerate(zip(rows, self.numbered)):
             for column, place in enumerate(places):
                 value = _number(row[place], decimal)
                 if value is None:
@@ -156,20 +172,24 @@ def _number(cell: str, decimal: str) -> float | None:
 
 def read_text_table(path: Path) -> TextTable:
     """Reads the rows of a text and what its header says. Raises DataError when it is no table of numbers."""
-    numbered = [(k, line.strip("\r\n \x00")) for k, line in enumerate(decode_text(path).split("\n"), 1)]
-    numbered = [(k, line) for k, line in numbered if line.strip()]
-    if not numbered:
+    text = decode_text(path)
+    head = list(enumerate(text.split("\n", _HEAD)[:_HEAD], 1))
+    head = [(k, line.strip(_EDGES)) for k, line in head if line.strip()]
+    if not head:
         raise DataError(f"{path}: no rows; expected numbers in columns")
     delimiter = None
-    if re.fullmatch(r"sep=.", numbered[0][1], re.IGNORECASE):  # as Excel tells itself
-        delimiter = numbered.pop(0)[1][-1]
-    header, names = _find_header(path, numbered, delimiter)
-    rows = [(k, line) for k, line in numbered[header:] if not line.startswith(_COMMENT)]
-    rows = _without_count(path, rows)
+    if re.fullmatch(r"sep=.", head[0][1], re.IGNORECASE):  # as Excel tells itself
+        delimiter = head.pop(0)[1][-1]
+    first, names = _find_header(path, head, delimiter)
+    body = text.split("\n", first - 1)[-1] if first > 1 else text
+    table = TextTable(path, tuple(names), body, first)
+    rows = table.first_rows(2)
     if not rows:
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
-    delimiter = delimiter or _delimiter(rows[0][1])
-    table = TextTable(path, tuple(names), [line for _, line in rows], [k for k, _ in rows], delimiter)
+    if re.fullmatch(r"\d+", rows[0][1]) and (len(rows) == 1 or len(_rough_cells(rows[1][1])) > 2):
+        table = _without_count(table, *rows)
+        rows = rows[1:] or rows
+    table = replace(table, delimiter=delimiter or _delimiter(rows[0][1]))
     return table if names else _checked_unnamed(table)
 
 
@@ -190,21 +210,19 @@ def decode_text(path: Path) -> str:
         return data.decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _find_header(path: Path, numbered: list[tuple[int, str]], delimiter: str | None) -> tuple[int, list[str]]:
-    """Returns where the rows begin, and the names of their columns, [] without."""
-    for place, (_, line) in enumerate(numbered[:_LOOKED_AT]):
+def _find_header(path: Path, head: list[tuple[int, str]], delimiter: str | None) -> tuple[int, list[str]]:
+    """Returns the line where the rows begin, from 1, and the names of their columns, [] without."""
+    for number, line in head[:_LOOKED_AT]:
         names = _names(line, delimiter)
         if names and named_axes(path, names) is not None:
-            return place + 1, names
-    place, (number, line) = next(
-        ((place, one) for place, one in enumerate(numbered) if not one[1].startswith(_COMMENT)), (0, numbered[0])
-    )
+            return number + 1, names
+    number, line = next((one for one in head if not one[1].startswith(_COMMENT)), head[0])
     if not all(
         re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)
     ):
         words = ", ".join(_names(line, delimiter) or line.split())[:80]
         raise DataError(f"{path}:{number}: columns {words}; expected x, y and z among them, or numbers only")
-    return place, []
+    return number, []
 
 
 def _names(line: str, delimiter: str | None) -> list[str]:
@@ -232,26 +250,28 @@ def _delimiter(line: str) -> str | None:
     return None if decimal else ","
 
 
-def _without_count(path: Path, rows: list[tuple[int, str]]) -> list[tuple[int, str]]:
-    """Returns the rows without a first one that counts them. Raises DataError when it counts others."""
-    if len(rows) < 1 or not re.fullmatch(r"\d+", rows[0][1]) or (len(rows) > 1 and len(_rough_cells(rows[1][1])) < 3):
-        return rows
-    count, rest = int(rows[0][1]), rows[1:]
-    if len(rest) != count:
+def _without_count(table: TextTable, counted: tuple[int, str], *_: tuple[int, str]) -> TextTable:
+    """Returns the table without a first row that counts the others. Raises DataError when it counts wrong."""
+    number, text = counted
+    body = table.body.split("\n", number - table.first_line + 1)[-1]
+    rest = replace(table, body=body, first_line=number + 1)
+    found = len(rest.numbered) if "\n" in table.body else 0
+    if found != int(text):
         raise DataError(
-            f"{path}: says {count} points in line {rows[0][0]}, holds {len(rest)}; truncated, or two clouds"
+            f"{table.path}: says {text} points in line {number}, holds {found}; truncated, or two clouds in one file"
         )
     return rest
 
 
 def _checked_unnamed(table: TextTable) -> TextTable:
     """Returns the table. Raises DataError when its numbers seem cut by their own decimal commas."""
-    if table.delimiter == "," and not any('"' in line for line in table.lines[:_LOOKED_AT]):
-        cells = [cell for line in table.lines[:_LOOKED_AT] for cell in table.cells(line)]
+    rows = table.first_rows(_LOOKED_AT)
+    if table.delimiter == "," and not any('"' in line for _, line in rows):
+        cells = [cell for _, line in rows for cell in table.cells(line)]
         whole = all(re.fullmatch(r"[-+]?\d+|", cell) for cell in cells)
         if whole and any(re.fullmatch(r"-0|0\d+", cell) for cell in cells):
             raise DataError(
-                f"{table.path}:{table.line_numbers[0]}: decimal commas between commas can't be told apart; save it with"
+                f"{table.path}:{rows[0][0]}: decimal commas between commas can't be told apart; save it with"
                 " decimal points, or with semicolons between the columns"
             )
     return table

@@ -61,11 +61,12 @@ def assemble(
     points = np.concatenate([clouds[t].points for t in kept])
     if divisor != 1:
         points = points.astype(np.float64) / divisor
-    points, shift = _near_origin(points, int(counts[kept[0]]))
+    ends = _ends(points)
+    points, shift = _near_origin(points, int(counts[kept[0]]), ends)
     if shift is not None:
         notes[SHIFTED] = 1
     if lengths.unit == "m":
-        notes |= _doubts(points, shift)
+        notes |= _doubts(*ends)
     extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
     sequence = CloudSequence(
         item.name,
@@ -80,24 +81,30 @@ def assemble(
     return Sample(sequence, notes)
 
 
-def _near_origin(points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray | None]:
+def _ends(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the least and the greatest x, y and z of points (N,3), f64 (3) each; NumPy is slow along short rows."""
+    columns = [points[:, axis] for axis in range(3)]
+    return np.array([c.min() for c in columns], np.float64), np.array([c.max() for c in columns], np.float64)
+
+
+def _near_origin(
+    points: np.ndarray, first: int, ends: tuple[np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Returns the points less the corner of their first frame (its ``first`` points), and that corner f64 (3), or None
     where float32 holds them as they are.
     """
-    if max(points.max(), -points.min()) <= _FAR_AWAY:
+    if np.abs(ends).max() <= _FAR_AWAY:
         return points, None
     corner = np.floor(points[:first].astype(np.float64).min(0))
     return points - corner, corner
 
 
-def _doubts(points: np.ndarray, shift: np.ndarray | None) -> dict[str, int]:
-    """Returns notes about lengths that no sensor sees."""
-    low, high = points.min(0), points.max(0)
+def _doubts(low: np.ndarray, high: np.ndarray) -> dict[str, int]:
+    """Returns notes about lengths that no sensor sees. low, high: the ends of the original coordinates, f64 (3)."""
     widest = float((high - low).max())
     if widest > _ABSURD:
         return {"sequences more than 100 km wide; are they in meters? --scale N divides them": 1}
-    origin = -shift if shift is not None else np.zeros(3)
-    if widest > _WIDE and ((low <= origin) & (origin <= high)).all():
+    if widest > _WIDE and ((low <= 0) & (high >= 0)).all():
         return {"sequences that reach 1 km around their sensor; if these are millimeters, give --scale 1000": 1}
     return {}
 

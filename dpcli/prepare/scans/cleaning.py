@@ -25,7 +25,9 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
     found: Counter[str] = Counter()
     origins = []
     for cloud in clouds:
-        found[NOT_FINITE] += _drop(cloud, ~np.isfinite(cloud.points).all(1))
+        finite = np.isfinite(cloud.points)
+        if not finite.all():
+            found[NOT_FINITE] += _drop(cloud, ~finite.all(1))
         found[IMPOSSIBLE] += _drop(cloud, _impossible(cloud.points))
         zero = cloud.points[:, 0] == 0
         origins.append(zero & (cloud.points[:, 1:] == 0).all(1) if zero.any() else zero)

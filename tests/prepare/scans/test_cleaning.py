@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.closing_line import closing_lines
+from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.scans.cleaning import AT_ORIGIN, IMPOSSIBLE, NOT_FINITE, clean
