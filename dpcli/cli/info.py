@@ -94,20 +94,20 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
-    from dpcli.draw.contact_sheet import contact_sheet
-    from dpcli.evaluate.classification.confusion_picture import check_picture
+    from dpcli.draw.clouds_sheet import clouds_sheet
+    from dpcli.runtime.whole_file import FIGURES, check_target
     from dpcli.store import CloudsReader
 
     if kind not in ("clouds", "parts", "views"):
         raise UsageError(
             f"--picture draws point clouds and views, this file holds {kind!r}; for scores: dpc evaluate classification"
         )
-    check_picture(picture)
+    check_target(picture, "--picture", FIGURES)
     if kind == "views":
         _draw_views(path, picture, **options)
         return
     with CloudsReader(path) as reader:
-        contact_sheet(reader, picture, **options)
+        clouds_sheet(reader, picture, **options)
 
 
 def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str | None) -> None:

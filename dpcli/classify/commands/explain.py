@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.videos import check_classes, report_short, select_videos
-from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet, plane_picture, view_axes
+from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet, plane_picture
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud, Question, activation_cloud
 from dpcli.classify.explain.tsne import (
     NEIGHBORS,
@@ -25,6 +25,7 @@ from dpcli.classify.explain.tsne import (
 )
 from dpcli.classify.network.kinet import STREAMS
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.draw.view import default_view, parse_view
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -68,7 +69,7 @@ def run_pac(
     with input_file(data) as path, output_file(output) as place:
         reader = CloudsReader(path)
         check_classes(reader, info, model_name)
-        axes = view_axes(view, reader.length_unit)
+        axes = parse_view(view or default_view(reader.length_unit))
         sequences = chosen_samples(reader, samples, _pool(reader, samples, split, info, model_name))
         source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=seed)
         report_short(source, info.config.num_frames)

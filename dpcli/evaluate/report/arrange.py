@@ -1,4 +1,4 @@
-"""Results as sections: what is shown of each, in which order, and the thesis's tables beside them."""
+"""Arranges results as sections: what is shown of each, in which order, and the thesis's tables beside them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from dpcli.errors import DataError
 from dpcli.evaluate.report.blocks import Cell, Report, Section, Table, table
 from dpcli.evaluate.report.classification_section import SHOWN_HERE, classification_blocks
 from dpcli.evaluate.report.collect import Collected, Result
-from dpcli.evaluate.report.general import denominator, detail_lists, headline, metric_blocks
-from dpcli.evaluate.report.thesis import beside_table, chosen_tables
+from dpcli.evaluate.report.metric_tables import denominator, detail_lists, headline, metric_blocks
+from dpcli.evaluate.report.thesis_tables import beside_table, chosen_tables
 
 
 def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[str] = ()) -> Report:
-    """The report of all results. beside: ids of the thesis's tables, none = those that know the data.
+    """Returns the report of all results. beside: ids of the thesis's tables, none = those that know the data.
 
     DataError when a result's numbers have no shape that can be shown; UsageError for a table there isn't.
     """
@@ -36,7 +36,7 @@ def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[st
 
 
 def _titles(results: Sequence[Result]) -> list[str]:
-    """The input's file name, or the whole path where names repeat within a task, or a number after it."""
+    """Returns the input's file name, or the whole path where names repeat within a task, or a number after it."""
     full = [_input(result) for result in results]
     short = [PurePath(text).name or text for text in full]
     seen = Counter((own.found["task"], name) for own, name in zip(results, short))

@@ -1,4 +1,4 @@
-"""What only a classification result has: streams, classes with bars, the confusion matrix, and what is confused most."""
+"""Blocks that only a classification result has: streams, classes with bars, the confusion matrix, and what is confused most."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, table, title_of
+from dpcli.evaluate.metric_titles import title_of
+from dpcli.evaluate.report.blocks import Cell, Figure, Table, cell, interval_text, table
 from dpcli.evaluate.report.charts import confusion_grid
 
 SHOWN_HERE = ("streams", "per_class", "confusion")
@@ -17,7 +18,7 @@ _MOST_PAIRS = 12
 
 
 def classification_blocks(found: Mapping[str, Any]) -> list[Table | Figure]:
-    """Tables and the matrix of a classification object; those whose numbers it lacks are left out. DataError: `_matrix`."""
+    """Returns tables and the matrix of a classification object; those whose numbers it lacks are left out. DataError: `_matrix`."""
     metrics = found.get("metrics", {})
     classes = [row for row in metrics.get("per_class", []) if isinstance(row, Mapping)]
     blocks: list[Table | Figure] = []
@@ -65,7 +66,7 @@ def _classes(classes: list[Mapping[str, Any]]) -> Table:
 
 
 def _matrix(found: Any, classes: int) -> np.ndarray | None:
-    """The confusion matrix, i64 (C,C); None without one. DataError unless it is square, of counts, of all classes."""
+    """Returns the confusion matrix, i64 (C,C); None without one. DataError unless it is square, of counts, of all classes."""
     if found is None:
         return None
     try:
@@ -95,7 +96,7 @@ def _confusions(confusion: np.ndarray, names: list[str]) -> list[Table | Figure]
 
 
 def _confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
-    """The pairs that are mixed up most often, most samples first, then by label."""
+    """Returns the pairs that are mixed up most often, most samples first, then by label."""
     wrong = confusion * (1 - np.eye(len(confusion), dtype=np.int64))
     cells = [tuple(own) for own in np.argwhere(wrong > 0).tolist()]
     cells.sort(key=lambda own: (-wrong[own], own))

@@ -1,4 +1,4 @@
-"""What the arguments of a report hold: result objects, or scores, parts and videos that are evaluated here."""
+"""Collects the results that the arguments of a report name: result objects, or scores, parts and videos that are evaluated here."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any, BinaryIO
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.report.blocks import Figure, Table
-from dpcli.evaluate.report.clouds import part_blocks
-from dpcli.evaluate.report.strips import strip_figure
+from dpcli.evaluate.report.error_clouds import part_blocks
+from dpcli.evaluate.report.video_strips import strip_figure
 from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 from dpcli.store.pipes import standard_input
 
@@ -26,7 +26,7 @@ _VIDEO = ("views", "gaussians")
 
 @dataclass
 class Result:
-    """A result object and where it is from; `extras`: figures that only the files behind it could give."""
+    """Holds a result object and where it is from; `extras`: figures that only the files behind it could give."""
 
     found: dict[str, Any]
     source: str
@@ -36,7 +36,7 @@ class Result:
 
 @dataclass
 class Collected:
-    """All results in the order given, and what was given twice."""
+    """Holds all results in the order given, and what was given twice."""
 
     results: list[Result]
     duplicates: list[str]
@@ -50,7 +50,7 @@ def collect(
     pictures: bool = True,
     stdin: BinaryIO | None = None,
 ) -> Collected:
-    """The results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
+    """Returns the results of all arguments: files, `-` for a pipe, or `PRED=TRUTH`.
 
     truth: of the parts files, and of scores files if given with them only. pictures: also what needs the files behind a
     result (clouds, strips). Equal objects count once. DataError for a file that holds no result, UsageError for no
@@ -85,7 +85,7 @@ def _results(
 
 
 def _named(argument: str) -> tuple[Path, Path | None]:
-    """`PRED=TRUTH` -> both; a file that has an equals sign in its name stays one."""
+    """Returns both paths of `PRED=TRUTH`; a file that has an equals sign in its name stays one."""
     if "=" not in argument or Path(argument).exists():
         return Path(argument), None
     cuts = [i for i, letter in enumerate(argument) if letter == "="]
@@ -99,7 +99,7 @@ def _is_store(path: Path) -> bool:
 
 
 def _objects(data: bytes, source: str, pictures: bool) -> list[Result]:
-    """Result objects from text: one object, a list of them, or one on each line."""
+    """Returns result objects from text: one object, a list of them, or one on each line."""
     if data.startswith(_HDF5):
         raise DataError(f"{source}: an HDF5 file; save it and name it (the report reads it more than once)")
     try:
@@ -137,7 +137,7 @@ def _parsed(text: str, source: str) -> list[tuple[Any, str]]:
 
 
 def _json(text: str) -> Any:
-    """JSON without NaN and Infinity, which no result has. ValueError."""
+    """Returns what JSON says. ValueError for NaN and Infinity, which no result has."""
 
     def refuse(name: str) -> None:
         raise ValueError(f"{name} is no number")
@@ -149,7 +149,7 @@ def _json(text: str) -> Any:
 
 
 def _checked(found: Any, where: str) -> dict[str, Any]:
-    """The object, if it has the shape of a result; a task that nobody knows is fine. DataError."""
+    """Returns the object, if it has the shape of a result; a task that nobody knows is fine. DataError."""
     if not isinstance(found, dict) or not isinstance(found.get("task"), str):
         shown = (
             f"an object with {', '.join(list(found)[:5]) or 'nothing'}"
@@ -173,17 +173,19 @@ def _checked(found: Any, where: str) -> dict[str, Any]:
 
 def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
+    from dpcli.evaluate.classification.protocol import evaluate_classification
+    from dpcli.evaluate.classification.result_json import classification_json
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
-    return Result(_plain(as_json(report, str(path), ScoresReader(path).provenance)), str(path))
+    return Result(_plain(classification_json(report, str(path), ScoresReader(path).provenance)), str(path))
 
 
 def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[Result]:
-    """Segmentation, and motion where the truth has poses and the prediction frame pairs."""
+    """Returns segmentation, and motion where the truth has poses and the prediction frame pairs."""
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion, motion_json
-    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation, segmentation_json
+    from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
+    from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+    from dpcli.evaluate.segmentation.result_json import motion_json, segmentation_json
 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
@@ -206,7 +208,7 @@ def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) ->
 
 def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
     from dpcli.evaluate.video.comparison import evaluate_video
-    from dpcli.evaluate.video.tables import video_json
+    from dpcli.evaluate.video.result_json import video_json
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")
@@ -217,7 +219,7 @@ def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
 
 
 def _add_strips(result: Result) -> None:
-    """Pictures of the files that the object names, if they are still there; else a note that says why not."""
+    """Adds pictures of the files that the object names, if they are still there; else a note that says why not."""
     protocol = result.found.get("protocol", {})
     said, real = result.found.get("input"), protocol.get("truth")
     if not (isinstance(said, str) and isinstance(real, str) and Path(said).exists() and Path(real).exists()):
@@ -234,7 +236,7 @@ def _add_strips(result: Result) -> None:
 
 
 def _plain(found: dict[str, Any]) -> dict[str, Any]:
-    """The object as its JSON text would be read, so that files and objects make the same page."""
+    """Returns the object as its JSON text would be read, so that files and objects make the same page."""
     return json.loads(json.dumps(found, allow_nan=False))
 
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.ops.rotations import motion_matrix, quaternion_to_matrix
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -72,24 +74,8 @@ def slerp(first: np.ndarray, last: np.ndarray, s: np.ndarray) -> np.ndarray:
 
 def matrices(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """Returns transforms f64 (T,4,4) = translation (T,3) x rotation (T,4, x y z w) x scale (T,3)."""
-    x, y, z, w = np.moveaxis(normalize(rotation), -1, 0)
-    turned = np.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - z * w),
-            2 * (x * z + y * w),
-            2 * (x * y + z * w),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - x * w),
-            2 * (x * z - y * w),
-            2 * (y * z + x * w),
-            1 - 2 * (x * x + y * y),
-        ],
-        axis=-1,
-    ).reshape(-1, 3, 3)
-    result = np.tile(np.eye(4), (len(turned), 1, 1))
-    result[:, :3, :3], result[:, :3, 3] = turned * scale[:, None, :], translation
-    return result
+    turned = quaternion_to_matrix(normalize(rotation)[..., [3, 0, 1, 2]])
+    return motion_matrix(turned * scale[:, None, :], translation)
 
 
 def skin(

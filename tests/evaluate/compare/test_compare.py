@@ -13,14 +13,18 @@ import typer
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
-from dpcli.cli.evaluate.compare import register
+from dpcli.cli.evaluate.compare import compare
+from dpcli.cli.evaluate.runs import runs
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.bootstrap import Resampling
 from dpcli.evaluate.classification.protocol import evaluate_classification
-from dpcli.evaluate.compare.paired import compare_json, compare_measured, mcnemar, pair
-from dpcli.evaluate.compare.runs import spread
-from dpcli.evaluate.compare.sample_metrics import of_values
-from dpcli.evaluate.compare.tables import compare_notes, compare_picture, compare_tables
+from dpcli.evaluate.compare.file_metrics import metrics_of_values
+from dpcli.evaluate.compare.paired import compare_metrics, pair_metrics
+from dpcli.evaluate.compare.paired_picture import draw_comparison
+from dpcli.evaluate.compare.paired_tables import compare_notes, compare_tables
+from dpcli.evaluate.compare.result_json import compare_json
+from dpcli.evaluate.compare.runs import mean_with_t_interval
+from dpcli.evaluate.compare.significance_tests import mcnemar
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts, write_truth
 
@@ -30,7 +34,8 @@ CLASSES = ("wave", "push", "pull")
 @pytest.fixture(scope="module")
 def app() -> typer.Typer:
     own = typer.Typer()
-    register(own)
+    own.command()(compare)
+    own.command()(runs)
     return own
 
 
@@ -166,8 +171,11 @@ def test_pairing_takes_away_what_is_hard_for_both():
     """A constant gain under a large spread of samples: the paired interval sees it, separate ones overlap."""
     hard = np.random.default_rng(0).normal(20, 5, 30)
     tables = [{f"x{i}": {"psnr": v + shift} for i, v in enumerate(hard)} for shift in (0.2, 0)]
-    sides = [of_values(name, "video", "views", table, {"psnr": "dB"}) for name, table in zip("AB", tables, strict=True)]
-    found = pair(*sides, Resampling(500)).changes["psnr"]
+    sides = [
+        metrics_of_values(name, "video", "views", table, {"psnr": "dB"})
+        for name, table in zip("AB", tables, strict=True)
+    ]
+    found = pair_metrics(*sides, Resampling(500)).changes["psnr"]
     assert found.interval.low == pytest.approx(0.2) == found.interval.high and found.p < 0.01
     single = Resampling(500).intervals(sides[0].metric, 30)["psnr"]
     assert single.high - single.low > 2
@@ -178,9 +186,10 @@ def test_bootstrap_difference_of_means_equals_scipy():
 
     a, b = np.random.default_rng(0).normal(size=(2, 25))
     sides = [
-        of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"}) for side in (a, b)
+        metrics_of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"})
+        for side in (a, b)
     ]
-    found = pair(*sides, Resampling(4000)).changes["m"]
+    found = pair_metrics(*sides, Resampling(4000)).changes["m"]
     expected = bootstrap(
         (a, b),
         lambda x, y, axis=-1: (x - y).mean(axis=axis),
@@ -198,34 +207,36 @@ def test_a_table_of_values_becomes_a_whole_report(tmp_path):
     """What a video's views or frames need: tables, notes, JSON and picture from {sample: {metric: value}}."""
     tables = [{f"view {i}": {"psnr": 20 + i + s, "lpips": 0.1 * i + s / 10} for i in range(4)} for s in (0, 1)]
     sides = [
-        of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
+        metrics_of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
         for n, table in zip("ab", tables, strict=True)
     ]
-    report = compare_measured(*sides, Resampling(200))
+    report = compare_metrics(*sides, Resampling(200))
     found = json.loads(json.dumps(compare_json(report), allow_nan=False))
     assert found["metrics"]["psnr"]["interval"] == pytest.approx([-1, -1])
     assert (found["metrics"]["psnr"]["b_better"], found["metrics"]["lpips"]["a_better"]) == (4, 4)
     (table, changed), notes = compare_tables(report), compare_notes(report)
     assert table.rows[0][:4] == ["PSNR (dB)", "21.5", "22.5", "-1"] and len(changed.rows) == 4
     assert any("4 views" in line for line in notes) and found["units"] == {"psnr": "dB", "lpips": "1"}
-    compare_picture(report, tmp_path / "v.png")
+    draw_comparison(report, tmp_path / "v.png")
     assert (tmp_path / "v.png").stat().st_size > 5000
 
 
 def test_values_that_are_missing_or_infinite():
     units = {"psnr": "dB"}
-    a = of_values("a", "video", "views", {"x": {"psnr": 1.0}, "y": {"psnr": 2.0}, "z": {}}, units)
-    b = of_values("b", "video", "views", {"x": {"psnr": 2.0}, "y": {"psnr": 4.0}, "z": {}}, units)
-    found = pair(a, b, Resampling(200)).changes["psnr"]
+    a = metrics_of_values("a", "video", "views", {"x": {"psnr": 1.0}, "y": {"psnr": 2.0}, "z": {}}, units)
+    b = metrics_of_values("b", "video", "views", {"x": {"psnr": 2.0}, "y": {"psnr": 4.0}, "z": {}}, units)
+    found = pair_metrics(a, b, Resampling(200)).changes["psnr"]
     assert found.difference == -1.5 and (found.a_better, found.b_better, found.ties) == (0, 2, 0)
     with pytest.raises(DataError, match="psnr of 2 views is infinite: 'y', 'z'"):
-        of_values("f", "video", "views", {"x": {"psnr": 1}, "y": {"psnr": np.inf}, "z": {"psnr": -np.inf}}, units)
+        metrics_of_values(
+            "f", "video", "views", {"x": {"psnr": 1}, "y": {"psnr": np.inf}, "z": {"psnr": -np.inf}}, units
+        )
     with pytest.raises(DataError, match="no views"):
-        of_values("f", "video", "views", {}, units)
+        metrics_of_values("f", "video", "views", {}, units)
     with pytest.raises(DataError, match="unit of psnr: 'dB' in a, 'bel' in c"):
-        pair(a, of_values("c", "video", "views", {"x": {"psnr": 1}}, {"psnr": "bel"}), Resampling(0))
-    alone = of_values("a", "video", "views", {"x": {"psnr": 1.0}}, units)
-    only = pair(alone, alone, Resampling(200)).changes["psnr"]
+        pair_metrics(a, metrics_of_values("c", "video", "views", {"x": {"psnr": 1}}, {"psnr": "bel"}), Resampling(0))
+    alone = metrics_of_values("a", "video", "views", {"x": {"psnr": 1.0}}, units)
+    only = pair_metrics(alone, alone, Resampling(200)).changes["psnr"]
     assert not only.interval.defined and np.isnan(only.p)
 
 
@@ -327,19 +338,19 @@ def test_spread_equals_scipy():
     from scipy.stats import t
 
     values = np.random.default_rng(0).normal(size=6)
-    found = spread(values, 0.9)
+    found = mean_with_t_interval(values, 0.9)
     expected = t.interval(0.9, 5, values.mean(), values.std(ddof=1) / math.sqrt(6))
     assert (found.interval.low, found.interval.high) == pytest.approx(expected, abs=1e-12)
-    one = spread([0.5])
+    one = mean_with_t_interval([0.5])
     assert one.mean == 0.5 and math.isnan(one.sd) and not one.interval.defined
 
 
 def test_the_interval_of_a_share_ends_where_its_mean_does():
-    two = spread([0.9, 0.98], share=True).interval  # two runs: 12.7 standard errors
+    two = mean_with_t_interval([0.9, 0.98], share=True).interval  # two runs: 12.7 standard errors
     assert two.low == pytest.approx(0.94 - 12.7062 * 0.04, abs=1e-4) and two.high == 1
-    assert spread([0.02, 0.1], share=True).interval.low == 0
+    assert mean_with_t_interval([0.02, 0.1], share=True).interval.low == 0
     for length in ([0.9, 0.98], [0.9, 1.4]):  # a length, or a share of the diameter that isn't one
-        assert spread(length, share=length[1] > 1).interval.high > 1.4
+        assert mean_with_t_interval(length, share=length[1] > 1).interval.high > 1.4
 
 
 def test_runs_of_parts_and_of_their_json_are_the_same(run, parts, tmp_path):

@@ -18,13 +18,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from dpcli.cli.evaluate.report import register
+from dpcli.cli.evaluate.report import report as report_command
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
 from dpcli.evaluate.report.blocks import interval_text, sort_key, table, text_of
-from dpcli.evaluate.report.clouds import Cloud, _renamed, packed
-from dpcli.evaluate.report.text import latex
-from dpcli.evaluate.report.thesis import chosen_tables, thesis_tables
+from dpcli.evaluate.report.error_clouds import Cloud, _renamed, packed
+from dpcli.evaluate.report.markdown_and_latex import latex
+from dpcli.evaluate.report.thesis_tables import chosen_tables, thesis_tables
 from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
 from tests.support.browser import needs_browser, open_page
 
@@ -145,10 +145,11 @@ def test_the_page_has_the_numbers_of_the_command(scores, parts, truth, page):
 
 def test_files_and_their_json_make_the_same_sections(scores, folder):
     from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
+    from dpcli.evaluate.classification.protocol import evaluate_classification
+    from dpcli.evaluate.classification.result_json import classification_json
     from dpcli.store import ScoresReader
 
-    found = as_json(
+    found = classification_json(
         evaluate_classification(scores, resampling=Resampling()), str(scores), ScoresReader(scores).provenance
     )
     (folder / "one.json").write_text(json.dumps(found))
@@ -479,7 +480,7 @@ def test_a_video_has_its_pictures_in_the_page(tmp_path):
 
 def test_the_command(scores, tmp_path):
     app = typer.Typer()
-    register(app)
+    app.command()(report_command)
     app.command("other")(lambda: None)  # two commands: the name is needed
     run = lambda *args: CliRunner().invoke(app, ["report", *map(str, args)])  # noqa: E731
     page = tmp_path / "r.html"

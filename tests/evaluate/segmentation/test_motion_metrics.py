@@ -17,10 +17,8 @@ from dpcli.evaluate.segmentation.motion_metrics import (
     motion_compute,
     motion_merge,
     part_motion_update,
-    rotation_angle,
-    true_flow,
-    true_motion,
 )
+from dpcli.evaluate.segmentation.rigid_motion import rotation_angle, true_flow, true_motion
 from tests.support.parts_helpers import CHAIN, perfect, rigid, rotation, truth_sequence, write_parts, write_truth
 
 TOLERANCE = 1e-6

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import sqrtm
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.frechet import (
+from dpcli.evaluate.video.frechet.distance import (
     ROOTS,
     FeatureStatistics,
     feature_merge,

@@ -17,11 +17,13 @@ from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks.clip import Clip, clip_across_views, clip_similarity, clip_spherical, clip_temporal
 from dpcli.evaluate.networks.lpips import Lpips
 from dpcli.evaluate.video.comparison import evaluate_video
-from dpcli.evaluate.video.frechet import feature_update, frechet_distance
-from dpcli.evaluate.video.frechet_features import FeatureNetwork, feature_variant, prepare
-from dpcli.evaluate.video.image_metrics import ssim_reference
+from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
+from dpcli.evaluate.video.frechet.distance import feature_update, frechet_distance
+from dpcli.evaluate.video.frechet.frame_inputs import prepare_frame
+from dpcli.evaluate.video.frechet.variants import feature_variant
+from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute
 from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
-from dpcli.evaluate.video.warping import Warping, warping_compute
+from dpcli.evaluate.video.ssim import ssim_reference
 from tests.evaluate.video.test_comparison import FRAMES, clip, header, white, write
 
 ROLES = ("reference", "test", "test")
@@ -100,7 +102,7 @@ def test_each_metric_is_that_of_its_own_function(files, fake_networks) -> None:
 
     parts = []
     for video, truth in zip(ours, theirs):
-        warping = Warping()
+        warping = WarpingError()
         for pair in zip(video, truth):
             warping.add(*pair)
         parts.append(warping_compute(warping.result()))
@@ -115,7 +117,7 @@ def test_frechet_distances_by_hand(files, fake_networks) -> None:
     network = FeatureNetwork.load("consistent4d", Path())
     each = []
     for video, truth in zip(pictures(0), pictures(1)):
-        f, g = (network.features([prepare(network.variant, frame) for frame in v]) for v in (video, truth))
+        f, g = (network.features([prepare_frame(network.variant, frame) for frame in v]) for v in (video, truth))
         each.append(((f - g) ** 2).sum() + (f.std(ddof=1) - g.std(ddof=1)) ** 2)
     assert report.learned["fvd"].value == pytest.approx(np.mean(each), rel=1e-4)
     assert report.learned["fid_vid_inception"].counts == {"videos": 3, "clips": 3 * FRAMES, "frames": 3 * FRAMES}
@@ -170,7 +172,7 @@ def test_a_frame_left_out_leaves_no_neighbors(tmp_path: Path, fake_networks) -> 
     found = evaluate_video(said, truth, metrics=("lpips", "warping", "clip_temporal"), intersect=True).learned
     assert found["lpips"].counts == {"views": 1, "frames": 5}
     assert found["warping"].counts == found["clip_temporal"].counts == {"views": 1, "pairs": 3}
-    pairs, warping = [(0, 1), (1, 2), (6, 7)], Warping()
+    pairs, warping = [(0, 1), (1, 2), (6, 7)], WarpingError()
     for pair in pairs:
         warping.restart()
         for frame in pair:
@@ -209,7 +211,9 @@ def test_windows_do_not_reach_across_a_gap(tmp_path: Path, fake_networks) -> Non
     sides = []
     for video in (ours[0], theirs[0]):
         windows = [range(start, start + 16) for start in (3, 4, 21, 22, 23, 24)]
-        rows = [network.features([prepare(network.variant, video[frame]) for frame in window]) for window in windows]
+        rows = [
+            network.features([prepare_frame(network.variant, video[frame]) for frame in window]) for window in windows
+        ]
         sides.append(feature_update(np.stack(rows)))
     assert report.learned["fid_vid_r3d50"].value == pytest.approx(frechet_distance(*sides), rel=1e-4, abs=1e-6)
 

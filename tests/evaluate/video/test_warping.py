@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.warping import Warping, moved, optical_flow, seen_in_both, warping_compute, warping_merge
+from dpcli.evaluate.video.learned.optical_flow import optical_flow, seen_in_both, warped
+from dpcli.evaluate.video.learned.warping import WarpingError, warping_compute, warping_merge
 from dpcli.runtime.seeds import generator
 
 FRAMES, SIDE = 6, 96
@@ -30,7 +31,7 @@ def moving() -> np.ndarray:
 
 
 def measured(predicted: np.ndarray, truth: np.ndarray | None = None):
-    warping = Warping()
+    warping = WarpingError()
     for t, frame in enumerate(predicted):
         warping.add(frame, None if truth is None else truth[t])
     return warping_compute(warping.result(), warping.flow_of)
@@ -84,7 +85,7 @@ def test_what_a_moving_square_uncovers_is_left_out():
     seen = seen_in_both(back, forth)
     assert 0.5 < (~seen).sum() / (48 * 8) < 2  # about the area that nobody has seen before, and mostly there
     assert seen[36:76, 31:37].mean() < 0.5 and seen[40:72, 48:76].mean() > 0.95 and seen[:24].mean() > 0.99
-    everything = np.square(frames[1].transpose(1, 2, 0) - moved(frames[0].transpose(1, 2, 0), back)).mean()
+    everything = np.square(frames[1].transpose(1, 2, 0) - warped(frames[0].transpose(1, 2, 0), back)).mean()
     assert measured(np.stack(frames)).squared < 0.5 * everything
 
 
@@ -103,13 +104,13 @@ def test_moved_is_bilinear_and_repeats_edges():
     ramp = np.tile(np.arange(6, dtype=np.float32), (4, 1))[..., None]
     flow = np.zeros((4, 6, 2), np.float32)
     flow[..., 0] = 0.5
-    np.testing.assert_allclose(moved(ramp, flow)[0].ravel(), [0.5, 1.5, 2.5, 3.5, 4.5, 5], atol=1e-6)
+    np.testing.assert_allclose(warped(ramp, flow)[0].ravel(), [0.5, 1.5, 2.5, 3.5, 4.5, 5], atol=1e-6)
 
 
 def test_videos_merge_as_their_pixels(moving):
     parts = []
     for video in (moving[:3], moving[2:]):
-        warping = Warping()
+        warping = WarpingError()
         for frame in video:
             warping.add(frame, frame)
         parts.append(warping.result())
