@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import SegmentationReport
-from dpcli.evaluate.segmentation.tables import TITLES, class_rows
+from dpcli.evaluate.segmentation.tables import class_rows
 
 _SHOWN = ("ap", "pq", "f1", "miou", "ri")
 _INCH_PER_ROW = 0.75
@@ -18,7 +19,7 @@ def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
     """Draws the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
     rows = class_rows(report.main, report.classes, report.class_names)
     bars, spread = _panels(len(rows), 2)
-    values = {TITLES[key]: [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
+    values = {title_of(key): [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
     _bars(bars, [f"{title} ({own.objects})" for title, own in rows], values)
     bars.set_xlabel("%")
     bars.set_xlim(0, max(100, bars.get_xlim()[1]))

@@ -22,9 +22,9 @@ from dpcli.cli.evaluate.report import report as report_command
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
 from dpcli.evaluate.report.blocks import interval_text, sort_key, table, text_of
-from dpcli.evaluate.report.error_clouds import Cloud, _renamed, packed
-from dpcli.evaluate.report.markdown_and_latex import latex
-from dpcli.evaluate.report.thesis_tables import chosen_tables, thesis_tables
+from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud
+from dpcli.evaluate.report.markdown_and_latex import escape_latex
+from dpcli.evaluate.report.thesis_tables import choose_tables, thesis_tables
 from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
 from tests.support.browser import needs_browser, open_page
 
@@ -259,14 +259,14 @@ def test_tables_are_chosen_by_data_or_by_name(scores):
     }
     other = {"task": "classification", "provenance": [{"command": "dpc prepare synthetic gestures"}]}
     assert (
-        [own.id for own in chosen_tables([], [found])]
+        [own.id for own in choose_tables([], [found])]
         == ["table-3.4"]
-        == [own.id for own in chosen_tables([], [named])]
+        == [own.id for own in choose_tables([], [named])]
     )
-    assert chosen_tables([], [other]) == [] == chosen_tables(["none"], [found])
-    assert [own.id for own in chosen_tables(["table-3.1"], [other])] == ["table-3.1"]
+    assert choose_tables([], [other]) == [] == choose_tables(["none"], [found])
+    assert [own.id for own in choose_tables(["table-3.1"], [other])] == ["table-3.1"]
     with pytest.raises(UsageError, match="table-9.9.*expected none or some of table-3.1"):
-        chosen_tables(["table-9.9"], [])
+        choose_tables(["table-9.9"], [])
     rows = arrange(collect([str(scores)])).beside[0].rows
     assert {own[0].mark for own in rows[:3]} == {"ours"} and {own[0].mark for own in rows[3:]} == {"thesis"}
     assert all(own[1].text.startswith("thesis") for own in rows[3:])
@@ -411,7 +411,7 @@ def test_markdown_escapes_and_lines_up(scores):
 
 
 def test_latex_escapes():
-    assert latex("a_b 50% & #1 {x} $ ~ ^ \\") == (
+    assert escape_latex("a_b 50% & #1 {x} $ ~ ^ \\") == (
         r"a\_b 50\% \& \#1 \{x\} \$ \textasciitilde{} \textasciicircum{} \textbackslash{}"
     )
 
@@ -446,7 +446,7 @@ def test_latex_compiles(scores, tmp_path):
 def test_a_cloud_is_packed_up_to_rounding():
     points = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
     truth, part = np.array([-1, 0, 1, 2, 0, 1, 300]), np.array([0, -1, 1, 2, 0, 1, 2])
-    data = packed(Cloud(points, truth, part, np.array([np.nan, 0, 1, 2, 4, 0.5, 3]), "m"))
+    data = pack_cloud(Cloud(points, truth, part, np.array([np.nan, 0, 1, 2, 4, 0.5, 3]), "m"))
     steps = np.frombuffer(data[:42], "<u2").reshape(3, 7).T / 65535
     side = np.ptp(points, axis=0).max()
     np.testing.assert_allclose((steps - steps[0]) * side, points - points[0], atol=side / 60000)
@@ -457,9 +457,9 @@ def test_a_cloud_is_packed_up_to_rounding():
 
 def test_predicted_parts_take_the_names_of_the_true_ones():
     truth, part = np.array([0, 0, 0, 1, 1, 5, -1]), np.array([7, 7, 3, 3, 3, 9, -1])
-    assert _renamed(truth, part).tolist() == [0, 0, 1, 1, 1, 5, -1]
-    assert _renamed(truth, np.array([2, 2, 2, 2, 2, 4, 6])).tolist() == [0, 0, 0, 0, 0, 5, 8]
-    assert _renamed(truth, np.full(7, -1)).tolist() == [-1] * 7
+    assert _rename_parts(truth, part).tolist() == [0, 0, 1, 1, 1, 5, -1]
+    assert _rename_parts(truth, np.array([2, 2, 2, 2, 2, 4, 6])).tolist() == [0, 0, 0, 0, 0, 5, 8]
+    assert _rename_parts(truth, np.full(7, -1)).tolist() == [-1] * 7
 
 
 def test_a_video_has_its_pictures_in_the_page(tmp_path):
