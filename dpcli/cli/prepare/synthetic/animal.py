@@ -25,7 +25,7 @@ def animal(
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
-    """Returns a made-up animal that moves, filmed: shape, coat and gait by --seed, exact tracks and rigid parts.
+    """Makes and films a made-up animal that moves: shape, coat and gait by --seed, exact tracks and rigid parts.
 
     Needs no data.
     """
