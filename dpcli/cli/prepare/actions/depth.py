@@ -84,7 +84,7 @@ def depth(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Returns any depth video, 8 or 16 bits, to points in meters.
+    """Any depth video, 8 or 16 bits, to points in meters.
 
     For example: dpc prepare depth my_videos --label-from-folder --fov 70 -o own.h5
     """
