@@ -1,4 +1,4 @@
-"""Which class of which file becomes which class: what joins sources with different class lists.
+"""Label maps: a file says which class of which source becomes which, so that sources with unlike classes can be joined.
 
     classes = ["wave", "push"]     # optional: the order of the new classes; else as they first appear
 

@@ -1,4 +1,4 @@
-"""What every raw-format reader offers: a cheap index of items, and one item read into a sample."""
+"""The interface of a reader of raw data: a cheap index of items, and one item read into a sample."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `--check` looks for in a clip or an ARTEMIS animal beyond its recipe: an index that opens no picture wholly."""
+"""Indices of a clip or an ARTEMIS animal for `--check`: they find beyond the recipe what lacks, and open no picture wholly."""
 
 from __future__ import annotations
 
