@@ -44,7 +44,8 @@ class Sample:
 
 
 class Reader(Protocol):
-    """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker processes.
+    """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker
+    processes.
 
     What an option decides is a property, what is always the same a ClassVar.
     """

@@ -19,8 +19,8 @@ _OPEN = 64  # files held open at a time; shards are read in turn, and there may 
 class Source:
     """Holds what the index of one file says; its points stay on the disk.
 
-    made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped, where
-    the file is a shard. prefix: what goes before its samples' names in the joined file.
+    made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped,
+    where the file is a shard. prefix: what goes before its samples' names in the joined file.
     """
 
     path: Path

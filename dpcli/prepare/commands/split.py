@@ -139,8 +139,8 @@ def split(
 ) -> dict[str, int]:
     """Writes `output/SPLIT.h5` for each split, or, when `output` ends in .h5, one file whose samples have new splits.
 
-    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams; stopped
-    or killed, it goes on from the last sample when run again.
+    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams;
+    stopped or killed, it goes on from the last sample when run again.
     """
     source = read_source(path)
     with CloudsReader(path) as reader:

@@ -25,7 +25,7 @@ def animal(
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
-    """A made-up animal that moves, filmed: shape, coat and gait by --seed, exact tracks and rigid parts. Needs no data."""
+    """A made-up animal, filmed: shape, coat and gait by --seed, exact tracks and rigid parts; needs no data."""
     from dpcli.prepare.synthetic.animal import animal_clip, animal_config
     from dpcli.runtime.device import cpu_count
 
