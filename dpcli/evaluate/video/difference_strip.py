@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, View
 
 _INSTANTS, _MOST_VIEWS = 6, 8
-_SIDE, _GAP, _TITLE = 160, 4, 18  # pixels
+_SIDE = 160  # pixels of a cell
 
 
 class DifferenceStrip:
@@ -34,26 +35,15 @@ class DifferenceStrip:
 
     def save(self, path: Path) -> None:
         """Writes the picture. DataError when there is nothing to show, or it can't be written."""
-        from PIL import Image, ImageDraw
-
         if not self.rows:
             raise DataError(f"--picture {path}: no pictures were compared")
-        columns = max(len(cells) for cells in self.rows.values())
-        height = _TITLE + 3 * _SIDE + _GAP
-        sheet = Image.new("RGB", (columns * (_SIDE + _GAP) + _GAP, len(self.rows) * height), (40, 44, 52))
-        draw = ImageDraw.Draw(sheet)
-        for place, (title, cells) in enumerate(self.rows.items()):
-            draw.text((_GAP, place * height + 3), title, fill=(226, 230, 236))
-            for column, (frame, cell) in enumerate(cells):
-                corner = (_GAP + column * (_SIDE + _GAP), place * height + _TITLE)
-                sheet.paste(Image.fromarray((cell * 255 + 0.5).astype(np.uint8)), corner)
-                draw.text((corner[0] + 3, corner[1] + 2), str(frame), fill=(110, 110, 110))
-        try:
-            sheet.save(path)
-        except (ValueError, OSError) as error:
-            raise DataError(
-                f"--picture {path}: cannot be written ({error}); name a .png in an existing folder"
-            ) from None
+        rows = [
+            SheetRow(
+                title, [str(frame) for frame, _ in cells], [(cell * 255 + 0.5).astype(np.uint8) for _, cell in cells]
+            )
+            for title, cells in self.rows.items()
+        ]
+        save_picture(contact_sheet(rows), path)
 
 
 def _small(colors: np.ndarray) -> np.ndarray:
