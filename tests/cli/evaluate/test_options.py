@@ -11,8 +11,8 @@ import typer
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import word_option
+from dpcli.cli.option_groups import with_option_groups
 from dpcli.errors import UsageError
 
 
