@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from statistics import mean, stdev
 
-from dpcli.evaluate.report.thesis import thesis_tables
+from dpcli.evaluate.report.thesis_tables import thesis_tables
 from dpcli.runtime.provenance import file_digest
 from dpcli.runtime.whole_file import write_whole
 

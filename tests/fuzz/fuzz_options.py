@@ -47,7 +47,7 @@ prepare synthetic articulated -o objects.h5 --objects 2 --sequences-per-object 1
 classify train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
 segment predict objects.h5 -o parts.h5 --flow nearest --split all
-generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --dense-steps 1 --sparse-steps 1
+generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --set dense_steps=1 --set sparse_steps=1
 """
 COMMANDS = """
 info gestures.h5
@@ -69,7 +69,7 @@ segment predict objects.h5 -o out/parts.h5 --flow nearest
 segment flow objects.h5 -o out/flow --steps 1 --batch 1
 segment estimate-flow objects.h5 -o out/ef.h5 --flow nearest
 segment profile
-generate4d fit views.h5 -o out/scene.h5 --preset tiny --size 16 --dense-steps 1 --sparse-steps 1
+generate4d fit views.h5 -o out/scene.h5 --preset tiny --size 16 --set dense_steps=1 --set sparse_steps=1
 generate4d render scene.h5 -o out/r.png
 generate4d export scene.h5 --as ply -o out/ply
 generate4d view scene.h5 -o out/v.html

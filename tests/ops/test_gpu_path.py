@@ -13,7 +13,7 @@ import torch
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.presets import PRESETS
-from dpcli.generate4d.fit import Fit
+from dpcli.generate4d.optimizer import SceneOptimizer, StepResult
 from dpcli.ops.backend import reference_only
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.store import ScoresReader
@@ -22,8 +22,8 @@ from dpcli.store.parts import PartsReader
 from tests.classify.commands.test_train_predict import TRAIN, gestures
 from tests.classify.network.backbones.test_backbones import tiny
 from tests.generate4d.test_fit import toy_views
-from tests.segment.commands.test_train_predict import TRAIN as TRAIN_PARTS
-from tests.segment.commands.test_train_predict import drawers
+from tests.support.drawers import TRAIN as TRAIN_PARTS
+from tests.support.drawers import drawers
 from tests.support.pretend_card import Resident, pretend_card
 
 
@@ -133,7 +133,8 @@ def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, 
 
 def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, tmp_path):
     data, model = drawers(tmp_path / "clouds.h5", 3), tmp_path / "model"
-    words = [*TRAIN_PARTS, "--epochs", 1, "--pairs-per-epoch", 2]
+    words = ["pairs_per_epoch=2" if word == "pairs_per_epoch=6" else word for word in TRAIN_PARTS]
+    words += ["--epochs", 1]
     done = dpc_here("segment", "train", data, "-o", model, *words)
     assert done.returncode == 0 and b"training on cuda" in done.stderr, done.stderr
     masks = []
@@ -153,7 +154,8 @@ def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, t
             device,
             "--split",
             "all",
-            "--no-amp",
+            "--set",
+            "amp=false",
         )
         assert done.returncode == 0, done.stderr
         with PartsReader(found) as reader:
@@ -173,24 +175,25 @@ def test_a_scene_fitted_on_the_card_stops_and_goes_on(card, dpc_here, tmp_path, 
         "tiny",
         "--size",
         16,
-        "--gaussians",
-        40,
-        "--control-points",
-        8,
-        "--dense-steps",
-        2,
-        "--sparse-steps",
-        2,
+        "--set",
+        "gaussians=40",
+        "--set",
+        "control_points=8",
+        "--set",
+        "dense_steps=2",
+        "--set",
+        "sparse_steps=2",
     )
-    step = Fit._one_step
+    take_step = SceneOptimizer.take_step
 
-    def stop_after_three(fit: Fit) -> None:
-        step(fit)
-        if fit.step == 3:
+    def stop_after_three(optimizer: SceneOptimizer) -> StepResult:
+        result = take_step(optimizer)
+        if optimizer.step == 3:
             os.kill(os.getpid(), signal.SIGTERM)
+        return result
 
     with monkeypatch.context() as patched:
-        patched.setattr(Fit, "_one_step", stop_after_three)
+        patched.setattr(SceneOptimizer, "take_step", stop_after_three)
         done = dpc_here(*words)
     assert done.returncode not in (0, 1) and b"saved at step 3" in done.stderr, done.stderr
     done = dpc_here(*words)

@@ -16,10 +16,11 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.videos import check_classes, report_short, select_videos
 from dpcli.classify.explain.pac_settings import PacSettings
-from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet, view_axes
+from dpcli.classify.explain.pictures import ANIMATIONS, activation_animation, activation_sheet
 from dpcli.classify.explain.point_activation_cloud import ActivationCloud, Question, activation_cloud
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.draw.view import default_view, parse_view
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
@@ -70,7 +71,7 @@ def explain_pac(task: ModelTask, request: PacRequest) -> Explained:
     with input_file(task.data) as path, output_file(task.output) as place:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
-        axes = view_axes(settings.view, reader.length_unit)
+        axes = parse_view(settings.view or default_view(reader.length_unit))
         pool = _pool(reader, request.samples, task, info)
         sequences = chosen_samples(reader, request.samples, pool)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, seed=task.seed)

@@ -17,7 +17,7 @@ from torch import Tensor
 from dpcli.classify.network.st_surface import deviations, fit_surface, solve_rule
 from dpcli.ops.backend import chosen_backend
 from dpcli.ops.cpu.cache_blocks import TASKS, ranges, share_tasks, steps
-from dpcli.ops.small_inverses import KERNEL_SIZE
+from dpcli.ops.small_inverses import GUARDS, KERNEL_SIZE, mend_guarded_gradients
 from dpcli.runtime.mixed_precision import is_reduced
 
 _PIECE = 1 << 20  # bytes of reduced features
@@ -197,6 +197,18 @@ class _Case:
             *self.sizes,
         )
 
+    def mend(self, moment: np.ndarray, to_plane: np.ndarray, to_matrix: np.ndarray, moved: np.ndarray) -> None:
+        """Sets the gradients of the fits of a piece whose determinant the guard moved."""
+        groups, size = self.layout.groups, self.layout.size + 1
+        mend_guarded_gradients(
+            moment.reshape(-1, self.layout.entries, groups),
+            self.layout.places,
+            (self.rule[3], GUARDS[self.rule[4]]),
+            to_plane.reshape(-1, size, groups),
+            to_matrix.reshape(-1, size, size, groups),
+            moved.reshape(-1, groups),
+        )
+
 
 def _flat(tensor: Tensor) -> np.ndarray:
     return tensor.contiguous().numpy().reshape(-1)
@@ -259,11 +271,12 @@ class _SurfaceFit(torch.autograd.Function):
                 rows, (some, weight, moment) = case.rows(low, high), map(_flat, case.parts(made, low, high))
                 plane = slice(*(end * (layout.size + 1) * layout.groups for end in (low, high)))
                 away = _cut(to_away, rows, layout.groups)
-                to_plane, to_matrix, to_right = room.of_fits(high - low)
+                to_plane, to_matrix, to_right, moved = room.of_fits(high - low)
                 to_plane[:] = to_planes[plane]
                 if len(away):
                     case.row_kernels.deviation_back(some, away, to_plane, *case.sizes)
-                case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right)
+                case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right, moved)
+                case.mend(moment, to_plane, to_matrix, moved)
                 to_features = room.features[: rows.stop - rows.start]
                 case.row_kernels.fit_back(
                     some,
@@ -293,12 +306,15 @@ class _Gradients:
         self.features, self.ones = torch.empty(rows, case.layout.width), torch.ones(1, rows)
         self.planes, self.right = (np.empty(case.step * self.size, np.float32) for _ in range(2))
         self.matrix = np.empty(case.step * self.size * (case.layout.size + 1), np.float32)
+        self.moved, self.groups = np.empty(case.step * case.layout.groups, np.bool_), case.layout.groups
 
-    def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns room for so many centroids: of their planes, normal matrices and right sides."""
+    def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Returns room for the gradients of so many centroids' planes, normal matrices and right sides, and for which of
+        their determinants a guard moved."""
         numbers = count * self.size
         return (
             self.planes[:numbers],
             self.matrix[: numbers * len(self.matrix) // len(self.planes)],
             self.right[:numbers],
+            self.moved[: count * self.groups],
         )

@@ -18,7 +18,6 @@ from torch import nn
 from dpcli.classify.commands.explain_pac import chosen_samples
 from dpcli.classify.data.clips import ClipSource, normalize
 from dpcli.classify.explain.features import ClipVectors, Layer, stage_layer
-from dpcli.classify.explain.pictures import view_axes
 from dpcli.classify.explain.point_activation_cloud import (
     Question,
     _in_network_coordinates,
@@ -328,11 +327,6 @@ def test_rescaling_and_wrong_questions(data):
     assert not rescaled(np.full(4, 7, np.float32)).any()
     with pytest.raises(UsageError, match="activation or gradient"):
         Question("attention")
-    for view in ("xxy", "xy", "x-z-"):
-        with pytest.raises(UsageError, match="x-zy"):
-            view_axes(view, "m")
-    assert (view_axes("x-zy", "m") @ [1, 2, 3]).tolist() == [1, -3, 2]
-    assert view_axes(None, "row, column, depth").tolist() == view_axes("yx-z", "m").tolist()
     reader = CloudsReader(data)  # labels 0 1 2 0 1 2
     picked = [chosen_samples(reader, wanted, range(6)) for wanted in ("2", "3", "4", "v5,v0,v5")]
     assert picked == [[0, 2], [0, 1, 2], [0, 3, 1, 2], [5, 0]]
