@@ -292,7 +292,7 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
 
 
 def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, capfd):
-    """Shapes with labels, one frame each, as ModelNet40 is prepared; then `--static-from` with other classes."""
+    """Shapes with labels, one frame each, as ModelNet40 is prepared; then `static_from` with other classes."""
     rng = np.random.default_rng(0)
     with CloudsWriter(tmp_path / "shapes.h5", class_names=["ball", "rod", "disc"]) as writer:
         for i in range(9):
