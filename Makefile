@@ -63,7 +63,7 @@ demo: $(READY)
 	$(DPC) segment predict demo/objects.h5 -o demo/parts.h5 --picture demo/parts.png --turntable demo/parts.gif --force
 	$(DPC) evaluate segmentation demo/parts.h5 --truth demo/objects.h5 --split all
 	$(DPC) prepare synthetic animal -o demo/animal.h5 --size 128 --frames 16 --train-azimuths 90,180 --azimuths 45,135 --force
-	$(DPC) generate4d fit demo/animal.h5 -o demo/scene.h5 --prior views --most-gaussians 6000 --dense-steps 200 --sparse-steps 500
+	$(DPC) generate4d fit demo/animal.h5 -o demo/scene.h5 --prior views --set most_gaussians=6000 --set dense_steps=200 --set sparse_steps=500
 	$(DPC) generate4d render demo/scene.h5 -o demo/scene.mp4 --picture demo/scene.png --force
 	$(DPC) generate4d view demo/scene.h5 -o demo/scene.html --force
 	$(DPC) evaluate video demo/scene.h5 --truth demo/animal.h5
@@ -117,7 +117,7 @@ table-3.5: $(READY)
 	$(call needs,NTU60,the folder of nturgb+d_depth_masked or of its ZIPs)
 	$(TABLES).accuracy_tables 3.5 "$(NTU60)" table/3.5 $(PLAN) -- $(BUDGET)
 
-# SWEEPS: "group-size=2,4 radius=0.25,0.5" replaces the values of these; "radius=" leaves one out. ONLY=0,1: these folds.
+# SWEEPS: "group_size=2,4 radius=0.25,0.5" replaces the values of these; "radius=" leaves one out. ONLY=0,1: these folds.
 figure-3.5: $(READY)
 	$(call needs_either)
 	$(TABLES).figure_3_5 $(EITHER) table/figure-3.5 --preset $(PRESET) --folds $(FOLDS) --only "$(ONLY)" \

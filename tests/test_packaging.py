@@ -104,8 +104,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
 
 def test_the_wheel_holds_the_package_and_nothing_else(wheel: zipfile.ZipFile) -> None:
     names = wheel.namelist()
-    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "dpcli").rglob("*.py")}
-    assert modules <= set(names)
+    kinds = (".py", ".js", ".html", ".css")  # modules, and what pages are made of
+    sources = {str(path.relative_to(ROOT)) for path in (ROOT / "dpcli").rglob("*.*") if path.suffix in kinds}
+    assert sources <= set(names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"dpcli", "dpc_toolkit"}
     assert any(name.endswith("licenses/LICENSE") for name in names)
     entry = next(name for name in names if name.endswith("entry_points.txt"))

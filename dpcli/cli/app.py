@@ -16,6 +16,7 @@ from typing import Any
 import typer
 
 from dpcli import __version__
+from dpcli.cli.help_groups import SectionedGroup
 from dpcli.errors import DpcError, UsageError
 from dpcli.runtime.tuning import tune_environment
 
@@ -29,10 +30,10 @@ ROOMS = {
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
     "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.",
+    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.",
 }
 
-_WRITTEN = ("output", "picture", "animation", "ply", "turntable")  # options that name what a command writes
+_WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 
@@ -53,6 +54,7 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
     """`dpc` with the one command that the words name set up and the other rooms by name only; with all of it for None."""
     dpc = typer.Typer(
         name="dpc",
+        cls=SectionedGroup,
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode=None,

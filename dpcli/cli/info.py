@@ -27,14 +27,28 @@ def info(
     ],
     as_object: Json = False,
     picture: Picture = None,
-    samples: Annotated[int, typer.Option("--samples", min=1, max=100, help="Rows of the picture.")] = 8,
+    samples: Annotated[
+        int, typer.Option("--samples", min=1, max=100, help="Rows of the picture; sequences on the page.")
+    ] = 8,
     frames: Annotated[int, typer.Option("--frames", min=1, max=60, help="Columns of the picture: moments.")] = 8,
     view: Annotated[
         str | None,
         typer.Option("--view", help="Axes that point right, down and away in the picture, such as xyz or x-zy (z up)."),
     ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option(
+            "--page", help="Write one HTML page (.html) that shows the file in any browser, without a network."
+        ),
+    ] = None,
+    sequence: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sequence", help="On the page only this sequence: its name or its number from 0; may be repeated."
+        ),
+    ] = None,
 ) -> None:
-    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames.
+    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.
 
     Of a model: its classes, configuration and training.
     """
@@ -48,13 +62,36 @@ def info(
             raise UsageError(
                 f"--picture draws point clouds and views, {model} holds weights; a training folder has curves.png"
             )
-        _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
+        if page is not None:
+            raise UsageError(f"--page shows data files, {model} holds weights; without --page you see what is in it")
+        _tell({"file": str(model), **weights_summary(model), **_settings_beside(model)}, as_object, _show_model)
         return
+    if sequence and page is None:
+        raise UsageError("--sequence chooses what --page shows; give --page FILE.html, too")
     with input_file(file) as path:
         found = {"file": file, **summary(path)}
         if picture is not None:
             _draw(path, found["kind"], picture, samples=samples, frames=frames, view=view)
+        if page is not None:
+            _write_page(path, found, page, samples=samples, chosen=sequence or [], view=view)
     _tell(found, as_object, _show)
+
+
+def _write_page(path: Path, found: dict[str, Any], page: Path, **choice: Any) -> None:
+    from dpcli.cli.info_page import write_info_page
+    from dpcli.runtime.progress import log
+
+    title = "standard input" if found["file"] == "-" else Path(found["file"]).name
+    left_out = write_info_page(path, page, title=title, kind=found["kind"], rows=_lines(found), **choice)
+    log.info(" ".join([f"{page}: {page.stat().st_size / 1e6:.2g} MB.", *left_out]))
+
+
+def _settings_beside(model: Path) -> dict[str, Any]:
+    """Returns the settings of the run that made the weights, by group, where its folder holds them."""
+    from dpcli.runtime.toml_file import read_toml
+
+    file = model.parent / "settings.toml"
+    return {"settings": read_toml(file)} if file.is_file() else {}
 
 
 def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]], None]) -> None:
@@ -65,20 +102,20 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
-    from dpcli.draw.contact_sheet import contact_sheet
-    from dpcli.evaluate.classification.confusion_picture import check_picture
+    from dpcli.draw.clouds_sheet import clouds_sheet
+    from dpcli.runtime.whole_file import FIGURES, check_target
     from dpcli.store import CloudsReader
 
     if kind not in ("clouds", "parts", "views"):
         raise UsageError(
             f"--picture draws point clouds and views, this file holds {kind!r}; for scores: dpc evaluate classification"
         )
-    check_picture(picture)
+    check_target(picture, "--picture", FIGURES)
     if kind == "views":
         _draw_views(path, picture, **options)
         return
     with CloudsReader(path) as reader:
-        contact_sheet(reader, picture, **options)
+        clouds_sheet(reader, picture, **options)
 
 
 def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str | None) -> None:
@@ -120,7 +157,7 @@ def _show_model(told: dict[str, Any]) -> None:
     ]
     if told["card"]:
         lines.append(("card", told["card"]))
-    for key, value in told["header"].items():
+    for key, value in (told["header"] | told.get("settings", {})).items():
         within = value.items() if isinstance(value, dict) else [("", value)]
         lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
     for name, value in lines:

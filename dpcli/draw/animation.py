@@ -1,10 +1,11 @@
-"""Pictures out, one at a time: a video (.mp4), an animation (.gif), a picture (.png) or a folder of pictures."""
+"""Writing pictures one after the other: as a video (.mp4), an animation (.gif), a picture (.png) or a folder."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,11 +15,17 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import check_replaced, whole_file
 
 KINDS = (".mp4", ".gif", ".png")
-_QUALITY = 18  # x264's constant rate factor: visually lossless
+_X264 = ("-crf", "18", "-preset", "veryfast", "-threads", "2", "-movflags", "+faststart")  # crf 18: visually lossless
+_COLORS = 255  # of an animation
+_PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from
 
 
 def output_kind(path: Path) -> str:
-    """.mp4, .gif, .png, or "" for a folder; UsageError for anything else."""
+    """Returns .mp4, .gif, .png, or "" for a folder. Raises UsageError for anything else.
+
+    >>> output_kind(Path("turn.GIF")), output_kind(Path("frames"))
+    ('.gif', '')
+    """
     kind = path.suffix.lower()
     if kind and kind not in KINDS and not path.is_dir():
         raise UsageError(f"-o {path}: expected a name that ends in {', '.join(KINDS)}, or a folder for pictures")
@@ -26,7 +33,7 @@ def output_kind(path: Path) -> str:
 
 
 def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, force: bool = False) -> None:
-    """Write u8 pictures (H,W,3), or (H,W,4) for .png and folders, all of one size, to what the name says.
+    """Writes u8 pictures (H,W,3), or (H,W,4) for .png and folders, all of one size, to what the name says.
 
     A .png takes the first one. Nothing half-written stays under the name. UsageError when it exists and `force` is off.
     """
@@ -49,40 +56,29 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     except ImportError:
         _mp4_by_opencv(path, pictures, fps)
         return
-    writer: Any = None
-    for picture in map(_even, pictures):
-        if writer is None:
-            size = picture.shape[1::-1]
-            writer = imageio_ffmpeg.write_frames(
-                str(path),
-                size,
-                fps=fps,
-                codec="libx264",
-                pix_fmt_out="yuv420p",
-                macro_block_size=1,
-                quality=None,
-                output_params=[
-                    "-crf",
-                    str(_QUALITY),
-                    "-preset",
-                    "veryfast",
-                    "-threads",
-                    "2",
-                    "-movflags",
-                    "+faststart",
-                ],
-                ffmpeg_log_level="error",
-            )
+    frames = map(_even, pictures)
+    for first in frames:
+        writer = imageio_ffmpeg.write_frames(
+            str(path),
+            first.shape[1::-1],
+            fps=fps,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=1,
+            quality=None,
+            output_params=list(_X264),
+            ffmpeg_log_level="error",
+        )
+        with closing(writer):  # ends the encoder, also where a picture fails
             writer.send(None)
-        writer.send(np.ascontiguousarray(picture))
-    if writer is not None:
-        writer.close()
+            for picture in chain([first], frames):
+                writer.send(np.ascontiguousarray(picture))
     if not path.exists():
         raise DpcError("the video encoder wrote nothing; a .gif or a folder of pictures needs no encoder")
 
 
 def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """MPEG-4 part 2, which players read and browsers don't: what OpenCV alone can write."""
+    """Writes MPEG-4 part 2, which players read and browsers don't: OpenCV alone can write no other."""
     import cv2
 
     log.warn("mp4 without H.264, so browsers may not play it; pip install imageio-ffmpeg")
@@ -95,7 +91,7 @@ def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> No
 
 
 def _even(picture: np.ndarray) -> np.ndarray:
-    """Even width and height, as H.264's 4:2:0 needs: the last column and row are repeated."""
+    """Repeats the last column and row where width and height are odd: H.264's 4:2:0 needs even ones."""
     height, width = picture.shape[:2]
     return np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
@@ -103,7 +99,10 @@ def _even(picture: np.ndarray) -> np.ndarray:
 def _gif(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     from PIL import Image
 
-    images = [Image.fromarray(picture).quantize(128) for picture in pictures]
+    whole = list(pictures)
+    chosen = np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1)
+    table = Image.fromarray(chosen).quantize(_COLORS)  # one for all pictures, so that nothing flickers
+    images = [Image.fromarray(picture).quantize(palette=table, dither=Image.Dither.NONE) for picture in whole]
     pause = max(2, round(100 / fps)) * 10  # milliseconds; GIF counts in hundredths and players slow down below two
     images[0].save(path, save_all=True, append_images=images[1:], duration=pause, loop=0, disposal=1)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.draw.palette import part_colors
+from dpcli.draw.sequences import PointSequence
 from dpcli.errors import DataError
-from dpcli.store import CloudSequence
 
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("part", "<i4")]
@@ -17,7 +17,7 @@ _NAMES = {"f": "float", "u": "uchar", "i": "int"}
 
 
 def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: np.ndarray) -> None:
-    """Write one frame: points f32 (N,3), colors u8 (N,3) (None: by part), part ids (N) as an int property `part`.
+    """Writes one frame of points f32 (N,3), colors u8 (N,3) (None: by part), part ids (N) as an int property `part`.
 
     Binary, little-endian, PLY 1.0 (Turk 1994). DataError on shapes that don't fit, or when it can't be written.
     """
@@ -36,8 +36,8 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: n
         raise DataError(f"{path}: cannot be written ({error.strerror}); name an existing folder to write to") from None
 
 
-def write_ply_frames(folder: Path, sequence: CloudSequence) -> list[Path]:
-    """Write every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which is made."""
+def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
+    """Writes every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which is made."""
     if sequence.part is None:
         raise DataError(f"sample {sequence.name!r} has no parts to write; `dpc segment predict` finds them")
     try:

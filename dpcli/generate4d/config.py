@@ -1,112 +1,143 @@
-"""What a fit is told: sizes, steps, rates, weights and switches. `thesis` follows appendix C, `quick` two CPU cores."""
+"""The settings of a fit: sizes, steps, weights of losses, learning rates, and the presets `thesis`, `quick` and `tiny`.
+
+`thesis` follows appendix C of the thesis, `quick` suits two CPU cores, `tiny` is a trial of some seconds.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from dpcli.errors import UsageError
+from dpcli.runtime.settings.catalog import Catalog, Given
+from dpcli.runtime.settings.fields import check, setting
 
-PRIORS = ("none", "views", "zero123")
-STARTS = ("auto", "sphere", "inflate", "hull")
+Start = Literal["auto", "sphere", "inflate", "hull"]
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """Lengths in the scene's unit (the object fits a sphere of 0.75), rates are Adam's.
+    """Holds how a scene is fitted. Lengths are in the scene's unit (the object fits a sphere of 0.75), rates are Adam's.
 
-    Weights of losses are those of thesis 5.4.3 and C.2 where it gives them, else SC4D's (reconstruction 5000, alpha a tenth
-    of it, control points 10, as-rigid-as-possible 10).
+    Weights of losses are those of the thesis (5.4.3 and C.2) where it gives them, else those of SC4D (Wu et al. 2024):
+    reconstruction 5000, silhouette a tenth of it, drift of control points 10, as-rigid-as-possible 10.
+    Raises UsageError for a value that is not legal.
     """
 
-    size: int = 256  # pixels: the side that targets are resized to
-    dense_steps: int = 1000
-    sparse_steps: int = 500
-    batch: int = 4  # pictures per step
-    start: str = "auto"  # inflate for one view, hull for several
-    start_radius: float = 0.5  # of --start sphere
-    gaussians: int = 4096  # at the start
-    most_gaussians: int = 80_000
-    parts: int = 8
-    control_points: int = 512
-    neighbors: int = 8  # control points that move a Gaussian
-    width: int = 256
-    depth: int = 8
-    partition: str = "static"  # or "time": a part may gain and lose points while the clip plays (M^tau of the thesis)
-    seeds: bool = True  # parts start from places spread over the object instead of a random network
-    # switches of Table 5.2
-    rigid: bool = True
-    temporal: bool = True
-    spatial: bool = True
-    fusion: bool = True
-    sparse: bool = True
-    # weights
-    reconstruction: float = 5000.0
-    foreground: float = 0.1  # of the reconstruction's
-    views: float = 1.0  # of the reconstruction's, for given novel views
-    augmentation: float = 1.0  # score distillation
-    identification: float = 1.0
-    temporal_weight: float = 10.0
-    spatial_weight: float = 0.1
-    spatial_radius: float = 0.1
-    spatial_neighbors: int = 10
-    control: float = 10.0
-    arap: float = 10.0
-    thickness: float = 100.0  # --prior none: depth stays where the silhouette's inflation put it
-    roundness: float = 10.0  # longest axis of a Gaussian at most `aspect` times its mean
-    aspect: float = 2.0
-    # rates: (first, last), log-linear in between
-    rate_mean: tuple[float, float] = (1e-2, 2e-4)
-    rate_opacity: float = 0.05
-    rate_scale: float = 0.005
-    rate_quaternion: float = 0.005
-    rate_color: float = 0.01
-    rate_radius: float = 0.005
-    rate_network: tuple[float, float] = (2e-4, 2e-6)
-    rate_rigid: float = 0.01
-    rate_control: float = 2e-6
-    # densify and prune
-    grow_every: int = 100
-    grow_until: float = 0.8  # of all steps
-    grow_share: float = 0.1  # at most this share of the Gaussians at a time
-    grow_threshold: float = 0.0  # of the mean screen gradient per step, in units of half a picture
-    prune_opacity: float = 0.01
-    # pictures
-    coarse: tuple[tuple[float, int], ...] = ((0.13, 4), (0.2, 2))  # until this share of the steps: 1/n of the size
-    inversion: float = 0.5  # probability of a black background
+    size: int = setting(256, "Longer side of the fitted pictures, pixels.", least=16)
+    dense_steps: int = setting(1000, "Steps of the dense stage, in which every Gaussian moves by itself.", least=1)
+    sparse_steps: int = setting(500, "Steps of the sparse stage, in which control points carry the Gaussians.", least=0)
+    batch: int = setting(4, "Pictures per step.", least=1)
+    start: Start = setting(
+        "auto",
+        "Where the first Gaussians are: in a sphere, in the inflated silhouette of one view, in the hull of several; "
+        "auto inflates one or two views and takes the hull of more.",
+    )
+    start_radius: float = setting(0.5, "Radius of the sphere of start = sphere, scene units.", above=0)
+    gaussians: int = setting(4096, "Gaussians at the start.", least=16)
+    most_gaussians: int = setting(80_000, "Gaussians at most; fewer than `gaussians` also start with fewer.", least=16)
+    parts: int = setting(8, "Rigid parts at most.", least=1)
+    control_points: int = setting(512, "Control points at most.", least=1)
+    neighbors: int = setting(8, "Control points that move one Gaussian.", least=1)
+    width: int = setting(256, "Units of a layer of the motion networks.", least=1)
+    depth: int = setting(8, "Layers of the deformation network; the other networks have half as many.", least=1)
+    partition: Literal["static", "time"] = setting(
+        "static", "static: a point keeps its part; time: a part may gain and lose points while the clip plays."
+    )
+    seeds: bool = setting(
+        True, "Start the parts at places spread over the object, not where an untrained network puts them."
+    )
+
+    rigid: bool = setting(True, "Rigid motion of parts; false leaves non-rigid motion alone (row a of Table 5.2).")
+    temporal: bool = setting(True, "Find parts by temporal-change preservation, eq. 5.3; false: row b of Table 5.2.")
+    spatial: bool = setting(True, "Keep neighboring points in one part by spatial coherence, eq. 5.4.")
+    fusion: bool = setting(
+        True,
+        "Blend rigid and non-rigid motion by a learned weight, eq. 5.6; false adds them, eq. 5.5 (rows b, c of Table 5.2).",
+    )
+    sparse: bool = setting(True, "Have a sparse stage; false stays dense to the end (rows a to d of Table 5.2).")
+
+    reconstruction: float = setting(5000.0, "Weight of the pictures' loss.", least=0)
+    foreground: float = setting(0.1, "Weight of the silhouette, as a share of the reconstruction's.", least=0)
+    views: float = setting(1.0, "Weight of given novel views, as a share of the reconstruction's.", least=0)
+    augmentation: float = setting(1.0, "Weight of score distillation, eq. C.11.", least=0)
+    identification: float = setting(1.0, "Weight of both losses that find parts.", least=0)
+    temporal_weight: float = setting(10.0, "Weight lambda_temporal of eq. 5.3.", least=0)
+    spatial_weight: float = setting(0.1, "Weight lambda_spatial of eq. 5.4.", least=0)
+    spatial_radius: float = setting(0.1, "Distance within which points are neighbors in eq. 5.4, scene units.", above=0)
+    spatial_neighbors: int = setting(10, "Neighbors of a point in eq. 5.4, at most.", least=1)
+    control: float = setting(
+        10.0, "Weight of the drift of control points from the dense stage's motion, C.13.", least=0
+    )
+    arap: float = setting(10.0, "Weight of the as-rigid-as-possible energy.", least=0)
+    thickness: float = setting(
+        100.0, "Weight that keeps one view's depth where the silhouette's inflation put it.", least=0
+    )
+    roundness: float = setting(10.0, "Weight against needles and discs.", least=0)
+    aspect: float = setting(2.0, "Longest axis of a Gaussian over its mean axis that `roundness` allows.", above=0)
+
+    rate_mean: tuple[float, float] = setting((1e-2, 2e-4), "Rate of positions, first and last, log-linear.", above=0)
+    rate_opacity: float = setting(0.05, "Rate of opacities.", least=0)
+    rate_scale: float = setting(0.005, "Rate of sizes.", least=0)
+    rate_quaternion: float = setting(0.005, "Rate of orientations.", least=0)
+    rate_color: float = setting(0.01, "Rate of colors.", least=0)
+    rate_radius: float = setting(0.005, "Rate of the control points' radii.", least=0)
+    rate_network: tuple[float, float] = setting(
+        (2e-4, 2e-6), "Rate of the networks but the parts' motion, first and last, log-linear.", above=0
+    )
+    rate_rigid: float = setting(0.01, "Rate of the network of the parts' motion.", least=0)
+    rate_control: float = setting(2e-6, "Rate of the control points' positions.", least=0)
+
+    grow_every: int = setting(100, "Steps between two rounds of densifying and pruning.", least=1)
+    grow_until: float = setting(0.8, "Share of all steps after which Gaussians are only pruned.", least=0, most=1)
+    grow_share: float = setting(0.1, "Share of the Gaussians that one round adds, at most.", least=0, most=1)
+    grow_threshold: float = setting(
+        0.0, "Mean screen gradient above which a Gaussian is densified, in units of half a picture.", least=0
+    )
+    prune_opacity: float = setting(0.01, "Opacity below which a Gaussian is dropped.", least=0, most=1)
+
+    coarse: tuple[tuple[float, int], ...] = setting(
+        ((0.13, 4), (0.2, 2)), "Until this share of the steps, pictures are 1/n of the size: share,n.", above=0
+    )
+    inversion: float = setting(0.5, "Probability that a picture's background is black, not white.", least=0, most=1)
 
     def __post_init__(self) -> None:
-        for name, low in (
-            ("size", 16),
-            ("dense_steps", 1),
-            ("sparse_steps", 0),
-            ("batch", 1),
-            ("parts", 1),
-            ("control_points", 1),
-            ("neighbors", 1),
-            ("gaussians", 16),
-        ):
-            if getattr(self, name) < low:
-                raise UsageError(f"--{name.replace('_', '-')} {getattr(self, name)}: expected {low} or more")
+        check(self)
         if self.most_gaussians < self.gaussians:
             raise UsageError(
-                f"--most-gaussians {self.most_gaussians}: expected at least the {self.gaussians} of the start (--gaussians)"
+                f"most_gaussians = {self.most_gaussians}: expected at least the {self.gaussians} of the start (gaussians)"
             )
-        if self.start not in STARTS:
-            raise UsageError(f"--start {self.start}: expected one of {', '.join(STARTS)}")
-        if self.partition not in ("static", "time"):
-            raise UsageError(f"--partition {self.partition}: expected static or time")
 
     @property
     def steps(self) -> int:
+        """The steps of both stages together."""
         return self.dense_steps + self.sparse_steps
 
     @property
     def sparse_from(self) -> int:
-        """First step of the sparse stage; past the end when it is switched off."""
+        """The first step of the sparse stage; past the end when it is switched off."""
         return self.dense_steps if self.sparse else self.steps
 
 
-PRESETS = {
+@dataclass(frozen=True)
+class Supervision:
+    """Holds what guides the sides of the object that nobody filmed. Raises UsageError for a value that is not legal."""
+
+    prior: Literal["none", "views", "zero123"] = setting(
+        "none",
+        "What is known beside the input view: nothing, the file's views of the role train, or a diffusion model.",
+    )
+    prior_model: str | None = setting(
+        None, "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded."
+    )
+    regularize: bool = setting(True, "Keep the object from going flat by the losses `thickness` and `roundness`.")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+CATALOG = Catalog(fit=FitConfig, supervision=Supervision)
+FIT_PRESETS = {
     "thesis": FitConfig(size=512, start="sphere", seeds=False),
     "quick": FitConfig(
         dense_steps=600,
@@ -140,19 +171,18 @@ PRESETS = {
         coarse=(),
     ),
 }
+PRESETS: dict[str, dict[str, Any]] = {
+    name: {"fit": config, "supervision": Supervision()} for name, config in FIT_PRESETS.items()
+}
 
 
-def preset(name: str, **changes: object) -> FitConfig:
-    """A named preset with some fields changed; None leaves a field alone."""
-    if name not in PRESETS:
-        raise UsageError(f"--preset {name}: expected one of {', '.join(PRESETS)}")
-    known = {field.name for field in fields(FitConfig)}
-    unknown = sorted(changes.keys() - known)
-    if unknown:
-        raise UsageError(f"unknown setting {unknown[0]!r} of a fit; expected one of {', '.join(sorted(known))}")
-    given = {key: value for key, value in changes.items() if value is not None}
-    if (
-        "most_gaussians" in given and "gaussians" not in given
-    ):  # the preset's start may be more than what is allowed now
-        given["gaussians"] = min(PRESETS[name].gaussians, int(given["most_gaussians"]))
-    return replace(PRESETS[name], **given)
+def resolve_settings(given: Given) -> tuple[FitConfig, Supervision]:
+    """Returns the preset's settings with what a user gave over them. Raises UsageError where they don't fit one another.
+
+    A limit below the number of Gaussians that the preset starts with lowers that number, unless it was given too.
+    """
+    base, values = dict(PRESETS[given.preset or "quick"]), given.values
+    if "most_gaussians" in values and "gaussians" not in values:
+        base["fit"] = replace(base["fit"], gaussians=min(base["fit"].gaussians, values["most_gaussians"]))
+    resolved = CATALOG.resolve(base, given)
+    return resolved["fit"], resolved["supervision"]

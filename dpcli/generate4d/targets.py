@@ -1,4 +1,4 @@
-"""The pictures a fit has to match, as tensors at the size of the moment."""
+"""The pictures that a fit has to match, as tensors at any fraction of their size."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from dpcli.store.views import ViewsReader
 
 @dataclass
 class Targets:
-    """Pictures of V views by T frames, their cameras and times; color is multiplied by alpha.
+    """Holds pictures of V views by T frames, their cameras and times; color is multiplied by alpha.
 
     pictures: f16 (V,T,S,S',4); intrinsics f64 (V,3,3) for that size; reference: the index of the input view among them.
     """
@@ -31,28 +31,32 @@ class Targets:
 
     @property
     def num_views(self) -> int:
+        """The number of views, V."""
         return self.pictures.shape[0]
 
     @property
     def num_frames(self) -> int:
+        """The number of frames, T."""
         return self.pictures.shape[1]
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height)"""
+        """Width and height of the pictures, pixels."""
         return self.pictures.shape[3], self.pictures.shape[2]
 
     def times(self) -> Tensor:
-        """Frame times in 0..1, what the networks are asked."""
+        """Returns the frames' times f32 (T) in 0..1, as the networks take them."""
         return torch.linspace(0, 1, self.num_frames) if self.num_frames > 1 else torch.zeros(1)
 
     def widest_frame(self) -> int:
-        """The frame in which most of the object is seen, over all views: limbs hide each other least, so that parts which
-        only touch in passing don't start as one."""
+        """Returns the frame in which most of the object is seen, over all views.
+
+        There limbs hide each other least, so that parts which only touch in passing don't start as one.
+        """
         return int(self.pictures[..., 3].float().sum((0, 2, 3)).argmax())
 
     def at(self, views: list[int], frames: list[int], shrink: int = 1) -> tuple[Tensor, Tensor, Tensor]:
-        """Pictures f32 (C,H,W,4), intrinsics (C,3,3) and world_to_camera (C,4,4) of (view, frame) pairs, 1/shrink the size."""
+        """Returns pictures f32 (C,H,W,4), intrinsics (C,3,3) and world_to_camera (C,4,4) of (view, frame) pairs, 1/shrink the size."""
         chosen = self.pictures[views, frames].float()
         matrices = torch.from_numpy(self.intrinsics[views]).float()
         if shrink > 1:
@@ -62,16 +66,16 @@ class Targets:
         return chosen, matrices, torch.from_numpy(self.world_to_camera[views]).float()
 
     def picture(self, view: int, frame: int) -> np.ndarray:
-        """f32 (H,W,4) with straight color, 0..1."""
+        """Returns a picture f32 (H,W,4) with straight color, 0..1."""
         value = self.pictures[view, frame].float().numpy().copy()
         value[..., :3] /= np.maximum(value[..., 3:], 1e-3)
         return value.clip(0, 1)
 
 
 def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
-    """The views of a file that have one of the roles, resized so that the longer side has `size` pixels (never enlarged).
+    """Returns the reference view and those of these roles, resized to a longer side of `size` pixels (never enlarged).
 
-    DataError when the reference view is empty in every frame.
+    Raises DataError when the reference view is empty in every frame.
     """
     with ViewsReader(path) as reader:
         header = reader.header
@@ -101,7 +105,7 @@ def load_targets(path: Path, size: int, roles: tuple[str, ...]) -> Targets:
 
 
 def _resize(rgba: np.ndarray, width: int, height: int) -> Tensor:  # [H, W, 4]
-    """Color times alpha and alpha, area-averaged to the size."""
+    """Returns color times alpha, and alpha, area-averaged to the size."""
     value = torch.from_numpy(rgba).float() / 255
     value[..., :3] *= value[..., 3:]
     if rgba.shape[:2] == (height, width):

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import knn, weighted_kabsch
-from dpcli.ops.rigid import rigid_flow, to_matrix
+from dpcli.ops.rigid import rigid_flow
+from dpcli.ops.rotations import motion_matrix
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.network.slot_matching import one_hot
@@ -78,7 +79,7 @@ def motion_in_input_units(motion: tuple[Tensor, Tensor], mask: Tensor, scale: fl
     rotation, shift = motion
     used = one_hot(mask).sum(0) > 0
     own = shift / scale + center - (rotation @ center)
-    return torch.where(used[:, None, None], to_matrix(rotation, own), torch.eye(4)).numpy()
+    return torch.where(used[:, None, None], motion_matrix(rotation, own), torch.eye(4)).numpy()
 
 
 def part_flow(points: Tensor, mask: Tensor, motion: tuple[Tensor, Tensor], scale: float) -> np.ndarray:

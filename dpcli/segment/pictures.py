@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.draw.palette import part_colors
-from dpcli.draw.shaded_points import draw_balls, view_matrix
+from dpcli.draw.animation import write_pictures
+from dpcli.draw.palette import DARK, LIGHT, Theme, part_colors
+from dpcli.draw.points import Raster, draw_balls
+from dpcli.draw.sheet import save_picture, spread_evenly, text_font, write_line
+from dpcli.draw.view import turntable_view
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence
 
-_WHITE, _DARK = (255, 255, 255), (17, 20, 26)
 _GAP, _TITLE = 8, 22
 _AZIMUTH, _ELEVATION = np.deg2rad(-60.0), np.deg2rad(22.0)
 _MARGIN = 1.12  # of the picture around what is seen
@@ -23,8 +25,11 @@ _RATE = 15  # images per second of an animation
 
 @dataclass(frozen=True)
 class Look:
-    """How parts are drawn. cell: pixels of a picture's side; up: the axis that points upwards, such as z or -y;
-    azimuth, elevation: of the camera, radians; dark: on a dark background."""
+    """Holds how parts are drawn.
+
+    cell: pixels of a picture's side. up: the axis that points upwards, such as z or -y. azimuth, elevation: of the
+    camera, radians. dark: on a dark background.
+    """
 
     cell: int = 200
     up: str = "z"
@@ -37,12 +42,9 @@ class Look:
             raise UsageError(f"up axis {self.up!r}: expected x, y, z, -x, -y or -z")
 
     @property
-    def background(self) -> tuple[int, int, int]:
-        return _DARK if self.dark else _WHITE
-
-    @property
-    def ink(self) -> tuple[int, int, int]:
-        return (226, 230, 236) if self.dark else (40, 44, 52)
+    def theme(self) -> Theme:
+        """The colors of the ground and of letters."""
+        return DARK if self.dark else LIGHT
 
 
 def matched_ids(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -91,11 +93,11 @@ def parts_picture(
         title = titles[index] if titles is not None else sequence.name
         if real is not None:
             found = matched_ids(found, _true_parts(sequence, real))
-        shown = np.unique(np.linspace(0, sequence.num_frames - 1, frames).round().astype(int)).tolist()
+        shown = spread_evenly(sequence.num_frames, frames)
         rows.append((title, found, _draw_row(sequence, found, shown, look)))
         if real is not None:
             rows.append(("truth", real.part, _draw_row(sequence, real.part, shown, look)))
-    _save(_assemble(rows, look), path)
+    save_picture(_assemble(rows, look), path)
 
 
 def _parts_of(sequence: CloudSequence) -> np.ndarray:
@@ -113,14 +115,14 @@ def _true_parts(sequence: CloudSequence, real: CloudSequence) -> np.ndarray:
 
 def _draw_row(sequence: CloudSequence, part: np.ndarray, shown: list[int], look: Look) -> list[np.ndarray]:
     """Cells u8 (cell,cell,3), all of one scale."""
-    matrix = view_matrix(look.azimuth, look.elevation, look.up)
+    matrix = turntable_view(look.azimuth, look.elevation, look.up)
     seen = sequence.points @ matrix.T
     low, high = np.percentile(seen, [0.1, 99.9], axis=0)
     scale = look.cell / (_MARGIN * max(float((high - low)[:2].max()), 1e-9))
     offsets, colors = sequence.frame_offsets, part_colors(part)
     spans = [slice(offsets[t], offsets[t + 1]) for t in shown]
-    size, center, depth = (look.cell, look.cell), (low + high)[:2] / 2, (float(low[2]), float(high[2]))
-    return [draw_balls(seen[span], colors[span], size, center, scale, look.background, depth) for span in spans]
+    raster, depth = Raster(look.cell, look.cell, (low + high)[:2] / 2, scale), (float(low[2]), float(high[2]))
+    return [draw_balls(seen[span], colors[span], raster, look.theme.background, depth) for span in spans]
 
 
 def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) -> Any:
@@ -128,12 +130,12 @@ def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) 
 
     columns = max(len(cells) for _, _, cells in rows)
     step = look.cell + _TITLE
-    sheet = Image.new("RGB", (columns * look.cell + 2 * _GAP, len(rows) * step + 2 * _GAP), look.background)
+    sheet = Image.new("RGB", (columns * look.cell + 2 * _GAP, len(rows) * step + 2 * _GAP), look.theme.background)
     draw = ImageDraw.Draw(sheet)
     for place, (title, part, cells) in enumerate(rows):
         top = _GAP + place * step
         room = _legend(draw, top, sheet.width - _GAP, part, look)
-        _write(draw, (_GAP, top + 3), title, room - 2 * _GAP, look)
+        write_line(draw, (_GAP, top + 3), title, room - 2 * _GAP, look.theme.ink)
         for column, cell in enumerate(cells):
             sheet.paste(Image.fromarray(cell), (_GAP + column * look.cell, top + _TITLE))
     return sheet
@@ -142,32 +144,18 @@ def _assemble(rows: list[tuple[str, np.ndarray, list[np.ndarray]]], look: Look) 
 def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> int:
     """Swatches of the parts with their share of the points, right-aligned as far as half the row; where they start."""
     ids, counts = np.unique(part, return_counts=True)
-    font, start, left = _font(11), right // 2, right
+    font, start, left = text_font(11), right // 2, right
     for own, count in reversed(list(zip(ids.tolist(), counts.tolist(), strict=True))):
         text = f"{'?' if own < 0 else own}: {100 * count / len(part):.0f} %"
         width = int(draw.textlength(text, font=font)) + 20
         if left - width < start:
-            draw.text((left - 14, top + 4), "…", fill=look.ink, font=font)
+            draw.text((left - 14, top + 4), "…", fill=look.theme.ink, font=font)
             return left - 14
         left -= width
         color = tuple(part_colors(np.array([own]))[0].tolist())
         draw.ellipse((left, top + 6, left + 9, top + 15), fill=color)
-        draw.text((left + 13, top + 4), text, fill=look.ink, font=font)
+        draw.text((left + 13, top + 4), text, fill=look.theme.ink, font=font)
     return left
-
-
-def _write(draw: Any, place: tuple[int, int], text: str, room: int, look: Look) -> None:
-    """Text in one line, shortened to the room (pixels) there is."""
-    font = _font(13)
-    while draw.textlength(text, font=font) > room and len(text) > 2:
-        text = text[:-2] + "…"
-    draw.text(place, text, fill=look.ink, font=font)
-
-
-def _font(size: int) -> Any:
-    from PIL import ImageFont
-
-    return ImageFont.load_default(size=size)
 
 
 def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look: Look | None = None) -> None:
@@ -182,15 +170,15 @@ def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look
     low, high = np.percentile(sequence.points, [0.1, 99.9], axis=0)
     centered = sequence.points - (low + high) / 2
     radius = max(float(np.percentile(np.linalg.norm(centered, axis=1), 99.9)), 1e-9)
-    scale, count = look.cell / (2 * radius * _MARGIN), max(int(seconds * _RATE), 1)
+    raster = Raster(look.cell, look.cell, np.zeros(2), look.cell / (2 * radius * _MARGIN))
+    count = max(int(seconds * _RATE), 1)
     images = []
     for image, t in enumerate(there_and_back(sequence.num_frames, count)):
-        matrix = view_matrix(look.azimuth + 2 * np.pi * image / count, look.elevation, look.up)
+        matrix = turntable_view(look.azimuth + 2 * np.pi * image / count, look.elevation, look.up)
         span = slice(offsets[t], offsets[t + 1])
-        size, depth = (look.cell, look.cell), (-radius, radius)
         seen = centered[span] @ matrix.T
-        images.append(draw_balls(seen, colors[span], size, np.zeros(2), scale, look.background, depth))
-    _save_animation(images, path)
+        images.append(draw_balls(seen, colors[span], raster, look.theme.background, (-radius, radius)))
+    write_pictures(path, images, _RATE, force=True)
 
 
 def there_and_back(frames: int, count: int) -> list[int]:
@@ -198,23 +186,3 @@ def there_and_back(frames: int, count: int) -> list[int]:
     phase = np.arange(count) / count
     swing = (1 - np.cos(2 * np.pi * phase)) / 2
     return np.minimum((swing.round(9) * frames).astype(int), frames - 1).tolist()
-
-
-def _save_animation(images: list[np.ndarray], path: Path) -> None:
-    """All images with one table of colors, so that nothing flickers."""
-    from PIL import Image
-
-    some = np.concatenate(images[:: max(1, len(images) // 4)], axis=1)
-    table = Image.fromarray(some).quantize(255)
-    frames = [Image.fromarray(image).quantize(palette=table, dither=Image.Dither.NONE) for image in images]
-    _save(frames[0], path, save_all=True, append_images=frames[1:], duration=round(1000 / _RATE), loop=0)
-
-
-def _save(image: Any, path: Path, **options: Any) -> None:
-    kind = ".gif" if options else ".png"
-    try:
-        image.save(path, **options)
-    except (ValueError, OSError) as error:
-        raise DataError(
-            f"{path}: the picture cannot be written ({error}); name a {kind} in an existing folder"
-        ) from None

@@ -16,10 +16,14 @@ import torch
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.ops.splatting.rasterization import rasterization
-from dpcli.store.gaussians import read_scene
+from dpcli.store.gaussians import read_scene, scene_origin
 from dpcli.store.views import ViewsHeader, ViewsWriter
 
 SIZE, FRAMES = 48, 6
+
+
+def steps(dense: int, sparse: int) -> tuple[str, ...]:
+    return "--set", f"dense_steps={dense}", "--set", f"sparse_steps={sparse}"
 
 
 def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) -> Path:
@@ -59,19 +63,7 @@ def toy_views(path: Path, train: int = 0, test: int = 0, empty: bool = False) ->
 def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
     done = dpc(
-        "generate4d",
-        "fit",
-        views,
-        "-o",
-        scene,
-        "--preset",
-        "tiny",
-        "--dense-steps",
-        60,
-        "--sparse-steps",
-        60,
-        "--picture",
-        tmp_path / "sheet.png",
+        "generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(60, 60), "--picture", tmp_path / "sheet.png"
     )
     assert done.returncode == 0, done.stderr
     result = read_scene(scene)
@@ -82,7 +74,7 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     assert (tmp_path / "scene.fit" / "curves.png").stat().st_size > 5000
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
-    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--dense-steps", 60, "--sparse-steps", 60)
+    same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(60, 60))
     assert same.returncode == 0 and "finished" in same.stderr.decode()
     again = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
     assert again.returncode == 2 and "--force" in again.stderr.decode()
@@ -94,8 +86,7 @@ def test_given_views_make_the_side_right(tmp_path, dpc_here, one_thread):
     values = {}
     for prior in ("none", "views"):
         scene = tmp_path / f"with_{prior}.h5"
-        steps = ("--dense-steps", 50, "--sparse-steps", 30)
-        done = dpc_here("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", prior, *steps)
+        done = dpc_here("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", prior, *steps(50, 30))
         assert done.returncode == 0, done.stderr
         scored = dpc_here("evaluate", "video", scene, "--truth", views, "--metrics", "psnr", "--json")
         assert scored.returncode == 0, scored.stderr
@@ -105,7 +96,7 @@ def test_given_views_make_the_side_right(tmp_path, dpc_here, one_thread):
 
 def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc):
     views = toy_views(tmp_path / "views.h5")
-    options = ("--preset", "tiny", "--dense-steps", "60", "--sparse-steps", "60", "--device", "cpu")
+    options = ("--preset", "tiny", *steps(60, 60), "--device", "cpu")
     whole = dpc("generate4d", "fit", views, "-o", tmp_path / "whole.h5", *options)
     assert whole.returncode == 0, whole.stderr
     command = [sys.executable, "-m", "dpcli", "generate4d", "fit", str(views), "-o", str(tmp_path / "cut.h5"), *options]
@@ -126,10 +117,10 @@ def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc):
 
 def test_the_switches_of_table_5_2_do_what_they_say(tmp_path, dpc_here):
     views = toy_views(tmp_path / "views.h5")
-    steps = ("--preset", "tiny", "--dense-steps", 8, "--sparse-steps", 8)
-    scenes = {}
-    for name, switches in {"a": ("--no-rigid", "--no-sparse"), "c": ("--no-fusion", "--no-sparse"), "e": ()}.items():
-        done = dpc_here("generate4d", "fit", views, "-o", tmp_path / f"{name}.h5", *steps, *switches)
+    options, scenes = ("--preset", "tiny", *steps(8, 8)), {}
+    for name, off in {"a": ("rigid", "sparse"), "c": ("fusion", "sparse"), "e": ()}.items():
+        switches = [word for switch in off for word in ("--set", f"{switch}=false")]
+        done = dpc_here("generate4d", "fit", views, "-o", tmp_path / f"{name}.h5", *options, *switches)
         assert done.returncode == 0, done.stderr
         scenes[name] = read_scene(tmp_path / f"{name}.h5")
     assert len(scenes["a"].control_point) == 0 and len(scenes["e"].control_point) == 24
@@ -142,8 +133,8 @@ def test_what_is_wrong_is_said(tmp_path, dpc_here):
     for code, words, arguments in (
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
         (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
-        (2, "--prior magic", (views, "-o", tmp_path / "a.h5", "--prior", "magic")),
-        (2, "--preset slow", (views, "-o", tmp_path / "a.h5", "--preset", "slow")),
+        (2, "prior = magic: expected one of", (views, "-o", tmp_path / "a.h5", "--prior", "magic")),
+        (2, "preset = slow: expected one of", (views, "-o", tmp_path / "a.h5", "--preset", "slow")),
         (2, "--run FOLDER", (views, "-o", "-", "--preset", "tiny")),
         (3, "not an HDF5 file", (__file__, "-o", tmp_path / "a.h5")),
     ):
@@ -171,25 +162,27 @@ def test_another_configuration_in_the_same_place_is_refused(tmp_path, dpc_here):
     assert done.returncode == 2 and b"another configuration" in done.stderr
 
 
+def test_the_settings_of_a_run_make_the_same_run_again(tmp_path, dpc_here):
+    views = toy_views(tmp_path / "views.h5", train=1)
+    words = ("--preset", "tiny", "--prior", "views", "--size", "16", *steps(2, 1), "--set", "regularize=false")
+    assert dpc_here("generate4d", "fit", views, "-o", tmp_path / "a.h5", *words).returncode == 0
+    settings = tmp_path / "a.fit" / "settings.toml"
+    done = dpc_here("generate4d", "fit", views, "-o", tmp_path / "b.h5", "--config", settings)
+    assert done.returncode == 0, done.stderr
+    one, two = (scene_origin(tmp_path / name)[1][-1]["config"] for name in ("a.h5", "b.h5"))
+    assert one == two and (one["regularize"], one["prior"], one["config"]["dense_steps"]) == (False, "views", 2)
+    assert settings.read_text() == (tmp_path / "b.fit" / "settings.toml").read_text()
+    other = dpc_here(
+        "generate4d", "fit", views, "-o", tmp_path / "c.h5", "--run", tmp_path / "a.fit", *words, "--parts", 2
+    )
+    assert other.returncode == 2 and b"config.parts 3, now 2" in other.stderr
+
+
 def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
     import imageio.v3 as imageio
 
     views, scene = toy_views(tmp_path / "views.h5", train=1), tmp_path / "scene.h5"
-    words = (
-        "generate4d",
-        "fit",
-        views,
-        "-o",
-        scene,
-        "--preset",
-        "tiny",
-        "--prior",
-        "views",
-        "--dense-steps",
-        20,
-        "--sparse-steps",
-        20,
-    )
+    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--prior", "views", *steps(20, 20))
     assert dpc_here(*words, "--picture", tmp_path / "first.png").returncode == 0
     before = scene.read_bytes()
     done = dpc_here(*words, "--picture", tmp_path / "later.png")
@@ -200,21 +193,7 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
 
 def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monkeypatch):
     views, scene = toy_views(tmp_path / "views.h5"), tmp_path / "scene.h5"
-    words = (
-        "generate4d",
-        "fit",
-        views,
-        "-o",
-        scene,
-        "--preset",
-        "tiny",
-        "--size",
-        16,
-        "--dense-steps",
-        1,
-        "--sparse-steps",
-        1,
-    )
+    words = ("generate4d", "fit", views, "-o", scene, "--preset", "tiny", "--size", 16, *steps(1, 1))
     for name, said in (("no/x.png", b"the folder"), ("x.foo", b"unknown kind '.foo'"), ("", b"unknown kind ''")):
         done = dpc_here(*words, "--picture", tmp_path / name if name else "")
         assert done.returncode in (2, 3) and said in done.stderr and not (tmp_path / "scene.fit").exists()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from tests.support.ops_helpers import backend
 def python(code: str, **environment: str) -> str:
     """Output of a fresh interpreter."""
     import os
-from pathlib import Path
 
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, env={**os.environ, **environment})
@@ -145,5 +145,5 @@ def test_keys_sort_as_distance_then_index() -> None:
 
 def test_no_module_hides_a_function_of_the_package():
     """A submodule of the same name would take the function's place as soon as anything imports it."""
-    modules = {path.stem for path in Path(ops.__file__).parent.iterdir()}
-    assert not modules & set(ops.__all__)
+    modules = {path.stem for path in Path(dpcli.ops.__file__).parent.iterdir()}
+    assert not modules & set(dpcli.ops.__all__)

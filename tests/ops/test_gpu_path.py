@@ -12,8 +12,8 @@ import torch
 
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
-from dpcli.classify.presets import find_preset
-from dpcli.generate4d.fit import Fit
+from dpcli.classify.presets import PRESETS
+from dpcli.generate4d.optimizer import SceneOptimizer, StepResult
 from dpcli.ops.backend import reference_only
 from dpcli.runtime.mixed_precision import wanted
 from dpcli.store import ScoresReader
@@ -64,7 +64,7 @@ def test_the_card_allows_what_a_gpu_allows(card):
 
 def small(backbone: str) -> KinetConfig:
     if backbone == "pointnet2":
-        return replace(find_preset("tiny").config, num_classes=3, num_frames=4, points_per_frame=12, centroids=(16, 8))
+        return replace(PRESETS["tiny"]["network"], num_classes=3, num_frames=4, points_per_frame=12, centroids=(16, 8))
     return tiny(backbone)
 
 
@@ -110,14 +110,14 @@ def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, 
         *TRAIN,
         "--epochs",
         1,
-        "--epochs-dynamic",
-        2,
-        "--workers",
-        0,
-        "--draws",
-        1,
-        "--static-temporal-radius",
-        0,
+        "--set",
+        "epochs_dynamic=2",
+        "--set",
+        "workers=0",
+        "--set",
+        "draws=1",
+        "--set",
+        "static_temporal_radius=0",
     )
     assert done.returncode == 0 and b"training on pretend card" in done.stderr, done.stderr
     scores = []
@@ -175,24 +175,25 @@ def test_a_scene_fitted_on_the_card_stops_and_goes_on(card, dpc_here, tmp_path, 
         "tiny",
         "--size",
         16,
-        "--gaussians",
-        40,
-        "--control-points",
-        8,
-        "--dense-steps",
-        2,
-        "--sparse-steps",
-        2,
+        "--set",
+        "gaussians=40",
+        "--set",
+        "control_points=8",
+        "--set",
+        "dense_steps=2",
+        "--set",
+        "sparse_steps=2",
     )
-    step = Fit._one_step
+    take_step = SceneOptimizer.take_step
 
-    def stop_after_three(fit: Fit) -> None:
-        step(fit)
-        if fit.step == 3:
+    def stop_after_three(optimizer: SceneOptimizer) -> StepResult:
+        result = take_step(optimizer)
+        if optimizer.step == 3:
             os.kill(os.getpid(), signal.SIGTERM)
+        return result
 
     with monkeypatch.context() as patched:
-        patched.setattr(Fit, "_one_step", stop_after_three)
+        patched.setattr(SceneOptimizer, "take_step", stop_after_three)
         done = dpc_here(*words)
     assert done.returncode not in (0, 1) and b"saved at step 3" in done.stderr, done.stderr
     done = dpc_here(*words)

@@ -1,4 +1,4 @@
-"""Truth, prediction and their difference side by side, some instants of each view, as one picture."""
+"""Draws truth, prediction and their difference side by side, some instants of each view, as one picture."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
 from dpcli.errors import DataError
-from dpcli.evaluate.video.sources import Picture, View
+from dpcli.evaluate.video.sources.source import Picture, View
 
 _INSTANTS, _MOST_VIEWS = 6, 8
-_SIDE, _GAP, _TITLE = 160, 4, 18  # pixels
+_SIDE = 160  # pixels of a cell
 
 
-class Strip:
+class DifferenceStrip:
     """Collects small cells while a video is scored (`evaluate_video`'s `watch`), and writes them as one picture.
 
     For each of the first eight views three rows: truth, prediction, and four times the absolute difference.
@@ -33,31 +34,20 @@ class Strip:
         self.rows.setdefault(title, []).append((frame, np.concatenate([theirs, ours, apart])))
 
     def save(self, path: Path) -> None:
-        """Write the picture. DataError when there is nothing to show, or it can't be written."""
-        from PIL import Image, ImageDraw
-
+        """Writes the picture. DataError when there is nothing to show, or it can't be written."""
         if not self.rows:
             raise DataError(f"--picture {path}: no pictures were compared")
-        columns = max(len(cells) for cells in self.rows.values())
-        height = _TITLE + 3 * _SIDE + _GAP
-        sheet = Image.new("RGB", (columns * (_SIDE + _GAP) + _GAP, len(self.rows) * height), (40, 44, 52))
-        draw = ImageDraw.Draw(sheet)
-        for place, (title, cells) in enumerate(self.rows.items()):
-            draw.text((_GAP, place * height + 3), title, fill=(226, 230, 236))
-            for column, (frame, cell) in enumerate(cells):
-                corner = (_GAP + column * (_SIDE + _GAP), place * height + _TITLE)
-                sheet.paste(Image.fromarray((cell * 255 + 0.5).astype(np.uint8)), corner)
-                draw.text((corner[0] + 3, corner[1] + 2), str(frame), fill=(110, 110, 110))
-        try:
-            sheet.save(path)
-        except (ValueError, OSError) as error:
-            raise DataError(
-                f"--picture {path}: cannot be written ({error}); name a .png in an existing folder"
-            ) from None
+        rows = [
+            SheetRow(
+                title, [str(frame) for frame, _ in cells], [(cell * 255 + 0.5).astype(np.uint8) for _, cell in cells]
+            )
+            for title, cells in self.rows.items()
+        ]
+        save_picture(contact_sheet(rows), path)
 
 
 def _small(colors: np.ndarray) -> np.ndarray:
-    """f32 (3,H,W) in 0..1 -> f32 (S,S,3), the longer side filling the cell."""
+    """Returns a picture f32 (3,H,W) in 0..1 as f32 (S,S,3), the longer side filling the cell."""
     from PIL import Image
 
     image = Image.fromarray((np.nan_to_num(colors).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,37 +16,35 @@ from dpcli.runtime.whole_file import check_replaced, whole_file, write_whole
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
-FORMATS = ("ply", "ply-sequence", "splat", "splat-sequence", "clouds", "cameras", "metrics")
-AXES = ("player", "keep")
 _SINGLE = {"ply": write_splat_ply, "splat": write_splat}
 
 
-def visible(scene: GaussianScene, least: float) -> np.ndarray:
-    """Which Gaussians are at least `least` opaque (0..1), indices i64 (M). DataError when none is."""
-    kept = np.flatnonzero(opacity_of(scene.opacity_logit) >= least)
+def opaque_indices(scene: GaussianScene, min_opacity: float) -> np.ndarray:
+    """Returns the indices i64 (M) of Gaussians of at least that opacity (0..1). Raises DataError when there is none."""
+    kept = np.flatnonzero(opacity_of(scene.opacity_logit) >= min_opacity)
     if not len(kept):
-        raise DataError(f"no Gaussian is {least:g} opaque or more; the most opaque has {scene.opacity.max():.3g}")
+        raise DataError(f"no Gaussian is {min_opacity:g} opaque or more; the most opaque has {scene.opacity.max():.3g}")
     return kept
 
 
-def thinned(scene: GaussianScene, least: float) -> GaussianScene:
-    """The scene without Gaussians less than `least` opaque; frames, parts, control points and cameras stay."""
-    kept = visible(scene, least)
+def keep_opaque(scene: GaussianScene, min_opacity: float) -> GaussianScene:
+    """Returns the scene without Gaussians below that opacity; frames, parts, control points and cameras stay."""
+    kept = opaque_indices(scene, min_opacity)
     if len(kept) == scene.num_gaussians:
         return scene
-    own = {key: getattr(scene, key) for key in scene.__dataclass_fields__}
-    own |= {
-        key: own[key][kept]
-        for key in ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part", "part_probability")
-    }
-    own |= {key: own[key][:, kept] for key in ("frame_mean", "frame_quaternion", "rigid_weight")}
-    return GaussianScene(**own)
+    of_gaussian = ("mean", "log_scale", "quaternion", "opacity_logit", "sh", "part", "part_probability")
+    of_frame = ("frame_mean", "frame_quaternion", "rigid_weight")
+    return replace(
+        scene,
+        **{key: getattr(scene, key)[kept] for key in of_gaussian},
+        **{key: getattr(scene, key)[:, kept] for key in of_frame},
+    )
 
 
 def export_file(
     scene: GaussianScene, path: Path, form: str, *, time: float | None = None, axes: str = "player"
 ) -> None:
-    """One .ply or .splat: the canonical Gaussians, or those at `time` seconds."""
+    """Writes one .ply or .splat: the canonical Gaussians, or those at `time` seconds. Raises DataError when it can't."""
     _SINGLE[form](path, Splats.of(scene, time, axes))
 
 
@@ -58,9 +57,10 @@ def export_sequence(
     times: Sequence[float] | None = None,
     force: bool = False,
 ) -> list[Path]:
-    """frame0001.ply (or .splat), ... in `folder`, with cameras.json and metrics.json; the names players line up as a clip.
+    """Writes frame0001.ply (or .splat), ... into `folder`, with cameras.json and metrics.json; returns the frames' paths.
 
-    The folder appears whole. UsageError when it exists and `force` is off; then it is replaced.
+    Players show files of such names as a clip. The folder appears whole. Raises UsageError when it exists and `force` is
+    off, which would replace it.
     """
     if folder.exists() and not force:
         raise UsageError(f"{folder}: exists already; --force replaces it")
@@ -90,7 +90,7 @@ def _make_folder(part: Path, folder: Path) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
+    """Writes readable JSON, the same bytes for the same content, whole or not at all. DataError when it can't be written."""
     write_whole(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
 
@@ -98,18 +98,18 @@ def as_sequence(
     scene: GaussianScene,
     name: str,
     *,
-    least: float = 0.3,
+    min_opacity: float = 0.3,
     points: int | None = None,
     rng: np.random.Generator | None = None,
     axes: str = "player",
 ) -> CloudSequence:
-    """The Gaussians' means as a point cloud video: T frames of the same M points.
+    """Returns the Gaussians' means as a point cloud video: T frames of the same M points.
 
-    Kept: those at least `least` opaque; of them `points` drawn without replacement by `rng`, if there are more. `track`
+    Kept: those of at least `min_opacity`; of them `points` drawn without replacement by `rng`, if there are more. `track`
     is the index of the Gaussian, `part` its rigid part, `pose` the parts' motions, canonical to frame. axes player:
     x right, y down, z away from the reference camera at azimuth 0, as `clouds` have them.
     """
-    kept = visible(scene, least)
+    kept = opaque_indices(scene, min_opacity)
     if points is not None and points < len(kept):
         if rng is None:
             raise UsageError(f"{points} of {len(kept)} points: a generator must draw them")
@@ -136,7 +136,7 @@ def write_clouds(
     length_unit: str = "",
     force: bool = False,
 ) -> None:
-    """A `clouds` file of one sequence."""
+    """Writes a `clouds` file of one sequence."""
     fields = [key for key in ("time", "color", "part", "track", "pose") if getattr(sequence, key) is not None]
     with CloudsWriter(
         path, length_unit=length_unit, source=source, seed=seed, fields=fields, provenance=provenance, force=force

@@ -25,14 +25,24 @@ WEIGHTS = np.array(
 
 
 def weight_colors(weight: np.ndarray) -> np.ndarray:
-    """Color u8 (...,3) of values 0..1 (clamped): viridis, dark to bright."""
+    """Returns the colors u8 (...,3) of values 0..1 (clamped): viridis, dark to bright.
+
+    >>> weight_colors(np.array([-1.0, 0.5, 1.0])).tolist()
+    [[68, 1, 84], [33, 145, 140], [253, 231, 37]]
+    """
     stops = np.linspace(0, 1, len(WEIGHTS))
     channels = [np.interp(weight, stops, WEIGHTS[:, channel]) for channel in range(3)]
     return np.stack(channels, -1).round().astype(np.uint8)
 
 
 def parse_background(text: str) -> tuple[int, int, int] | None:
-    """`white`, `black`, `r,g,b` (0..255), or `none` (transparent, None); UsageError otherwise."""
+    """Returns red, green and blue (0..255) of `white`, `black` or `r,g,b`; None, transparent, of `none`.
+
+    Raises UsageError for any other text.
+
+    >>> parse_background("white"), parse_background("17,20,26"), parse_background("none")
+    ((255, 255, 255), (17, 20, 26), None)
+    """
     if text == "none":
         return None
     if text in _BACKGROUNDS:

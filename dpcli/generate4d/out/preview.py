@@ -1,4 +1,4 @@
-"""A strip of pictures while a fit goes on, and of a finished one: input, render, parts, the object seen from elsewhere."""
+"""The preview of a fit, running or finished: input, render, parts, and the object seen from elsewhere."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import torch
 from torch import Tensor
 
 from dpcli.draw.palette import part_colors
+from dpcli.draw.sheet import save_picture, spread_evenly
 from dpcli.generate4d.out.picture_colors import weight_colors
 from dpcli.generate4d.scene.model import Model4D
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting.rasterization import rasterization
-from dpcli.runtime.whole_file import whole_file
 from dpcli.store.gaussians import SH_C0, GaussianScene
 
 
 @dataclass
 class _Instants:
-    """N Gaussians at F times, tensors of one device, and what colors them."""
+    """Holds N Gaussians at F times and what colors them, as tensors of one device."""
 
     mean: Tensor  # [F, N, 3]
     quaternion: Tensor  # [F, N, 4]
@@ -32,7 +32,7 @@ class _Instants:
     weight: Tensor  # [F, N]
 
 
-def _of_model(model: Model4D, times: Tensor) -> _Instants:
+def _instants_of_model(model: Model4D, times: Tensor) -> _Instants:
     own, device = model.gaussians, model.gaussians.mean.device
     instant, field = model.at(times.to(device)), model.field(own.mean, times.to(device))
     return _Instants(
@@ -46,7 +46,7 @@ def _of_model(model: Model4D, times: Tensor) -> _Instants:
     )
 
 
-def _of_scene(scene: GaussianScene, frames: list[int]) -> _Instants:
+def _instants_of_scene(scene: GaussianScene, frames: list[int]) -> _Instants:
     arrays = (
         scene.frame_mean[frames],
         scene.frame_quaternion[frames],
@@ -63,48 +63,44 @@ def _of_scene(scene: GaussianScene, frames: list[int]) -> _Instants:
 def write_preview(
     fitted: Model4D | GaussianScene, targets: Targets, path: Path, columns: int = 5, side: int = 128
 ) -> None:
-    """Rows: input, render, parts in color, rigid weight, a view from 60 degrees to the side; columns: times."""
-    import imageio.v3 as imageio
-
-    frames = np.unique(np.linspace(0, targets.num_frames - 1, columns).round().astype(int)).tolist()
+    """Writes a picture whose rows are input, render, parts, rigid weight, and a view from 60 degrees aside; columns: times."""
+    frames = spread_evenly(targets.num_frames, columns)
     shrink = max(targets.size[1] // side, 1)
-    wanted, intrinsics, poses = targets.at([targets.reference] * len(frames), frames, shrink)
-    height, width = wanted.shape[1:3]
-    own = _of_scene(fitted, frames) if isinstance(fitted, GaussianScene) else _of_model(fitted, targets.times()[frames])
-    device = own.mean.device
-    wanted, intrinsics, poses = wanted.to(device), intrinsics.to(device), poses.to(device)
-    parts = torch.from_numpy(part_colors(own.part.cpu().numpy()) / 255).float().to(device)
-    rigid = torch.from_numpy(weight_colors(own.weight.cpu().numpy()) / 255).float().to(device)
-    azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
-    aside = (
-        torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius))
-        .float()
-        .expand(len(frames), 4, 4)
-        .to(device)
-    )
-
-    def draw(colors: Tensor, cameras: Tensor) -> Tensor:
-        return rasterization(
-            own.mean,
-            own.quaternion,
-            own.scale,
-            own.opacity,
-            colors,
-            cameras,
-            intrinsics,
-            width,
-            height,
-            backgrounds=torch.ones(len(frames), 3, device=device),
-        )[0]
-
-    own_color = own.color.expand(len(frames), -1, -1)
+    truth, intrinsics, poses = targets.at([targets.reference] * len(frames), frames, shrink)
+    if isinstance(fitted, GaussianScene):
+        instants = _instants_of_scene(fitted, frames)
+    else:
+        instants = _instants_of_model(fitted, targets.times()[frames])
+    size, color = (truth.shape[2], truth.shape[1]), instants.color.expand(len(frames), -1, -1)
+    parts, weights = part_colors(instants.part.cpu().numpy()), weight_colors(instants.weight.cpu().numpy())
     rows = [
-        wanted[..., :3] + 1 - wanted[..., 3:],
-        draw(own_color, poses),
-        draw(parts, poses),
-        draw(rigid, poses),
-        draw(own_color, aside),
+        truth[..., :3] + 1 - truth[..., 3:],
+        _draw(instants, color, poses, intrinsics, size),
+        _draw(instants, torch.from_numpy(parts / 255), poses, intrinsics, size),
+        _draw(instants, torch.from_numpy(weights / 255), poses, intrinsics, size),
+        _draw(instants, color, _aside(targets).expand(len(frames), 4, 4), intrinsics, size),
     ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
-    with whole_file(path) as part:
-        imageio.imwrite(part, (sheet.clamp(0, 1) * 255).round().byte().cpu().numpy())
+    save_picture((sheet.clamp(0, 1) * 255).round().byte().numpy(), path)
+
+
+def _aside(targets: Targets) -> Tensor:  # [4, 4]
+    """Returns a camera to the side of the reference camera and above it, which no picture of a single view shows."""
+    azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
+    return torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius))
+
+
+def _draw(instants: _Instants, colors: Tensor, poses: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:
+    """Returns pictures f32 (F,H,W,3) on white, on the CPU."""
+    device = instants.mean.device
+    return rasterization(
+        instants.mean,
+        instants.quaternion,
+        instants.scale,
+        instants.opacity,
+        colors.float().to(device),
+        poses.float().to(device),
+        intrinsics.to(device),
+        *size,
+        backgrounds=torch.ones(len(poses), 3, device=device),
+    )[0].cpu()

@@ -11,14 +11,13 @@ import numpy as np
 import torch
 
 from dpcli.draw.palette import part_colors
-from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.out.camera_paths import Shot
 from dpcli.generate4d.out.picture_colors import weight_colors
+from dpcli.generate4d.render_settings import Color
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import GaussianScene
 from dpcli.store.views import ViewsHeader, ViewsWriter
 
-COLORS = ("appearance", "part", "rigid", "depth")
 _TRAILS = 64  # Gaussians that draw trails in a scene without control points
 _TRAIL_SHARE = 0.4  # of the clip that a trail reaches back
 _FINE = 4  # fractional bits of line ends
@@ -27,15 +26,11 @@ _TRAIL_SHADE = 0.45  # of the part's color, so that trails show on it
 
 @dataclass(frozen=True)
 class Look:
-    """What is drawn: color by `color`; background u8 (r,g,b), None = transparent; trails of control points or not."""
+    """Holds what is drawn: colors, background u8 (r,g,b) or None (transparent), whether trails of control points show."""
 
-    color: str = "appearance"
+    color: Color = "appearance"
     background: tuple[int, int, int] | None = (255, 255, 255)
     trajectories: bool = False
-
-    def __post_init__(self) -> None:
-        if self.color not in COLORS:
-            raise UsageError(f"--color {self.color}: expected one of {', '.join(COLORS)}")
 
 
 class Renderer:
@@ -48,13 +43,13 @@ class Renderer:
         self._parts = self._tensor(part_colors(scene.part) / 255)
         low, high = scene.frame_mean.min((0, 1)), scene.frame_mean.max((0, 1))
         self._center, self._reach = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-        self._owner = _owners(scene)
+        self._trails = _trail_points(scene)
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.float32(values), device=self.device)
 
     def picture(self, shot: Shot, look: Look = Look()) -> np.ndarray:
-        """One picture u8 (H,W,3), or (H,W,4) with straight alpha when the background is None."""
+        """Returns one picture u8 (H,W,3), or (H,W,4) with straight alpha when the background is None."""
         color, alpha = self._draw(shot, look.color)
         if look.background is None:
             straight = np.where(alpha > 1e-6, color / np.maximum(alpha, 1e-6), 0)
@@ -65,7 +60,7 @@ class Renderer:
 
     @torch.no_grad()
     def _draw(self, shot: Shot, color: str) -> tuple[np.ndarray, np.ndarray]:
-        """Premultiplied color f32 (H,W,3) and alpha f32 (H,W,1), both 0..1."""
+        """Returns premultiplied color f32 (H,W,3) and alpha f32 (H,W,1), both 0..1."""
         means, quaternions = self.scene.at(shot.time)
         values, options = self._values(shot, color)
         drawn, alpha, _ = rasterization(
@@ -85,7 +80,7 @@ class Renderer:
         return drawn[..., :3], alpha
 
     def _values(self, shot: Shot, color: str) -> tuple[torch.Tensor, dict[str, Any]]:
-        """Colors of the Gaussians, and the rasterizer's options that go with them."""
+        """Returns the colors of the Gaussians, and the rasterizer's options that go with them."""
         if color == "appearance":
             return self._sh, {"sh_degree": self.scene.sh_degree}
         if color == "rigid":
@@ -95,7 +90,7 @@ class Renderer:
         return self._parts, {"render_mode": "ED"} if color == "depth" else {}
 
     def _depth_colors(self, depth: np.ndarray, shot: Shot) -> np.ndarray:
-        """Near bright, far dark, the same scale in every picture of this distance; f32 (H,W,3), 0..1."""
+        """Returns colors f32 (H,W,3), 0..1, near bright and far dark, in one scale for all pictures of this distance."""
         middle = float((shot.world_to_camera[:3, :3] @ self._center + shot.world_to_camera[:3, 3])[2])
         return weight_colors(0.5 - (depth - middle) / (2 * max(self._reach, 1e-6))).astype(np.float32) / 255
 
@@ -103,7 +98,7 @@ class Renderer:
         import cv2
 
         a, b, w = self.scene.between(shot.time)
-        tracks, colors = self._owner
+        tracks, colors = self._trails
         first = max(0, a - max(2, round(_TRAIL_SHARE * self.scene.num_frames)))
         now = (1 - w) * tracks[a] + w * tracks[b]
         pixels, ahead = _project(np.concatenate([tracks[first : a + 1], now[None]]), shot)
@@ -118,12 +113,12 @@ class Renderer:
         return image
 
     def pictures(self, shots: Sequence[Shot], look: Look = Look()) -> Iterator[np.ndarray]:
-        """One picture after the other."""
+        """Yields one picture after the other."""
         return (self.picture(shot, look) for shot in shots)
 
 
-def _owners(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
-    """What draws trails: positions f32 (T,M,3) and colors u8 (M,3), those of the parts, a little darker."""
+def _trail_points(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
+    """Returns positions f32 (T,M,3) and colors u8 (M,3), a little darker than their parts', of what draws trails."""
     if len(scene.control_point):
         from scipy.spatial import cKDTree
 
@@ -135,7 +130,7 @@ def _owners(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _project(points: np.ndarray, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (...,2) of world points (...,3), corners at integers as OpenCV draws them, and which are ahead, bool (...)."""
+    """Returns the pixels (...,2) of world points (...,3), corners at integers as OpenCV draws them, and which are ahead, bool (...)."""
     camera = points @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
     ahead = camera[..., 2] > 1e-3
     image = camera @ shot.intrinsics.T
@@ -147,31 +142,13 @@ def _bytes(image: np.ndarray) -> np.ndarray:
 
 
 def render_views(renderer: Renderer, header: ViewsHeader, path: Path, look: Look = Look(), **root: Any) -> None:
-    """A `views` file: the scene seen by the header's cameras at its times, RGBA, as `look` says but for its background.
-    `root`: options of ViewsWriter."""
+    """Writes a `views` file: the scene seen by the header's cameras at its times, RGBA on no background.
+
+    look: what is drawn; its background is not. root: further arguments of ViewsWriter.
+    """
     look = replace(look, background=None)
     with ViewsWriter(path, header, **root) as writer:
         for view, (lens, pose) in enumerate(zip(header.intrinsics, header.world_to_camera, strict=True)):
             for frame, time in enumerate(header.time.tolist()):
                 shot = Shot(time, pose, lens, tuple(header.size))
                 writer.add(view, frame, renderer.picture(shot, look))
-
-
-def sheet(rows: Sequence[tuple[str, Sequence[np.ndarray]]], titles: Sequence[str]) -> np.ndarray:
-    """A contact sheet u8 (H,W,3): rows of (name, pictures u8 (h,w,3) of one size), column titles above."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    if not rows or not rows[0][1]:
-        raise DataError("a contact sheet needs at least one picture")
-    gap, left, top = 4, 96, 22
-    height, width = rows[0][1][0].shape[:2]
-    page = Image.new("RGB", (left + len(titles) * (width + gap), top + len(rows) * (height + gap)), (255, 255, 255))
-    draw, font = ImageDraw.Draw(page), ImageFont.load_default(size=13)
-    for column, title in enumerate(titles):
-        draw.text((left + column * (width + gap) + width // 2, 4), title, fill=(60, 64, 72), font=font, anchor="ma")
-    for place, (name, pictures) in enumerate(rows):
-        y = top + place * (height + gap)
-        draw.text((6, y + height // 2), name, fill=(60, 64, 72), font=font, anchor="lm")
-        for column, picture in enumerate(pictures):
-            page.paste(Image.fromarray(picture), (left + column * (width + gap), y))
-    return np.asarray(page)

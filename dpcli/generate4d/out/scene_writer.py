@@ -1,4 +1,4 @@
-"""From a fitted model to the arrays of a `gaussians` file."""
+"""The arrays of a `gaussians` file, made from a fitted model."""
 
 from __future__ import annotations
 
@@ -8,53 +8,39 @@ from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.model import Model4D
-from dpcli.generate4d.scene.quaternion import normalize
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
+from dpcli.ops.rotations import normalize_quaternion
 from dpcli.store.gaussians import GaussianScene
 
 
 @torch.no_grad()
 def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
-    """Every frame's Gaussians, their parts and how those move.
+    """Returns every frame's Gaussians, their parts and how those move.
 
     A part's motion is the one that best explains where its Gaussians went (weighted Kabsch, weights part probability
     times opacity), which is also what a fit without rigid motion can be asked for.
     """
-    own, times = model.gaussians, targets.times()
-    model.refresh_neighbors()
-    means, quaternions, weights, parts, control, turns = [], [], [], [], [], []
-    for frame in range(len(times)):
-        instant = model.at(times[[frame]])
-        field = model.field(own.mean, times[[frame]])
-        means.append(instant.mean[0])
-        quaternions.append(instant.quaternion[0])
-        weights.append(field.weight[0, :, 0])
-        parts.append(field.part[0])
-        if model.control is not None:
-            control.append(model.control.position + instant.motion.displacement[0])
-            turns.append(instant.motion.quaternion[0])
-    probability = torch.stack(parts).mean(0)
-    frame_mean = torch.stack(means)
-    empty = torch.zeros(len(times), 0, 3)
-    points = torch.zeros(0, 3) if model.control is None else model.control.position
+    gaussians, control = model.gaussians, model.control
+    motion = _motion_of_frames(model, targets)
+    probability, frame_mean = motion["part"].mean(0), motion["mean"]
     return GaussianScene(
-        mean=_array(own.mean),
-        log_scale=_array(own.log_scale),
-        quaternion=_array(normalize(own.quaternion)),
-        opacity_logit=_array(own.opacity_logit),
-        sh=_array((own.color[:, None] - 0.5) / SH0),
+        mean=_array(gaussians.mean),
+        log_scale=_array(gaussians.log_scale),
+        quaternion=_array(normalize_quaternion(gaussians.quaternion)),
+        opacity_logit=_array(gaussians.opacity_logit),
+        sh=_array((gaussians.color[:, None] - 0.5) / SH0),
         time=targets.seconds,
         frame_mean=_array(frame_mean),
-        frame_quaternion=_array(normalize(torch.stack(quaternions))),
+        frame_quaternion=_array(normalize_quaternion(motion["quaternion"])),
         part=probability.argmax(1).numpy().astype(np.int16),
         part_probability=_array(probability),
-        part_motion=_part_motion(own.mean, frame_mean, probability, own.opacity_logit.sigmoid()),
-        rigid_weight=_array(torch.stack(weights)),
-        control_point=_array(points),
-        control_radius=_array(torch.zeros(0) if model.control is None else model.control.log_radius.exp()),
-        control_position=_array(torch.stack(control) if control else empty),
-        control_quaternion=_array(normalize(torch.stack(turns)) if turns else torch.zeros(len(times), 0, 4)),
+        part_motion=_part_motion(gaussians.mean, frame_mean, probability, gaussians.opacity_logit.sigmoid()),
+        rigid_weight=_array(motion["weight"]),
+        control_point=_array(torch.zeros(0, 3) if control is None else control.position),
+        control_radius=_array(torch.zeros(0) if control is None else control.log_radius.exp()),
+        control_position=_array(motion["control"]),
+        control_quaternion=_array(normalize_quaternion(motion["turn"])),
         camera_intrinsics=targets.intrinsics,
         camera_world_to_camera=targets.world_to_camera,
         size=targets.size,
@@ -63,8 +49,26 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     )
 
 
+def _motion_of_frames(model: Model4D, targets: Targets) -> dict[str, Tensor]:
+    """Returns what changes from frame to frame, each (T,N,...), of control points (T,K,...); K = 0 where there are none."""
+    rows: dict[str, list[Tensor]] = {name: [] for name in ("mean", "quaternion", "weight", "part", "control", "turn")}
+    times = targets.times()
+    model.refresh_neighbors()
+    for frame in range(len(times)):
+        instant = model.at(times[[frame]])
+        field = model.field(model.gaussians.mean, times[[frame]])
+        rows["mean"].append(instant.mean[0])
+        rows["quaternion"].append(instant.quaternion[0])
+        rows["weight"].append(field.weight[0, :, 0])
+        rows["part"].append(field.part[0])
+        sparse = model.control is not None
+        rows["control"].append(model.control.position + instant.motion.displacement[0] if sparse else torch.zeros(0, 3))
+        rows["turn"].append(instant.motion.quaternion[0] if sparse else torch.zeros(0, 4))
+    return {name: torch.stack(values) for name, values in rows.items()}
+
+
 def _part_motion(mean: Tensor, frame_mean: Tensor, probability: Tensor, opacity: Tensor) -> np.ndarray:
-    """f32 (T,S,4,4), canonical to frame."""
+    """Returns the motion of each part f32 (T,S,4,4), canonical to frame."""
     count = len(frame_mean)
     start = mean.double().expand(count, -1, -1)
     weights = (probability * opacity[:, None]).double().expand(count, -1, -1)

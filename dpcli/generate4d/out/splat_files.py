@@ -20,8 +20,10 @@ _SPLAT = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), (
 
 @dataclass
 class Splats:
-    """Gaussians at one instant: mean, log_scale f32 (N,3); quaternion f32 (N,4) wxyz; opacity_logit f32 (N); sh f32
-    (N,(degree+1)^2,3); as in `GaussianScene`."""
+    """Holds Gaussians at one instant, as in `GaussianScene`.
+
+    mean, log_scale: f32 (N,3). quaternion: f32 (N,4), wxyz. opacity_logit: f32 (N). sh: f32 (N,(degree+1)^2,3).
+    """
 
     mean: np.ndarray
     log_scale: np.ndarray
@@ -31,13 +33,13 @@ class Splats:
 
     @classmethod
     def of(cls, scene: GaussianScene, time: float | None = None, axes: str = "player") -> Splats:
-        """The canonical Gaussians, or those at `time` (seconds); axes: player (x right, y down) or keep."""
+        """Returns the canonical Gaussians, or those at `time` (seconds); axes: player (x right, y down) or keep."""
         mean, quaternion = (scene.mean, scene.quaternion) if time is None else scene.at(time)
         whole = cls(mean, scene.log_scale, quaternion, scene.opacity_logit, scene.sh)
         return whole if axes == "keep" else whole.turned()
 
     def turned(self) -> Splats:
-        """Half a turn about x, which TO_PLAYER is."""
+        """Returns the Gaussians after half a turn about x, which TO_PLAYER is."""
         w, x, y, z = self.quaternion.T
         return Splats(
             self.mean * np.float32(TO_PLAYER.diagonal()),
@@ -49,9 +51,9 @@ class Splats:
 
 
 def write_splat_ply(path: Path, splats: Splats) -> None:
-    """One 3DGS .ply: binary little-endian; opacity as a logit, sizes as logarithms, color terms channel by channel.
+    """Writes one 3DGS .ply: binary little-endian; opacity as a logit, sizes as logarithms, color terms channel by channel.
 
-    DataError when it can't be written.
+    Raises DataError when it can't be written.
     """
     rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(len(splats.mean), -1)  # all terms of red, then green, blue
     columns = {
@@ -75,9 +77,9 @@ def write_splat_ply(path: Path, splats: Splats) -> None:
 
 
 def write_splat(path: Path, splats: Splats) -> None:
-    """One .splat: 32 bytes a Gaussian, the largest and most opaque first; the color is the one without direction.
+    """Writes one .splat: 32 bytes a Gaussian, the largest and most opaque first; the color is the one without direction.
 
-    DataError when it can't be written.
+    Raises DataError when it can't be written.
     """
     opacity = opacity_of(splats.opacity_logit)
     rows = np.empty(len(splats.mean), _SPLAT)
@@ -89,8 +91,10 @@ def write_splat(path: Path, splats: Splats) -> None:
 
 
 def camera_list(scene: GaussianScene, axes: str = "player") -> list[dict[str, Any]]:
-    """The scene's cameras as 3DGS's cameras.json has them: position, rotation (camera to world, columns x right, y down,
-    z forward), fx and fy in pixels; and what that lacks: cx, cy, whether it is the reference."""
+    """Returns the scene's cameras as 3DGS's cameras.json has them, and beside that cx, cy and which is the reference.
+
+    Each has position, rotation (camera to world, columns x right, y down, z forward), fx and fy in pixels.
+    """
     width, height = scene.size
     turn = np.eye(3) if axes == "keep" else TO_PLAYER
     cameras = []

@@ -1,1 +1,1 @@
-"""What supervises the views nobody filmed: a diffusion model, given views, or geometry alone, behind one interface."""
+"""This folder holds what judges views that nobody filmed: score distillation from a diffusion model, behind an interface."""

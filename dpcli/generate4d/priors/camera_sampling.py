@@ -1,4 +1,4 @@
-"""Random new cameras for a prior to judge."""
+"""Random new cameras, from which a prior judges the object."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ _ELEVATION = np.deg2rad(30.0)  # offsets drawn from +-30 degrees, azimuth from a
 def novel_cameras(
     targets: Targets, count: int, size: int, rng: torch.Generator
 ) -> tuple[list[tuple[float, float, float]], Tensor, Tensor]:
-    """(azimuth, elevation, radius) offsets from the reference, world_to_camera (count,4,4), intrinsics (count,3,3)."""
+    """Returns random cameras: offsets (azimuth, elevation, radius) from the reference, poses and intrinsics f32.
+
+    The poses are world_to_camera (count,4,4), the intrinsics (count,3,3) are of square pictures of `size` pixels.
+    """
     azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
     drawn = torch.rand(count, 2, generator=rng).numpy()
     heights = np.clip(elevation + (drawn[:, 1] * 2 - 1) * _ELEVATION, -1.5, 1.5)  # never straight above or below

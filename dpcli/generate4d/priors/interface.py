@@ -1,4 +1,4 @@
-"""The interface that all priors share."""
+"""The interface of a prior: it judges renders from cameras that the video doesn't show."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Prior(Protocol):
         self,
         reference_frames: np.ndarray,  # [T, H, W, 4]
     ) -> None:
-        """Called once before the first loss. reference_frames: the video, u8 RGBA with straight alpha."""
+        """Gets ready; called once before the first loss. reference_frames: the video, u8 RGBA with straight alpha."""
 
     def loss(
         self,
@@ -32,7 +32,7 @@ class Prior(Protocol):
         progress: float,
         generator: torch.Generator,
     ) -> torch.Tensor:  # scalar
-        """Loss of B renders, RGB in 0..1 on white, of `frames` (indices into the video) seen by `cameras`.
+        """Returns the loss of B renders, RGB in 0..1 on white, of `frames` (indices into the video) seen by `cameras`.
 
         progress: share of the fit that is done, 0..1. generator: the only source of randomness.
         """

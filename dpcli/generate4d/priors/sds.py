@@ -1,7 +1,8 @@
-"""Score distillation from Zero123, a diffusion model that knows how an object looks from another camera.
+"""Score distillation sampling (SDS, Poole et al. 2022) from Zero123, which knows an object from another camera.
 
 Equation C.11 of the thesis: the gradient w(t) (eps_hat(z_t; reference, camera, t) - eps) flows through the VAE's encoder
-into the render. Where the thesis is silent the settings are SC4D's: guidance 5, w(t) = 1 - abar_t, annealed t.
+into the render. Where the thesis is silent the settings are those of SC4D (Wu et al. 2024): guidance 5,
+w(t) = 1 - abar_t, annealed t.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def camera_scalars(
     cameras: Sequence[RelativeCamera],  # B
     reference_elevation: float | None = None,
 ) -> torch.Tensor:  # [B, 4]
-    """f32: change of the polar angle (down is positive), sine and cosine of the change of azimuth, change of the radius.
+    """Returns what Zero123 is told of cameras, f32: change of the polar angle (down is positive), sine and cosine of that
+    of the azimuth, change of the radius.
 
     reference_elevation (radians, up is positive): for Stable Zero123, whose fourth scalar is the reference's polar angle
     pi/2 - elevation in place of the radius.
@@ -39,24 +41,36 @@ def camera_scalars(
 
 
 def annealed_timestep(progress: float, t_range: tuple[float, float], steps: int) -> int:
-    """round((1 - progress) steps), clipped to t_range (shares of `steps`): much noise first, details later (SC4D)."""
+    """Returns round((1 - progress) steps), clipped to t_range (shares of `steps`): much noise first, details later (SC4D).
+
+    >>> [annealed_timestep(progress, (0.2, 0.8), 1000) for progress in (0.0, 0.5, 1.0)]
+    [800, 500, 200]
+    """
     low, high = round(t_range[0] * steps), round(t_range[1] * steps)
     return min(max(round((1 - progress) * steps), low), high, steps - 1)
 
 
 def guided_noise(conditional: torch.Tensor, unconditional: torch.Tensor, scale: float) -> torch.Tensor:
-    """Classifier-free guidance (Ho and Salimans 2022): 1 is the conditional prediction, 0 the unconditional one."""
+    """Returns the noise of classifier-free guidance (Ho and Salimans 2022); scale 1: the conditional one, 0: the other."""
     return unconditional + scale * (conditional - unconditional)
 
 
-def distillation_loss(latents: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-    """Scalar whose derivative by latents (B,...) is gradient / B, gradient taken as constant. Its value: |gradient|^2 / 2B."""
+def sds_loss(latents: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+    """Returns the SDS loss, a scalar whose derivative by latents (B,...) is gradient / B, the gradient taken as constant.
+
+    gradient: w(t) (eps_hat - eps) (Poole et al. 2022). The value |gradient|^2 / 2B means nothing.
+
+    >>> latents = torch.zeros(2, 3, requires_grad=True)
+    >>> sds_loss(latents, torch.ones(2, 3)).backward()
+    >>> latents.grad.tolist()
+    [[0.5, 0.5, 0.5], [0.5, 0.5, 0.5]]
+    """
     target = (latents - gradient).detach()
     return 0.5 * functional.mse_loss(latents, target, reduction="sum") / len(latents)
 
 
-class Zero123:
-    """`Prior` by score distillation. The model is frozen; its conditioning on the video is computed once per frame.
+class ScoreDistillation:
+    """A `Prior` by score distillation sampling. The model is frozen; its conditioning is computed once for each frame.
 
     guidance_scale: classifier-free guidance. timestep: "annealed" by progress, or "random", uniform in t_range, one per
     view. t_range: shares of the model's steps; may be set anew between stages (SC4D: 0.6-0.8, then 0.2-0.8).
@@ -88,8 +102,8 @@ class Zero123:
         self._embedding = self._reference = torch.empty(0)  # [T, E] and [T, 4, h, w]
 
     @classmethod
-    def load(cls, model: str | None, device: str | torch.device = "auto", **options: Any) -> Zero123:
-        """From `--prior-model` (a folder or a hub id, see `load_zero123`) and the constructor's options."""
+    def load(cls, model: str | None, device: str | torch.device = "auto", **options: Any) -> ScoreDistillation:
+        """Returns the prior with the model of `--prior-model` (a folder or a hub id, see `load_zero123`) and these options."""
         device = choose_device(device) if isinstance(device, str) else device
         loaded = load_zero123(model, device)
         if device.type == "cpu":
@@ -101,7 +115,7 @@ class Zero123:
         self,
         reference_frames: np.ndarray,  # [T, H, W, 4]
     ) -> None:
-        """Encodes the video (u8 RGBA, straight alpha): composed on white, padded to a square, resized to image_size."""
+        """Encodes the video (u8 RGBA, straight alpha), composed on white, padded to a square, resized to image_size."""
         model, parts = self.model, []
         model.image_encoder.to(model.device)
         with Progress("encode the video", len(reference_frames), "frame") as progress:
@@ -121,7 +135,7 @@ class Zero123:
         progress: float,
         generator: torch.Generator,
     ) -> torch.Tensor:  # scalar
-        """Score distillation loss of square renders (RGB in 0..1, on white), mean over views; see `Prior.loss`.
+        """Returns the SDS loss of square renders (RGB in 0..1, on white), mean over views; see `Prior.loss`.
 
         Its derivative means something, its value doesn't. Views whose gradient overflows float16 add nothing; DpcError when
         all do. ValueError: `prepare` wasn't called, counts differ, renders not square.
@@ -134,7 +148,7 @@ class Zero123:
             abar = self.model.alphas_cumprod[timestep].to(latents.device)[:, None, None, None]
             noisy = abar.sqrt() * latents + (1 - abar).sqrt() * noise
             gradient = (1 - abar) * (self._noise_prediction(noisy, timestep, cameras, frames) - noise)
-        return distillation_loss(latents, _finite_views(gradient)).to(renders.device)
+        return sds_loss(latents, _finite_views(gradient)).to(renders.device)
 
     def _check(self, renders: torch.Tensor, cameras: Sequence[RelativeCamera], frames: Sequence[int]) -> None:
         if renders.ndim != 4 or renders.shape[-1] != 3 or renders.shape[1] != renders.shape[2]:
@@ -145,7 +159,7 @@ class Zero123:
             raise ValueError(f"frames {list(frames)}: prepare() was given {len(self._reference)} frames")
 
     def _latents(self, renders: torch.Tensor) -> torch.Tensor:
-        """f32 (B,4,h,w), scaled; the encoder's mean, whose spread is negligible beside the noise that is added."""
+        """Returns latents f32 (B,4,h,w), scaled: the encoder's mean, whose spread is negligible beside the noise that is added."""
         images = self._resized(renders.to(self.model.device).float().permute(0, 3, 1, 2))
         if images.requires_grad:
             images.register_hook(_finite_views)  # the encoder's backward pass is in half precision, too
@@ -168,7 +182,7 @@ class Zero123:
     def _noise_prediction(
         self, noisy: torch.Tensor, timestep: torch.Tensor, cameras: Sequence[RelativeCamera], frames: Sequence[int]
     ) -> torch.Tensor:
-        """f32 (B,4,h,w) eps_hat; without condition both the token and the reference's latent are zero."""
+        """Returns eps_hat f32 (B,4,h,w); without condition both the token and the reference's latent are zero."""
         token = self._tokens(cameras, frames)
         reference = self._reference[list(frames)]
         arguments = (torch.cat([noisy, noisy]), torch.cat([timestep, timestep]).to(noisy.device))
@@ -184,7 +198,7 @@ class Zero123:
         return self.model.unet(stacked, timestep, encoder_hidden_states=token).sample.float()
 
     def _tokens(self, cameras: Sequence[RelativeCamera], frames: Sequence[int]) -> torch.Tensor:
-        """(B,1,cross-attention width)"""
+        """Returns the conditioning tokens (B,1,cross-attention width)."""
         scalars = camera_scalars(cameras, self.reference_elevation).to(self._embedding)
         return self.model.camera_projection(torch.cat([self._embedding[list(frames)], scalars], 1))[:, None]
 
@@ -194,7 +208,7 @@ class Zero123:
         return functional.interpolate(images, (self.image_size,) * 2, mode="bilinear", antialias=True)
 
     def _clip_embedding(self, images: torch.Tensor) -> torch.Tensor:
-        """(B,E) of images (B,3,S,S) in 0..1: CLIP's own size and statistics."""
+        """Returns CLIP's embedding (B,E) of images (B,3,S,S) in 0..1, brought to CLIP's own size and statistics."""
         encoder = self.model.image_encoder
         size = (encoder.config.image_size,) * 2
         pixels = functional.interpolate(images, size, mode="bicubic", antialias=True).clamp(0, 1)
@@ -203,7 +217,7 @@ class Zero123:
 
 
 def _on_white(frames: np.ndarray) -> torch.Tensor:
-    """f32 (T,3,S,S) in 0..1 of u8 RGBA (T,H,W,4); the shorter side is padded with white, the picture stays centered."""
+    """Returns pictures u8 RGBA (T,H,W,4) as f32 (T,3,S,S) in 0..1 on white, square and centered."""
     rgba = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2).float() / 255
     image = rgba[:, :3] * rgba[:, 3:] + (1 - rgba[:, 3:])
     height, width = image.shape[-2:]

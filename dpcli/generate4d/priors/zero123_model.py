@@ -32,7 +32,7 @@ _VARIANTS = {True: ("fp16", "fp16_ema", "", "ema"), False: ("", "ema", "fp16", "
 
 @dataclass
 class Zero123Model:
-    """The frozen networks on one device in one precision, and the noise schedule."""
+    """Holds the frozen networks on one device in one precision, and the noise schedule."""
 
     unet: torch.nn.Module  # UNet2DConditionModel: noise from 4 noisy + 4 reference latent channels and one token
     vae: torch.nn.Module  # AutoencoderKL, encoder only
@@ -43,17 +43,19 @@ class Zero123Model:
 
     @property
     def device(self) -> torch.device:
+        """The device of all networks."""
         return self.camera_projection.weight.device
 
     @property
     def dtype(self) -> torch.dtype:
+        """The precision of all networks."""
         return self.camera_projection.weight.dtype
 
 
 def load_zero123(
     model: str | None, device: torch.device, *, half: bool | None = None, stable: bool | None = None
 ) -> Zero123Model:
-    """Zero123 or Stable Zero123 from `--prior-model`: a folder, or the id of a hub repository.
+    """Returns Zero123 or Stable Zero123 from `--prior-model`: a folder, or the id of a hub repository.
 
     half: float16; default: on CUDA only. stable: which camera scalars the model takes; default: Stable Zero123's when
     its name says "stable". The hub is asked only for an id that is not in its local cache. UsageError: no model named,
@@ -83,7 +85,7 @@ def load_zero123(
 
 
 def weight_file(names: Iterable[str], half: bool) -> tuple[str, str, bool] | None:
-    """(file name, variant, is safetensors) of the weights to take among a folder's files; None when there are none.
+    """Returns name, variant and whether it is safetensors, of the weights to take among a folder's files; None without any.
 
     Half precision prefers the fp16 files, otherwise plain ones; then safetensors before .bin.
     """
@@ -100,7 +102,7 @@ def weight_file(names: Iterable[str], half: bool) -> tuple[str, str, bool] | Non
 
 
 def missing_parts(files: Iterable[str], half: bool) -> list[str]:
-    """What a model with these files (paths relative to its folder, with /) lacks, e.g. `vae/config.json`, `unet weights`."""
+    """Returns what a model of these files (paths in its folder, with /) lacks, such as `vae/config.json`, `unet weights`."""
     files = set(files)
     missing = [f"{part}/{config}" for part, config in _CONFIGS.items() if config and f"{part}/{config}" not in files]
     for part in _CONFIGS:
@@ -142,7 +144,7 @@ def _files_of(folder: Path) -> list[str]:
 
 
 def _hub_folder(model: str, half: bool) -> Path:
-    """The cached copy of a hub repository; what of it is needed is fetched first when it isn't there."""
+    """Returns the cached copy of a hub repository, whose needed files are fetched first where they aren't there."""
     import huggingface_hub as hub
 
     try:
@@ -162,7 +164,7 @@ def _hub_folder(model: str, half: bool) -> Path:
 
 
 def _needed(files: list[str], half: bool) -> list[str]:
-    """Of a repository's files those to fetch: the configurations and one variant of each network's weights."""
+    """Returns the files of a repository to fetch: the configurations and one variant of each network's weights."""
     wanted = []
     for part, config in _CONFIGS.items():
         inside = [name.removeprefix(f"{part}/") for name in files if name.startswith(f"{part}/")]

@@ -7,13 +7,13 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from dpcli.generate4d.scene.motion import Motion
-from dpcli.generate4d.scene.quaternion import multiply, normalize, to_matrix
 from dpcli.ops.farthest_point_sampling import fps
 from dpcli.ops.nearest_neighbors import knn
+from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix
 
 
 class ControlPoints(nn.Module):
-    """K canonical positions (K,3) and log radii (K,), both learned; `neighbors` of them move each Gaussian."""
+    """Holds K canonical positions (K,3) and log radii (K), both learned; `neighbors` of them move each Gaussian."""
 
     def __init__(self, positions: Tensor, neighbors: int = 8) -> None:
         super().__init__()
@@ -24,16 +24,16 @@ class ControlPoints(nn.Module):
 
     @classmethod
     def among(cls, points: Tensor, count: int, neighbors: int = 8) -> ControlPoints:
-        """Farthest point sampling of at most `count` of the points (N,3)."""
+        """Returns at most `count` of the points (N,3) as control points, chosen by farthest point sampling."""
         chosen = fps(points.detach()[None], min(count, len(points)))[0]
         return cls(points[chosen], neighbors)
 
     def nearest(self, points: Tensor) -> Tensor:  # [N, 3] -> [N, k]
-        """Indices of the control points that will move each point."""
+        """Returns the indices of the control points that will move each point."""
         return knn(points.detach()[None], self.position.detach()[None], self.neighbors)[1][0]
 
     def weights(self, points: Tensor, nearest: Tensor) -> Tensor:  # [N, k]
-        """omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
+        """Returns omega of C.12: exp(-d^2 / radius^2), normalized over the neighbors; stable far from all of them."""
         squared = (points[:, None] - self.position[nearest]).square().sum(-1)
         return (-squared / (2 * self.log_radius[nearest]).exp()).softmax(-1)
 
@@ -43,12 +43,12 @@ class ControlPoints(nn.Module):
         nearest: Tensor,  # [N, k]
         motion: Motion,  # of the control points
     ) -> tuple[Tensor, Tensor]:  # [B, N, 3], [B, N, 4]
-        """Positions of canonical points at the motion's times, and the quaternions that turn their frames (eq. 5.8).
+        """Returns positions of canonical points at the motion's times, and quaternions that turn their frames (eq. 5.8).
 
         The motion's quaternions must lie in one hemisphere (w >= 0), as `MotionField` gives them, so that they can be averaged.
         """
         weights = self.weights(points, nearest)
-        matrix = to_matrix(motion.quaternion)  # [B, K, 3, 3]
+        matrix = quaternion_to_matrix(motion.quaternion)  # [B, K, 3, 3]
         shift = self.position + motion.displacement - (matrix @ self.position[..., None]).squeeze(-1)
         table = torch.cat([matrix.flatten(-2), shift, motion.quaternion], -1)  # [B, K, 16]
         count = len(table)
@@ -58,11 +58,11 @@ class ControlPoints(nn.Module):
         blended = blended.reshape(-1, count, 16).transpose(0, 1)
         matrix, shift, turn = blended.split([9, 3, 4], -1)
         moved = (matrix.unflatten(-1, (3, 3)) * points[:, None]).sum(-1) + shift
-        return moved, normalize(turn)
+        return moved, normalize_quaternion(turn)
 
 
 def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [N]
-    """Mean distance of each point to its `count` nearest others; 0.01 where there is no other."""
+    """Returns the mean distance of each point to its `count` nearest others; 0.01 where there is no other."""
     count = min(count, len(points) - 1)
     if count < 1:
         return torch.full((len(points),), 0.01).to(points)
@@ -71,5 +71,5 @@ def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [
 
 
 def turn_frames(turn: Tensor, quaternion: Tensor) -> Tensor:  # [B, N, 4], [N, 4] -> [B, N, 4]
-    """A Gaussian's own quaternion after the turn."""
-    return multiply(turn, normalize(quaternion).expand_as(turn))
+    """Returns the quaternions of Gaussians after a turn."""
+    return multiply_quaternions(turn, normalize_quaternion(quaternion).expand_as(turn))

@@ -14,7 +14,9 @@ def temporal_loss(
     displacement: Tensor,  # [B, N, 3] taken as given
     part: Tensor,  # [B, N, S]
 ) -> Tensor:
-    """How badly one rigid motion per part (weighted Kabsch) explains where points went: eq. 5.3, mean over times.
+    """Returns temporal-change preservation, eq. 5.3: how badly one rigid motion per part explains where points went.
+
+    The motion is that of weighted Kabsch; the squared distance is averaged over points and times.
 
     The displacement is a target ("from the previous iteration"), so gradients reach the partition alone.
     """
@@ -28,13 +30,22 @@ def spatial_loss(
     part: Tensor,  # [B, N, S]
     neighbors: Tensor,  # [N, H] indices of points nearby; a row's own index fills what is missing
 ) -> Tensor:
-    """Mean L2 distance between the part probabilities of a point and its neighbors: eq. 5.4."""
+    """Returns spatial coherence, eq. 5.4: the mean distance between part probabilities of a point and its neighbors.
+
+    >>> parts = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
+    >>> round(spatial_loss(parts, torch.tensor([[1], [0]])).item(), 4)
+    1.4142
+    """
     difference = part[:, :, None] - part[:, neighbors]
     return (difference.square().sum(-1) + 1e-12).sqrt().mean()
 
 
 def ball_neighbors(points: Tensor, radius: float, count: int) -> Tensor:  # [N, 3] -> [N, count]
-    """Indices of up to `count` points within `radius`, nearest first, without the point; its own index fills the rest."""
+    """Returns up to `count` other points within `radius`, nearest first, as indices; a point's own index fills the rest.
+
+    >>> ball_neighbors(torch.tensor([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]), 1.5, 2).tolist()
+    [[1, 0], [0, 1], [2, 2]]
+    """
     own = torch.arange(len(points), device=points.device)[:, None]
     if len(points) < 2:
         return own

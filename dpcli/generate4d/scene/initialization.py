@@ -1,4 +1,4 @@
-"""Where the first Gaussians are put: in a sphere, in the inflated silhouette of one view, or in the hull of several.
+"""The first Gaussians of a fit: in a sphere, in the inflated silhouette of one view, or in the visual hull of several.
 
 A single view says nothing about depth: a fit that starts from a sphere settles on any shape with that picture, most of
 them flat. Inflation gives every silhouette point a thickness by its distance from the outline, as a drawing is read.
@@ -11,21 +11,50 @@ import torch
 from torch import Tensor
 
 from dpcli.errors import DataError
+from dpcli.generate4d.config import FitConfig
+from dpcli.generate4d.targets import Targets
+
+_ROUNDS, _CANDIDATES = 200, 20_000  # at most so many draws of so many points look for those inside a hull
 
 
-def in_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray:
-    """Positions f32 (count,3), uniform in the volume of a sphere about the origin."""
+def choose_start(config: FitConfig, targets: Targets) -> str:
+    """Returns `sphere`, `inflate` or `hull`: what the settings say, else the hull where more than two views carve one."""
+    if config.start != "auto":
+        return config.start
+    return "hull" if targets.num_views > 2 else "inflate"
+
+
+def first_points(
+    kind: str, config: FitConfig, targets: Targets, rng: np.random.Generator
+) -> tuple[Tensor, Tensor]:  # [N, 3], [N, 3]
+    """Returns positions and colors (0..1), f32, of the first Gaussians of the kind that `choose_start` returns."""
+    if kind == "sphere":
+        points = sample_sphere(config.gaussians, config.start_radius, rng)
+        return torch.from_numpy(points), torch.full((len(points), 3), 0.5)
+    reference, frame = targets.reference, targets.widest_frame()
+    if kind == "inflate":
+        camera = targets.intrinsics[reference], targets.world_to_camera[reference]
+        points, colors = inflate_silhouette(targets.picture(reference, frame), *camera, config.gaussians, rng)
+    else:
+        pictures = [targets.picture(view, frame) for view in range(targets.num_views)]
+        points, colors = carve_hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
+    return torch.from_numpy(points), torch.from_numpy(colors)
+
+
+def sample_sphere(count: int, radius: float, rng: np.random.Generator) -> np.ndarray:
+    """Returns positions f32 (count,3), uniform in the volume of a sphere about the origin."""
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return (direction * radius * np.cbrt(rng.random((count, 1)))).astype(np.float32)
 
 
-def inflated(
+def inflate_silhouette(
     rgba: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and colors (count,3) f32 that fill one picture (H,W,4, 0..1) with round thickness about the origin's depth.
+    """Returns positions and colors (count,3) f32 that fill a picture (H,W,4, 0..1) with round thickness.
 
-    The thickness is that of `ball_thickness`. Colors are the pixel's, on the far side as well.
+    The thickness is that of `ball_thickness`, half before and half behind the depth of the world's origin; colors are the
+    pixel's, on the far side as well. Raises DataError for an empty picture.
     """
     mask = rgba[..., 3] > 0.5
     if not mask.any():
@@ -52,8 +81,10 @@ def inflated(
 
 
 def ball_thickness(mask: np.ndarray) -> np.ndarray:
-    """Half the thickness (H,W) in pixels of a silhouette blown up into the union of the balls of its medial axis: a disc
-    becomes a ball, a limb a rod. At least half a pixel inside the mask, 0 outside."""
+    """Returns half the thickness (H,W) in pixels of a silhouette that is the union of the balls of its medial axis.
+
+    A disc becomes a ball, a limb a rod. The thickness is at least half a pixel inside the mask and 0 outside.
+    """
     from scipy import ndimage
 
     distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
@@ -70,46 +101,58 @@ def ball_thickness(mask: np.ndarray) -> np.ndarray:
     return np.where(mask, ndimage.gaussian_filter(np.sqrt(squared.clip(0.25)), 1.0), 0.0)
 
 
-def hull(
+def carve_hull(
     pictures: list[np.ndarray], intrinsics: np.ndarray, poses: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and colors (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
+    """Returns positions and colors (count,3) f32 inside the silhouettes of all views (V pictures (H,W,4), 0..1), rounded.
 
     The common hull of few silhouettes has corners that no view contradicts: two views at a right angle make a box of every
     body. With u the distance from a silhouette's middle line as a share of its half width, points are kept whose
     u_i^2 + u_j^2 is at most 1 for every two views that look across each other, which makes that box an ellipse.
-    A color is the mean over views, weighted toward the view whose camera is nearest to the point.
+    A color is the mean over views, weighted toward the view whose camera is nearest to the point. Raises DataError when
+    no point lies in all silhouettes.
     """
-    offsets = [np.dstack([picture, _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
     across = np.abs(poses[:, 2, :3] @ poses[:, 2, :3].T) < 0.7  # viewing directions at more than 45 degrees
+    pairs = list(zip(*np.nonzero(np.triu(across))))
+    masked = [np.dstack([picture[..., 3], _share_of_width(picture[..., 3] > 0.5)]) for picture in pictures]
     kept: list[np.ndarray] = []
-    total = 0
-    for _ in range(200):
-        points = in_sphere(20_000, 0.85, rng)
-        seen = np.stack([_sample(o, points, k, p)[0][:, 3:] for o, k, p in zip(offsets, intrinsics, poses)])
-        inside = (seen[..., 0] > 0.5).all(0)
-        squared = seen[..., 1] ** 2
-        for i, j in zip(*np.nonzero(np.triu(across))):
+    for _ in range(_ROUNDS):
+        points = sample_sphere(_CANDIDATES, 0.85, rng)
+        seen = np.stack(
+            [
+                _sample_picture(picture, points, matrix, pose)[0]
+                for picture, matrix, pose in zip(masked, intrinsics, poses)
+            ]
+        )
+        inside, squared = (seen[..., 0] > 0.5).all(0), seen[..., 1] ** 2
+        for i, j in pairs:
             inside &= squared[i] + squared[j] <= 1
         kept.append(points[inside])
-        total += int(inside.sum())
-        if total >= count:
+        if sum(map(len, kept)) >= count:
             break
-    if not total:
-        raise DataError("the silhouettes of the views have no point in common; are the cameras right?")
     points = np.concatenate(kept)[:count]
-    colors = np.zeros_like(points)
-    weights = np.zeros((len(points), 1), np.float32)
+    if not len(points):
+        raise DataError("the silhouettes of the views have no point in common; are the cameras right?")
+    return points, _mean_colors(points, pictures, intrinsics, poses)
+
+
+def _mean_colors(
+    points: np.ndarray, pictures: list[np.ndarray], intrinsics: np.ndarray, poses: np.ndarray
+) -> np.ndarray:  # [N, 3]
+    """Returns the colors of points f32, mean over views, weighted toward the nearest camera."""
+    colors, weights = np.zeros_like(points), np.zeros((len(points), 1), np.float32)
     for picture, matrix, pose in zip(pictures, intrinsics, poses):
-        values, depth = _sample(picture, points, matrix, pose)
+        values, depth = _sample_picture(picture, points, matrix, pose)
         weight = (np.exp(-8 * (depth - depth.min())) * values[:, 3])[:, None]
         colors, weights = colors + weight * values[:, :3], weights + weight
-    return points, (colors / np.maximum(weights, 1e-8)).astype(np.float32)
+    return (colors / np.maximum(weights, 1e-8)).astype(np.float32)
 
 
 def _share_of_width(mask: np.ndarray) -> np.ndarray:
-    """u (H,W): 0 on the middle line of a silhouette, 1 on its outline, from its distance d and ball thickness h:
-    h^2 = 2 R d - d^2 gives the half width R, and u = 1 - d / R."""
+    """Returns u (H,W), f32: 0 on the middle line of a silhouette, 1 on its outline and outside.
+
+    With d the distance from the outline and h the ball thickness, h^2 = 2 R d - d^2 gives the half width R, u = 1 - d / R.
+    """
     from scipy import ndimage
 
     distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
@@ -117,10 +160,10 @@ def _share_of_width(mask: np.ndarray) -> np.ndarray:
     return np.where(mask, (1 - distance / np.maximum(width, 1e-6)).clip(0, 1), 1.0).astype(np.float32)
 
 
-def _sample(
+def _sample_picture(
     picture: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel values (N,channels) under the points, zero outside the picture, and their depths (N,)."""
+    """Returns the pixel values (N,channels) under the points, zero outside the picture, and their depths (N)."""
     camera = points @ pose[:3, :3].T + pose[:3, 3]
     depth = np.maximum(camera[:, 2], 1e-6)
     column = np.floor(camera[:, 0] / depth * intrinsics[0, 0] + intrinsics[0, 2]).astype(int)
@@ -133,7 +176,7 @@ def _sample(
 
 
 def spread_seeds(points: Tensor, count: int) -> Tensor:
-    """`count` places spread over the points (N,3) by farthest point sampling, repeated when there are fewer points."""
+    """Returns `count` of the points (N,3), spread by farthest point sampling, repeated when there are fewer."""
     from dpcli.ops.farthest_point_sampling import fps
 
     chosen = fps(points.detach()[None], min(count, len(points)))[0]

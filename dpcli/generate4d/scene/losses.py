@@ -1,4 +1,4 @@
-"""Losses of the fit that are not about finding parts: pictures, silhouettes, shape."""
+"""The losses of a fit on pictures, silhouettes and shape; those that find parts are in `identification.py`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
+from dpcli.ops.rotations import nearest_rotation
 
 
 def picture_loss(
@@ -15,9 +16,9 @@ def picture_loss(
     background: Tensor,  # [C, 3]
     foreground: float,
 ) -> Tensor:
-    """Mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
-    wanted = target[..., :3] + (1 - target[..., 3:]) * background[:, None, None]
-    return (rendered - wanted).square().mean() + foreground * (alpha - target[..., 3:]).square().mean()
+    """Returns the mean squared error of colors on a background plus `foreground` times that of the silhouette (C.8 to C.10)."""
+    truth = target[..., :3] + (1 - target[..., 3:]) * background[:, None, None]
+    return (rendered - truth).square().mean() + foreground * (alpha - target[..., 3:]).square().mean()
 
 
 def arap_loss(
@@ -25,33 +26,27 @@ def arap_loss(
     moved: Tensor,  # [B, N, 3]
     neighbors: Tensor,  # [N, H]
 ) -> Tensor:
-    """As-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbors are from one rotation of them.
+    """Returns the as-rigid-as-possible energy (Sorkine and Alexa 2007): how far edges to neighbors are from one rotation.
 
     The best rotation of each point is found without gradient. A row's own index, where neighbors lack, adds nothing.
     """
-
     before = (rest[neighbors] - rest[:, None]).detach()  # [N, H, 3]
     after = moved[:, neighbors] - moved[:, :, None]  # [B, N, H, 3]
     with torch.no_grad():
         covariance = torch.einsum("bnhi,nhj->bnij", after, before)
-        rotation = _nearest_rotation(covariance)
+        rotation = nearest_rotation(covariance)
     return (after - torch.einsum("bnij,nhj->bnhi", rotation, before)).square().sum(-1).mean()
 
 
-def _nearest_rotation(matrix: Tensor) -> Tensor:  # [..., 3, 3]
-    """U diag(1, 1, det) V^T."""
-    u, _, vh = torch.linalg.svd(matrix)
-    u = torch.cat([u[..., :2], u[..., 2:] * torch.det(u @ vh)[..., None, None]], -1)
-    return u @ vh
-
-
 def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:
-    """Needles and discs along the line of sight look right in the one picture and wrong in all others: the longest axis
-    beyond `aspect` times the geometric mean is penalized (log ratio)."""
+    """Returns how far the longest axes exceed `aspect` times the geometric mean of the three, as a log ratio, mean over N.
+
+    Needles and discs along the line of sight look right in the one picture and wrong in all others.
+    """
     log_scale = gaussians.log_scale
     return (log_scale.max(1).values - log_scale.mean(1) - torch.tensor(aspect).log()).relu().mean()
 
 
 def thickness_loss(gaussians: CanonicalGaussians, view_axis: Tensor) -> Tensor:
-    """Mean squared drift along the line of sight (unit vector (3,)) from where the start put each Gaussian."""
+    """Returns the mean squared drift along the line of sight (unit vector (3)) from where the start put each Gaussian."""
     return ((gaussians.mean - gaussians.anchor) @ view_axis).square().mean()

@@ -15,7 +15,7 @@ from dpcli.ops.splatting.rasterization import rasterization
 
 @dataclass
 class Instant:
-    """The Gaussians at B times, and the motion of what carries them (themselves, or the control points)."""
+    """Holds the Gaussians at B times, and the motion of their carriers: themselves, or the control points."""
 
     mean: Tensor  # [B, N, 3]
     quaternion: Tensor  # [B, N, 4]
@@ -37,17 +37,17 @@ class Model4D(nn.Module):
         self.nearest: Tensor | None = None  # [N, k] control points that move each Gaussian
 
     def start_control(self) -> None:
-        """From now on K control points, chosen among the Gaussians, carry them all."""
+        """Lets K control points, chosen among the Gaussians, carry them all from now on."""
         own = self.gaussians.mean
         self.control = ControlPoints.among(own, self.config.control_points, self.config.neighbors).to(own.device)
         self.nearest = None
 
     def refresh_neighbors(self) -> None:
-        """Look again which control points are nearest to each Gaussian."""
+        """Searches again for the control points nearest to each Gaussian."""
         self.nearest = self.control.nearest(self.gaussians.mean) if self.control is not None else None
 
     def at(self, times: Tensor) -> Instant:  # [B]
-        """Positions and orientations at times in 0..1: eq. 5.6 for the dense stage, eq. 5.8 for the sparse one."""
+        """Returns positions and orientations at times in 0..1: eq. 5.6 in the dense stage, eq. 5.8 in the sparse one."""
         own = self.gaussians
         if self.control is None:
             motion = self.field(own.mean, times)
@@ -63,7 +63,7 @@ class Model4D(nn.Module):
     def render(
         self, instant: Instant, viewmats: Tensor, intrinsics: Tensor, width: int, height: int, backgrounds: Tensor
     ) -> tuple[Tensor, Tensor, dict]:
-        """Colors (C,H,W,3) on the backgrounds (C,3), alphas (C,H,W,1), and the rasterizer's notes; camera c sees time c."""
+        """Returns colors (C,H,W,3) on the backgrounds (C,3), alphas (C,H,W,1), the rasterizer's notes; camera c sees time c."""
         own = self.gaussians
         return rasterization(
             instant.mean,

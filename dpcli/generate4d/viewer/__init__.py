@@ -1,24 +1,21 @@
-"""One HTML file that shows a scene: page, scripts and quantised data in it; no server, no network."""
+"""One HTML file that shows a scene: page, scripts and quantized data in it; no server, no network."""
 
 from __future__ import annotations
 
-import base64
 import html
-import json
-import zlib
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dpcli import __version__
+from dpcli.draw.page import assemble
+from dpcli.draw.page.assemble import SHARED, STYLE, as_base64, as_json, filled, script_text, source_text
 from dpcli.draw.palette import part_colors
 from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
 from dpcli.generate4d.out.picture_colors import WEIGHTS
 from dpcli.ops.cameras import orbit_of
-from dpcli.runtime.whole_file import write_whole
 from dpcli.store.gaussians import GaussianScene
 
 SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")
@@ -31,26 +28,20 @@ def write_page(
     """Write the page; returns its size in bytes. DataError when it can't be written. fps: frames of the clip per second,
     None = as videos play it (`clip_rate`).
 
-    Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colours, opacities and weights
-    to 1/255; colour terms that depend on the direction are left out. Equal scenes give equal bytes.
+    Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colors, opacities and weights
+    to 1/255; color terms that depend on the direction are left out. Equal scenes give equal bytes.
     """
     arrays = packed(scene)
     blob = b"".join(values.tobytes() for values in arrays.values())
     header = describe(scene, arrays, title=title, history=history, fps=fps or clip_rate(scene))
-    page = _filled(title, header, base64.b64encode(zlib.compress(blob, 9)).decode("ascii")).encode("utf-8")
-    write_whole(path, page)
-    return len(page)
-
-
-def _filled(title: str, header: dict[str, Any], data: str) -> str:
-    source = files(__package__)
-    script = "\n".join(source.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS)
-    inside = json.dumps(header, allow_nan=False, sort_keys=True).replace("<", "\\u003c")  # nothing may end the script
-    page = source.joinpath("page.html").read_text(encoding="utf-8")
-    for mark, content in (("TITLE", html.escape(title)), ("HEADER", inside), ("SCRIPT", script), ("DATA", data)):
-        before, after = page.split(f"<!--{mark}-->", 1)
-        page = before + content + after
-    return page
+    page = filled(
+        source_text("page.html", __package__),
+        {
+            "TITLE": html.escape(title), "STYLE": source_text(STYLE), "HEADER": as_json(header), "DATA": as_base64(blob),
+            "SCRIPT": f"{script_text(SHARED)}\n{script_text(SCRIPTS, __package__)}",
+        },
+    )  # fmt: skip
+    return assemble.write_page(page, path)
 
 
 def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
@@ -62,7 +53,7 @@ def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
 def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
     """What the page reads, in its order. Moving things are differences to the frame before, which compress better;
     bytes of 16-bit numbers lie apart, low bytes first: position u8 (2,T,3,N), turn u8 (T,4,N), weight u8 (T,N), scale
-    f32 (3,N), colour u8 (4,N) with opacity, part u8 (N) = id + 1."""
+    f32 (3,N), color u8 (4,N) with opacity, part u8 (N) = id + 1."""
     low, extent = _box(scene)
     steps = np.rint((scene.frame_mean - low) / extent * _POSITIONS).astype(np.uint16).transpose(0, 2, 1)
     change = _differences(steps)
@@ -74,7 +65,7 @@ def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
         "turn": _differences(turns),
         "weight": _differences(weight),
         "scale": scene.scale.T.astype("<f4"),
-        "colour": rgba,
+        "color": rgba,
         "part": np.clip(scene.part + 1, 0, 255).astype(np.uint8),
     }
 
@@ -118,7 +109,7 @@ def describe(
             "fovy": 2 * float(np.arctan2(scene.size[1] / 2, lens[1, 1])),
         },
         "parts": [
-            {"id": int(i), "count": int(c), "colour": part_colors(np.array([i]))[0].tolist()}
+            {"id": int(i), "count": int(c), "color": part_colors(np.array([i]))[0].tolist()}
             for i, c in zip(ids, counts)
         ],
         "weights": WEIGHTS.tolist(),

@@ -9,7 +9,7 @@ class CanvasPainter {
     this.blobs = new Map();
   }
 
-  // A blob of a colour, made once; colours are rounded to 5 bits a channel.
+  // A blob of a color, made once; colors are rounded to 5 bits a channel.
   blob(r, g, b) {
     const key = ((r >> 3) << 10) | ((g >> 3) << 5) | (b >> 3);
     let found = this.blobs.get(key);

@@ -1,24 +1,10 @@
-// The scene: unpacking what the page carries, Gaussians at a time, their order from far to near.
-
-async function unpacked(text, bytes) {
-  const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const whole = new Uint8Array(await new Response(stream).arrayBuffer());
-  if (whole.length !== bytes) throw new Error(`the page is damaged: ${whole.length} bytes of data, expected ${bytes}`);
-  return whole;
-}
-
-// Frames are stored as differences to the frame before, modulo the type's range; typed arrays wrap by themselves.
-function summed(values, frame) {
-  for (let i = frame; i < values.length; i++) values[i] += values[i - frame];
-  return values;
-}
+// The scene: Gaussians at a time, their order from far to near.
 
 class Scene {
   constructor(header, blob) {
     const { count, frames, starts } = header;
     const cut = (name, length) => blob.slice(starts[name], starts[name] + length);
-    Object.assign(this, { header, count, frames, time: header.time });
+    Object.assign(this, { header, count, frames, timeline: new Timeline(header.time, header.rate, header.tail) });
     const bytes = cut("position", 6 * frames * count), planes = 3 * frames * count;
     const position = new Uint16Array(planes);
     for (let i = 0; i < planes; i++) position[i] = bytes[i] | (bytes[planes + i] << 8);
@@ -26,7 +12,7 @@ class Scene {
     this.turn = summed(new Int8Array(cut("turn", 4 * frames * count).buffer), 4 * count);
     this.weight = summed(cut("weight", frames * count), count);
     this.scale = new Float32Array(cut("scale", 12 * count).buffer);
-    this.colour = cut("colour", 4 * count);
+    this.color = cut("color", 4 * count);
     this.part = cut("part", count);
     this.mean = new Float32Array(3 * count);
     this.covariance = new Float32Array(6 * count);
@@ -36,22 +22,11 @@ class Scene {
     this.now = NaN;
   }
 
-  get start() { return this.time[0]; }
-  get length() { return this.time[this.frames - 1] - this.time[0]; }
-
-  // The frames around a time, and the weight of the later one.
-  between(time) {
-    let b = this.time.findIndex((value) => value > time);
-    if (b === 0) return [0, 0, 0];
-    if (b < 0) return [this.frames - 1, this.frames - 1, 0];
-    return [b - 1, b, (time - this.time[b - 1]) / (this.time[b] - this.time[b - 1])];
-  }
-
   moveTo(time) {
     if (time === this.now) return;
     this.now = time;
     const { count, position, turn, scale, mean, covariance, header } = this;
-    const [a, b, w] = this.between(time), step = header.extent.map((length) => length / 65535);
+    const [a, b, w] = this.timeline.between(time), step = header.extent.map((length) => length / 65535);
     for (let axis = 0; axis < 3; axis++) {
       const one = (3 * a + axis) * count, two = (3 * b + axis) * count;
       for (let i = 0; i < count; i++)
@@ -108,19 +83,17 @@ class Scene {
   }
 
   // r g b a (0..255) of all Gaussians.
-  colours(kind) {
-    const { count, colour, part, header } = this, out = this.rgba || (this.rgba = new Uint8ClampedArray(4 * count));
-    const byPart = new Map(header.parts.map((one) => [one.id + 1, one.colour]));
-    const [a, b, w] = this.between(this.now), stops = header.weights.length - 1;
+  colors(kind) {
+    const { count, color, part, header } = this, out = this.rgba || (this.rgba = new Uint8ClampedArray(4 * count));
+    const byPart = new Map(header.parts.map((one) => [one.id + 1, one.color]));
+    const [a, b, w] = this.timeline.between(this.now);
     for (let i = 0; i < count; i++) {
       let rgb;
       if (kind === "part") rgb = byPart.get(part[i]);
       else if (kind === "rigid") {
-        const value = ((1 - w) * this.weight[a * count + i] + w * this.weight[b * count + i]) / 255 * stops;
-        const k = Math.min(Math.floor(value), stops - 1), f = value - k, one = header.weights[k], two = header.weights[k + 1];
-        rgb = [one[0] + f * (two[0] - one[0]), one[1] + f * (two[1] - one[1]), one[2] + f * (two[2] - one[2])];
-      } else rgb = [colour[i], colour[count + i], colour[2 * count + i]];
-      out[4 * i] = rgb[0]; out[4 * i + 1] = rgb[1]; out[4 * i + 2] = rgb[2]; out[4 * i + 3] = colour[3 * count + i];
+        rgb = ramped(header.weights, ((1 - w) * this.weight[a * count + i] + w * this.weight[b * count + i]) / 255);
+      } else rgb = [color[i], color[count + i], color[2 * count + i]];
+      out[4 * i] = rgb[0]; out[4 * i + 1] = rgb[1]; out[4 * i + 2] = rgb[2]; out[4 * i + 3] = color[3 * count + i];
     }
     return out;
   }

@@ -1,14 +1,14 @@
-// Gaussians as blended quads, far to near (EWA splatting, Zwicker 2001; constants as in the fit's rasteriser).
+// Gaussians as blended quads, far to near (EWA splatting, Zwicker 2001; constants as in the fit's rasterizer).
 
 const VERTEX = `#version 300 es
 precision highp float;
-in vec2 corner; in vec3 centre; in vec3 spreadA; in vec3 spreadB; in vec4 colour;
+in vec2 corner; in vec3 center; in vec3 spreadA; in vec3 spreadB; in vec4 color;
 uniform mat3 rotation; uniform vec3 shift; uniform vec2 focal; uniform vec2 size;
 out vec2 place; out vec4 tint;
 void main() {
-  vec3 p = rotation * centre + shift;
-  tint = colour;
-  float reach = sqrt(max(2.0 * log(255.0 * colour.a), 0.0));
+  vec3 p = rotation * center + shift;
+  tint = color;
+  float reach = sqrt(max(2.0 * log(255.0 * color.a), 0.0));
   if (p.z < 0.02 || reach == 0.0) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
   vec2 limit = 1.3 * 0.5 * size / focal;
   vec2 t = clamp(p.xy / p.z, -limit, limit);
@@ -34,41 +34,29 @@ void main() {
   result = vec4(tint.rgb * alpha, alpha);
 }`;
 
-const FLOATS = 13;  // of one Gaussian: centre, covariance, colour
+const FLOATS = 13;  // of one Gaussian: center, covariance, color
 
 class GlPainter {
-  constructor(canvas, count) {
-    const gl = canvas.getContext("webgl2", { antialias: false, depth: false });
-    if (!gl) throw new Error("no WebGL 2");
-    this.gl = gl;
-    this.program = this.linked();
+  constructor(canvas, count, wake) {
     this.rows = new Float32Array(FLOATS * count);
+    this.gl = glContext(canvas, { antialias: false, depth: false }, (gl) => this.build(gl), wake);
+  }
+
+  build(gl) {
+    this.gl = gl;
+    this.program = glProgram(gl, VERTEX, FRAGMENT);
     gl.useProgram(this.program);
     this.attribute("corner", 2, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), 0, 0, 0);
     this.buffer = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.buffer);
     gl.bufferData(gl.ARRAY_BUFFER, this.rows.byteLength, gl.DYNAMIC_DRAW);
     let offset = 0;
-    for (const [name, size] of [["centre", 3], ["spreadA", 3], ["spreadB", 3], ["colour", 4]]) {
+    for (const [name, size] of [["center", 3], ["spreadA", 3], ["spreadB", 3], ["color", 4]]) {
       this.attribute(name, size, null, 4 * FLOATS, 4 * offset, 1);
       offset += size;
     }
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-  }
-
-  linked() {
-    const gl = this.gl, program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`shader: ${gl.getShaderInfoLog(shader)}`);
-      gl.attachShader(program, shader);
-    }
-    gl.linkProgram(program);
-    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(`program: ${gl.getProgramInfoLog(program)}`);
-    return program;
   }
 
   attribute(name, size, values, stride, offset, divisor) {
@@ -90,11 +78,11 @@ class GlPainter {
       for (let j = 0; j < 6; j++) rows[o + 3 + j] = covariance[6 * i + j];
       for (let j = 0; j < 4; j++) rows[o + 9 + j] = rgba[4 * i + j] / 255;
     }
-    const uniform = (name) => gl.getUniformLocation(program, name), R = camera.rotation;
+    const uniform = (name) => gl.getUniformLocation(program, name);
     gl.viewport(0, 0, camera.width, camera.height);
     gl.clearColor(...background.map((value) => value / 255), 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.uniformMatrix3fv(uniform("rotation"), false, [R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]]);
+    gl.uniformMatrix3fv(uniform("rotation"), false, asColumns(camera.rotation));
     gl.uniform3fv(uniform("shift"), camera.shift);
     gl.uniform2f(uniform("focal"), camera.focal, camera.focal);
     gl.uniform2f(uniform("size"), camera.width, camera.height);

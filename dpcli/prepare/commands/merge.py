@@ -24,30 +24,35 @@ from dpcli.store.writing.already_made import already_made
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Source:
-    """What the index of one file says; its points stay on the disk."""
+    """Holds what the index of one file says; its points stay on the disk.
+
+    made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped, where
+    the file is a shard. prefix: what goes before its samples' names in the joined file.
+    """
 
     path: Path
     class_names: list[str]
     length_unit: str
-    seed: int
-    made_by: str
-    names: list[str]
-    labels: list[int]
-    fields: tuple[str, ...]
-    provenance: list[dict[str, Any]]
-    skipped: list[tuple[str, str]]
-    positions: tuple[list[int], list[int]] | None
-    shard: Shard | None = field(default=None)
-    prefix: str = ""  # what goes before its samples' names
+    seed: int = 0
+    made_by: str = ""
+    names: list[str] = field(default_factory=list)
+    labels: list[int] = field(default_factory=list)
+    fields: tuple[str, ...] = ()
+    provenance: list[dict[str, Any]] = field(default_factory=list)
+    skipped: list[tuple[str, str]] = field(default_factory=list)
+    positions: tuple[list[int], list[int]] | None = None
+    shard: Shard | None = None
+    prefix: str = ""
 
     def sample_name(self, index: int) -> str:
+        """Returns the sample's name in the joined file."""
         return self.prefix + self.names[index]
 
 
 def read_source(path: Path) -> Source:
-    """The index of a clouds file; DataError when it is none."""
+    """Returns the index of a clouds file. Raises DataError when it is none."""
     if file_kind(path) != "clouds":
         raise DataError(
             f"{path}: holds {file_kind(path)}; merge and split take clouds files, as dpc prepare makes them"
@@ -56,28 +61,29 @@ def read_source(path: Path) -> Source:
         root = reader.attributes
         found = shard_of(reader.provenance[-1]) if reader.provenance else None
         return Source(
-            path,
-            reader.class_names,
-            reader.length_unit,
-            int(root.get("seed", 0)),
-            str(root.get("source", "")),
-            list(reader.names),
-            reader.labels.tolist(),
-            reader.fields,
-            reader.provenance,
-            reader.skipped,
-            read_positions(reader.file),
-            found[0] if found else None,
+            path=path,
+            class_names=reader.class_names,
+            length_unit=reader.length_unit,
+            seed=int(root.get("seed", 0)),
+            made_by=str(root.get("source", "")),
+            names=list(reader.names),
+            labels=reader.labels.tolist(),
+            fields=reader.fields,
+            provenance=reader.provenance,
+            skipped=reader.skipped,
+            positions=read_positions(reader.file),
+            shard=found[0] if found else None,
         )
 
 
 class OpenFiles:
-    """Readers by path, only the latest used of them open."""
+    """Keeps readers by path, only the latest used of them open."""
 
     def __init__(self) -> None:
         self._readers: OrderedDict[Path, CloudsReader] = OrderedDict()
 
     def read(self, path: Path, index: int) -> CloudSequence:
+        """Returns one sequence of a file, which is opened when it isn't."""
         if path not in self._readers:
             self._readers[path] = CloudsReader(path)
         self._readers.move_to_end(path)
@@ -87,6 +93,7 @@ class OpenFiles:
         return sequence
 
     def close(self) -> None:
+        """Closes all files."""
         for reader in self._readers.values():
             reader.close()
 
@@ -101,7 +108,7 @@ def merge(
     force: bool = False,
     resume: bool = True,
 ) -> Report:
-    """Join clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
+    """Joins clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
 
     All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
     whole's. Other files follow one another as given; their class lists must agree unless `labels` maps them.
@@ -143,17 +150,17 @@ def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool
     first = next(source for source in sources if source.names)
     samples = [(*places[place], None) for place in sorted(places)]
     skipped, compression = [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none"))
-    return _write(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
+    return _copy_samples(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
 
 
 def _whole_entry(sources: list[Source]) -> dict[str, Any]:
-    """The provenance that all shards share but for which they are; UsageError unless they are the pieces of one whole."""
+    """Returns the provenance that all shards share. Raises UsageError unless they are the pieces of one whole."""
     entries = [shard_of(source.provenance[-1])[1] for source in sources]  # type: ignore[index]
     first = sources[0]
     for source, entry in zip(sources, entries):
         different = [key for key in ("config", "seed", "version") if entry.get(key) != entries[0].get(key)]
         if different or source.shard.count != first.shard.count:  # type: ignore[union-attr]
-            what = _difference(entries[0], entry) if different else f"{first.shard} and {source.shard}"
+            what = _differing_facts(entries[0], entry) if different else f"{first.shard} and {source.shard}"
             raise UsageError(f"{source.path}: is a shard of another conversion than {first.path} ({what})")
     count, seen = first.shard.count, {}  # type: ignore[union-attr]
     for source in sources:
@@ -170,7 +177,7 @@ def _whole_entry(sources: list[Source]) -> dict[str, Any]:
     return entries[0]
 
 
-def _difference(one: dict[str, Any], other: dict[str, Any]) -> str:
+def _differing_facts(one: dict[str, Any], other: dict[str, Any]) -> str:
     flat = [
         {**entry.get("config", {}), "seed": entry.get("seed"), "version": entry.get("version")}
         for entry in (one, other)
@@ -209,8 +216,9 @@ def _merge_unlike(
         "sources": [source.provenance for source in sources],
     }
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
-    pattern = Source(output, class_names, sources[0].length_unit, 0, "merge", [], [], fields, [], [], None)
-    return _write(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
+    unit = sources[0].length_unit
+    pattern = Source(path=output, class_names=class_names, length_unit=unit, made_by="merge", fields=fields)
+    return _copy_samples(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
 
 
 def _refuse_equal_names(sources: list[Source]) -> None:
@@ -226,7 +234,7 @@ def _refuse_equal_names(sources: list[Source]) -> None:
             seen[own] = source.path
 
 
-def _write(
+def _copy_samples(
     output: Path,
     entry: dict[str, Any],
     pattern: Source,
@@ -237,7 +245,7 @@ def _write(
     force: bool,
     resume: bool,
 ) -> Report:
-    """Copy (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
+    """Copies (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
     report = Report(skipped=skipped)
     if not force and already_made(output, entry, CloudsReader):
         log.info(f"{output}: already complete, made of the same files (--force makes it again)")
@@ -264,7 +272,7 @@ def _write(
             done = copied_before(writer, [source.sample_name(index) for source, index, _ in samples])
             bar.skip(done)
             for source, index, label in samples[done:]:
-                sequence = _relabeled(files.read(source.path, index), source, pattern, label)
+                sequence = _relabel(files.read(source.path, index), source, pattern, label)
                 writer.write(sequence)
                 bar.advance(1, frames=sequence.num_frames)
                 stop.check(f"{len(writer)} of {len(samples)} samples are kept")
@@ -275,7 +283,10 @@ def _write(
 
 
 def copied_before(writer: CloudsWriter, names: list[str]) -> int:
-    """How many of the samples, from the first on, a stopped run left; UsageError when it left others, which stay."""
+    """Returns how many samples, from the first on, a stopped run left.
+
+    Raises UsageError when it left others, which stay.
+    """
     done = len(writer.written_names)
     if writer.written_names != names[:done]:
         writer.keep = True
@@ -288,8 +299,8 @@ def copied_before(writer: CloudsWriter, names: list[str]) -> int:
     return done
 
 
-def _relabeled(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
-    """The sample as the joined file has it: its label, its name, and no field that others lack."""
+def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:
+    """Returns the sample as the joined file has it: its label, its name, and no field that others lack."""
     if label is not None:
         sequence.label = label
     sequence.name = source.prefix + sequence.name

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.articulated.object_splits import SPLITS
 from dpcli.prepare.commands.merge import Source, copied_before, read_source
+from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
@@ -24,7 +24,7 @@ from dpcli.store.writing.already_made import already_made
 
 @dataclass(frozen=True)
 class SplitChoice:
-    """How samples are divided: one of the three ways, or none, which keeps the splits that the file tells.
+    """Says how samples are divided: one of the three ways, or none, which keeps the splits that the file tells.
 
     subjects: per split the subject numbers, `{"train": (1, 3)}`; others are test. listed: a CSV `name,split`.
     fractions: of train, validation and test, drawn from `seed`; stratify: each class in these fractions; by_subject:
@@ -48,24 +48,29 @@ class SplitChoice:
                 raise UsageError(f"--fractions {self.fractions}: expected three numbers from 0 that sum to 1")
 
     def assign(self, source: Source, splits: Sequence[str], subjects: Sequence[int]) -> list[str]:
-        """The split of each sample, "" for those that go nowhere; DataError when the file lacks what is asked for."""
+        """Returns the split of each sample, "" for those that go nowhere.
+
+        Raises DataError when the file lacks what is asked for.
+        """
         if self.listed is not None:
-            return by_list(source, self.listed)
+            return splits_by_list(source, self.listed)
         if self.subjects is not None:
-            return by_subject(source, subjects, self.subjects)
+            return splits_by_subject(source, subjects, self.subjects)
         if self.fractions is not None:
             if self.by_subject and min(subjects) < 0:
                 raise DataError(f"{source.path}: subjects are not known of all samples; leave --by-subject out")
             groups = list(subjects) if self.by_subject else list(range(len(splits)))
             strata = source.labels if self.stratify and not self.by_subject else [0] * len(splits)
-            return by_fraction(groups, strata, self.fractions, self.seed)
+            return draw_splits(groups, strata, self.fractions, self.seed)
         if not any(splits):
             raise DataError(f"{source.path}: tells no splits; choose --list, --subjects or --fractions")
         return list(splits)
 
 
-def by_list(source: Source, path: Path) -> list[str]:
-    """From a CSV of name,split, with or without that header; names of samples that are not there are an error."""
+def splits_by_list(source: Source, path: Path) -> list[str]:
+    """Returns splits from a CSV of name,split, with or without that header; names of samples that are not there are an
+    error.
+    """
     try:
         rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
     except FileNotFoundError:
@@ -85,8 +90,11 @@ def by_list(source: Source, path: Path) -> list[str]:
     return [chosen.get(name, "") for name in source.names]
 
 
-def by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[int, ...]]) -> list[str]:
-    """Named subjects to their split, the others to test; DataError when a subject is unknown or named twice."""
+def splits_by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[int, ...]]) -> list[str]:
+    """Returns the named subjects' splits, test for the others.
+
+    Raises DataError for an unknown subject, UsageError for two splits.
+    """
     where: dict[int, str] = {}
     for split, numbers in wanted.items():
         for number in numbers:
@@ -100,10 +108,10 @@ def by_subject(source: Source, subjects: Sequence[int], wanted: dict[str, tuple[
     return [where.get(subject, "test") for subject in subjects]
 
 
-def by_fraction(
+def draw_splits(
     groups: Sequence[int], strata: Sequence[int], fractions: tuple[float, float, float], seed: int
 ) -> list[str]:
-    """A split per sample: equal `groups` stay together, each of `strata` is divided in these fractions.
+    """Draws a split per sample: equal `groups` stay together, each of `strata` is divided in these fractions.
 
     Of n groups in a stratum each split gets its share rounded down; the rest goes to the splits that lag most behind
     their share of all so far. The draw depends on the seed and the strata alone.
@@ -128,7 +136,7 @@ def by_fraction(
 def split(
     path: Path, output: Path, choice: SplitChoice, *, compression: str = "none", force: bool = False
 ) -> dict[str, int]:
-    """Write `output/SPLIT.h5` for each split, or, when `output` ends in .h5, one file whose samples have new splits.
+    """Writes `output/SPLIT.h5` for each split, or, when `output` ends in .h5, one file whose samples have new splits.
 
     -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams; stopped
     or killed, it goes on from the last sample when run again.

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
+from dpcli.draw.learning_curves import Curve, Panel, draw_learning_curves
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import log
@@ -49,17 +50,6 @@ def train_flow_estimator(
 
 
 def draw_flow_curves(rows: list[dict], path: Path) -> None:
-    """Draws the Chamfer distance in training and the end point error, where poses are known, over steps, as a PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.6, 3.8), layout="constrained")
-    axes = figure.add_subplot()
-    for key, label in (("chamfer", "Chamfer, training"), ("validation_epe", "end point error, validation")):
-        known = [(row["step"], row[key]) for row in rows if row.get(key) is not None]
-        if known:
-            axes.plot(*zip(*known), label=label)
-    axes.set(xlabel="step", ylabel="object diameters", title="flow estimator")
-    axes.set_ylim(bottom=0)
-    if axes.get_lines():
-        axes.legend(frameon=False)
-    figure.savefig(path, dpi=120)
+    """Draws the Chamfer distance in training, and the end point error where poses are known, over steps, as a PNG."""
+    curves = [Curve("chamfer", "Chamfer, training"), Curve("validation_epe", "end point error, validation")]
+    draw_learning_curves(rows, [Panel("flow estimator", curves, "object diameters", (0, None))], path, "step")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dpcli.ops.rotations import mean_rotation, normalize_quaternion, quaternion_to_matrix
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS, RotationGroup
 
@@ -23,34 +24,6 @@ def relative_labels(rotation: Tensor, group: RotationGroup) -> tuple[Tensor, Ten
     turned = torch.einsum("gij,...ik->...gjk", anchors, rotation)  # R_a^T T
     label = torch.einsum("...gjk,lkj->...gl", turned, anchors).argmax(-1)
     return label, turned @ anchors[label]
-
-
-def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """Returns the rotation (...,3,3) of quaternions (...,4), (w,x,y,z), of any length."""
-    w, x, y, z = nn.functional.normalize(quaternion, dim=-1, eps=1e-8).unbind(-1)
-    rows = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
-def mean_rotation(rotations: Tensor, weights: Tensor) -> Tensor:
-    """Returns the weighted chordal mean (...,3,3) of rotations (...,M,3,3), weights (...,M).
-
-    It is the rotation nearest to the weighted sum.
-    """
-    left, _, right = torch.linalg.svd((weights[..., None, None] * rotations).sum(-3))
-    sign = torch.linalg.det(left @ right)
-    scale = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    return (left * scale[..., None, :]) @ right
 
 
 class MotionHead(nn.Module):
@@ -104,7 +77,7 @@ class MotionHead(nn.Module):
         anchors = self.group.rotations_like(confidence)
         weight, target = confidence.topk(min(best, confidence.shape[-1]), -1)  # [B, S, a, k]
         picked = residual.gather(3, target[..., None].expand(*target.shape, 4))
-        turned = quaternion_to_matrix(picked)  # r ~ R_a^T T^T R_l
+        turned = quaternion_to_matrix(normalize_quaternion(picked))  # r ~ R_a^T T^T R_l
         rotation = anchors[target] @ turned.mT @ anchors[:, None].mT  # T = R_l r^T R_a^T
         means = mean_rotation(rotation.transpose(2, 3), weight.transpose(2, 3))
         top = weight[..., 0].argmax(-1)[..., None, None, None, None].expand(-1, -1, 1, 1, 3, 3)
@@ -121,7 +94,7 @@ def rotation_loss(
     """
     label, wanted = relative_labels(rotation.mT, group)
     at = residual.gather(3, label[..., None, None].expand(*label.shape, 1, 4)).squeeze(3)
-    error = (quaternion_to_matrix(at) - wanted).square().mean((-1, -2))
+    error = (quaternion_to_matrix(normalize_quaternion(at)) - wanted).square().mean((-1, -2))
     chosen = confidence.gather(3, label[..., None]).squeeze(-1).clamp(min=1e-8).log()
     return (weight[..., None] * (error - 0.1 * chosen)).sum() / (weight.sum() * label.shape[-1]).clamp(min=1e-6)
 

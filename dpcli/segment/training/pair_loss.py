@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import apply_motions, weighted_kabsch
+from dpcli.ops.rotations import normalize_quaternion, quaternion_to_matrix
 from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.flow.rigid_groups import rigid_groups
-from dpcli.segment.network.motion_head import quaternion_to_matrix, rotation_loss
+from dpcli.segment.network.motion_head import rotation_loss
 from dpcli.segment.network.part_network import FrameParts, PartNetwork
 from dpcli.segment.network.slot_matching import match_slots, permute_slots
 from dpcli.segment.smoothness import smoothness_loss, smoothness_neighbors
@@ -187,6 +188,6 @@ def _supervised(model: PartNetwork, batch: Batch, frames: FrameParts, objective:
 def turn_randomly(points: Tensor, rng: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
     """Returns each pair (frames b and b + B) turned by a rotation of its own: points (2B,N,3), rotations (2B,3,3)."""
     half = len(points) // 2
-    rotation = quaternion_to_matrix(torch.randn(half, 4, generator=rng)).to(points)
+    rotation = quaternion_to_matrix(normalize_quaternion(torch.randn(half, 4, generator=rng))).to(points)
     rotation = torch.cat([rotation, rotation])
     return points @ rotation.mT, rotation

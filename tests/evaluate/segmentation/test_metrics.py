@@ -23,8 +23,9 @@ from dpcli.evaluate.segmentation.metrics import (
     segmentation_merge,
     segmentation_update,
 )
-from dpcli.evaluate.segmentation.part_matching import match_parts, mean_iou, rand_index
+from dpcli.evaluate.segmentation.part_matching import match_parts, mean_iou
 from dpcli.evaluate.segmentation.protocol import compressed_over_pairs, evaluate_segmentation
+from dpcli.evaluate.segmentation.rand_index import rand_index
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 
 TOLERANCE = 1e-6

@@ -12,10 +12,12 @@ from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
 from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.choices import parse_video_metrics
 from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
-from dpcli.evaluate.video.image_metrics import PSNR_CAP, psnr, ssim, ssim_reference
-from dpcli.evaluate.video.protocol import PROTOCOLS, parse_metrics
-from dpcli.evaluate.video.sources import open_source
+from dpcli.evaluate.video.protocol import PROTOCOLS, video_protocol
+from dpcli.evaluate.video.psnr import PSNR_CAP, psnr
+from dpcli.evaluate.video.sources.open_source import open_source
+from dpcli.evaluate.video.ssim import ssim, ssim_reference
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader, ViewsWriter
@@ -88,7 +90,7 @@ def numbers(report: VideoReport, name: str) -> list[float]:
 
 @pytest.mark.parametrize("background", ["white", "black"])
 def test_the_numbers_of_every_view_by_hand(said: Path, truth: Path, background: str) -> None:
-    report = evaluate_video(said, truth, background=background)
+    report = evaluate_video(said, truth, protocol=video_protocol("dpc", background))
     ours, theirs = (white(c, background == "white") for c in (clip(1, noise=6), clip()))
     for v in range(4):
         errors = ((ours[v] - theirs[v]) ** 2).mean((1, 2, 3))
@@ -171,7 +173,7 @@ def test_protocols_differ_where_they_say(said: Path, truth: Path) -> None:
     with pytest.raises(UsageError, match="--protocol svd: expected dpc, thesis, consistent4d, disco, torchmetrics"):
         evaluate_video(said, truth, protocol="svd")
     with pytest.raises(UsageError, match="--background red"):
-        evaluate_video(said, truth, background="red")
+        evaluate_video(said, truth, protocol=video_protocol("dpc", "red"))
 
 
 @pytest.mark.parametrize("name", ["{}.png", "{:03d}_rgba.png", "frame_{:04d}.webp"])
@@ -332,12 +334,12 @@ def test_masks_without_an_object(tmp_path: Path, truth: Path) -> None:
 def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> None:
     with pytest.raises(DataError, match="32x24; ms_ssim needs at least 176 pixels"):
         evaluate_video(said, truth, metrics=("ms_ssim",))
-    assert parse_metrics("ssim, psnr") == ("psnr", "ssim") and parse_metrics(None) is None
+    assert parse_video_metrics("ssim, psnr") == ("psnr", "ssim") and parse_video_metrics(None) is None
     for wrong in ("psnr,lpip", "", ","):
         with pytest.raises(
             UsageError, match="expected some of psnr,psnr_foreground,ssim,ms_ssim,lpips,.*,parts,tracks"
         ):
-            parse_metrics(wrong)
+            parse_video_metrics(wrong)
     with pytest.raises(DataError, match="--metrics parts needs a gaussians file and a views file, not a views file"):
         evaluate_video(said, truth, metrics=("parts",))
 
@@ -394,7 +396,7 @@ def test_the_command_prints_tables_markdown_and_a_strip(said: Path, truth: Path,
     assert "over white" in result.stdout and "data range 1.0" in result.stdout
     with Image.open(strip) as image:
         pixels = np.asarray(image.convert("RGB")).astype(int)
-    first = pixels[18 : 18 + 24, 4 : 4 + 32]  # truth of view 0, frame 0: pictures smaller than a cell keep their size
+    first = pixels[22 : 22 + 24, 4 : 4 + 32]  # truth of view 0, frame 0: pictures smaller than a cell keep their size
     assert np.abs(first / 255 - white(clip()[0, 0]))[10:, 10:].max() < 0.01  # but for the frame's number
     assert isinstance(run(said, "--truth", truth, "--picture", tmp_path / "no" / "x.png").exception, DataError)
     assert isinstance(run(said, "--truth", truth, "--metrics", "parts", "--picture", strip).exception, UsageError)

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from sklearn.metrics import adjusted_rand_score
 
 from dpcli.errors import DataError
+from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index
 from dpcli.evaluate.video.part_discovery import (
     PART_NEIGHBORS,
     TRACK_NEIGHBORS,
-    _clusters,
-    adjusted_rand_index,
-    attach,
-    carry,
+    _kmeans_parts,
+    carry_points,
+    nearest_gaussians,
     part_score,
     surface_parts,
     track_score,
@@ -64,7 +64,7 @@ def test_attach_takes_the_nearest_and_a_point_on_a_gaussian_has_it_alone() -> No
     rng = np.random.default_rng(0)
     means, points, opacity = rng.normal(size=(60, 3)), rng.normal(size=(30, 3)), rng.uniform(0.2, 1, 60)
     points[0] = means[17]
-    index, weight = attach(points, means, opacity, 4)
+    index, weight = nearest_gaussians(points, means, opacity, 4)
     distance = np.linalg.norm(points[:, None] - means, axis=-1)
     assert np.array_equal(index, np.argsort(distance, 1)[:, :4])  # brute force
     near = np.take_along_axis(distance, index, 1)[1:]
@@ -77,10 +77,10 @@ def test_attach_passes_by_faint_gaussians_unless_there_are_no_others() -> None:
     means, point = np.arange(12.0)[:, None] * [1, 0, 0], np.array([[0.2, 0, 0]])
     opacity = np.full(12, 0.9)
     opacity[:3] = 0.01
-    assert sorted(attach(point, means, opacity, 4)[0][0]) == [3, 4, 5, 6]
-    assert sorted(attach(point, means, np.full(12, 0.01), 4)[0][0]) == [0, 1, 2, 3]
-    assert attach(point, means[:2], opacity[:2], 4)[0].shape == (1, 2)
-    assert np.allclose(attach(point, means, np.zeros(12), 4)[1], 0.25)  # nothing is visible: no NaN
+    assert sorted(nearest_gaussians(point, means, opacity, 4)[0][0]) == [3, 4, 5, 6]
+    assert sorted(nearest_gaussians(point, means, np.full(12, 0.01), 4)[0][0]) == [0, 1, 2, 3]
+    assert nearest_gaussians(point, means[:2], opacity[:2], 4)[0].shape == (1, 2)
+    assert np.allclose(nearest_gaussians(point, means, np.zeros(12), 4)[1], 0.25)  # nothing is visible: no NaN
 
 
 def test_the_scenes_own_parts_are_found() -> None:
@@ -143,7 +143,7 @@ def test_points_of_a_rigid_scene_are_carried_exactly() -> None:
     scene, motion = rigid_scene(rng)
     local = rng.normal(size=(50, 3))  # far from any Gaussian, too
     truth = np.einsum("tij,mj->tmi", motion[:, :3, :3], local) + motion[:, None, :3, 3]
-    assert np.abs(carry(scene, truth[0], scene.time) - truth).max() < 2e-5  # float32 quaternions
+    assert np.abs(carry_points(scene, truth[0], scene.time) - truth).max() < 2e-5  # float32 quaternions
     score = track_score(scene, truth, scene.time)
     assert score.epe < 2e-5 < score.static and (score.points, score.frames) == (50, 3)
     frozen = replace(scene, frame_quaternion=np.tile(scene.frame_quaternion[:1], (4, 1, 1)))
@@ -178,10 +178,10 @@ def test_fewer_gaussians_than_neighbors() -> None:
     scene = toy_scene(per_part=1)
     assert scene.num_gaussians == 2 < TRACK_NEIGHBORS
     points = scene.frame_mean[0].astype(np.float64)
-    assert carry(scene, points, scene.time).shape == (5, 2, 3)
+    assert carry_points(scene, points, scene.time).shape == (5, 2, 3)
     assert list(surface_parts(scene, points, 0.0)) == [0, 1]
 
 
 def test_any_seed_serves_k_means():
     points = np.random.default_rng(0).normal(size=(40, 3))
-    assert len(np.unique(_clusters(points, 3, 2**40 + 1))) == 3
+    assert len(np.unique(_kmeans_parts(points, 3, 2**40 + 1))) == 3

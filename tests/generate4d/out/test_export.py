@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.generate4d.commands.output import run_export
-from dpcli.generate4d.out.export import as_sequence, export_sequence, thinned
+from dpcli.generate4d.commands.export import export_scene
+from dpcli.generate4d.out.export import as_sequence, export_sequence, keep_opaque
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
 from dpcli.prepare.decode.open3d_import import load_open3d
 from dpcli.store import CloudsReader, PartsReader
@@ -188,20 +188,18 @@ def test_faint_gaussians_and_surplus_points_are_left_out(scene):
     assert len(few.frame(2)) == 50 and set(few.track) <= set(sequence.track)
     np.testing.assert_array_equal(few.frame(2), (faint.frame_mean[2] * [1, -1, -1])[few.track[:50]].astype(np.float32))
     with pytest.raises(DataError, match="the most opaque has 0.9"):
-        as_sequence(faint, "toy", least=0.95)
-    less = thinned(faint, 0.3)
+        as_sequence(faint, "toy", min_opacity=0.95)
+    less = keep_opaque(faint, 0.3)
     less.validate()
     assert less.num_gaussians == 200 and len(less.control_point) == 6
 
 
 def test_the_command_says_what_it_cannot_do(scene_file, tmp_path):
-    usual = {"time": None, "axes": "player", "least": None, "points": None, "seed": 0, "force": False}
+    usual = {"time": None, "axes": "player", "min_opacity": None, "points": None, "seed": 0, "force": False}
     for form, output, changes, says in (
-        ("obj", tmp_path / "a.obj", {}, "expected one of ply, ply-sequence"),
         ("ply", tmp_path / "a.splat", {}, "ends in .ply"),
         ("ply", "-", {}, "only --as clouds"),
         ("ply", tmp_path / "clip", {"time": 0.5}, "--time is of one file"),
-        ("ply", tmp_path / "a.ply", {"axes": "up"}, "expected one of player, keep"),
         ("splat-sequence", tmp_path / "clip", {"time": 0.5}, "name it with --as splat -o FILE.splat"),
         ("clouds", tmp_path / "a.h5", {"time": 0.5}, "--time is of one file: name it with --as ply -o FILE.ply"),
         ("cameras", tmp_path / "a.json", {"time": 0.0}, "--time is of one file"),
@@ -210,12 +208,12 @@ def test_the_command_says_what_it_cannot_do(scene_file, tmp_path):
         ("cameras", tmp_path / "notes.txt", {}, "ends in .json"),
     ):
         with pytest.raises(UsageError, match=says):
-            run_export(str(scene_file), str(output), form=form, **{**usual, **changes})
+            export_scene(str(scene_file), str(output), form=form, **{**usual, **changes})
     assert not list(tmp_path.iterdir())
 
 
 def test_cameras_and_metrics_replace_nothing_unasked(scene_file, tmp_path, monkeypatch):
-    usual = {"time": None, "axes": "player", "least": None, "points": None, "seed": 0}
+    usual = {"time": None, "axes": "player", "min_opacity": None, "points": None, "seed": 0}
     for form, name in (
         ("cameras", "notes.txt"),
         ("metrics", "scene.h5"),
@@ -224,7 +222,7 @@ def test_cameras_and_metrics_replace_nothing_unasked(scene_file, tmp_path, monke
     ):
         (tmp_path / name).write_bytes(b"mine")
         with pytest.raises(UsageError, match="--force replaces it" if name == "mine.json" else "ends in .json"):
-            run_export(str(scene_file), str(tmp_path / name), form=form, force=False, **usual)
+            export_scene(str(scene_file), str(tmp_path / name), form=form, force=False, **usual)
         assert (tmp_path / name).read_bytes() == b"mine"
     written = Path.write_bytes
 
@@ -236,19 +234,19 @@ def test_cameras_and_metrics_replace_nothing_unasked(scene_file, tmp_path, monke
     monkeypatch.setattr(Path, "write_bytes", half)
     for form, name in (("metrics", "mine.json"), ("ply", "mine.ply")):
         with pytest.raises(DpcError, match=f"{name}: no space left"):
-            run_export(str(scene_file), str(tmp_path / name), form=form, force=True, **usual)
+            export_scene(str(scene_file), str(tmp_path / name), form=form, force=True, **usual)
         assert (tmp_path / name).read_bytes() == b"mine"
     monkeypatch.undo()
-    run_export(str(scene_file), str(tmp_path / "mine.json"), form="metrics", force=True, **usual)
+    export_scene(str(scene_file), str(tmp_path / "mine.json"), form="metrics", force=True, **usual)
     assert json.loads((tmp_path / "mine.json").read_text()) == {"psnr": 31.5}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.json", "mine.ply", "notes.txt", "scene.h5"]
     with pytest.raises(DataError, match="cannot be written"):
-        run_export(str(scene_file), str(tmp_path / "no" / "a.json"), form="cameras", force=False, **usual)
+        export_scene(str(scene_file), str(tmp_path / "no" / "a.json"), form="cameras", force=False, **usual)
 
 
 def test_single_files_and_an_instant(scene_file, tmp_path):
-    usual = {"form": "ply", "axes": "player", "least": None, "points": None, "seed": 0, "force": False}
-    run_export(str(scene_file), str(tmp_path / "a.ply"), time=1.0, **usual)
+    usual = {"form": "ply", "axes": "player", "min_opacity": None, "points": None, "seed": 0, "force": False}
+    export_scene(str(scene_file), str(tmp_path / "a.ply"), time=1.0, **usual)
     blue = _open3d(tmp_path / "a.ply")["positions"][-1] * [1, -1, -1]
     start = toy_scene().mean[-1] - HINGE
     c, s = np.cos(SWING), np.sin(SWING)
@@ -256,7 +254,7 @@ def test_single_files_and_an_instant(scene_file, tmp_path):
         blue, HINGE + [c * start[0] - s * start[1], s * start[0] + c * start[1], start[2]], atol=1e-5
     )
     with pytest.raises(UsageError, match="--force"):
-        run_export(str(scene_file), str(tmp_path / "a.ply"), time=None, **usual)
+        export_scene(str(scene_file), str(tmp_path / "a.ply"), time=None, **usual)
 
 
 def test_an_export_flows_into_the_segmenter(dpc, scene_file, tmp_path):

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import typer
 
-from dpcli.cli.generate4d.output import render
-from dpcli.draw.animation import output_kind, write_pictures
+from dpcli.cli.generate4d.render import render
 from dpcli.draw.palette import PALETTE, part_colors
-from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, plan
+from dpcli.errors import UsageError
+from dpcli.generate4d.out.camera_paths import Lens, clip_rate, default_rate, instants, plan_shots
 from dpcli.generate4d.out.picture_colors import WEIGHTS, parse_background, weight_colors
-from dpcli.generate4d.out.render import Look, Renderer, render_views, sheet
+from dpcli.generate4d.out.render import Look, Renderer, render_views
+from dpcli.generate4d.render_settings import CATALOG
 from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.store import ViewsHeader, ViewsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
@@ -37,14 +36,14 @@ def renderer(scene) -> Renderer:
 
 
 def test_the_reference_path_is_the_input_frame_by_frame(scene):
-    shots = plan(scene, "reference")
+    shots = plan_shots(scene, "reference")
     assert [shot.time for shot in shots] == pytest.approx(scene.time[:5].tolist(), abs=1e-6)
     assert all((shot.world_to_camera == scene.camera_world_to_camera[0]).all() for shot in shots)
     assert (shots[0].intrinsics == scene.camera_intrinsics[0]).all() and shots[0].size == (48, 48)
 
 
 def test_a_turntable_loops_in_space_and_time(scene):
-    shots = plan(scene, "turntable", Lens(elevation=0.2))
+    shots = plan_shots(scene, "turntable", Lens(elevation=0.2))
     azimuths = np.unwrap([orbit_of(shot.world_to_camera)[0] for shot in shots])
     steps = np.diff(azimuths)
     np.testing.assert_allclose(steps, 2 * np.pi / len(shots), atol=1e-9)
@@ -61,18 +60,20 @@ def test_a_slow_or_fast_clip_shows_every_frame(rate, shown):
     clip = toy_scene(per_part=5, frames=8)
     clip = replace(clip, time=3 + np.arange(8) / rate)
     assert clip_rate(clip) == pytest.approx(shown)
-    assert [clip.time.searchsorted(shot.time, "right") - 1 for shot in plan(clip, "reference")] == list(range(8))
-    np.testing.assert_allclose([shot.time for shot in plan(clip, "fixed")], clip.time, atol=1e-6 / rate)
+    assert [clip.time.searchsorted(shot.time, "right") - 1 for shot in plan_shots(clip, "reference")] == list(range(8))
+    np.testing.assert_allclose([shot.time for shot in plan_shots(clip, "fixed")], clip.time, atol=1e-6 / rate)
     step = round(default_rate(clip, "turntable") / shown)  # pictures a frame
-    times = np.array([shot.time for shot in plan(clip, "turntable")])
+    times = np.array([shot.time for shot in plan_shots(clip, "turntable")])
     assert len(times) % (8 * step) == 0  # whole loops
     np.testing.assert_allclose(times[: 7 * step], 3 + np.arange(7 * step) / step / rate, atol=1e-6 / rate)
-    assert len(plan(clip, "fixed", fps=120)) == round(8 * 120 / shown)
+    assert len(plan_shots(clip, "fixed", fps=120)) == round(8 * 120 / shown)
 
 
 @pytest.mark.parametrize(("path", "azimuth", "elevation"), [("swing", 70, 0), ("orbit", 360, 40), ("fixed", 0, 0)])
 def test_paths_reach_as_far_as_they_should(scene, path, azimuth, elevation):
-    places = np.rad2deg([orbit_of(shot.world_to_camera)[:2] for shot in plan(scene, path, Lens(radius=3.0), frames=72)])
+    places = np.rad2deg(
+        [orbit_of(shot.world_to_camera)[:2] for shot in plan_shots(scene, path, Lens(radius=3.0), frames=72)]
+    )
     reach = np.ptp(np.unwrap(places[:, 0], period=360)), np.ptp(places[:, 1])
     assert reach == pytest.approx((azimuth * (71 / 72 if path == "orbit" else 1), elevation), abs=0.5)
 
@@ -80,30 +81,34 @@ def test_paths_reach_as_far_as_they_should(scene, path, azimuth, elevation):
 def test_size_and_field_of_view(scene):
     wide = replace(scene, size=(96, 48))
     for lens, size in ((Lens(), (96, 48)), (Lens(size=192), (192, 96)), (Lens(size=192, fovy=1.0), (192, 96))):
-        shot = plan(wide, "fixed", lens, frames=1)[0]
+        shot = plan_shots(wide, "fixed", lens, frames=1)[0]
         assert shot.size == size
         focal = 48 / math.tan(0.5) if lens.fovy else scene.camera_intrinsics[0, 1, 1] * size[1] / 48
         assert shot.intrinsics[1, 1] == pytest.approx(focal)
 
 
 def test_a_still_instant_and_a_scene_of_one_frame(scene):
-    assert [shot.time for shot in plan(scene, "fixed", time=0.3)] == [0.3]
-    assert {shot.time for shot in plan(scene, "turntable", time=0.3)} == {0.3}
+    assert [shot.time for shot in plan_shots(scene, "fixed", time=0.3)] == [0.3]
+    assert {shot.time for shot in plan_shots(scene, "turntable", time=0.3)} == {0.3}
     one = toy_scene(per_part=5, frames=1)
-    assert len(plan(one, "reference")) == 1 and len(plan(one, "turntable")) == 120
+    assert len(plan_shots(one, "reference")) == 1 and len(plan_shots(one, "turntable")) == 120
 
 
-def test_wrong_cameras_are_refused(scene):
-    for wrong, says in (
-        (lambda: Lens(radius=0), "--radius 0"),
-        (lambda: Lens(fovy=math.pi), "--fovy 180"),
-        (lambda: Lens(elevation=2), "--elevation 114"),
-        (lambda: Lens(size=4), "--size 4"),
-        (lambda: plan(scene, "spiral"), "--path spiral: expected one of turntable"),
-        (lambda: Look("shape"), "--color shape"),
-    ):
-        with pytest.raises(UsageError, match=says):
-            wrong()
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("radius=0", "radius = 0: expected a number above 0"),
+        ("fovy=180", "fovy = 180: expected a number above 0 and below 180"),
+        ("elevation=114", "elevation = 114: expected at least -90 and at most 90"),
+        ("size=4", "size = 4: expected at least 8"),
+        ("fps=0.5", "fps = 0.5: expected at least 1"),
+        ("path=spiral", "path = spiral: expected one of turntable"),
+        ("color=shape", "color = shape: expected one of appearance"),
+    ],
+)
+def test_wrong_cameras_are_refused(word, says):
+    with pytest.raises(UsageError, match=says):
+        CATALOG.parse_set([word])
 
 
 # --- what is drawn
@@ -117,14 +122,14 @@ def _blue(picture: np.ndarray) -> np.ndarray:
 
 def test_things_are_where_the_camera_sees_them_at_every_time(scene, renderer):
     for time in (0.0, 0.6, 1.0):
-        shot = plan(scene, "fixed", time=time)[0]
+        shot = plan_shots(scene, "fixed", time=time)[0]
         camera = scene.at(time)[0][scene.part == 1] @ shot.world_to_camera[:3, :3].T + shot.world_to_camera[:3, 3]
         expected = (camera @ shot.intrinsics.T)[:, :2] / camera[:, 2:]
         assert np.linalg.norm(_blue(renderer.picture(shot)) - expected.mean(0)) < 1.0
 
 
 def test_backgrounds_and_transparency_agree(scene, renderer):
-    shot = plan(scene, "fixed", time=0.5)[0]
+    shot = plan_shots(scene, "fixed", time=0.5)[0]
     clear = renderer.picture(shot, Look(background=None)).astype(float)
     alpha = clear[..., 3:] / 255
     for ground in ((255, 255, 255), (0, 0, 0), (10, 200, 30)):
@@ -135,14 +140,14 @@ def test_backgrounds_and_transparency_agree(scene, renderer):
 
 
 def test_part_rigid_and_depth_colors(scene, renderer):
-    shot = plan(scene, "fixed", time=0.0)[0]
+    shot = plan_shots(scene, "fixed", time=0.0)[0]
     middles = [tuple(np.array([24, 24]) + [0, side]) for side in (-8, 8)]
     for part, place in enumerate(middles):
         by_part = renderer.picture(shot, Look("part"))[place]
         assert np.abs(by_part.astype(int) - PALETTE[part]).max() < 12
     weightless = Renderer(replace(scene, rigid_weight=np.zeros_like(scene.rigid_weight)))
     assert np.abs(weightless.picture(shot, Look("rigid"))[middles[0]].astype(int) - WEIGHTS[0]).max() < 12
-    aside = plan(scene, "fixed", Lens(azimuth=1.2), time=0.0)[0]  # from the blue box's side: blue is nearer
+    aside = plan_shots(scene, "fixed", Lens(azimuth=1.2), time=0.0)[0]  # from the blue box's side: blue is nearer
     depth, color = renderer.picture(aside, Look("depth")).astype(int), renderer.picture(aside)
     near = color[..., 2].astype(int) - color[..., 0] > 150
     far = color[..., 0].astype(int) - color[..., 2] > 150
@@ -150,7 +155,7 @@ def test_part_rigid_and_depth_colors(scene, renderer):
 
 
 def test_trails_follow_control_points_and_start_where_they_were(scene, renderer):
-    shot = plan(scene, "fixed", time=1.0)[0]
+    shot = plan_shots(scene, "fixed", time=1.0)[0]
     plain, drawn = (renderer.picture(shot, Look(trajectories=on)) for on in (False, True))
     changed = (plain != drawn).any(-1)
     assert 10 < changed.sum() < 0.3 * changed.size
@@ -172,74 +177,6 @@ def test_color_tables():
 # --- where it ends
 
 
-def _moving(count: int = 6, shape: tuple[int, int] = (31, 40)) -> list[np.ndarray]:
-    pictures = [np.full((*shape, 3), 255, np.uint8) for _ in range(count)]
-    for number, picture in enumerate(pictures):
-        picture[8:24, 4 * number : 4 * number + 12] = [200, 30, 40]
-    return pictures
-
-
-def test_a_video_plays_back(tmp_path):
-    import cv2
-
-    write_pictures(tmp_path / "a.mp4", iter(_moving()), fps=12.5)
-    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
-    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(12.5)
-    frames = [picture[..., ::-1] for ok, picture in iter(video.read, (False, None)) if ok]
-    assert len(frames) == 6 and frames[0].shape == (32, 40, 3)  # an even height
-    for read, own in zip(frames, _moving()):
-        assert np.abs(read[:31].astype(int) - own).mean() < 10
-
-
-def test_a_video_without_the_encoder_package(tmp_path, monkeypatch, capsys):
-    import sys
-
-    import cv2
-
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    write_pictures(tmp_path / "a.mp4", iter(_moving()), fps=10)
-    assert "imageio-ffmpeg" in capsys.readouterr().err
-    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 6
-
-
-def test_animation_folder_and_picture(tmp_path):
-    from PIL import Image
-
-    write_pictures(tmp_path / "a.gif", iter(_moving()), fps=10)
-    with Image.open(tmp_path / "a.gif") as image:
-        assert (image.n_frames, image.info["duration"], image.info["loop"], image.size) == (6, 100, 0, (40, 31))
-    write_pictures(tmp_path / "all", iter(_moving()), fps=10)
-    assert [path.name for path in sorted((tmp_path / "all").iterdir())] == [f"{i:04d}.png" for i in range(6)]
-    write_pictures(tmp_path / "a.png", iter(_moving()), fps=10)
-    for path, number in ((tmp_path / "all" / "0003.png", 3), (tmp_path / "a.png", 0)):
-        np.testing.assert_array_equal(np.asarray(Image.open(path)), _moving()[number])
-
-
-def test_nothing_half_made_stays(tmp_path):
-    def breaking():
-        yield from _moving(2)
-        raise DataError("no more")
-
-    for name in ("a.mp4", "a.gif", "all"):
-        with pytest.raises(DataError, match="no more"):
-            write_pictures(tmp_path / name, breaking(), fps=10)
-    assert not list(tmp_path.iterdir())
-    (tmp_path / "a.png").write_bytes(b"mine")
-    with pytest.raises(UsageError, match="--force"):
-        write_pictures(tmp_path / "a.png", iter(_moving()), fps=10)
-    assert (tmp_path / "a.png").read_bytes() == b"mine"
-    with pytest.raises(UsageError, match="ends in .mp4, .gif, .png"):
-        output_kind(Path("a.avi"))
-    write_pictures(tmp_path / "frames", iter(_moving()), fps=10)
-    write_pictures(tmp_path / "frames", iter(_moving()), fps=10, force=True)
-    (tmp_path / "frames" / "thesis.tex").write_bytes(b"mine")
-    with pytest.raises(UsageError, match="other things, too, such as thesis.tex"):
-        write_pictures(tmp_path / "frames", iter(_moving()), fps=10, force=True)
-    assert (tmp_path / "frames" / "thesis.tex").read_bytes() == b"mine"
-    with pytest.raises(DpcError, match="does not exist"):
-        write_pictures(tmp_path / "no" / "a.png", iter(_moving()), fps=10)
-
-
 def test_a_views_file_has_the_pictures_of_its_cameras(scene, renderer, tmp_path):
     poses = np.stack([orbit_pose(0.0, 0.0), orbit_pose(1.0, 0.3)])
     header = ViewsHeader(
@@ -249,7 +186,7 @@ def test_a_views_file_has_the_pictures_of_its_cameras(scene, renderer, tmp_path)
     with ViewsReader(tmp_path / "v.h5") as reader:
         assert (reader.num_views, reader.num_frames, reader.header.role) == (2, 2, ["reference", "test"])
         shot = replace(
-            plan(scene, "fixed", time=0.4)[0], world_to_camera=poses[1], intrinsics=scene.camera_intrinsics[1]
+            plan_shots(scene, "fixed", time=0.4)[0], world_to_camera=poses[1], intrinsics=scene.camera_intrinsics[1]
         )
         np.testing.assert_array_equal(reader.rgba(1, 1), renderer.picture(shot, Look(background=None)))
 
@@ -273,16 +210,16 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
     words = [str(tmp_path / "s.h5"), "--device", "cpu", "--cameras", str(tmp_path / "v.h5"), "-o"]
     done = CliRunner().invoke(app, [*words, str(tmp_path / "p.h5"), "--color", "part", "--trajectories"])
     assert done.exit_code == 0, done.exception
-    shot = plan(scene, "reference", time=1.0)[0]
+    shot = plan_shots(scene, "reference", time=1.0)[0]
     with ViewsReader(tmp_path / "p.h5") as reader:
         np.testing.assert_array_equal(reader.rgba(0, 0), renderer.picture(shot, Look("part", None, True)))
         assert reader.provenance[-1]["config"] == {"cameras": True, "color": "part", "trajectories": True}
     for more, says in (
-        (["--background", "black"], "--background: not with --cameras"),
-        (["--path", "swing"], "--path: not with"),
-        (["--frames", "3", "--fps", "9"], "--frames, --fps: not with"),
-        (["--azimuth", "0", "--time", "0"], "--azimuth, --time:"),
-        (["--size", "32"], "--size: not with"),
+        (["--background", "black"], "background: not with --cameras"),
+        (["--path", "swing"], "path: not with"),
+        (["--set", "frames=3", "--set", "fps=9"], "frames, fps: not with"),
+        (["--azimuth", "0", "--time", "0"], "azimuth, time:"),
+        (["--size", "32"], "size: not with"),
     ):
         refused = CliRunner().invoke(app, [*words, str(tmp_path / "q.h5"), *more])
         assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
@@ -290,8 +227,8 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
     sheet_words = [
         "--picture",
         str(tmp_path / "sheet.png"),
-        "--columns",
-        "1",
+        "--set",
+        "columns=1",
         "--size",
         "16",
         "--time",
@@ -303,15 +240,6 @@ def test_a_views_file_has_the_look_that_was_asked_for(scene, renderer, tmp_path)
         app, [*words, str(tmp_path / "q.h5"), *sheet_words]
     )  # what a sheet has use for is its own
     assert done.exit_code == 0 and (tmp_path / "q.h5").exists(), done.exception
-
-
-def test_a_sheet_has_its_pictures_in_rows(renderer):
-    pictures = _moving(3)
-    page = sheet([("front", pictures), ("back", pictures[::-1])], ["0 s", "1 s", "2 s"])
-    np.testing.assert_array_equal(page[22 : 22 + 31, 96 : 96 + 40], pictures[0])
-    np.testing.assert_array_equal(page[22 + 35 : 22 + 66, 96 + 88 : 96 + 128], pictures[0])
-    with pytest.raises(DataError, match="at least one"):
-        sheet([], [])
 
 
 def test_the_command_draws_and_refuses(scene, tmp_path):
@@ -331,20 +259,20 @@ def test_the_command_draws_and_refuses(scene, tmp_path):
             "swing",
             "--size",
             "32",
-            "--frames",
-            "7",
+            "--set",
+            "frames=7",
             "--color",
             "part",
             "--trajectories",
             "--picture",
             str(tmp_path / "sheet.png"),
-            "--columns",
-            "3",
+            "--set",
+            "columns=3",
         ],
     )
     assert done.exit_code == 0, done.exception
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 7
-    assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (22 + 4 * (32 + 4), 96 + 3 * (32 + 4))
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape[:2] == (4 + 4 * (32 + 22), 4 + 3 * (32 + 4))
     for more, says in (
         ([str(tmp_path / "b.mp4"), "--background", "none"], "has no transparency"),
         ([str(tmp_path / "b.mp4"), "--cameras", str(tmp_path / "s.h5")], "-o FILE.h5"),

@@ -17,7 +17,7 @@ import torch
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.priors import sds as zero123
-from dpcli.generate4d.priors.sds import Zero123, annealed_timestep, camera_scalars, guided_noise
+from dpcli.generate4d.priors.sds import ScoreDistillation, annealed_timestep, camera_scalars, guided_noise
 from dpcli.generate4d.priors.zero123_model import Zero123Model, load_zero123, weight_file
 from dpcli.ops.cameras import orbit_pose
 
@@ -90,11 +90,11 @@ def video() -> np.ndarray:
 
 
 @pytest.fixture
-def prior(model: Zero123Model, video: np.ndarray) -> Zero123:
-    return prepared(Zero123(model, image_size=SIZE), video)
+def prior(model: Zero123Model, video: np.ndarray) -> ScoreDistillation:
+    return prepared(ScoreDistillation(model, image_size=SIZE), video)
 
 
-def prepared(prior: Zero123, video: np.ndarray) -> Zero123:
+def prepared(prior: ScoreDistillation, video: np.ndarray) -> ScoreDistillation:
     prior.prepare(video)
     return prior
 
@@ -107,7 +107,7 @@ def seeded(seed: int = 7) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def gradient_of(prior: Zero123, progress: float = 0.5, seed: int = 7) -> torch.Tensor:
+def gradient_of(prior: ScoreDistillation, progress: float = 0.5, seed: int = 7) -> torch.Tensor:
     images = renders()
     prior.loss(images, CAMERAS, FRAMES, progress, seeded(seed)).backward()
     return images.grad
@@ -157,31 +157,33 @@ def clip_embedding(model: Zero123Model, image: np.ndarray) -> torch.Tensor:
         return model.image_encoder(torch.from_numpy(pixels).float().permute(2, 0, 1)[None]).image_embeds
 
 
-def assert_is_equation_c11(prior: Zero123, video: np.ndarray, fourth: float | None = None) -> None:
+def assert_is_equation_c11(prior: ScoreDistillation, video: np.ndarray, fourth: float | None = None) -> None:
     """The checker. Relative difference measured: 1.3e-6; of the mildest broken twin: 1.6e-2."""
     expected, found = expected_gradient(prior.model, video, 500, fourth), gradient_of(prior)
     assert (found - expected).abs().max() < 2e-5 * expected.abs().max()
 
 
-def test_gradient_is_equation_c11(prior: Zero123, video: np.ndarray) -> None:
+def test_gradient_is_equation_c11(prior: ScoreDistillation, video: np.ndarray) -> None:
     assert_is_equation_c11(prior, video)
 
 
 def test_stable_zero123_gets_the_polar_angle(folder: Path, video: np.ndarray) -> None:
     model = load_zero123(str(folder), CPU, stable=True)
-    prior = prepared(Zero123(model, image_size=SIZE, reference_elevation=0.3), video)
+    prior = prepared(ScoreDistillation(model, image_size=SIZE, reference_elevation=0.3), video)
     assert_is_equation_c11(prior, video, fourth=np.deg2rad(90) - 0.3)
     with pytest.raises(AssertionError):
         assert_is_equation_c11(prior, video)
 
 
 def test_checker_rejects_broken_twins(model: Zero123Model, video: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
-    def make(**options: object) -> Zero123:
-        return prepared(Zero123(model, image_size=SIZE, **options), video)
+    def make(**options: object) -> ScoreDistillation:
+        return prepared(ScoreDistillation(model, image_size=SIZE, **options), video)
 
     scaled = make()
     scaled._reference = scaled._reference * 0.18215
-    black = prepared(Zero123(model, image_size=SIZE), np.concatenate([video[..., :3], 255 + 0 * video[..., 3:]], -1))
+    black = prepared(
+        ScoreDistillation(model, image_size=SIZE), np.concatenate([video[..., :3], 255 + 0 * video[..., 3:]], -1)
+    )
     for broken in (make(guidance_scale=4), make(t_range=(0.51, 0.8)), scaled, black):
         with pytest.raises(AssertionError):
             assert_is_equation_c11(broken, video)
@@ -233,18 +235,18 @@ def test_timestep_anneals_within_its_range() -> None:
 
 
 def test_random_timesteps_cover_their_range(model: Zero123Model) -> None:
-    prior = Zero123(model, timestep="random", t_range=(0.3, 0.31))
+    prior = ScoreDistillation(model, timestep="random", t_range=(0.3, 0.31))
     assert prior._timesteps(500, 0.9, seeded()).unique().tolist() == list(range(300, 311))
 
 
-def test_repeats_with_the_generator_and_leaves_the_global_one_alone(prior: Zero123) -> None:
+def test_repeats_with_the_generator_and_leaves_the_global_one_alone(prior: ScoreDistillation) -> None:
     state = torch.get_rng_state()
     once, again, other = gradient_of(prior), gradient_of(prior), gradient_of(prior, seed=8)
     assert torch.equal(once, again) and not torch.allclose(once, other, rtol=0.1)
     assert torch.equal(state, torch.get_rng_state())
 
 
-def test_descent_leads_to_what_the_model_expects(prior: Zero123, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_descent_leads_to_what_the_model_expects(prior: ScoreDistillation, monkeypatch: pytest.MonkeyPatch) -> None:
     """A denoiser that knows the true latent: following the loss brings the render's latent there."""
     with torch.no_grad():
         goal = prior._latents(renders(1))
@@ -267,7 +269,7 @@ def test_conditions_each_frame_once(model: Zero123Model, video: np.ndarray) -> N
     seen = []
     hook = model.image_encoder.register_forward_pre_hook(lambda _, inputs: seen.append(len(inputs[0])))
     try:
-        prior = prepared(Zero123(model, image_size=SIZE), np.repeat(video, 7, 0))
+        prior = prepared(ScoreDistillation(model, image_size=SIZE), np.repeat(video, 7, 0))
         assert sum(seen) == 21 and max(seen) <= 8
         gradient_of(prior)
         assert sum(seen) == 21
@@ -275,13 +277,13 @@ def test_conditions_each_frame_once(model: Zero123Model, video: np.ndarray) -> N
         hook.remove()
 
 
-def test_low_memory_changes_nothing(model: Zero123Model, video: np.ndarray, prior: Zero123) -> None:
-    sparing = prepared(Zero123(model, image_size=SIZE, low_memory=True), video)
+def test_low_memory_changes_nothing(model: Zero123Model, video: np.ndarray, prior: ScoreDistillation) -> None:
+    sparing = prepared(ScoreDistillation(model, image_size=SIZE, low_memory=True), video)
     torch.testing.assert_close(gradient_of(sparing), gradient_of(prior), rtol=1e-4, atol=1e-6)
 
 
 def test_larger_renders_and_oblong_frames(model: Zero123Model, video: np.ndarray) -> None:
-    prior = Zero123(model, image_size=SIZE)
+    prior = ScoreDistillation(model, image_size=SIZE)
     oblong = np.zeros((3, SIZE, SIZE, 4), np.uint8)
     oblong[:, 4:12] = video[:, 4:12]  # what padding with white must give back
     embeddings = []
@@ -294,7 +296,7 @@ def test_larger_renders_and_oblong_frames(model: Zero123Model, video: np.ndarray
     assert images.grad.shape == images.shape and images.grad.abs().sum() > 0
 
 
-def test_views_that_overflow_add_nothing(prior: Zero123, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_that_overflow_add_nothing(prior: ScoreDistillation, monkeypatch: pytest.MonkeyPatch) -> None:
     clean, unet = gradient_of(prior), prior.model.unet
 
     def overflowing(rows: list[int]) -> Callable:
@@ -313,7 +315,7 @@ def test_views_that_overflow_add_nothing(prior: Zero123, monkeypatch: pytest.Mon
         gradient_of(prior)
 
 
-def test_rejects_wrong_arguments(model: Zero123Model, prior: Zero123) -> None:
+def test_rejects_wrong_arguments(model: Zero123Model, prior: ScoreDistillation) -> None:
     images = renders()
     for wrong, cameras, frames, message in (
         (images[:, :8], CAMERAS, FRAMES, "S, S, 3"),
@@ -323,11 +325,11 @@ def test_rejects_wrong_arguments(model: Zero123Model, prior: Zero123) -> None:
         with pytest.raises(ValueError, match=message):
             prior.loss(wrong, cameras, frames, 0.0, seeded())
     with pytest.raises(ValueError, match="given 0 frames"):
-        Zero123(model).loss(images, CAMERAS, FRAMES, 0.0, seeded())
+        ScoreDistillation(model).loss(images, CAMERAS, FRAMES, 0.0, seeded())
     with pytest.raises(ValueError, match="t_range"):
-        Zero123(model, t_range=(200, 800))
+        ScoreDistillation(model, t_range=(200, 800))
     with pytest.raises(ValueError, match="timestep"):
-        Zero123(model, timestep="sometimes")
+        ScoreDistillation(model, timestep="sometimes")
 
 
 def changed(folder: Path, target: Path, change: Callable[[Path], object]) -> str:
@@ -423,20 +425,20 @@ def test_bin_weights_load_alike(folder: Path, model: Zero123Model, tmp_path: Pat
         assert ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
-def test_half_precision(folder: Path, video: np.ndarray, prior: Zero123) -> None:
+def test_half_precision(folder: Path, video: np.ndarray, prior: ScoreDistillation) -> None:
     half = load_zero123(str(folder), CPU, half=True)
     for network in (half.unet, half.vae, half.image_encoder, half.camera_projection):
         assert {p.dtype for p in network.parameters()} == {torch.float16}
         assert not any(p.requires_grad for p in network.parameters()) and not network.training
-    expected, found = gradient_of(prior), gradient_of(prepared(Zero123(half, image_size=SIZE), video))
+    expected, found = gradient_of(prior), gradient_of(prepared(ScoreDistillation(half, image_size=SIZE), video))
     assert found.dtype == torch.float32
     assert (found - expected).norm() < 0.02 * expected.norm()
 
 
 def test_loads_as_the_command_does(
-    folder: Path, video: np.ndarray, prior: Zero123, capsys: pytest.CaptureFixture
+    folder: Path, video: np.ndarray, prior: ScoreDistillation, capsys: pytest.CaptureFixture
 ) -> None:
-    loaded = prepared(Zero123.load(str(folder), "cpu", image_size=SIZE), video)
+    loaded = prepared(ScoreDistillation.load(str(folder), "cpu", image_size=SIZE), video)
     assert torch.equal(gradient_of(loaded), gradient_of(prior))
     shown = capsys.readouterr()
     assert "a minute a step" in shown.err and not shown.out

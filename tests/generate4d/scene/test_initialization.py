@@ -1,19 +1,22 @@
-"""Where Gaussians start, how they grow, what they are fitted to."""
+"""The first Gaussians, how their number grows and shrinks, and the losses on pictures and shape."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import DataError, UsageError
-from dpcli.generate4d.config import PRESETS, preset
+from dpcli.errors import DataError
+from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.scene.canonical_gaussians import NAMES, CanonicalGaussians
-from dpcli.generate4d.scene.initialization import ball_thickness, hull, in_sphere, inflated
+from dpcli.generate4d.scene.initialization import ball_thickness, carve_hull, inflate_silhouette, sample_sphere
 from dpcli.generate4d.scene.losses import picture_loss, roundness_loss, thickness_loss
 from dpcli.ops.cameras import orbit_pose, pinhole
 
 RNG = np.random.default_rng(0)
+QUICK = FIT_PRESETS["quick"]
 
 
 def _disc(size: int, radius: float) -> np.ndarray:
@@ -38,7 +41,7 @@ def test_a_disc_becomes_a_ball_and_a_bar_a_rod():
 def test_inflated_points_project_into_the_silhouette_with_its_colors():
     rgba, intrinsics = _disc(64, 20), pinhole(np.deg2rad(49.1), 64, 64)
     pose = orbit_pose(0.7, 0.3)
-    points, colors = inflated(rgba, intrinsics, pose, 500, RNG)
+    points, colors = inflate_silhouette(rgba, intrinsics, pose, 500, RNG)
     camera = points @ pose[:3, :3].T + pose[:3, 3]
     pixel = (camera / camera[:, 2:]) @ intrinsics.T
     assert rgba[pixel[:, 1].astype(int), pixel[:, 0].astype(int), 3].all()
@@ -49,7 +52,7 @@ def test_inflated_points_project_into_the_silhouette_with_its_colors():
 
 def test_an_empty_first_frame_is_explained():
     with pytest.raises(DataError, match="shows nothing"):
-        inflated(np.zeros((8, 8, 4), np.float32), pinhole(1.0, 8, 8), orbit_pose(0, 0), 10, RNG)
+        inflate_silhouette(np.zeros((8, 8, 4), np.float32), pinhole(1.0, 8, 8), orbit_pose(0, 0), 10, RNG)
 
 
 def test_the_hull_is_inside_every_silhouette_and_takes_the_near_color():
@@ -57,13 +60,13 @@ def test_the_hull_is_inside_every_silhouette_and_takes_the_near_color():
     poses = np.stack([orbit_pose(0, 0), orbit_pose(np.pi, 0)])
     front, back = _disc(64, 15), _disc(64, 15)
     back[..., :3] = [0, 0, 1]
-    points, colors = hull([front, back], intrinsics, poses, 800, RNG)
+    points, colors = carve_hull([front, back], intrinsics, poses, 800, RNG)
     near, far = points[:, 2] > 0.3, points[:, 2] < -0.3
     assert len(points) == 800 and (colors[near, 0] > colors[near, 2]).all() and (colors[far, 2] > colors[far, 0]).all()
     side = np.stack([orbit_pose(0, 0), orbit_pose(np.pi / 2, 0)])
     off = np.roll(_disc(64, 4), 28, axis=0)
     with pytest.raises(DataError, match="no point in common"):
-        hull([_disc(64, 4), off], intrinsics, side, 100, RNG)
+        carve_hull([_disc(64, 4), off], intrinsics, side, 100, RNG)
 
 
 def test_two_views_at_a_right_angle_make_a_rod_round_not_square():
@@ -71,7 +74,7 @@ def test_two_views_at_a_right_angle_make_a_rod_round_not_square():
     poses = np.stack([orbit_pose(0, 0), orbit_pose(np.pi / 2, 0)])
     bar = np.zeros((96, 96, 4), np.float32)
     bar[16:80, 36:60] = 1.0
-    points, _ = hull([bar, bar], intrinsics, poses, 2000, RNG)
+    points, _ = carve_hull([bar, bar], intrinsics, poses, 2000, RNG)
     points = points[np.abs(points[:, 1]) < 0.2]
     half = 12 / intrinsics[0, 0, 0] * 2  # of the bar, in the world
     radius = np.linalg.norm(points[:, [0, 2]], axis=1)
@@ -79,14 +82,14 @@ def test_two_views_at_a_right_angle_make_a_rod_round_not_square():
 
 
 def test_sphere_points_fill_the_volume_evenly():
-    radius = np.linalg.norm(in_sphere(20_000, 0.5, RNG), axis=1)
+    radius = np.linalg.norm(sample_sphere(20_000, 0.5, RNG), axis=1)
     assert radius.max() <= 0.5 and np.mean(radius < 0.25) == pytest.approx(1 / 8, abs=0.01)
 
 
 def _trained(count: int) -> tuple[CanonicalGaussians, torch.optim.Adam]:
     torch.manual_seed(0)
     gaussians = CanonicalGaussians(torch.randn(count, 3), torch.rand(count, 3))
-    optimizer = torch.optim.Adam(gaussians.groups(PRESETS["quick"]))
+    optimizer = torch.optim.Adam(gaussians.parameter_groups(QUICK))
     sum((getattr(gaussians, name) ** 2).sum() for name in NAMES).backward()
     optimizer.step()
     return gaussians, optimizer
@@ -99,8 +102,8 @@ def test_growing_copies_the_busy_and_drops_the_transparent():
     gaussians.seen += 1
     before = {name: getattr(gaussians, name).detach().clone() for name in NAMES}
     memory = optimizer.state[gaussians.color]["exp_avg"].clone()
-    config = preset("quick", grow_share=0.1)
-    gaussians.grow_and_prune(optimizer, config, torch.Generator().manual_seed(0), grow=True)
+    config = replace(QUICK, grow_share=0.1)
+    gaussians.densify_and_prune(optimizer, config, torch.Generator().manual_seed(0), grow=True)
     kept = [i for i in range(20) if i != 3]
     assert len(gaussians) == 21
     torch.testing.assert_close(gaussians.color.data, before["color"][kept + [5, 7]])
@@ -117,10 +120,12 @@ def test_growth_stops_at_the_cap_and_something_always_remains():
     gaussians.gradient += 1
     gaussians.seen += 1
     rng = torch.Generator().manual_seed(0)
-    gaussians.grow_and_prune(optimizer, preset("quick", grow_share=0.9, most_gaussians=24), rng, grow=True)
+    gaussians.densify_and_prune(
+        optimizer, replace(QUICK, grow_share=0.9, gaussians=24, most_gaussians=24), rng, grow=True
+    )
     assert len(gaussians) == 24
     gaussians.opacity_logit.data[:] = -20.0
-    gaussians.grow_and_prune(optimizer, preset("quick"), rng, grow=False)
+    gaussians.densify_and_prune(optimizer, QUICK, rng, grow=False)
     assert len(gaussians) == 1
 
 
@@ -140,23 +145,3 @@ def test_picture_loss_by_hand_and_shape_losses_see_what_they_should():
     assert thickness_loss(gaussians, axis) == 0
     gaussians.mean.data[:, 2] += 0.1
     assert thickness_loss(gaussians, axis).item() == pytest.approx(0.01, rel=1e-4)
-
-
-def test_wrong_settings_are_named():
-    with pytest.raises(UsageError, match="expected one of thesis"):
-        preset("slow")
-    with pytest.raises(UsageError, match="--parts 0"):
-        preset("quick", parts=0)
-    with pytest.raises(UsageError, match="--start cube"):
-        preset("quick", start="cube")
-    with pytest.raises(UsageError, match="unknown setting 'speed'"):
-        preset("quick", speed=3)
-    assert preset("quick", size=None) == PRESETS["quick"]
-
-
-def test_a_limit_on_gaussians_holds_from_the_start():
-    assert (
-        preset("quick", most_gaussians=800).gaussians == 800 and preset("quick", most_gaussians=9000).gaussians == 6000
-    )
-    with pytest.raises(UsageError, match="--most-gaussians 800: expected at least the 900"):
-        preset("quick", most_gaussians=800, gaussians=900)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import typer
 
-from dpcli.cli.generate4d.output import view
+from dpcli.cli.generate4d.view import view
 from dpcli.errors import UsageError
 from dpcli.generate4d.out.camera_paths import Shot
 from dpcli.generate4d.out.render import Look, Renderer

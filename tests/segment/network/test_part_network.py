@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from dpcli.ops.kernel_convolution import kernel_convolution, kernel_convolution_reference
+from dpcli.ops.rotations import mean_rotation, normalize_quaternion, quaternion_to_matrix
 from dpcli.segment.network.config import NETWORK_PRESETS, Layer, PartConfig, compact, release
 from dpcli.segment.network.cost import convolution_macs, count_macs, count_parameters, paper_parameters
 from dpcli.segment.network.icosahedron import find_rotation, icosahedral_group, trivial_group
 from dpcli.segment.network.kernel_points import kernel_points
-from dpcli.segment.network.motion_head import MotionHead, mean_rotation, quaternion_to_matrix, relative_labels
+from dpcli.segment.network.motion_head import MotionHead, relative_labels
 from dpcli.segment.network.neighborhood import first_neighborhood, nearest_neighborhood
 from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.network.se3_conv import GroupConv, SpatialConv
@@ -235,7 +236,7 @@ def test_motion_head_finds_a_rotation_of_the_group_in_matching_features():
 
 def test_candidates_contain_the_rotation_of_perfect_answers():
     head = MotionHead(small())
-    rotation = quaternion_to_matrix(torch.tensor([0.9, 0.2, -0.3, 0.25]))
+    rotation = quaternion_to_matrix(normalize_quaternion(torch.tensor([0.9, 0.2, -0.3, 0.25])))
     label, wanted = relative_labels(rotation.mT, head.group)
     confidence = torch.full((1, 1, 60, 60), 1e-6)
     confidence[0, 0, torch.arange(60), label] = 1.0

@@ -1,0 +1,96 @@
+"""Contact sheets: rows of a title and equal cells; the one font of all sheets; pictures written whole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from dpcli.draw.palette import DARK, RGB, Theme
+from dpcli.errors import DataError
+from dpcli.runtime.whole_file import whole_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GAP = 4  # pixels between cells
+TITLE_HEIGHT = 18  # pixels of a title's line
+
+
+class SheetRow(NamedTuple):
+    """Holds a row of a sheet: its title, and its cells u8 (H,W,3) with a mark for each, such as the frame's number."""
+
+    title: str
+    marks: Sequence[str]
+    cells: Sequence[np.ndarray]
+
+
+def contact_sheet(rows: Sequence[SheetRow], theme: Theme = DARK) -> Any:
+    """Returns a PIL image of rows of cells, all of one size, each row under its title.
+
+    Raises DataError when there is no cell to draw.
+    """
+    from PIL import Image, ImageDraw
+
+    columns = max((len(row.cells) for row in rows), default=0)
+    if not columns:
+        raise DataError("a contact sheet needs at least one picture")
+    height, width = next(row.cells[0].shape[:2] for row in rows if len(row.cells))
+    size = (columns * (width + GAP) + GAP, len(rows) * (height + TITLE_HEIGHT + GAP) + GAP)
+    sheet = Image.new("RGB", size, theme.page)
+    draw = ImageDraw.Draw(sheet)
+    for place, row in enumerate(rows):
+        top = GAP + place * (height + TITLE_HEIGHT + GAP)
+        write_line(draw, (GAP + 2, top + 1), row.title, size[0] - 2 * GAP, theme.ink)
+        for column, (mark, cell) in enumerate(zip(row.marks, row.cells, strict=True)):
+            left = GAP + column * (width + GAP)
+            sheet.paste(Image.fromarray(cell), (left, top + TITLE_HEIGHT))
+            draw.text((left + 4, top + TITLE_HEIGHT + 2), mark, fill=theme.faint, font=text_font(10))
+    return sheet
+
+
+def spread_evenly(count: int, most: int) -> list[int]:
+    """Returns at most `most` of the numbers 0 to count - 1, evenly spread, the first and the last among them.
+
+    >>> spread_evenly(9, 3), spread_evenly(2, 5), spread_evenly(0, 4)
+    ([0, 4, 8], [0, 1], [])
+    """
+    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()
+
+
+def text_font(size: int) -> Any:
+    """Returns the font of all sheets, letters `size` pixels high."""
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size=size)
+
+
+def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB, size: int = 13) -> None:
+    """Writes a text in one line on a PIL drawing, shortened to the room (pixels) there is."""
+    font = text_font(size)
+    while draw.textlength(text, font=font) > room and len(text) > 2:
+        text = text[:-2] + "…"
+    draw.text(place, text, fill=ink, font=font)
+
+
+def save_picture(image: Any, path: Path) -> None:
+    """Writes a PIL image, or an array u8 (H,W,3), whole or not at all. Raises DataError when it can't be written."""
+    from PIL import Image
+
+    image = Image.fromarray(image) if isinstance(image, np.ndarray) else image
+    try:
+        with whole_file(path) as part:
+            image.save(part)
+    except (ValueError, OSError) as error:
+        raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None
+
+
+def save_figure(figure: Figure, path: Path, dpi: int = 150) -> None:
+    """Writes a matplotlib figure, whole or not at all. Raises DataError when it can't be written."""
+    try:
+        with whole_file(path) as part:
+            figure.savefig(part, dpi=dpi)
+    except (ValueError, OSError) as error:
+        raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None

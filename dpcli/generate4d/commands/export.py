@@ -1,0 +1,91 @@
+"""What `dpc generate4d export` does; the options are in `cli/generate4d/export.py`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dpcli.errors import UsageError
+from dpcli.generate4d.out.export import as_sequence, export_file, export_sequence, keep_opaque, write_clouds, write_json
+from dpcli.generate4d.out.formats import Axes, Format
+from dpcli.generate4d.out.splat_files import camera_list
+from dpcli.runtime import provenance
+from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import generator
+from dpcli.store import CloudSequence, input_file, output_file
+from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
+
+_SPLATS = ("ply", "splat")  # one file for a file's name, one a frame for a folder's
+_TABLES = ("cameras", "metrics")  # one .json each
+_CLOUD_OPACITY = 0.3  # least opacity of a point of a cloud, where nothing else is asked for
+
+
+def export_scene(
+    scene_file: str,
+    output: str,
+    *,
+    form: Format,
+    time: float | None,
+    axes: Axes,
+    min_opacity: float | None,
+    points: int | None,
+    seed: int,
+    force: bool,
+) -> None:
+    """Writes a scene in another format. Raises UsageError where the options or the name of `output` don't fit the format."""
+    if output == "-" and form != "clouds":
+        raise UsageError(f"-o -: only --as clouds goes through a pipe; name a file or folder for {form}")
+    if time is not None and not _is_single(form, Path(output)):
+        kind = form.partition("-")[0] if form.startswith(_SPLATS) else _SPLATS[0]
+        raise UsageError(f"--time is of one file: name it with --as {kind} -o FILE.{kind}")
+    if points is not None and form != "clouds":
+        raise UsageError(f"--points is of --as clouds; leave it out for {form}")
+    with input_file(scene_file) as place:
+        scene, (root, history) = read_scene(place), scene_origin(place)
+        config = {"as": form, "axes": axes, "min_opacity": min_opacity, "points": points}
+        entry = provenance.record(config, seed, {"gaussians": place}) if form == "clouds" else {}
+    if form == "clouds":
+        name, least = str(root["source"]) or "scene", _CLOUD_OPACITY if min_opacity is None else min_opacity
+        sequence = as_sequence(scene, name, min_opacity=least, points=points, rng=generator(seed), axes=axes)
+        _export_clouds(sequence, output, root, [*history, entry], seed, force)
+    else:
+        _export_files(keep_opaque(scene, min_opacity or 0.0), Path(output), form, time, axes, force)
+
+
+def _export_clouds(
+    sequence: CloudSequence, output: str, root: dict, history: list[dict], seed: int, force: bool
+) -> None:
+    with output_file(output) as target:
+        write_clouds(
+            target,
+            sequence,
+            provenance=history,
+            source=str(root["source"]),
+            seed=seed,
+            length_unit=str(root["length_unit"]),
+            force=force,
+        )
+    log.info(f"{sequence.num_frames} frames of {len(sequence.frame(0))} points")
+
+
+def _is_single(form: Format, output: Path) -> bool:
+    """Returns whether that is one .ply or .splat, or was meant to be: such a suffix makes no folder."""
+    return form in _SPLATS and output.suffix.lower() in (".ply", ".splat", ".json")
+
+
+def _export_files(
+    scene: GaussianScene, output: Path, form: Format, time: float | None, axes: Axes, force: bool
+) -> None:
+    kind, single = form.partition("-")[0], _is_single(form, output)
+    if form in _TABLES and output.suffix.lower() != ".json":
+        raise UsageError(f"-o {output}: expected a name that ends in .json")
+    if single and output.suffix.lower() != f".{kind}":
+        raise UsageError(f"-o {output}: expected a name that ends in .{kind}, or a folder for one file a frame")
+    if (form in _TABLES or single) and output.exists() and not force:
+        raise UsageError(f"{output}: exists already; --force replaces it")
+    if form in _TABLES:
+        write_json(output, camera_list(scene, axes) if form == "cameras" else scene.metrics)
+    elif single:
+        export_file(scene, output, kind, time=time, axes=axes)
+    else:
+        paths = export_sequence(scene, output, kind, axes=axes, force=force)
+        log.info(f"{output}: {paths[0].name} to {paths[-1].name}, cameras.json, metrics.json")

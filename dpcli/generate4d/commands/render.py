@@ -1,0 +1,135 @@
+"""What `dpc generate4d render` does; the options are in `cli/generate4d/render.py`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.draw.animation import output_kind, write_pictures
+from dpcli.draw.palette import LIGHT
+from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
+from dpcli.errors import UsageError
+from dpcli.generate4d.out.camera_paths import Lens, default_rate, plan_shots
+from dpcli.generate4d.out.picture_colors import parse_background
+from dpcli.generate4d.out.render import Look, Renderer, render_views
+from dpcli.generate4d.render_settings import RenderSettings
+from dpcli.runtime import provenance
+from dpcli.runtime.device import choose_device
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.whole_file import check_target
+from dpcli.store import ViewsReader, input_file, output_file
+from dpcli.store.gaussians import read_scene, scene_origin
+
+_SHEET_AROUND = (0, 90, 180, 270)  # degrees from the reference view
+_SHEET_SIDE = 160  # pixels of its pictures
+
+
+def render_scene(
+    scene_file: str,
+    output: str | None,
+    settings: RenderSettings,
+    *,
+    picture: Path | None,
+    cameras: Path | None,
+    device: str,
+    force: bool,
+) -> None:
+    """Draws a scene along a path into `output`, as a contact sheet into `picture`, or as a views file seen by `cameras`."""
+    look = Look(settings.color, parse_background(settings.background), settings.trajectories)
+    if output is None and picture is None:
+        raise UsageError("nothing to write: -o FILE for a video, a picture or a folder, --picture FILE for a sheet")
+    if picture is not None:
+        check_target(picture, "--picture", (".png",))
+    if cameras is not None:
+        _check_views(output, settings, look, has_sheet=picture is not None)
+    with input_file(scene_file) as place:
+        scene, (root, history) = read_scene(place), scene_origin(place)
+        config = {"cameras": bool(cameras), "color": settings.color, "trajectories": settings.trajectories}
+        entry = provenance.record(config, int(root["seed"]), {"gaussians": place})
+    renderer = Renderer(scene, choose_device(device))
+    if cameras is not None:
+        _render_views(renderer, look, cameras, str(output), [*history, entry], root, force)
+    elif output is not None:
+        _render_path(renderer, look, Path(output), settings, force)
+    if picture is not None:
+        _render_sheet(renderer, look, picture, settings)
+
+
+def _lens(settings: RenderSettings) -> Lens:
+    degrees = (settings.azimuth, settings.elevation, settings.fovy)
+    azimuth, elevation, fovy = (None if angle is None else math.radians(angle) for angle in degrees)
+    return Lens(azimuth, elevation, settings.radius, fovy, settings.size)
+
+
+def _check_views(output: str | None, settings: RenderSettings, look: Look, *, has_sheet: bool) -> None:
+    """Raises UsageError where `output` can't be the views file of --cameras, or has no use for a setting that was given."""
+    if output is None or (output != "-" and Path(output).suffix not in (".h5", ".hdf5")):
+        raise UsageError("--cameras renders a views file: name it with -o FILE.h5, or - for a pipe")
+    unused = settings.changed("path", "frames", "fps")
+    if not has_sheet:  # which has use for these
+        unused += settings.changed("azimuth", "elevation", "radius", "fovy", "size", "time")
+        unused += ["background"] if look.background not in (None, LIGHT.background) else []
+    if unused:
+        raise UsageError(
+            f"{', '.join(unused)}: not with --cameras, whose file says from where, how large and when every picture"
+            " is, with a transparent background; leave out one or the other"
+        )
+
+
+def _render_path(renderer: Renderer, look: Look, output: Path, settings: RenderSettings, force: bool) -> None:
+    kind, path = output_kind(output), settings.path
+    if look.background is None and kind in (".mp4", ".gif"):
+        raise UsageError(f"-o {output}: {kind} has no transparency; use a .png or a folder, or another --background")
+    times = {"frames": settings.frames, "fps": settings.fps, "time": settings.time}
+    shots = plan_shots(renderer.scene, path, _lens(settings), **times)
+    shots = shots[:1] if kind == ".png" else shots
+    with Progress("render", len(shots), "picture") as progress:
+
+        def draw() -> Iterator[np.ndarray]:
+            for picture in renderer.pictures(shots, look):
+                yield picture
+                progress.advance()
+
+        write_pictures(output, draw(), settings.fps or default_rate(renderer.scene, path), force=force)
+    log.info(f"{output}: {len(shots)} picture(s) of {shots[0].size[0]} x {shots[0].size[1]}")
+
+
+def _render_views(
+    renderer: Renderer, look: Look, cameras: Path, output: str, history: list[dict], root: dict[str, Any], force: bool
+) -> None:
+    with ViewsReader(cameras) as reader:
+        header = reader.header
+    with output_file(output) as place:
+        render_views(
+            renderer,
+            header,
+            place,
+            look,
+            provenance=history,
+            source=str(root["source"]),
+            seed=int(root["seed"]),
+            force=force,
+        )
+    log.info(f"{output}: {header.num_views} views x {header.num_frames} frames")
+
+
+def _render_sheet(renderer: Renderer, look: Look, picture: Path, settings: RenderSettings) -> None:
+    """Writes the contact sheet: the reference camera and three more around the object as rows, instants as columns."""
+    look = replace(look, background=look.background or LIGHT.background)
+    scene, lens, time = renderer.scene, _lens(settings), settings.time
+    lens = replace(lens, size=lens.size or _SHEET_SIDE)
+    count = min(settings.columns, scene.num_frames)
+    instants = np.linspace(scene.time[0], scene.time[-1], count) if time is None else [time]
+    azimuth = lens.place(scene)[0]
+    rows = []
+    for degrees in _SHEET_AROUND:
+        turned = replace(lens, azimuth=azimuth + math.radians(degrees))
+        shots = [plan_shots(scene, "fixed", turned, time=float(instant), frames=1)[0] for instant in instants]
+        title, marks = f"azimuth {math.degrees(turned.azimuth):+.0f}°", [f"{instant:.2f} s" for instant in instants]
+        rows.append(SheetRow(title, marks, list(renderer.pictures(shots, look))))
+    save_picture(contact_sheet(rows, LIGHT), picture)

@@ -1,0 +1,27 @@
+"""What `dpc generate4d view` does; the options are in `cli/generate4d/view.py`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dpcli.errors import UsageError
+from dpcli.generate4d.out.export import keep_opaque
+from dpcli.generate4d.viewer import write_page
+from dpcli.runtime.progress import log
+from dpcli.store import input_file
+from dpcli.store.gaussians import read_scene, scene_origin
+
+
+def view_scene(
+    scene_file: str, output: Path, *, title: str | None, min_opacity: float, fps: float | None, force: bool
+) -> None:
+    """Writes one self-contained HTML page of a scene. Raises UsageError for a name that isn't .html or that exists."""
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise UsageError(f"-o {output}: expected a name that ends in .html")
+    if output.exists() and not force:
+        raise UsageError(f"{output}: exists already; --force replaces it")
+    with input_file(scene_file) as place:
+        scene, (root, history) = read_scene(place), scene_origin(place)
+    scene = keep_opaque(scene, min_opacity)
+    size = write_page(scene, output, title=title or str(root["source"]) or "scene", history=history, fps=fps)
+    log.info(f"{output}: {scene.num_gaussians} Gaussians, {scene.num_frames} frames, {size / 2**20:.1f} MiB")

@@ -1,0 +1,94 @@
+"""Videos, animations, pictures and folders of them: what players read, and nothing half made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.draw.animation import output_kind, write_pictures
+from dpcli.errors import DataError, DpcError, UsageError
+
+
+def moving_square(count: int = 6, shape: tuple[int, int] = (31, 40)) -> list[np.ndarray]:
+    pictures = [np.full((*shape, 3), 255, np.uint8) for _ in range(count)]
+    for number, picture in enumerate(pictures):
+        picture[8:24, 4 * number : 4 * number + 12] = [200, 30, 40]
+    return pictures
+
+
+def test_a_video_plays_back(tmp_path):
+    import cv2
+
+    write_pictures(tmp_path / "a.mp4", iter(moving_square()), fps=12.5)
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(12.5)
+    frames = [picture[..., ::-1] for ok, picture in iter(video.read, (False, None)) if ok]
+    assert len(frames) == 6 and frames[0].shape == (32, 40, 3)  # an even height
+    for read, own in zip(frames, moving_square()):
+        assert np.abs(read[:31].astype(int) - own).mean() < 10
+
+
+def test_a_video_without_the_encoder_package(tmp_path, monkeypatch, capsys):
+    import sys
+
+    import cv2
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    write_pictures(tmp_path / "a.mp4", iter(moving_square()), fps=10)
+    assert "imageio-ffmpeg" in capsys.readouterr().err
+    assert cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 6
+
+
+def test_animation_folder_and_picture(tmp_path):
+    from PIL import Image
+
+    write_pictures(tmp_path / "a.gif", iter(moving_square()), fps=10)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.n_frames, image.info["duration"], image.info["loop"], image.size) == (6, 100, 0, (40, 31))
+    write_pictures(tmp_path / "all", iter(moving_square()), fps=10)
+    assert [path.name for path in sorted((tmp_path / "all").iterdir())] == [f"{i:04d}.png" for i in range(6)]
+    write_pictures(tmp_path / "a.png", iter(moving_square()), fps=10)
+    for path, number in ((tmp_path / "all" / "0003.png", 3), (tmp_path / "a.png", 0)):
+        np.testing.assert_array_equal(np.asarray(Image.open(path)), moving_square()[number])
+
+
+def test_nothing_half_made_stays(tmp_path):
+    def breaking():
+        yield from moving_square(2)
+        raise DataError("no more")
+
+    for name in ("a.mp4", "a.gif", "all"):
+        with pytest.raises(DataError, match="no more"):
+            write_pictures(tmp_path / name, breaking(), fps=10)
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "a.png").write_bytes(b"mine")
+    with pytest.raises(UsageError, match="--force"):
+        write_pictures(tmp_path / "a.png", iter(moving_square()), fps=10)
+    assert (tmp_path / "a.png").read_bytes() == b"mine"
+    with pytest.raises(UsageError, match="ends in .mp4, .gif, .png"):
+        output_kind(Path("a.avi"))
+    write_pictures(tmp_path / "frames", iter(moving_square()), fps=10)
+    write_pictures(tmp_path / "frames", iter(moving_square()), fps=10, force=True)
+    (tmp_path / "frames" / "thesis.tex").write_bytes(b"mine")
+    with pytest.raises(UsageError, match="other things, too, such as thesis.tex"):
+        write_pictures(tmp_path / "frames", iter(moving_square()), fps=10, force=True)
+    assert (tmp_path / "frames" / "thesis.tex").read_bytes() == b"mine"
+    with pytest.raises(DpcError, match="does not exist"):
+        write_pictures(tmp_path / "no" / "a.png", iter(moving_square()), fps=10)
+
+
+def test_an_animation_has_one_table_of_colors(tmp_path):
+    """A color that stands still keeps its number in every picture, so that nothing flickers."""
+    from PIL import Image
+
+    write_pictures(tmp_path / "a.gif", moving_square(), fps=10)
+    with Image.open(tmp_path / "a.gif") as image:
+        shown = []
+        for number in range(image.n_frames):
+            image.seek(number)
+            shown.append(np.asarray(image.convert("RGB")).astype(int))
+    for picture, truth in zip(shown, moving_square()):
+        assert np.abs(picture - truth).max() <= 8
+    np.testing.assert_array_equal(np.unique([picture[0, 0] for picture in shown], axis=0), [shown[0][0, 0]])

@@ -1,0 +1,85 @@
+"""Figures drawn with matplotlib: learning curves, confusion matrix, bars. What they show is read from the figure itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from dpcli.draw import bars, confusion_matrix, learning_curves
+from dpcli.draw.bars import Bars, Histogram, draw_panels
+from dpcli.draw.confusion_matrix import draw_confusion
+from dpcli.draw.learning_curves import Curve, Panel, draw_learning_curves
+from dpcli.draw.sheet import save_figure
+from dpcli.errors import DataError
+
+
+@pytest.fixture
+def saved(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that were written, still open."""
+    figures: list[Figure] = []
+
+    def keep(figure: Figure, path: Path, dpi: int = 150) -> None:
+        figures.append(figure)
+        save_figure(figure, path, dpi)
+
+    for module in (bars, confusion_matrix, learning_curves):
+        monkeypatch.setattr(module, "save_figure", keep)
+    return figures
+
+
+def test_curves_leave_out_what_is_not_known(saved: list[Figure], tmp_path: Path) -> None:
+    rows = [{"epoch": n, "loss": 2.0 / n, "accuracy": None if n == 2 else n / 10, "truth": None} for n in (1, 2, 3)]
+    panel = Panel(
+        "training",
+        [Curve("loss", "loss"), Curve("truth", "never there")],
+        range=(0, None),
+        right=[Curve("accuracy", "accuracy", 100)],
+        right_range=(0, 102),
+        change=2.5,
+    )
+    late = Panel("late", [Curve("loss", "loss")], rows=rows[1:], logarithmic=True)
+    draw_learning_curves(rows, [panel, late], tmp_path / "curves.png", "epoch")
+    left, second, right = saved[0].axes
+    assert left.get_lines()[0].get_xydata().tolist() == [[1, 2], [2, 1], [3, 2 / 3]]
+    assert right.get_lines()[0].get_xydata().tolist() == [[1, 10], [3, 30]] and right.get_ylim() == (0, 102)
+    assert [text.get_text() for text in left.get_legend().get_texts()] == ["loss", "accuracy"]
+    assert second.get_yscale() == "log" and len(second.get_lines()[0].get_xdata()) == 2 and second.get_legend() is None
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_log_without_numbers_is_drawn(saved: list[Figure], tmp_path: Path) -> None:
+    draw_learning_curves([{"step": 1, "x": None}], [Panel("empty", [Curve("x", "x")])], tmp_path / "a.png", "step")
+    assert not saved[0].axes[0].get_lines()
+
+
+def test_a_confusion_matrix_shows_counts_and_shares(saved: list[Figure], tmp_path: Path) -> None:
+    counts = np.array([[3, 1, 0], [0, 2, 0], [0, 0, 0]])
+    draw_confusion(
+        counts, ["wave", "push", "a name that is far too long for an axis"], "accuracy 83 %", tmp_path / "c.png"
+    )
+    axes = saved[0].axes[0]
+    shares = np.asarray(axes.get_images()[0].get_array())
+    np.testing.assert_allclose(shares, [[0.75, 0.25, 0], [0, 1, 0], [0, 0, 0]])
+    told = {(round(t.get_position()[1]), round(t.get_position()[0])): t.get_text() for t in axes.texts}
+    assert told == {(0, 0): "3", (0, 1): "1", (1, 1): "2"}
+    names = [label.get_text() for label in axes.get_yticklabels()]
+    assert names[0] == "wave 0" and len(names[2]) <= 30 and "…" in names[2]
+    assert axes.get_title() == "accuracy 83 %"
+
+
+def test_bars_leave_undefined_numbers_out(saved: list[Figure], tmp_path: Path) -> None:
+    panels = [
+        Bars(["all", "cup"], {"AP": [50.0, np.nan], "PQ": [120.0, 10.0]}, "%", 100),
+        Bars(["all"], {"AccS": [120.0]}, "% of points", 100, cut=True),
+        Histogram(np.array([5.0, 5.0, 95.0, np.nan]), "%", "sequences"),
+    ]
+    draw_panels(panels, 2, "Parts", tmp_path / "b.png")
+    first, cut, counted = saved[0].axes
+    assert [bar.get_width() for bar in first.patches] == [50, 0, 120, 10] and first.get_xlim()[1] > 120
+    assert cut.get_xlim() == (0, 100)
+    assert sum(bar.get_height() for bar in counted.patches) == 3 and len(counted.patches) == 20
+    with pytest.raises(DataError, match="cannot be written"):
+        draw_panels(panels, 2, "Parts", tmp_path / "no" / "b.png")
