@@ -156,7 +156,7 @@ def _explain(error: BaseException) -> int:
     if _out_of_memory(error):
         log.error(
             f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"
-            " at a time: --batch or --accumulate in training, --points, --frames, --size, --jobs"
+            " at a time: --batch, or --set accumulate=2 in `classify train`, --points, --frames, --size, --jobs"
         )
         return 1
     if isinstance(error, OSError) and error.filename is not None and error.strerror:

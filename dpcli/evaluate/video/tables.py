@@ -106,7 +106,7 @@ def _part_table(score: PartScore) -> TextTable:
 
 
 def _track_table(score: TrackScore, unit: str) -> TextTable:
-    header = ["tracks of", f"EPE{f' ({unit})' if unit else ''}", "of the diameter", "points", "frames"]
+    header = ["tracks of", f"EPE{f' ({unit})' if unit else ''}", "EPE / diameter", "points", "frames"]
     rows = [
         [name, four_digits(error), _percent(error, score.diameter), str(score.points), str(score.frames)]
         for name, error in (("the scene", score.epe), ("no motion", score.static))

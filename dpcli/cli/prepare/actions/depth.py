@@ -84,7 +84,7 @@ def depth(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Any depth video, 8 or 16 bits, to points in meters.
+    """Turns any depth video, 8 or 16 bits, into points in meters.
 
     For example: dpc prepare depth my_videos --label-from-folder --fov 70 -o own.h5
     """

@@ -22,7 +22,7 @@ def sapien(
     fractions: CategoryFractions = "",
     conversion: ArticulatedConversion,
 ) -> None:
-    """Articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
+    """Reads articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
 
     Lengths are diameters of the object in frame 0.
     """

@@ -35,7 +35,7 @@ def clouds(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Point cloud files: a folder is a sequence, its files are the frames.
+    """Reads point cloud files: a folder is a sequence, its files are the frames.
 
     For example: dpc prepare clouds scans --fps 10 -o own.h5
     """

@@ -25,7 +25,10 @@ def animal(
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
-    """A made-up animal, filmed: shape, coat and gait by --seed, exact tracks and rigid parts; needs no data."""
+    """Makes and films a made-up animal that moves: shape, coat and gait by --seed, exact tracks and rigid parts.
+
+    Needs no data.
+    """
     from dpcli.prepare.synthetic.animal import animal_clip, animal_config
     from dpcli.runtime.device import cpu_count
 

@@ -12,6 +12,7 @@ from dpcli.errors import UsageError
 if TYPE_CHECKING:
     import numpy as np
 
+    from dpcli.classify.commands.model_task import ModelTask
     from dpcli.classify.stream.frame_source import CloudFiles
 
 Stream = Annotated[
@@ -34,56 +35,36 @@ JsonLines = Annotated[bool, typer.Option("--json", help="With --stream: one JSON
 
 
 def require_stream(**given: object) -> None:
-    """UsageError when an option of --stream is given without it."""
+    """Raises UsageError when an option of --stream is given without it."""
     for name, value in given.items():
         if value not in (None, False):
             raise UsageError(f"--{name} goes with --stream")
 
 
-def predict_stream(
-    data: str,
-    model: str,
-    output: str | None,
-    *,
-    refused: dict[str, bool],
-    hop: int | None,
-    window: int | None,
-    follow: float | None,
-    seed: int,
-    device: str,
-    force: bool,
-    json_output: bool,
-    backbone: str | None = None,
-) -> None:
-    """Check the options and run. `refused` maps options of batch prediction to whether they were given."""
-    for name in (name for name, given in refused.items() if given):
+def refuse_batch_options(given: dict[str, bool]) -> None:
+    """Raises UsageError when an option of batch prediction is given. given: option -> whether it is."""
+    for name in (name for name, typed in given.items() if typed):
         raise UsageError(f"--{name} does not go with --stream, which is one video, as it comes")
-    if output == "-":
+
+
+def predict_stream(task: ModelTask, hop: int | None, window: int | None, follow: float | None, as_json: bool) -> None:
+    """Checks the options and predicts, a line per prediction on stdout."""
+    if task.output == "-":
         raise UsageError("-o - would mix HDF5 with the lines on stdout; name a file, or leave -o out")
     if hop is not None and hop < 1:
         raise UsageError(f"--hop {hop}: expected at least 1 frame")
     if follow is not None and not follow >= 0:
         raise UsageError(f"--follow {follow:g}: expected seconds, 0 or more (inf: until a signal)")
-    from dpcli.classify.commands.stream import run_stream
+    from dpcli.classify.commands.stream import StreamOptions
+    from dpcli.classify.commands.stream import predict_stream as run
+    from dpcli.cli.classify.stream_lines import Lines
 
-    run_stream(
-        data,
-        model,
-        output,
-        hop=hop or 1,
-        window=window,
-        follow=follow or 0.0,
-        seed=seed,
-        device=device,
-        force=force,
-        json_output=json_output,
-        files=cloud_files(),
-        backbone=backbone,
-    )
+    options = StreamOptions(hop or 1, window, follow or 0.0, cloud_files())
+    run(task, options, lambda class_names, streams: Lines(class_names, streams, as_json))
 
 
 def cloud_files() -> CloudFiles:
-    """A folder's frames: what `dpc prepare clouds` reads, in its order."""
+    """Returns how a folder's frames are read: what `dpc prepare clouds` reads, in its order."""
     from dpcli.classify.stream.frame_source import CloudFiles
     from dpcli.prepare.decode.cloud_files import SUFFIXES
     from dpcli.prepare.reader import natural_key
@@ -92,7 +73,7 @@ def cloud_files() -> CloudFiles:
 
 
 def _read_points(path: Path) -> np.ndarray:
-    """The points of a file, those with NaN left out as `dpc prepare clouds` does: organized clouds mark gaps so."""
+    """Returns the points of a file, those with NaN left out as `dpc prepare clouds` does: organized clouds mark gaps so."""
     from dpcli.prepare.decode.cloud_files import read_cloud
     from dpcli.prepare.scans.clouds import drop_invalid
 
