@@ -72,7 +72,7 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
             dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
         else:
             room = import_module(f"dpcli.cli.{name}.app").app
-            dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about)
+            dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about, cls=SectionedGroup)
     return dpc
 
 
