@@ -11,6 +11,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.filming import Filming, film
 from dpcli.prepare.meshes.gltf import read_gltf
+from dpcli.prepare.meshes.gltf_extensions import name_unread, refuse_required
 from dpcli.prepare.meshes.gltf_mesh import bake
 from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
 from dpcli.prepare.views.views_pipeline import Clip
@@ -44,6 +45,8 @@ def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
     """
     with _well_formed(path):
         file = read_gltf(path)
+        refuse_required(file)
+        name_unread(file)
         chosen, names = choose_clip(file, clip), clip_names(file)
         if clip is None and len(names) > 1:
             log.info(f"{path}: clip {names[0]!r}, the first of {len(names)}; --list names them, --clip chooses")

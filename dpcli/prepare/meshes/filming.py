@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
-from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, rigid_parts, track_points
+from dpcli.prepare.meshes.bone_parts import choose_points, ever_hidden, heaviest_bones, rigid_parts, track_points
 from dpcli.prepare.meshes.raycast import FrameCaster
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
@@ -103,9 +103,14 @@ def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | Non
         return None, None
     points = choose_points(mesh, filming.tracks, generator(filming.seed))
     track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
+    hidden = int(ever_hidden(mesh, points).sum())
+    if hidden:
+        log.warn(
+            f"{mesh.name}: {hidden} of {filming.tracks} tracks are hidden in some frames, a point of no extent there"
+        )
     smallest = int(np.ceil(filming.min_part * filming.tracks))
     tolerance = filming.part_tolerance * OBJECT_RADIUS
-    part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(np.float64), tolerance, smallest)
+    part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track, tolerance, smallest)
     log.info(f"{mesh.name}: {int(part.max()) + 1} rigid parts of {len(np.unique(bone))} bones")
     return track, part
 

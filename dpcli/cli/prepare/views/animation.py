@@ -18,7 +18,8 @@ def animation(
     model: Annotated[Path, typer.Argument(help="A .glb or .gltf with an animation: skinned, morphing or of nodes.")],
     options: FilmingOptions,
     clip: Annotated[
-        str | None, typer.Option("--clip", help="Name of the animation, such as Walk. Default: the first.")
+        str | None,
+        typer.Option("--clip", help="Name or number of the animation, such as Walk or 2. Default: the first."),
     ] = None,
     list_: Annotated[bool, typer.Option("--list", help="Print the clips and their seconds; write nothing.")] = False,
     json_: Json = False,
@@ -51,5 +52,5 @@ def _print_clips(clips: list[tuple[str, float]], as_json: bool) -> None:
     if as_json:
         typer.echo(json.dumps({"clips": [{"name": name, "seconds": round(seconds, 6)} for name, seconds in clips]}))
         return
-    for name, seconds in clips:
-        typer.echo(f"{seconds:7.2f} s  {name}")
+    for number, (name, seconds) in enumerate(clips):
+        typer.echo(f"{number:3}  {seconds:7.2f} s  {name}")
