@@ -49,12 +49,14 @@ _FOREIGN = {  # how files of other formats begin
 class Gltf:
     """Holds a glTF file: its JSON and, read when asked for, its buffers.
 
-    `accessor` decodes numbers, `image` gives a texture's encoded bytes. All errors are DataErrors that name the file.
+    `accessor` decodes numbers, `image` gives a texture's encoded bytes; decoded: what accessors (by index) hold that a
+    compressed block gave, (count, components). All errors are DataErrors that name the file.
     """
 
     path: Path
     tree: dict[str, Any]
     binary: bytes | None = None
+    decoded: dict[int, np.ndarray] = field(default_factory=dict)
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
     def fail(self, problem: str) -> DataError:
@@ -89,11 +91,13 @@ class Gltf:
             raise self.fail(f"{what}: accessor {index} has no valid type or count; export the file again")
         if width is not None and columns != width:
             raise self.fail(f"{what}: accessor {index} is {entry['type']}, expected {width} components")
-        if "bufferView" in entry:
+        if index in self.decoded:
+            values = self._of_block(self.decoded[index], columns, dtype, what)
+        elif "bufferView" in entry:
             values = self._elements(entry["bufferView"], entry.get("byteOffset", 0), count, columns, dtype, what)
         else:
             values = np.zeros((count, columns), dtype)
-        if "sparse" in entry:
+        if "sparse" in entry and index not in self.decoded:
             values = self._replaced(values, entry["sparse"], what)
         if dtype is not np.float32 and entry.get("normalized"):
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1)
@@ -101,6 +105,15 @@ class Gltf:
             row = int(np.argmax(~np.isfinite(values).all(1)))
             raise self.fail(f"{what}: NaN or infinite at entry {row} of {count}; repair the model, export it again")
         return values[:, 0] if columns == 1 else values
+
+    def _of_block(self, values: np.ndarray, columns: int, dtype: type, what: str) -> np.ndarray:
+        if values.shape[1] != columns or not len(values):
+            raise self.fail(f"{what}: its Draco block has {values.shape[1]} components, expected {columns}")
+        return values.astype(dtype)
+
+    def view_bytes(self, index: Any) -> bytes:
+        """Returns the bytes of a buffer view."""
+        return self._view(index)[0]
 
     def _elements(self, view: Any, offset: int, count: int, columns: int, dtype: type, what: str) -> np.ndarray:
         data, stride = self._view(view)

@@ -14,6 +14,7 @@ READ = {
     "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
     "KHR_animation_pointer",
+    "KHR_draco_mesh_compression",
     "KHR_materials_emissive_strength",
     "KHR_materials_pbrSpecularGlossiness",
     "KHR_materials_unlit",
@@ -25,6 +26,7 @@ _UNSEEN = {  # what they say does not change a picture
     "CESIUM_primitive_outline",
     "EXT_mesh_features",
     "EXT_structural_metadata",
+    "FB_ngon_encoding",
     "KHR_accessor_float64",
     "KHR_materials_variants",
     "KHR_node_hoverability",
@@ -35,7 +37,6 @@ _UNSEEN = {  # what they say does not change a picture
     "VRMC_vrm",
 }
 _ADVICE = {
-    "KHR_draco_mesh_compression": "export it without compression",
     "EXT_meshopt_compression": "export it without compression",
     "KHR_meshopt_compression": "export it without compression",
     "KHR_texture_basisu": "export its textures as PNG or JPEG",

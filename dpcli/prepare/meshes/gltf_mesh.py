@@ -9,6 +9,7 @@ import numpy as np
 
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
+from dpcli.prepare.meshes.gltf_draco import decompress
 from dpcli.prepare.meshes.gltf_extensions import instances
 from dpcli.prepare.meshes.gltf_material import is_double_sided, read_material, texture_sets
 from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, node_visibility, read_clip
@@ -172,6 +173,7 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
     attributes = entry.get("attributes", {})
     if "POSITION" not in attributes:
         raise file.fail(f"{where} has no positions; export the file again")
+    decompress(file, entry, where)
     positions = _floats(file, attributes, "POSITION", where, 3)
     count = len(positions)
 
