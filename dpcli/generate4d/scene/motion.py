@@ -170,7 +170,10 @@ def blend_motions(
 
     The thesis writes R x + t, a position, in place of the displacement. Quaternions must lie in one hemisphere.
     """
-    return weight * rigid + (1 - weight) * rest, normalize(weight * rigid_turn + (1 - weight) * turn)
+    both = normalize(
+        weight * rigid_turn + (1 - weight) * turn
+    )  # first: the order of gradients' sums follows that of terms
+    return weight * rigid + (1 - weight) * rest, both
 
 
 def add_motions(rigid: Tensor, rigid_turn: Tensor, rest: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
