@@ -11,9 +11,7 @@ def main() -> None:
         from dpcli.standard_streams import ready_streams
 
         ready_streams()
-        from dpcli.prepare.head_start import head_start
 
-        head_start(sys.argv[1:])
         from dpcli.cli.app import main
 
         main()

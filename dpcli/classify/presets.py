@@ -1,25 +1,16 @@
-"""Named settings of network and schedule: what the thesis used, what the release used, and what suits a CPU."""
+"""Settings that belong together: the presets, and what a variant or a backbone changes in them.
+
+A preset is what the thesis used, what its published code uses, or what suits a CPU. `settings.py` puts a user's choices over one.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
-from dpcli.classify.data.augment import PRESETS as AUGMENTATIONS
-from dpcli.classify.data.augment import Augmentation
+from dpcli.classify.data.augment import AUGMENTATIONS
 from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.training.run_settings import RunSettings
 from dpcli.classify.training.schedule import Schedule
-from dpcli.errors import UsageError
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A configuration, a schedule and an augmentation that belong together."""
-
-    config: KinetConfig
-    schedule: Schedule
-    augmentation: Augmentation
-
 
 _SMALL = {
     "centroids": (256, 128),
@@ -42,30 +33,41 @@ _TINY = {
     "widths": ((32, 64), (64, 128), (128, 256)),
 }
 
+
+def _preset(network: KinetConfig, schedule: Schedule, augment: str) -> dict[str, Any]:
+    """Returns the groups of settings of a preset with the augmentation of that name."""
+    run = RunSettings(augment=augment)
+    return {"network": network, "schedule": schedule, "augmentation": AUGMENTATIONS[augment], "run": run}
+
+
 PRESETS = {
-    "thesis": Preset(KinetConfig(static_temporal_radius=0), Schedule(), AUGMENTATIONS["peers"]),
-    "release": Preset(
+    "thesis": _preset(KinetConfig(static_temporal_radius=0), Schedule(), "peers"),
+    "release": _preset(
         KinetConfig.release(num_frames=32, points_per_frame=128, normalize="image"),
-        Schedule((250, 250), batch=8, decay="staircase", validate_every=5),
-        AUGMENTATIONS["release"],
+        Schedule(250, 250, batch=8, decay="staircase", validate_every=5),
+        "release",
     ),
-    "quick": Preset(
-        KinetConfig(**_SMALL),
-        Schedule((80, 60), batch=8, weight_decay=0.01, label_smoothing=0.1),
-        AUGMENTATIONS["ours"],
-    ),
-    "tiny": Preset(
-        KinetConfig(**_TINY), Schedule((20, 40), batch=8, learning_rate=2e-3, weight_decay=0.01), AUGMENTATIONS["ours"]
-    ),
+    "quick": _preset(KinetConfig(**_SMALL), Schedule(80, 60, batch=8, weight_decay=0.01, label_smoothing=0.1), "ours"),
+    "tiny": _preset(KinetConfig(**_TINY), Schedule(20, 40, batch=8, learning_rate=2e-3, weight_decay=0.01), "ours"),
 }
 
-
-def find_preset(name: str) -> Preset:
-    """The preset of that name; UsageError lists them."""
-    if name not in PRESETS:
-        raise UsageError(f"--preset {name}: expected one of {', '.join(PRESETS)}")
-    return PRESETS[name]
-
+# What `variant` means: the fields in which the published code differs from the thesis's text, with the values of each.
+_DIFFERING = (
+    "variant",
+    "group_size",
+    "xyz_group",
+    "time_input",
+    "weighting",
+    "merge",
+    "guard",
+    "fusion",
+    "grouping",
+    "static_temporal_radius",
+)
+VARIANT_CHANGES: dict[str, dict[str, Any]] = {
+    name: {key: getattr(config, key) for key in _DIFFERING}
+    for name, config in (("thesis", KinetConfig()), ("release", KinetConfig.release()))
+}
 
 _GRAPH = {
     "neighbors": 20,
@@ -102,7 +104,11 @@ BACKBONE_CHANGES: dict[str, dict[str, dict[str, Any]]] = {
 }
 
 
-def with_backbone(config: KinetConfig, preset: str, backbone: str) -> KinetConfig:
-    """A preset's configuration on another backbone, with `BACKBONE_CHANGES`; a user's own (`module:Class`) changes nothing
-    else and reads from the configuration what it wants."""
-    return config.changed(backbone=backbone, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {}))
+def backbone_changes(preset: str, backbone: str) -> dict[str, Any]:
+    """Returns the fields of a preset's network that change with the backbone, by name.
+
+    A user's own (`module:Class`) shares one set of neighborhoods between both streams, and reads from the rest what it wants.
+    """
+    if backbone == "pointnet2":
+        return {"backbone": backbone}
+    return {"backbone": backbone, "static_temporal_radius": None, **BACKBONE_CHANGES.get(backbone, {}).get(preset, {})}

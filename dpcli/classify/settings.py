@@ -1,60 +1,116 @@
-"""From a preset and the options over it to a configuration and a schedule."""
+"""The settings of a network and of a training run, made from a preset and a user's choices over it.
+
+Each choice is a field of a dataclass: `network/config.py`, `training/schedule.py`, `data/augment.py`, `training/run_settings.py`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
-import torch
-
-from dpcli.classify.network.backbones.interface import BACKBONES
+from dpcli.classify.data.augment import AUGMENTATIONS, Augmentation
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.presets import find_preset, with_backbone
+from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES, backbone_changes
+from dpcli.classify.training.run_settings import RunSettings
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
-from dpcli.runtime.device import cpu_count
-from dpcli.runtime.mixed_precision import wanted
+from dpcli.runtime.settings.catalog import Catalog, Given
+from dpcli.runtime.settings.fields import settings_of
 
-_RELEASE = {
-    key: getattr(KinetConfig.release(), key)
-    for key in (
-        "variant",
-        "group_size",
-        "xyz_group",
-        "time_input",
-        "weighting",
-        "merge",
-        "guard",
-        "fusion",
-        "grouping",
-        "static_temporal_radius",
-    )
+NETWORK = Catalog(network=KinetConfig)
+TRAINING = Catalog(network=KinetConfig, schedule=Schedule, augmentation=Augmentation, run=RunSettings)
+NETWORK_PRESETS = {name: {"network": groups["network"]} for name, groups in PRESETS.items()}
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Holds all settings of a training run.
+
+    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise.
+    """
+
+    network: KinetConfig
+    schedule: Schedule
+    augmentation: Augmentation
+    run: RunSettings
+
+    def __post_init__(self) -> None:
+        speed = self.augmentation.speed
+        if speed and (self.run.timing == "uniform" or not self.schedule.clips_per_video):
+            raise UsageError(
+                f"augment_speed = {speed:g}: speed changes random clips of consecutive frames; leave it out with --timing"
+                " uniform or clips_per_video = 0"
+            )
+
+    def to_toml(self, command: str) -> str:
+        """Returns the settings as TOML, which `--config` reads back. command: the words that the first line names."""
+        return TRAINING.to_toml({one.name: getattr(self, one.name) for one in fields(self)}, command)
+
+
+def network_config(given: Given, classes: int) -> KinetConfig:
+    """Returns the preset's network with what was given over it, for so many classes. Raises UsageError where it doesn't fit."""
+    base = NETWORK_PRESETS[given.preset or ""]
+    return NETWORK.resolve(base, Given(config=_all_values(given)))["network"].changed(num_classes=classes)
+
+
+def training_settings(given: Given) -> TrainingSettings:
+    """Returns the preset's settings with what was given over them. Raises UsageError where they don't fit together."""
+    values = _all_values(given)
+    if values.get("pretrain"):
+        if values.get("frames", 1) != 1 or values.get("epochs_dynamic", 0) != 0:
+            raise UsageError(
+                "pretrain trains the static stream on clips of one frame; leave out --frames and epochs_dynamic"
+            )
+        values |= {"frames": 1, "temporal_radius": 0, "epochs_dynamic": 0}  # a single cloud a video
+    return TrainingSettings(**TRAINING.resolve(PRESETS[given.preset or ""], Given(config=values)))
+
+
+def with_classes(settings: TrainingSettings, classes: int) -> TrainingSettings:
+    """Returns the settings with a network for so many classes."""
+    return replace(settings, network=settings.network.changed(num_classes=classes))
+
+
+def _all_values(given: Given) -> dict[str, Any]:
+    """Returns every value that stands over the preset's, by public name: what is given, and below it what that implies."""
+    typed = {**given.sets, **given.flags}
+    config = {
+        name: value
+        for name, value in given.config.items()
+        if not any(name in members and _changes(head, given.config, typed) for head, members in _IMPLIED.items())
+    }
+    values = {**config, **typed}
+    return {**_implied_values(values, given.preset or ""), **values}
+
+
+def _implied_values(values: Mapping[str, Any], preset: str) -> dict[str, Any]:
+    """Returns what the settings that stand for several imply, by public name."""
+    network: dict[str, Any] = {}
+    if values.get("variant", PRESETS[preset]["network"].variant) != PRESETS[preset]["network"].variant:
+        network |= VARIANT_CHANGES[values["variant"]]
+    if "backbone" in values:
+        network |= backbone_changes(preset, values["backbone"])
+    if values.get("normals") is False:
+        network["weighting"] = "none"
+    implied = {_PUBLIC[KinetConfig][key]: value for key, value in network.items()}
+    if "augment" in values:
+        named = AUGMENTATIONS[values["augment"]]
+        implied |= {name: getattr(named, field) for field, name in _PUBLIC[Augmentation].items()}
+    return implied
+
+
+def _changes(name: str, config: Mapping[str, Any], typed: Mapping[str, Any]) -> bool:
+    """Returns whether the command line says another value of a setting than the file of settings."""
+    return name in typed and typed[name] != config.get(name)
+
+
+_PUBLIC = {cls: {one.field: one.name for one in settings_of(cls)} for cls in (KinetConfig, Augmentation)}
+# Settings that stand for several, with those several: where the command line changes one, a file's values of these give way.
+_IMPLIED = {
+    "variant": {_PUBLIC[KinetConfig][key] for key in VARIANT_CHANGES["release"]},
+    "backbone": {
+        _PUBLIC[KinetConfig][key] for of in BACKBONE_CHANGES.values() for changes in of.values() for key in changes
+    },
+    "normals": {"weighting"},
+    "augment": set(_PUBLIC[Augmentation].values()),
 }
-
-
-def network_config(
-    preset: str, variant: str | None, changes: dict[str, Any], classes: int, backbone: str | None = None
-) -> KinetConfig:
-    """The preset's configuration, the variant's and the backbone's choices over it, explicit options over all."""
-    config = find_preset(preset).config
-    if variant == "release":
-        config = config.changed(**_RELEASE)
-    elif variant not in (None, "thesis"):
-        raise UsageError(f"--variant {variant}: expected thesis or release")
-    if backbone in BACKBONES:
-        config = with_backbone(config, preset, backbone)
-    elif backbone is not None:
-        config = config.changed(backbone=backbone, static_temporal_radius=None)  # PointNet++'s alone
-    return config.changed(num_classes=classes, **{key: value for key, value in changes.items() if value is not None})
-
-
-def training_schedule(preset: str, changes: dict[str, Any], device: torch.device) -> Schedule:
-    """The preset's schedule with the options that were given; on a CPU clips are loaded in the same process."""
-    base = find_preset(preset).schedule
-    epochs = tuple(new if new is not None else old for new, old in zip(changes.pop("epochs"), base.epochs))
-    clips = changes.pop("clips_per_video") or None
-    workers = changes.pop("workers")
-    workers = workers if workers is not None else (0 if device.type == "cpu" else min(4, cpu_count()))
-    amp = wanted(changes.pop("amp"), device)
-    given = {key: value for key, value in changes.items() if value is not None}
-    return replace(base, epochs=epochs, clips_per_video=clips, workers=workers, amp=amp, **given)

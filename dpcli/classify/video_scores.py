@@ -14,7 +14,7 @@ from dpcli.classify.network.kinet import STREAMS, Kinet, fuse
 
 @dataclass
 class VideoScores:
-    """Mean probabilities (C) of one video, fused and by stream, and how many clips they come from."""
+    """Holds the mean probabilities (C) of one video, fused and by stream, and how many clips they come from."""
 
     sequence: int
     fused: np.ndarray
@@ -23,7 +23,7 @@ class VideoScores:
 
 
 def batches(source: ClipSource, clips: list[Clip], size: int) -> Iterator[tuple[list[Clip], torch.Tensor]]:
-    """Clips in order as tensors (b,T,P,3); the points drawn depend on the clip alone, not on the batch."""
+    """Yields clips in order as tensors (b,T,P,3); the points drawn depend on the clip alone, not on the batch."""
     for start in range(0, len(clips), size):
         chosen = clips[start : start + size]
         arrays = [source.load(clip, clip.sequence, *clip.frames) for clip in chosen]
@@ -40,7 +40,7 @@ def predict_videos(
     streams: Sequence[str] = STREAMS,
     done: Container[int] = (),
 ) -> Iterator[VideoScores]:
-    """Scores of every video of `source` that isn't `done`, in order, one video in memory at a time.
+    """Yields the scores of every video of `source` that isn't `done`, in order, one video in memory at a time.
 
     streams: those that were trained; with the static one alone, its scores are the fused ones. done: numbers of sequences.
     """
@@ -59,7 +59,7 @@ def predict_videos(
 
 
 def clip_scores(model: Kinet, points: torch.Tensor, streams: Sequence[str]) -> torch.Tensor:
-    """Probabilities of clips (B,T,P,3): fused, then by stream, (1 + streams, B, C)."""
+    """Returns the probabilities of clips (B,T,P,3): fused, then by stream, (1 + streams, B, C)."""
     if tuple(streams) != STREAMS:
         return torch.stack([torch.softmax(model.static_logits(points), -1)] * 2)
     static, dynamic = model(points)

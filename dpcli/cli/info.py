@@ -64,7 +64,7 @@ def info(
             )
         if page is not None:
             raise UsageError(f"--page shows data files, {model} holds weights; without --page you see what is in it")
-        _tell({"file": str(model), **weights_summary(model)}, as_object, _show_model)
+        _tell({"file": str(model), **weights_summary(model), **_settings_beside(model)}, as_object, _show_model)
         return
     if sequence and page is None:
         raise UsageError("--sequence chooses what --page shows; give --page FILE.html, too")
@@ -86,6 +86,14 @@ def _write_page(path: Path, found: dict[str, Any], page: Path, **choice: Any) ->
     log.info(" ".join([f"{page}: {page.stat().st_size / 1e6:.2g} MB.", *left_out]))
 
 
+def _settings_beside(model: Path) -> dict[str, Any]:
+    """Returns the settings of the run that made the weights, by group, where its folder holds them."""
+    from dpcli.runtime.toml_file import read_toml
+
+    file = model.parent / "settings.toml"
+    return {"settings": read_toml(file)} if file.is_file() else {}
+
+
 def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]], None]) -> None:
     if as_object:
         typer.echo(json.dumps(found, allow_nan=False))
@@ -95,14 +103,14 @@ def _tell(found: dict[str, Any], as_object: bool, show: Callable[[dict[str, Any]
 
 def _draw(path: Any, kind: str, picture: Any, **options: Any) -> None:
     from dpcli.draw.clouds_sheet import clouds_sheet
-    from dpcli.evaluate.classification.confusion_picture import check_picture
+    from dpcli.runtime.whole_file import FIGURES, check_target
     from dpcli.store import CloudsReader
 
     if kind not in ("clouds", "parts", "views"):
         raise UsageError(
             f"--picture draws point clouds and views, this file holds {kind!r}; for scores: dpc evaluate classification"
         )
-    check_picture(picture)
+    check_target(picture, "--picture", FIGURES)
     if kind == "views":
         _draw_views(path, picture, **options)
         return
@@ -133,6 +141,19 @@ def _show(found: dict[str, Any]) -> None:
     for number, entry in enumerate(found["provenance"], 1):
         short = _shortened(str(entry.get("command", "")))
         console.print(f"{'provenance' if number == 1 else '':<20} {number}. {printable(short)}", markup=False)
+    for name, value in _settings_lines(found):
+        console.print(printable(f"{name:<20} {value}"), markup=False)
+
+
+def _settings_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns the settings of the command that made the file, one line a group, where its provenance has them."""
+    from dpcli.runtime.settings.value_types import write_text
+
+    groups = found["provenance"][-1].get("config", {}).get("settings", {}) if found["provenance"] else {}
+    return [
+        (f"settings {group}", ", ".join(f"{name} {write_text(value)}" for name, value in values.items()))
+        for group, values in groups.items()
+    ]
 
 
 def _show_model(told: dict[str, Any]) -> None:
@@ -149,7 +170,7 @@ def _show_model(told: dict[str, Any]) -> None:
     ]
     if told["card"]:
         lines.append(("card", told["card"]))
-    for key, value in told["header"].items():
+    for key, value in (told["header"] | told.get("settings", {})).items():
         within = value.items() if isinstance(value, dict) else [("", value)]
         lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
     for name, value in lines:

@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
+from dpcli.errors import UsageError
+
+_LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
+
 Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
 Scene = Annotated[str, typer.Argument(help="A gaussians file, or - for a pipe.")]
-_LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
-Seed = Annotated[int, typer.Option("--seed", min=0, max=_LARGEST_SEED, help="Seed of all randomness.")]
+
+
+def _read_seed(text: str) -> int:
+    """Returns the seed. Raises UsageError unless it is a whole number that torch and an HDF5 attribute hold."""
+    try:
+        seed = int(text)
+    except ValueError:
+        seed = -1
+    if not 0 <= seed <= _LARGEST_SEED:
+        raise UsageError(f"--seed {text}: expected a whole number from 0 to {_LARGEST_SEED}")
+    return seed
+
+
+Seed = Annotated[int, typer.Option("--seed", parser=_read_seed, metavar="INTEGER", help="Seed of all randomness.")]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. Default: the CPUs this process may use.")]
 Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
-OnError = Annotated[str, typer.Option("--on-error", help="A bad sample: skip (list it at the end) or stop.")]
+OnError = Annotated[
+    Literal["skip", "stop"],
+    typer.Option("--on-error", help="After a bad sample: skip it and list it at the end, or stop."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Start over, even if the output or a part of it exists.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Picture = Annotated[Path | None, typer.Option("--picture", help="Write a picture (.png) to this file.")]

@@ -1,1 +1,1 @@
-"""Metrics as plain functions on arrays, protocols that say what was counted, tables and pictures that show it."""
+"""This room holds metrics as plain functions on arrays, protocols that say what was counted, and tables and pictures."""

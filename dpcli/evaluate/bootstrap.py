@@ -1,7 +1,7 @@
 """Bootstrap intervals: how far a metric would move with other samples of the same kind (Efron & Tibshirani 1993).
 
-What is resampled is a whole sample: a video of a scores file, a sequence of a parts file with all its frames and frame
-pairs, which are not independent of one another. A metric is a function of how often each sample counts (`Weighted`), so
+Whole samples are resampled: a video of a scores file, a sequence of a parts file with all its frames and frame pairs,
+which are not independent of one another. A metric is a function of how often each sample counts (`WeightedMetric`), so
 a resample is a row of counts and a thousand of them are a few sums.
 """
 
@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import UsageError
+from dpcli.evaluate.proportions import divide
 from dpcli.runtime.seeds import generator
 
-Weighted = Callable[[np.ndarray], dict[str, np.ndarray]]
+WeightedMetric = Callable[[np.ndarray], dict[str, np.ndarray]]
 """Counts f64 (R,n), how often each of n samples counts in each of R resamples -> value f64 (R) by metric, NaN = 0/0."""
 
 METHODS = ("bca", "percentile")
@@ -26,7 +27,10 @@ _EQUAL = 1e-12  # relative: sums in another order
 
 @dataclass(frozen=True)
 class Resampling:
-    """How to resample: `resamples` times (0 = no intervals), for intervals of `confidence`, from `seed`."""
+    """Says how to resample: `resamples` times (0 = no intervals), for intervals of `confidence` (0..1), from `seed`.
+
+    Raises UsageError for a confidence outside 0..1 and for fewer than 100 resamples, of which intervals can't be read.
+    """
 
     resamples: int = 2000
     confidence: float = 0.95
@@ -38,8 +42,8 @@ class Resampling:
         if self.resamples < 0 or 0 < self.resamples < 100:
             raise UsageError(f"--resamples {self.resamples}: expected 100 or more, or 0 for no intervals")
 
-    def intervals(self, metric: Weighted, samples: int, method: str = "bca") -> dict[str, Interval]:
-        """Interval of each metric over `samples` samples; empty when `resamples` is 0."""
+    def intervals(self, metric: WeightedMetric, samples: int, method: str = "bca") -> dict[str, Interval]:
+        """Returns the interval of each metric over `samples` samples; no intervals when `resamples` is 0."""
         if self.resamples == 0:
             return {}
         return bootstrap(
@@ -49,22 +53,47 @@ class Resampling:
 
 @dataclass(frozen=True)
 class Interval:
-    """Ends of an interval in the metric's own unit; NaN = undefined (fewer than two samples, or a metric of 0/0)."""
+    """Holds the ends of an interval in the metric's own unit; NaN = undefined (fewer than two samples, or a metric of 0/0)."""
 
     low: float
     high: float
 
     @property
     def defined(self) -> bool:
+        """Whether the interval has ends."""
         return not np.isnan(self.low)
+
+
+def ratios_of_sums(tops: Mapping[str, np.ndarray], bottoms: Mapping[str, np.ndarray]) -> WeightedMetric:
+    """Returns the metrics that are a ratio of sums over the samples.
+
+    tops, bottoms: numerator and denominator of each sample, f64 (n) by metric.
+
+    >>> half = ratios_of_sums({"share": np.array([1, 0])}, {"share": np.array([1, 1])})
+    >>> half(np.array([[1.0, 1], [2, 0]]))["share"].tolist()
+    [0.5, 1.0]
+    """
+    keys = list(tops)
+    top, bottom = (np.stack([np.asarray(side[key], np.float64) for key in keys], axis=1) for side in (tops, bottoms))
+
+    def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
+        return dict(zip(keys, divide(counts @ top, counts @ bottom).T, strict=True))
+
+    return metric
+
+
+def means_of_samples(values: Mapping[str, np.ndarray]) -> WeightedMetric:
+    """Returns the metrics that are a mean over the samples: f64 (n) by metric; NaN = the sample doesn't count for it."""
+    defined = {key: ~np.isnan(value) for key, value in values.items()}
+    return ratios_of_sums({key: np.nan_to_num(value) for key, value in values.items()}, defined)
 
 
 def drawn_counts(
     samples: int, resamples: int, rng: np.random.Generator, groups: np.ndarray | None = None
 ) -> Iterator[np.ndarray]:  # f64 (R,samples), blocks of rows
-    """Counts of `samples` samples drawn with replacement, `resamples` times.
+    """Draws `samples` samples with replacement, `resamples` times, and yields how often each was drawn, block by block.
 
-    `groups` i (samples), 0..G-1: samples of one group are drawn together, G groups each time.
+    groups i (samples), 0..G-1: samples of one group are drawn together, G groups each time.
     """
     units = samples if groups is None else int(groups.max()) + 1
     rows = max(1, _BLOCK // max(samples, 1))
@@ -76,16 +105,19 @@ def drawn_counts(
 
 
 def replicates(
-    metric: Weighted, samples: int, rng: np.random.Generator, resamples: int, groups: np.ndarray | None = None
+    metric: WeightedMetric, samples: int, rng: np.random.Generator, resamples: int, groups: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Value of each metric in each resample, f64 (resamples)."""
+    """Returns the value of each metric in each resample, f64 (resamples)."""
     return _joined(metric(counts) for counts in drawn_counts(samples, resamples, rng, groups))
 
 
-def left_out_once(metric: Weighted, samples: int, groups: np.ndarray | None = None) -> dict[str, np.ndarray] | None:
-    """Value of each metric without each sample (or group), f64 (samples); None for more than 2,000 of them.
+def left_out_once(
+    metric: WeightedMetric, samples: int, groups: np.ndarray | None = None
+) -> dict[str, np.ndarray] | None:
+    """Returns the jackknife: the value of each metric without each sample (or group), f64 (samples).
 
-    The acceleration they serve falls with the root of their number: it no longer moves an interval there.
+    Returns None for more than 2,000 of them: the acceleration that these values serve falls with the root of their
+    number and no longer moves an interval there.
     """
     groups = np.arange(samples) if groups is None else groups
     units = int(groups.max()) + 1
@@ -104,7 +136,7 @@ def _joined(parts: Iterator[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def bootstrap(
-    metric: Weighted,
+    metric: WeightedMetric,
     samples: int,
     rng: np.random.Generator,
     *,
@@ -113,10 +145,15 @@ def bootstrap(
     method: str = "bca",
     groups: np.ndarray | None = None,
 ) -> dict[str, Interval]:
-    """Interval of each metric from resamples of `samples` samples (of whole `groups`, see `drawn_counts`).
+    """Returns the interval of each metric from resamples of `samples` samples (of whole `groups`, see `drawn_counts`).
 
-    `method`: "bca", bias-corrected and accelerated (Efron 1987), or "percentile". A resample in which a metric is 0/0
-    doesn't count for it; when most are, or there is one sample only, the interval is undefined.
+    method: "bca", bias-corrected and accelerated (Efron 1987), or "percentile"; ValueError for another. A resample in
+    which a metric is 0/0 doesn't count for it; when most are, or there is one sample only, the interval is undefined.
+
+    >>> metric = means_of_samples({"mean": np.arange(10.0)})
+    >>> ends = bootstrap(metric, 10, np.random.default_rng(0), resamples=1000)["mean"]
+    >>> ends.low < 4.5 < ends.high
+    True
     """
     if method not in METHODS:
         raise ValueError(f"method {method!r}: expected one of {', '.join(METHODS)}")
@@ -145,7 +182,10 @@ def interval(
     bca: bool = False,
     jackknife: np.ndarray | None = None,  # f64 (n)
 ) -> Interval:
-    """Interval of an estimate from its replicates: percentiles of them, with `bca` moved by bias and acceleration."""
+    """Returns the interval of an estimate from its replicates: their percentiles, with `bca` moved by bias and acceleration.
+
+    jackknife: the estimate without each sample; without it the acceleration is 0. Undefined where most replicates are.
+    """
     defined = replicate[~np.isnan(replicate)]
     if np.isnan(estimate) or 2 * len(defined) < len(replicate) or len(defined) == 0:
         return Interval(np.nan, np.nan)
@@ -158,12 +198,12 @@ def interval(
 
 
 def snapped(replicate: np.ndarray, estimate: float) -> np.ndarray:
-    """Replicates that equal the estimate but for rounding, made equal to it."""
+    """Returns the replicates, those that equal the estimate but for rounding made equal to it."""
     return np.where(np.abs(replicate - estimate) <= _EQUAL * max(1.0, abs(estimate)), estimate, replicate)
 
 
 def _bca_shares(estimate: float, replicate: np.ndarray, shares: np.ndarray, jackknife: np.ndarray | None) -> np.ndarray:
-    """Percentiles to take instead of `shares`; the same ones where all replicates lie on one side of the estimate."""
+    """Returns the percentiles to take instead of `shares`: the same where all replicates lie on one side of the estimate."""
     from scipy.special import ndtr, ndtri
 
     below = float(((replicate < estimate).mean() + (replicate <= estimate).mean()) / 2)
@@ -182,10 +222,14 @@ def _acceleration(jackknife: np.ndarray | None) -> float:
 
 
 def two_sided_p(replicate: np.ndarray) -> float:
-    """p value of "no difference" from replicates of a difference, f64 (R): twice the smaller share on one side of 0.
+    """Returns the p value of "no difference" from replicates of a difference, f64 (R).
 
-    It counts the observed data as one more resample (so it is never 0), falls below 1 - confidence where the percentile
-    interval leaves out 0, and is 1 where nothing differs. NaN without defined replicates.
+    It is twice the smaller share on one side of 0, counts the observed data as one more resample (so it is never 0),
+    falls below 1 - confidence where the percentile interval leaves out 0, and is 1 where nothing differs. NaN without
+    defined replicates.
+
+    >>> two_sided_p(np.array([0.1] * 98 + [-0.1]))
+    0.04
     """
     defined = replicate[~np.isnan(replicate)]
     if len(defined) == 0:

@@ -101,14 +101,6 @@ def rigid_flow_reference(points: Tensor, mask: Tensor, rotation: Tensor, transla
     return torch.einsum("bns,bsnd->bnd", mask, apply_motions(points, rotation, translation)) - points
 
 
-def to_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Rotations (...,3,3) and translations (...,3) as matrices (...,4,4) for column vectors: x_target = M x_source."""
-    top = torch.cat([rotation, translation[..., None]], -1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 3] = 1.0
-    return torch.cat([top, bottom], -2)
-
-
 def _by_kernel(*tensors: Tensor) -> bool:
     plain = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in tensors)
     wanted = torch.is_grad_enabled() and any(x.requires_grad for x in tensors)

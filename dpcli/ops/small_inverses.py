@@ -3,6 +3,7 @@ without an inverse."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -65,6 +66,32 @@ def small_solve(matrices: Tensor, right: Tensor) -> Tensor:
     for pivot, row, side in zip(reversed(pivots), reversed(rows), reversed(sides)):
         found = torch.cat([(side - (row * found).sum(-1, keepdim=True)) / pivot, found], -1)
     return found
+
+
+def mend_guarded_gradients(
+    moments: np.ndarray,
+    places: np.ndarray,
+    guard: tuple[float, str],
+    grad: np.ndarray,
+    grad_matrix: np.ndarray,
+    moved: np.ndarray,
+) -> None:
+    """Sets the gradients of the fits whose determinant a guard moved, which the kernel `solve_planes_back` leaves wrong.
+
+    moments f32 (centroids,entries,groups); places i64 (n,n+1): which of a fit's entries are its normal matrix and right
+    side; guard: least determinant and name; grad f32 (centroids,n,groups) at the planes; grad_matrix f32
+    (centroids,n,n,groups), changed in place: G + G'; moved bool (centroids,groups). By autograd of the torch twin.
+    """
+    centroid, group = np.nonzero(moved)
+    if not len(centroid):
+        return
+    entries, size = moments[centroid, :, group], len(places)
+    matrices, right = (torch.from_numpy(entries[:, part]) for part in (places[:, :size], places[:, size]))
+    at_inverse = torch.from_numpy(grad[centroid, :, group])[:, :, None] * right[:, None]
+    with torch.inference_mode(False), torch.enable_grad():
+        leaf = matrices.clone().requires_grad_()
+        found = torch.autograd.grad(_inverse(leaf, *guard), leaf, at_inverse.clone())[0].numpy()
+    grad_matrix[centroid, :, :, group] = found + found.transpose(0, 2, 1)
 
 
 def _check(matrices: Tensor, guard: str) -> None:

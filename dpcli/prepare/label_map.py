@@ -1,4 +1,4 @@
-"""Which class of which file becomes which class: what joins sources with different class lists.
+"""Label maps: a file says which class of which source becomes which, so that sources with unlike classes can be joined.
 
     classes = ["wave", "push"]     # optional: the order of the new classes; else as they first appear
 
@@ -28,7 +28,7 @@ from dpcli.runtime.toml_file import read_toml
 
 @dataclass(frozen=True)
 class LabelMap:
-    """What a label map says; an empty one leaves all names as they are, and then class lists must agree."""
+    """Holds what a label map says; an empty one leaves all names as they are, and then class lists must agree."""
 
     classes: tuple[str, ...] = ()
     labels: dict[str, str] = field(default_factory=dict)
@@ -36,7 +36,7 @@ class LabelMap:
 
     @classmethod
     def read(cls, path: Path) -> LabelMap:
-        """From a .toml or .json file; DataError when it is not as the module says."""
+        """Reads a .toml or .json file. Raises DataError when it is not as the module says."""
         if path.suffix.lower() == ".json":
             try:
                 content = json.loads(path.read_text("utf-8"))
@@ -58,13 +58,15 @@ class LabelMap:
 
     @property
     def config(self) -> dict[str, Any]:
-        """For the provenance."""
+        """Returns the map for the provenance."""
         return {"classes": list(self.classes), "labels": self.labels, "files": self.files}
 
     def resolve(self, sources: Sequence[tuple[Path, list[str]]]) -> tuple[list[str], list[list[int | None]]]:
-        """(file, its classes) -> the new classes, and for each file the new number of each of its classes, None = out.
+        """Returns the new classes, and for each (file, its classes) the new number of each of its classes, None = left
+        out.
 
-        DataError: the lists disagree and nothing maps them; a name in the map that no file has; a class not in `classes`.
+        DataError: the lists disagree and nothing maps them; a name in the map that no file has; a class not in
+        `classes`.
         """
         if not (self.classes or self.labels or self.files):
             _require_equal(sources)

@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.object_splits import SPLIT_FOLDERS
-from dpcli.prepare.reader import Item
+from dpcli.prepare.reader import SPLIT_FOLDERS, Item
 
 _COLUMNS = ("name", "label", "subject", "split")
 
 
 @dataclass(frozen=True)
 class Row:
-    """What one line says about one sample; ``label`` indexes the table's class names."""
+    """Holds what one line says about one sample; ``label`` indexes the table's class names."""
 
     label: int
     subject: int
@@ -25,14 +24,17 @@ class Row:
 
 @dataclass(frozen=True)
 class LabelTable:
-    """Rows by sample name, and the class names that their labels index."""
+    """Holds rows by sample name, and the class names that their labels index."""
 
     path: Path
     rows: dict[str, Row]
     class_names: list[str]
 
     def apply(self, items: list[Item]) -> list[Item]:
-        """Items with the table's fields; an item it doesn't name keeps label -1. DataError when it names a stranger."""
+        """Returns items with the table's fields; one it doesn't name keeps label -1.
+
+        Raises DataError when it names a stranger.
+        """
         strangers = sorted(self.rows.keys() - {item.name for item in items})
         if strangers:
             known = ", ".join(item.name for item in items[:3])
@@ -42,7 +44,7 @@ class LabelTable:
 
 
 def read_labels(path: Path) -> LabelTable:
-    """Columns ``name,label[,subject][,split]`` with a header line, or the first two without one.
+    """Reads columns ``name,label[,subject][,split]`` with a header line, or the first two without one.
 
     Labels are whole numbers from 0, or words; words are numbered in alphabetical order. DataError names file and line.
     """
@@ -72,11 +74,12 @@ def read_labels(path: Path) -> LabelTable:
 
 
 def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTable:
-    """The first folder of a name is its class; where all begin with train, val(idation) or test, that is the split and the
-    next one the class. Classes are numbered in alphabetical order.
+    """Takes each name's first folder for its class; where all begin with train, val(idation) or test, that is the split
+    and the next one the class. Classes are numbered in alphabetical order.
 
-    names: relative to `root`, parts with `/`. layout: what a name holds at least, such as `CLASS/VIDEO`. DataError when one
-    holds less, or when most lie in folders of splits and some do not: those splits would silently become classes.
+    names: relative to `root`, parts with `/`. layout: what a name holds at least, such as `CLASS/VIDEO`. Raises
+    DataError when one holds less, or when most lie in folders of splits and some do not: those splits would silently
+    become classes.
     """
     least = len(layout.split("/"))
     parts = {name: name.split("/") for name in names}

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import signal
-import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -18,24 +17,61 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, DpcError, UsageError
-from dpcli.prepare.one_item import convert_item
+from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.shards import WHOLE, Shard, describe_shard
 from dpcli.prepare.thinning import Thinning
+from dpcli.runtime.device import cpu_count
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.signals import StopRequest, stop_requested
-from dpcli.runtime.worker_server import start_early
 from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.writing.already_made import already_made
 
 _LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
 
 
+@dataclass(frozen=True, kw_only=True)
+class Conversion:
+    """Says how raw data become a file, whatever reads them; none of `jobs`, `force` and `task` changes the bytes.
+
+    points, sampling: see Thinning. limit: only the first items. compression: that of the coordinates. on_error:
+    ``skip`` bad samples or ``stop`` at one. jobs: processes, None for as many as there are CPUs. shard: only its
+    items, for ``merge``; it may turn out empty. force: start over. task: what the progress bar calls it. Raises
+    UsageError for another word or number.
+    """
+
+    points: int = 0
+    sampling: str = "random"
+    limit: int | None = None
+    compression: str = "none"
+    on_error: str = "skip"
+    jobs: int | None = 1
+    shard: Shard | None = None
+    seed: int = 0
+    force: bool = False
+    task: str = "prepare"
+
+    def __post_init__(self) -> None:
+        if self.on_error not in ("skip", "stop"):
+            raise UsageError(f"--on-error {self.on_error}: expected skip or stop")
+        Thinning(self.points, self.sampling)
+
+    @property
+    def thinning(self) -> Thinning:
+        """Returns the rule by which frames lose points."""
+        return Thinning(self.points, self.sampling)
+
+    @property
+    def processes(self) -> int:
+        """Returns how many processes read items at a time."""
+        return self.jobs or cpu_count()
+
+
 @dataclass
 class Report:
-    """What a conversion did. ``skipped`` holds (name, reason); ``notes`` counts what readers left out."""
+    """Tells what a conversion did. ``skipped`` holds (name, reason); ``notes`` counts what readers left out."""
 
     written: int = 0
     frames: int = 0
@@ -45,7 +81,7 @@ class Report:
     was_complete: bool = False
 
     def lines(self) -> list[str]:
-        """The report in words; nothing that was left out goes unmentioned."""
+        """Returns what was left out, in words; nothing goes unmentioned."""
         lines = [f"{what}: {count}" for what, count in sorted(self.notes.items())]
         if self.skipped:
             lines.append(f"{len(self.skipped)} skipped:")
@@ -54,13 +90,21 @@ class Report:
                 lines.append(f"  ... and {len(self.skipped) - _LISTED} more; -v names every one")
         return lines
 
+    def counts(self) -> str:
+        """Returns what was written, in words."""
+        written = f"{self.written} sequences, {self.frames} frames, {self.points} points"
+        return f"{written}, {len(self.skipped)} skipped"
+
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
-    """Everything that decides the file's content, except the seed: equal configurations may continue each other."""
-    digest, looks = hashlib.sha256("\n".join(reader.class_names).encode()), cache(_looks)  # items may share a folder
+    """Returns everything that decides the file's content, except the seed: equal ones may continue each other."""
+    digest, fingerprint = (
+        hashlib.sha256("\n".join(reader.class_names).encode()),
+        cache(_fingerprint),
+    )  # items may share a folder
     for item in items:
-        said = (item.name, item.split, item.label, item.subject, item.camera, looks(item.path))
-        digest.update("\n".join(map(str, said)).encode())
+        facts = (item.name, item.split, item.label, item.subject, item.camera, fingerprint(item.path))
+        digest.update("\n".join(map(str, facts)).encode())
     thin = {"points": thinning.points, "sampling": thinning.sampling} if thinning.points else {"points": 0}
     reader_config = {"reader": type(reader).__name__, **reader.config}
     index = {"items": len(items), "items_digest": digest.hexdigest()[:16]}
@@ -68,9 +112,12 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
     return json.loads(json.dumps({**reader_config, **thin, "compression": compression, **index}))
 
 
-def _looks(path: Path) -> str:
-    """What tells an item's data from others of that name without reading them: a file's size; of a folder what lies in it
-    and the size of its last file. Not its place or date, which copying changes; not what we may be writing there."""
+def _fingerprint(path: Path) -> str:
+    """Returns what tells an item's data from others of that name without reading them.
+
+    That is a file's size, or a folder's list of names and the size of its last file: not its place or date, which
+    copying changes, and not what we may be writing there.
+    """
     try:
         if not path.is_dir():
             return str(path.stat().st_size)
@@ -86,87 +133,64 @@ def _looks(path: Path) -> str:
 def convert(
     reader: Reader,
     output: Path,
+    conversion: Conversion = Conversion(),
     *,
-    jobs: int = 1,
-    points: int = 0,
-    sampling: str = "random",
-    seed: int = 0,
-    on_error: str = "skip",
-    compression: str = "none",
-    force: bool = False,
-    limit: int | None = None,
-    task: str = "prepare",
-    shard: Shard | None = None,
     executor: Executor | None = None,
+    slots: int = 0,
     resume: bool = True,
 ) -> Report:
-    """Convert every item of a reader into one clouds file; running again continues where a stopped or killed run ended.
+    """Converts every item of a reader into one clouds file; running again continues where a stopped or killed run
+    ended.
 
-    points, sampling: see Thinning. limit: only the first items. on_error: ``skip`` bad samples or ``stop`` at one.
-    shard: only its items, for ``merge``; it may turn out empty. executor: where items are read, ``jobs`` at a time,
-    instead of processes on this machine. The file's bytes depend on neither. resume: off where nobody could run it
-    again (a pipe); saves the journal's disk space. UsageError when ``output`` was made
-    another way and ``force`` is off; DataError when no sample is good; Stopped after a stop signal, with what is done
-    kept beside ``output``.
+    executor: where items are read, `slots` at a time, instead of processes on this machine; the file's bytes don't
+    depend on it. resume: off where nobody could run it again (a pipe); saves the journal's disk space. Raises
+    UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
+    after a stop signal, with what is done kept beside `output`.
     """
-    if on_error not in ("skip", "stop"):
-        raise UsageError(f"--on-error {on_error}: expected skip or stop")
-    thinning = Thinning(points, sampling)
-    if jobs > 1 and executor is None:
-        start_early(_needed_by_workers(reader, thinning))
     items = reader.items()
     for line in reader.summary(items):
         log.info(line)
-    items = items[:limit]
-    provenance = describe_shard(record(configuration(reader, thinning, items, compression), seed), shard)
+    items = items[: conversion.limit]
+    config = configuration(reader, conversion.thinning, items, conversion.compression)
+    provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()
-    if not force and already_made(output, provenance, CloudsReader):
+    if not conversion.force and already_made(output, provenance, CloudsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
         return count_samples(report, output)
-    work = partial(convert_item, reader, thinning, seed)
-    with (
-        stop_requested() as stop,
-        CloudsWriter(
-            output,
-            class_names=reader.class_names,
-            length_unit=reader.length_unit,
-            source=type(reader).__name__,
-            seed=seed,
-            fields=reader.fields,
-            compression=compression,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        ) as writer,
-    ):
-        run = _Run(writer, report, stop, on_error, items, shard)
-        run.stream(work, jobs, executor, task)
+    work = partial(convert_item, reader, conversion.thinning, conversion.seed)
+    with stop_requested() as stop, _open_writer(output, reader, conversion, provenance, resume) as writer:
+        run = _Run(writer, report, stop, conversion, items)
+        run.stream(work, slots or conversion.processes, executor)
         writer.skipped = report.skipped
     return count_samples(report, output)
 
 
-def _needed_by_workers(reader: Reader, thinning: Thinning) -> list[str]:
-    """Modules that every worker imports and that take long: the reader's, the sampling's."""
-    video = ["dpcli.prepare.warm_video"] if "dpcli.prepare.decode.depth_files" in sys.modules else []
-    sampling = ["dpcli.prepare.warm_fps"] if thinning.points and thinning.sampling == "fps" else []
-    return [type(reader).__module__, convert_item.__module__, *video, *sampling]
+def _open_writer(
+    output: Path, reader: Reader, conversion: Conversion, provenance: dict[str, Any], resume: bool
+) -> CloudsWriter:
+    return CloudsWriter(
+        output,
+        class_names=reader.class_names,
+        length_unit=reader.length_unit,
+        source=type(reader).__name__,
+        seed=conversion.seed,
+        fields=reader.fields,
+        compression=conversion.compression,
+        provenance=provenance,
+        force=conversion.force,
+        resume=resume,
+    )
 
 
 class _Run:
-    """One pass over the items that are not written yet, in order, into the writer."""
+    """Passes once over the items that are not written yet, in order, into the writer."""
 
     def __init__(
-        self,
-        writer: CloudsWriter,
-        report: Report,
-        stop: StopRequest,
-        on_error: str,
-        items: list[Item],
-        shard: Shard | None,
+        self, writer: CloudsWriter, report: Report, stop: StopRequest, conversion: Conversion, items: list[Item]
     ) -> None:
-        self.writer, self.report, self.stop, self.on_error = writer, report, stop, on_error
-        self.items = [(place, items[place]) for place in (shard or WHOLE).places(len(items))]
+        self.writer, self.report, self.stop, self.conversion = writer, report, stop, conversion
+        self.items = [(place, items[place]) for place in (conversion.shard or WHOLE).places(len(items))]
         done = set(writer.written_names)
         if done:
             log.info(f"continuing: {len(done)} of {len(self.items)} were converted before")
@@ -174,10 +198,11 @@ class _Run:
         self.last = written[-1] if written else -1
         self.todo = [(place, item) for place, item in self.items if item.name not in done]
         self.places: tuple[list[int], list[int]] = (written, [])  # of the samples written, of those skipped
-        writer.positions = self.places if shard else None
+        writer.positions = self.places if conversion.shard else None
 
-    def stream(self, work: Any, jobs: int, executor: Executor | None, task: str) -> None:
-        with Progress(task, total=len(self.items), unit="video") as bar:
+    def stream(self, work: Any, jobs: int, executor: Executor | None) -> None:
+        """Writes every item's sample, or note why it has none; a stop or a failure leaves the file to be continued."""
+        with Progress(self.conversion.task, total=len(self.items), unit="video") as bar:
             bar.skip(len(self.items) - len(self.todo))
             try:
                 for indexed, result in ordered_map(work, self.todo, jobs, executor):
@@ -197,12 +222,14 @@ class _Run:
             raise DataError(f"none of the {len(self.items)} samples is good; the first: {reason}")
 
     def kept(self) -> str:
+        """Returns how many samples are kept, in words."""
         return f"{len(self.writer)} of {len(self.items)} samples are kept"
 
     def take(self, indexed: tuple[int, Item], result: Any, bar: Progress) -> None:
+        """Writes a sample, or note what was raised instead of one."""
         (place, item) = indexed
         if isinstance(result, Sample) and place > self.last:
-            with _whole():
+            with _interrupted_after():
                 self.writer.write(result.sequence)
             self.places[0].append(place)
             self.report.notes.update(result.notes)
@@ -210,13 +237,13 @@ class _Run:
                 log.detail(f"{item.name}: {what}: {count}")
             bar.advance(1, frames=result.sequence.num_frames)
         else:
-            _skip(item, result, self.report, bar, self.on_error)
+            _skip(item, result, self.report, bar, self.conversion.on_error)
             self.places[1].append(place)
 
 
 @contextmanager
-def _whole() -> Iterator[None]:
-    """Ctrl-C waits for the end of the block: a half-appended sample is not appended."""
+def _interrupted_after() -> Iterator[None]:
+    """Delays Ctrl-C until the block has ended, because a half-appended sample would be lost."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -245,7 +272,7 @@ def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str)
 
 
 def count_samples(report: Report, output: Path) -> Report:
-    """What the finished file holds, whether this run wrote all of it or continued another."""
+    """Returns the report with what the finished file holds, whether this run wrote all of it or continued another."""
     with CloudsReader(output) as reader:
         report.written = len(reader)
         report.skipped = reader.skipped

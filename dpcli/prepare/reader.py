@@ -1,9 +1,9 @@
-"""What every raw-format reader offers: a cheap index of items, and one item read into a sample."""
+"""The interface of a reader of raw data: a cheap index of items, and one item read into a sample."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -13,13 +13,13 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.store import CloudSequence
 
-# Which of so many points of a frame are kept, asked for each frame in order (`Thinning.blind`); None keeps all.
-Choose = Callable[[int], "np.ndarray | slice"] | None
+SPLITS = ("train", "validation", "test")
+SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # split of a folder that people call so
 
 
 @dataclass(frozen=True)
 class Item:
-    """One sample of the index: what is known about it before its data are opened.
+    """Holds one sample of the index: what is known about it before its data are opened.
 
     A non-empty ``problem`` marks an entry that can't be read at all (a list line naming a missing file,
     a label out of range); the pipeline reports it like a failed read and never calls the reader.
@@ -37,57 +37,70 @@ class Item:
 
 @dataclass
 class Sample:
-    """One sequence, and counts of what its reader left out, such as ``{"frames without depth dropped": 2}``."""
+    """Holds one sequence, and counts of what its reader left out, such as ``{"frames without depth dropped": 2}``."""
 
     sequence: CloudSequence
     notes: dict[str, int] = field(default_factory=dict)
 
 
 class Reader(Protocol):
-    """A raw format. Implementations are frozen dataclasses of their options, so they pickle into worker processes.
+    """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker
+    processes.
 
     What an option decides is a property, what is always the same a ClassVar.
     """
 
     @property
-    def class_names(self) -> Sequence[str]: ...
+    def class_names(self) -> Sequence[str]:
+        """Returns the class names in the order of their labels."""
+        ...
+
     @property
-    def length_unit(self) -> str: ...
+    def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
+        ...
+
     @property
-    def fields(self) -> tuple[str, ...]: ...
+    def fields(self) -> tuple[str, ...]:
+        """Returns the optional fields that every sample has, such as ``time``."""
+        ...
+
     @property
-    def config(self) -> dict[str, Any]: ...
+    def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
+        ...
 
     def items(self) -> list[Item]:
-        """The index in its final order; DataError when the folder is not what it should be."""
+        """Returns the index in its final order. Raises DataError when the folder is not what it should be."""
         ...
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
-        """One sample, in a worker process; DataError on a bad one. ``rng`` belongs to this item alone.
-
-        A reader whose `read` also takes ``choose`` and sets ``chooses`` may be told so which points of a frame to make.
-        """
+        """Returns one sample, in a worker process. Raises DataError on a bad one. ``rng`` belongs to this item alone."""
         ...
 
     def summary(self, items: list[Item]) -> list[str]:
-        """Lines for the log about what the index holds and lacks."""
+        """Returns lines for the log about what the index holds and lacks."""
         ...
 
 
 def describe(item: Item) -> dict[str, Any]:
-    """The fields of a CloudSequence that the index already knows."""
+    """Returns the fields of a CloudSequence that the index already knows."""
     return {"split": item.split, "label": item.label, "subject": item.subject, "camera": item.camera}
 
 
 def natural_key(path: Path | str) -> list[tuple[int, int, str]]:
-    """Sort key under which ``frame2`` comes before ``frame10``; equal numbers fall back to the spelling."""
+    """Returns sort key under which ``frame2`` comes before ``frame10``; equal numbers fall back to the spelling.
+
+    >>> sorted(["frame10.png", "frame2.png", "frame1.png"], key=natural_key)
+    ['frame1.png', 'frame2.png', 'frame10.png']
+    """
     text = path.name if isinstance(path, Path) else path
     parts = re.split(r"(\d+)", text)
     return [(0, int(p), p) if p.isdecimal() and p.isascii() else (1, 0, p) for p in parts if p]
 
 
 def require_folder(path: Path, expected: str) -> Path:
-    """``path`` when it is a folder; else DataError that says what was looked for in it."""
+    """Returns ``path`` when it is a folder. Raises DataError that says what was looked for in it otherwise."""
     if path.is_dir():
         return path
     found = "is a file" if path.exists() else "does not exist"
@@ -95,7 +108,7 @@ def require_folder(path: Path, expected: str) -> Path:
 
 
 def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[str, int]]:
-    """Which frames to keep. ``counts`` i64 (T) points per frame -> kept i64 (T'), notes.
+    """Returns which frames to keep, i64 (T'), of ``counts`` i64 (T) points per frame, and notes.
 
     A frame without a single valid point carries no geometry and would break samplers later, so it is
     dropped and counted; a sequence of nothing but such frames is a bad sample (DataError).
@@ -110,5 +123,9 @@ def drop_empty_frames(name: str, counts: np.ndarray) -> tuple[np.ndarray, dict[s
 
 
 def offsets(counts: np.ndarray) -> np.ndarray:
-    """Counts i64 (T) -> offsets i64 (T+1) that start with 0."""
+    """Returns offsets i64 (T+1) that start with 0, of counts i64 (T).
+
+    >>> offsets(np.array([2, 0, 3])).tolist()
+    [0, 2, 2, 5]
+    """
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)

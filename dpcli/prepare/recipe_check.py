@@ -37,7 +37,7 @@ _SHOWN = 10
 
 @dataclass(frozen=True)
 class Row:
-    """One `[[raw]]` table of a recipe."""
+    """Holds one `[[raw]]` table of a recipe."""
 
     paths: tuple[str, ...]
     what: str
@@ -49,7 +49,10 @@ class Row:
 
 
 def read_recipe(name: str) -> tuple[dict[str, Any], list[Row]]:
-    """A recipe and its rows; DataError when there is none, or when it says something that is not understood."""
+    """Reads a recipe and its rows.
+
+    Raises DataError when there is none, or when it says something that is not understood.
+    """
     path = RECIPES / f"{name}.toml"
     if not path.is_file():
         known = ", ".join(sorted(p.stem for p in RECIPES.glob("*.toml")))
@@ -67,22 +70,26 @@ def _row(table: dict[str, Any], path: Path) -> Row:
     paths = tuple(table["path"]) if isinstance(table["path"], list) else (table["path"],)
     each = table.get("each")
     if each is not None:
-        wanted = len(expand(paths[0]))
+        wanted = len(expand_braces(paths[0]))
         each = tuple(each) if isinstance(each, list) else (each,) * wanted
         if len(each) != wanted:
             raise DataError(f"{path}: each has {len(each)} numbers, but {paths[0]} names {wanted} paths")
-    count = _span(table["count"]) if "count" in table else None
-    size = _span(table["bytes"]) if "bytes" in table else (1, float("inf"))
+    count = _bounds(table["count"]) if "count" in table else None
+    size = _bounds(table["bytes"]) if "bytes" in table else (1, float("inf"))
     optional, instead_of = bool(table.get("optional", False)), table.get("instead_of", "")
     return Row(paths, table.get("what", paths[0]), count, each, size, optional, instead_of)
 
 
-def _span(value: int | list[int]) -> tuple[float, float]:
+def _bounds(value: int | list[int]) -> tuple[float, float]:
     return (value[0], value[1]) if isinstance(value, list) else (value, value)
 
 
-def expand(pattern: str) -> list[str]:
-    """`a{00..02}/{x,y}` -> a00/x, a00/y, a01/x, ...; without braces the pattern itself."""
+def expand_braces(pattern: str) -> list[str]:
+    """Returns `a{00..02}/{x,y}` as a00/x, a00/y, a01/x, ...; without braces the pattern itself.
+
+    >>> expand_braces("s{08..10}/{a,b}")
+    ['s08/a', 's08/b', 's09/a', 's09/b', 's10/a', 's10/b']
+    """
     match = re.search(r"\{([^{}]*)\}", pattern)
     if not match:
         return [pattern]
@@ -92,31 +99,32 @@ def expand(pattern: str) -> list[str]:
         words = [f"{n:0{width}}" for n in range(int(numbers[1]), int(numbers[2]) + 1)]
     else:
         words = match[1].split(",")
-    return [one for word in words for one in expand(pattern[: match.start()] + word + pattern[match.end() :])]
+    return [one for word in words for one in expand_braces(pattern[: match.start()] + word + pattern[match.end() :])]
 
 
 class Tree:
-    """The files below a folder (or one file), listed once: path -> size, -1 for links to nowhere."""
+    """Lists the files below a folder (or one file) once: path -> size, -1 for links to nowhere."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     @cached_property
     def files(self) -> dict[str, int]:
+        """Returns the size of every file by its path."""
         if self.folder.is_file():
             return {self.folder.name: self.folder.stat().st_size}
         return dict(_walk(self.folder, ""))
 
     def find(self, pattern: str) -> list[str]:
-        """Files that fit a pattern: * and ? within a name, ** over folders (none, too)."""
+        """Returns files that fit a pattern: * and ? within a name, ** over folders (none, too)."""
         if not any(sign in pattern for sign in "*?"):
             return [pattern] if pattern in self.files else []
-        fits = re.compile(_expression(pattern)).fullmatch
+        fits = re.compile(_pattern_to_regex(pattern)).fullmatch
         return sorted(name for name in self.files if fits(name))
 
 
 def _walk(folder: Path, prefix: str) -> Iterator[tuple[str, int]]:
-    """Follows links to folders, but none that lead back to where they came from."""
+    """Yields path and size of every file; follows links to folders, but none that lead back to where they came from."""
     stack = [(folder, prefix, (folder.resolve(),))]
     while stack:
         here, before, parents = stack.pop()
@@ -134,7 +142,7 @@ def _walk(folder: Path, prefix: str) -> Iterator[tuple[str, int]]:
                     yield name, -1
 
 
-def _expression(pattern: str) -> str:
+def _pattern_to_regex(pattern: str) -> str:
     pieces = []
     for piece in pattern.split("/"):
         if piece == "**":
@@ -146,13 +154,15 @@ def _expression(pattern: str) -> str:
 
 
 def check_row(row: Row, tree: Tree) -> tuple[list[str], str, int]:
-    """(what is missing or wrong, what was found, how many files) of one row; of several paths the best of those there."""
+    """Returns (what is missing or wrong, what was found, how many files) of one row; of several paths the best of those
+    there.
+    """
     return min((_check_path(row, pattern, tree) for pattern in row.paths), key=lambda one: (one[2] == 0, len(one[0])))
 
 
 def _check_path(row: Row, pattern: str, tree: Tree) -> tuple[list[str], str, int]:
     faults, total, wrong = [], 0, []
-    paths = expand(pattern)
+    paths = expand_braces(pattern)
     for number, path in enumerate(paths):
         names = tree.find(path)
         total += len(names)
@@ -162,14 +172,14 @@ def _check_path(row: Row, pattern: str, tree: Tree) -> tuple[list[str], str, int
         elif not names and row.count is None:
             faults.append(f"{path}: missing")
     if row.count is not None and not row.count[0] <= total <= row.count[1]:
-        faults.append(f"{pattern}: {total} files, expected {_words(row.count)}")
+        faults.append(f"{pattern}: {total} files, expected {_bounds_in_words(row.count)}")
     for name in wrong:
         size = "a link to nowhere" if tree.files[name] < 0 else f"{tree.files[name]} bytes"
-        faults.append(f"{name}: {size}, expected {_words(row.bytes)} bytes")
+        faults.append(f"{name}: {size}, expected {_bounds_in_words(row.bytes)} bytes")
     return faults, f"{total} files {pattern}", total
 
 
-def _words(span: tuple[float, float]) -> str:
+def _bounds_in_words(span: tuple[float, float]) -> str:
     low, high = span
     if low == high:
         return f"{low:.0f}"
@@ -177,9 +187,9 @@ def _words(span: tuple[float, float]) -> str:
 
 
 def check_rows(rows: list[Row], tree: Tree) -> tuple[list[str], list[str]]:
-    """(lines for the user, faults that are errors) of all rows."""
+    """Returns (lines for the user, faults that are errors) of all rows."""
     results = {row.what: (row, *check_row(row, tree)) for row in rows}
-    replaced = {_worse(results[row.instead_of], results[row.what]) for row in rows if row.instead_of}
+    replaced = {_name_of_less_useful(results[row.instead_of], results[row.what]) for row in rows if row.instead_of}
     lines, errors = [], []
     for what, (row, faults, found, _) in results.items():
         if not faults:
@@ -195,17 +205,18 @@ def check_rows(rows: list[Row], tree: Tree) -> tuple[list[str], list[str]]:
     return lines, errors
 
 
-def _worse(one: tuple[Row, list[str], str, int], other: tuple[Row, list[str], str, int]) -> str:
-    """Which of two rows need not be told, as the other suffices or is nearer to what is there."""
+def _name_of_less_useful(one: tuple[Row, list[str], str, int], other: tuple[Row, list[str], str, int]) -> str:
+    """Returns the which of two rows need not be told, as the other suffices or is nearer to what is there."""
     return max(other, one, key=lambda it: (bool(it[1]), it[3] == 0, len(it[1])))[0].what
 
 
 def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *, file: bool = False) -> Iterator[str]:
-    """Lines that say what of recipe `name` is in `raw` and what is not, then what the reader's own index finds.
+    """Yields lines that say what of recipe `name` is in `raw` and what is not, then what the reader's own index finds.
 
     make_reader: anything with the `items` and `summary` of a Reader. file: `raw` may be a single file.
 
-    DataError, after the last line, when something is missing; DataError at once when there is no recipe or no folder.
+    DataError, after the last line, when something is missing. Raises DataError at once when there is no recipe or no
+    folder.
     """
     recipe, rows = read_recipe(name)
     if raw is None:
@@ -230,7 +241,7 @@ def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *,
 
 
 def _index_lines(reader: Any, errors: list[str]) -> Iterator[str]:
-    """The index opens no data: it names list lines without a file, names that fit no pattern, labels out of range."""
+    """Yields what the index finds without opening data: list lines without a file, strange names, labels out of range."""
     items = reader.items()
     bad = [item for item in items if item.problem]
     for line in reader.summary(items):

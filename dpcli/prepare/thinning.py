@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ _CLOSE_ENOUGH = 1.05  # this many times more cubes than points: the rest is draw
 
 @dataclass(frozen=True)
 class Thinning:
-    """At most ``points`` points per frame, chosen by ``sampling``; smaller frames are kept whole. 0 = keep all."""
+    """Keeps at most ``points`` points per frame, chosen by ``sampling``; smaller frames are kept whole. 0 = keep all."""
 
     points: int = 0
     sampling: str = "random"
@@ -31,7 +30,7 @@ class Thinning:
             raise UsageError(f"--sampling {self.sampling}: expected one of {', '.join(METHODS)}")
 
     def choose(self, cloud: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Indices i64 (min(N, points)) into one frame f32 (N,3).
+        """Returns indices i64 (min(N, points)) into one frame f32 (N,3).
 
         ``random`` and ``voxel`` keep the frame's own order. ``fps`` starts at point 0 and keeps the order of
         choice, so that every prefix of the frame is a farthest point sample too.
@@ -48,17 +47,8 @@ class Thinning:
     def _draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         return np.sort(rng.choice(count, self.points, replace=False))
 
-    def blind(self, rng: np.random.Generator) -> Callable[[int], np.ndarray | slice] | None:
-        """What `apply` keeps of a frame, from its number of points alone: for readers that can leave the rest unmade.
-
-        To be asked for every frame once, in order. None where the choice depends on where the points are.
-        """
-        if not self.points or self.sampling != "random":
-            return None
-        return lambda count: self._draw(count, rng) if count > self.points else slice(None)
-
     def apply(self, sequence: CloudSequence, rng: np.random.Generator) -> CloudSequence:
-        """The sequence with each frame thinned; per-point fields follow their points."""
+        """Returns the sequence with each frame thinned; per-point fields follow their points."""
         counts = np.diff(sequence.frame_offsets)
         if self.points == 0 or counts.max(initial=0) <= self.points:
             return sequence
@@ -77,9 +67,13 @@ class Thinning:
 
 
 def voxel_representatives(cloud: np.ndarray, points: int) -> np.ndarray:
-    """One point per occupied cube of the coarsest grid found that still has at least ``points`` occupied cubes.
+    """Returns one point per occupied cube of the coarsest grid found that still has at least ``points`` occupied cubes.
 
     cloud: f32 (N,3), N >= points -> sorted indices i64 (M), points <= M <= N; the first point of a cube stands for it.
+
+    >>> cloud = np.array([[0, 0, 0], [0.1, 0, 0], [1, 0, 0], [1.1, 0, 0]], np.float32)
+    >>> voxel_representatives(cloud, 2).tolist()
+    [0, 2]
     """
     shifted = cloud - cloud.min(0)
     extent = float(shifted.max())

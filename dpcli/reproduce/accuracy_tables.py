@@ -23,6 +23,7 @@ from dpcli.reproduce.runs import (
     dpc,
     markdown,
     numbers,
+    override,
     samples,
     shares,
     some,
@@ -34,13 +35,15 @@ from dpcli.reproduce.runs import (
 from dpcli.store import CloudsReader
 
 STREAMS = ("static", "dynamic", "fused")
-MORE = "--epochs 15 --epochs-dynamic 40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
+MORE = (
+    "--epochs 15 --set epochs_dynamic=40 --lr 0.0005"  # the networks of 4 to 24 frames in docs/results.md were made so
+)
 EVERY_START = ("thesis", "release")  # presets that score every clip of a video by default; the others 8 spread over it
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One line of a table. cites: how the setting of the thesis's rows ends; streams: what else the thesis says of it."""
+    """Holds one line of a table. cites: how the setting of the thesis's rows ends; streams: what else the thesis says of it."""
 
     key: str
     name: str
@@ -52,7 +55,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A table: how its data are prepared (file: words of `dpc prepare`) and which settings are trained on them."""
+    """Holds a table: how its data are prepared (file: words of `dpc prepare`) and which settings are trained on them."""
 
     number: str
     title: str
@@ -62,7 +65,7 @@ class Experiment:
     first: str = ""  # the setting whose network the others go on from, where a setting only differs in length
 
 
-_GESTURES = ("--frames", "32", "--timing", "uniform", "--normalize", "image")  # facts of the peers' loaders
+_GESTURES = ("--frames", "32", "--timing", "uniform", "--set", "normalize=image")  # facts of the peers' loaders
 _NTU = ("--frames", "24")
 EXPERIMENTS = {
     "3.2": Experiment(
@@ -117,7 +120,7 @@ EXPERIMENTS = {
 
 @dataclass(frozen=True)
 class Plan:
-    """How every cell is trained and scored. clips: per video at prediction, 0 = every start.
+    """Says how every cell is trained and scored. clips: per video at prediction, 0 = every start.
 
     first: the setting whose network of the same seed all others go on from, by the words `more` after the budget's own.
     """
@@ -129,15 +132,16 @@ class Plan:
     more: tuple[str, ...] = ()
 
     def cell(self, setting: Setting, seed: int, clouds: Path, folder: Path) -> Cell:
+        """Returns the cell of a setting and a seed in its folder."""
         name, budget = f"{self.preset}-{setting.key}", self.budget
         if self.first and setting.key != self.first:
             start = folder / f"{self.preset}-{self.first}-seed{seed}" / "model"
-            name, budget = f"{name}-from{self.first}", (*budget, "--init", str(start), *self.more)
-        train = ("--preset", self.preset, "--validation", "none", *budget, *setting.words, "--seed", seed)
+            name, budget = f"{name}-from{self.first}", tuple(override(budget, ("--init", str(start), *self.more)))
+        train = ("--preset", self.preset, "--validation", "none", *override(budget, setting.words), "--seed", seed)
         return Cell(folder / f"{name}-seed{seed}", clouds, train, ("--clips-per-video", self.clips, "--seed", seed))
 
     def __str__(self) -> str:
-        """What a reader has to type."""
+        """Returns what a reader has to type."""
         said = f"`dpc classify train {' '.join(['--preset', self.preset, '--validation none', *self.budget])}`"
         return (
             said
@@ -150,7 +154,7 @@ class Plan:
 
 
 def too_short(clouds: Path, words: Sequence[str], split: str = "test") -> int:
-    """How many of a split's videos have fewer frames than a clip."""
+    """Returns how many of a split's videos have fewer frames than a clip."""
     with CloudsReader(clouds) as reader:
         counts = reader.frame_counts[[i for i, name in enumerate(reader.splits) if name == split]]
     return int((counts < int(words[words.index("--frames") + 1])).sum())
@@ -159,7 +163,7 @@ def too_short(clouds: Path, words: Sequence[str], split: str = "test") -> int:
 def score(
     run: Dpc, plan: Plan, experiment: Experiment, place: tuple[Setting, int, Path, Path], train: bool
 ) -> dict | None:
-    """What a cell says; without `train` only what is known already. `long`: only videos as long as a clip."""
+    """Returns what a cell says; without `train` only what is known already. `long`: only videos as long as a clip."""
     setting, _, clouds, _ = place
     found = plan.cell(*place).run(run) if train else plan.cell(*place).known()
     if found is None or not experiment.short:
@@ -171,7 +175,7 @@ def score(
 
 
 def peers(experiment: Experiment, setting: Setting) -> str:
-    """Methods and numbers that the thesis cites for the setting."""
+    """Returns the methods and numbers that the thesis cites for the setting."""
     rows = [
         row for row in thesis_rows(experiment.number) if not row.get("own") and row["setting"].endswith(setting.cites)
     ]
@@ -179,13 +183,13 @@ def peers(experiment: Experiment, setting: Setting) -> str:
 
 
 def thesis_value(experiment: Experiment, setting: Setting) -> float:
-    """Kinet's number in the thesis."""
+    """Returns Kinet's number in the thesis."""
     rows = thesis_rows(experiment.number)
     return next(row["values"][0] for row in rows if row.get("own") and row["setting"].endswith(setting.cites))
 
 
 def table(experiment: Experiment, cells: Mapping[str, Mapping[int, dict]], about: str) -> str:
-    """Markdown of what is there so far: by setting and seed what `score` said."""
+    """Returns markdown of what is there so far. cells: by setting and seed, what `score` said."""
     header = [
         "setting",
         *STREAMS,
@@ -212,7 +216,7 @@ def table(experiment: Experiment, cells: Mapping[str, Mapping[int, dict]], about
 def _rounds(
     experiment: Experiment, only: Sequence[str], seeds: Sequence[int], first: str = ""
 ) -> Iterator[tuple[Setting, int]]:
-    """Every setting once, then again with the next seed: a table that is stopped early has all lines. `first` leads."""
+    """Yields every setting once, then again with the next seed: a table that is stopped early has all lines. `first` leads."""
     order = sorted(experiment.settings, key=lambda one: one.key != first)
     return ((one, seed) for seed in seeds for one in order if one.key in only or one.key == first)
 
@@ -226,7 +230,7 @@ def make(
     only: Sequence[str],
     run: Dpc = dpc,
 ) -> dict[str, dict[int, dict]]:
-    """Run what isn't done; table.md and results.json after every cell. clouds: by name, the prepared files."""
+    """Runs what isn't done; writes table.md and results.json after every cell. clouds: by name, the prepared files."""
     about = (
         f"Ours: {plan} and each line's own {', '.join(word for word in experiment.settings[0].words if word.startswith('--'))}; "
         f"{some(plan.clips, 'clip') if plan.clips else 'every clip'} of a video scored. Thesis: its own data and budget"
@@ -235,6 +239,7 @@ def make(
     cells: dict[str, dict[int, dict]] = {one.key: {} for one in experiment.settings}
 
     def look(setting: Setting, seed: int, train: bool) -> None:
+        """Notes what a setting and a seed say, trained first if need be."""
         found = score(run, plan, experiment, (setting, seed, clouds[setting.data], folder), train)
         if found is not None:
             cells[setting.key][seed] = found
@@ -251,7 +256,7 @@ def make(
 def prepared(
     experiment: Experiment, raw: str, folder: Path, needed: Sequence[str], extra: Sequence[str], run: Dpc
 ) -> dict[str, Path]:
-    """The files of clouds that the settings need; `dpc prepare` passes over what is there."""
+    """Returns the files of clouds that the settings need; `dpc prepare` passes over what is there."""
     files = {name: folder / f"{name}.h5" for name in needed}
     for name, path in files.items():
         reader, *words = experiment.prepare[name]
@@ -261,7 +266,7 @@ def prepared(
 
 
 def add_plan(parser: argparse.ArgumentParser) -> None:
-    """Options that every accuracy has."""
+    """Adds the options that every accuracy has."""
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seeds", default="0,1,2")
     parser.add_argument(
@@ -272,11 +277,12 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
 
 
 def clips_of(preset: str, given: int | None) -> int:
-    """Clips per video at prediction."""
+    """Returns the clips per video at prediction."""
     return given if given is not None else (0 if preset in EVERY_START else 8)
 
 
 def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
+    """Runs the program by its words; `run` does the commands."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=list(EXPERIMENTS))

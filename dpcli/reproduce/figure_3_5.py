@@ -1,6 +1,6 @@
 """Figure 3.5 of the thesis: four settings of the dynamic stream, each swept with the others at the thesis's choice.
 
-    python -m dpcli.reproduce.figure_3_5 nvgesture|msraction3d RAW FOLDER [--folds 10] [--sweep group-size=2,4] [-- words]
+    python -m dpcli.reproduce.figure_3_5 nvgesture|msraction3d RAW FOLDER [--folds 10] [--sweep group_size=2,4] [-- words]
                                                                    [--only 0,1]: these folds now, a job each or several
 
 N-fold cross-validation over the training videos; accuracy is the dynamic stream's alone, after its last epoch. A fold's
@@ -20,17 +20,30 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.classify.presets import find_preset
+from dpcli.classify.presets import PRESETS
 from dpcli.reproduce.accuracy_tables import prepared
-from dpcli.reproduce.runs import DASH, Dpc, cut, digest, dpc, kept, markdown, numbers, once, write_json, write_text
+from dpcli.reproduce.runs import (
+    DASH,
+    Dpc,
+    cut,
+    digest,
+    dpc,
+    kept,
+    markdown,
+    numbers,
+    once,
+    override,
+    write_json,
+    write_text,
+)
 from dpcli.reproduce.table_3_1 import DATA
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """An option of `dpc classify train`, its values, the thesis's choice. static: the static stream depends on it."""
+    """Holds a setting of `dpc classify train`, its values, the thesis's choice. static: the static stream depends on it."""
 
-    option: str
+    setting: str
     title: str
     values: tuple[float, ...]
     chosen: float
@@ -39,36 +52,42 @@ class Sweep:
 
 SWEEPS = {
     "reduction": Sweep("reduction", "(a) reduction ratio", (0.125, 0.25, 0.5, 1.0), 0.5),
-    "group-size": Sweep("group-size", "(b) group size", (2, 4, 8, 16, 32), 4),
-    "temporal-radius": Sweep("temporal-radius", "(c) temporal radius, frames", (0, 1, 2, 3, 4, 5), 1, True),
+    "group_size": Sweep("group_size", "(b) group size", (2, 4, 8, 16, 32), 4),
+    "temporal_radius": Sweep("temporal_radius", "(c) temporal radius, frames", (0, 1, 2, 3, 4, 5), 1, True),
     "radius": Sweep("radius", "(d) spatial radius", (0.125, 0.25, 0.5, 1.0, 2.0), 0.5, True),
 }
 
 
 @dataclass(frozen=True)
 class Point:
-    """One choice of the four settings, in the order of SWEEPS."""
+    """Holds one choice of the four settings, in the order of SWEEPS."""
 
     values: tuple[float, ...]
 
     def words(self, static: bool = False) -> list[str]:
-        """Options of `train`; for the static stream only those that it depends on."""
-        pairs = zip(SWEEPS.values(), self.values)
-        return [
-            word for sweep, value in pairs if sweep.static or not static for word in (f"--{sweep.option}", f"{value:g}")
-        ]
+        """Returns the words of `train`; for the static stream only those that it depends on."""
+        return [word for name, value in self._pairs(static) for word in ("--set", f"{name}={_written(name, value)}")]
 
     def name(self, static: bool = False) -> str:
-        return "-".join(word.removeprefix("--") for word in self.words(static))
+        """Returns the name of the folder of this choice's networks."""
+        return "-".join(f"{name}-{value:g}" for name, value in self._pairs(static))
+
+    def _pairs(self, static: bool) -> list[tuple[str, float]]:
+        return [(s.setting, value) for s, value in zip(SWEEPS.values(), self.values) if s.static or not static]
+
+
+def _written(name: str, value: float) -> str:
+    """Returns a setting's value in words; the spatial radius doubles in the second stage."""
+    return f"{value:g},{2 * value:g}" if name == "radius" else f"{value:g}"
 
 
 def point(changed: str = "", value: float = 0) -> Point:
-    """The thesis's choice, with one setting changed."""
+    """Returns the thesis's choice, with one setting changed."""
     return Point(tuple(value if key == changed else sweep.chosen for key, sweep in SWEEPS.items()))
 
 
 def last_accuracy(folder: Path, stage: str) -> dict:
-    """Validation accuracy of a training folder's stage after its last epoch, and the best of all epochs."""
+    """Returns the validation accuracy of a training folder's stage after its last epoch, and the best of all epochs."""
     rows = [row for row in json.loads((folder / "log.json").read_text()) if row["stage"] == stage]
     known = [row["validation_accuracy"] for row in rows if row["validation_accuracy"] is not None]
     return {"last": known[-1], "best": max(known), "epochs": len(rows)}
@@ -85,14 +104,14 @@ class Fold:
     words: tuple[str, ...]  # preset, budget, clips
 
     def train(self, run: Dpc, out: Path, *words: str) -> None:
+        """Trains a network of the fold by the words after the common ones."""
         run(
             "classify",
             "train",
             self.clouds,
             "-o",
             out,
-            *self.words,
-            *words,
+            *override(self.words, words),
             "--validation",
             f"fold:{self.which}/{self.of}",
         )
@@ -102,6 +121,7 @@ class Fold:
 
     def _once(self, run: Dpc, out: Path, stage: str, *words: str) -> dict:
         def work() -> dict:
+            """Trains the network; returns its accuracy."""
             print(f"figure 3.5: {out}", file=sys.stderr)
             self.train(run, out, *words)
             return last_accuracy(out, stage)
@@ -109,29 +129,33 @@ class Fold:
         return once(out / "result.json", self._key(words), work)
 
     def _places(self, at: Point) -> tuple[Path, Path, list[str]]:
-        """Folders of the static and of the dynamic stream, and the latter's words."""
+        """Returns the folders of the static and of the dynamic stream, and the latter's words."""
         place = self.folder / f"fold{self.which}-of-{self.of}"
         static = place / f"static-{at.name(static=True)}"
         return (
             static,
             place / at.name(),
-            [*at.words(), "--epochs", "0", "--static-from", str(static / "last.safetensors")],
+            [*at.words(), "--epochs", "0", "--set", f"static_from={static / 'last.safetensors'}"],
         )
 
     def known(self, at: Point) -> dict | None:
-        """What `accuracy` found before, without doing anything."""
+        """Returns what `accuracy` found before, without doing anything."""
         _, out, words = self._places(at)
         return kept(out / "result.json", self._key(words))
 
     def accuracy(self, run: Dpc, at: Point) -> dict:
-        """Of the dynamic stream at one choice of settings, trained where it isn't, on the fold's static stream."""
+        """Returns the dynamic stream's accuracy at one choice of settings, trained where it isn't, on the fold's static stream."""
         static, out, words = self._places(at)
-        self._once(run, static, "static", *at.words(static=True), "--epochs-dynamic", "0")
+        self._once(run, static, "static", *at.words(static=True), "--set", "epochs_dynamic=0")
         return self._once(run, out, "dynamic", *words)
 
 
 def quartiles(values: Sequence[float]) -> list[float]:
-    """Lowest, first quartile, median, third quartile, highest."""
+    """Returns lowest, first quartile, median, third quartile, highest.
+
+    >>> quartiles([3, 1, 2, 5, 4])
+    [1.0, 2.0, 3.0, 4.0, 5.0]
+    """
     return np.percentile(values, (0, 25, 50, 75, 100)).tolist()
 
 
@@ -139,7 +163,7 @@ Found = Mapping[str, Mapping[float, Sequence[float]]]  # sweep -> value -> perce
 
 
 def table(found: Found, about: str) -> str:
-    """Markdown: the boxes of the figure as numbers."""
+    """Returns markdown: the boxes of the figure as numbers."""
     header = (
         "setting",
         "value",
@@ -163,7 +187,7 @@ def table(found: Found, about: str) -> str:
 
 
 def picture(found: Found, path: Path) -> None:
-    """Four panels of boxes over folds, the thesis's choice filled."""
+    """Draws four panels of boxes over folds, the thesis's choice filled."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 7), layout="constrained")
@@ -193,7 +217,7 @@ def make(
     run: Dpc = dpc,
     note: str = "",
 ) -> dict[str, dict[float, list[float]]]:
-    """Every value of the folds `only`, a fold after the other; a table after each network.
+    """Trains every value of the folds `only`, a fold after the other; writes a table after each network.
 
     words: preset, budget. Shown and returned are the other folds' networks, too, as far as another job has finished them.
     """
@@ -201,6 +225,7 @@ def make(
     about = f"Ours: `dpc classify train {' '.join(words)}`, {folds} folds of the training videos, one seed, the last epoch.{note}"
 
     def look() -> dict[str, dict[float, list[float]]]:
+        """Returns what is known so far, in percent by sweep and value."""
         known = {
             key: {one: [fold.known(point(key, one)) for fold in everyone] for one in own} for key, own in values.items()
         }
@@ -222,7 +247,7 @@ def make(
 
 
 def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    """Values of each sweep: `group-size=2,4` replaces a sweep's own, `group-size=` leaves it out."""
+    """Returns the values of each sweep: `group_size=2,4` replaces a sweep's own, `group_size=` leaves it out."""
     values = {key: sweep.values for key, sweep in SWEEPS.items()}
     for option in options:
         key, _, text = option.partition("=")
@@ -239,17 +264,18 @@ def swept(options: Sequence[str]) -> dict[str, tuple[float, ...]]:
 
 
 def possible(values: Mapping[str, Sequence[float]], preset: str) -> tuple[dict[str, tuple[float, ...]], str]:
-    """The values that a preset's network can have, and a sentence about those left out."""
-    config = find_preset(preset).config
+    """Returns the values that a preset's network can have, and a sentence about those left out."""
+    config = PRESETS[preset]["network"]
     if not config.xyz_group:
         return dict(values), ""
-    kept = {key: tuple(one for one in own if key != "group-size" or one >= 3) for key, own in values.items()}
-    left = [one for one in values.get("group-size", ()) if one < 3]
+    kept = {key: tuple(one for one in own if key != "group_size" or one >= 3) for key, own in values.items()}
+    left = [one for one in values.get("group_size", ()) if one < 3]
     told = f" Group size {', '.join(f'{one:g}' for one in left)} is left out: preset {preset} fits one group to the coordinates, "
     return {key: own for key, own in kept.items() if own}, told + "which are three." if left else ""
 
 
 def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
+    """Runs the program by its words; `run` does the commands."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", choices=list(DATA))

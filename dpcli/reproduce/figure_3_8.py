@@ -63,7 +63,7 @@ _NETWORK_POINTS = {"thesis": 2048}  # points a frame that the preset's networks 
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one row. paper: counted as table A.1 counts; true: 2 x multiply-adds / 1e9 and weights / 1e6."""
+    """Holds the cost of one row. paper: counted as table A.1 counts; true: 2 x multiply-adds / 1e9 and weights / 1e6."""
 
     paper_flops: float
     true_flops: float
@@ -72,7 +72,7 @@ class Cost:
 
 
 def costs(told: dict) -> dict[str, Cost]:
-    """By kind, from what `dpc classify profile --json` says. Flow: twice the static network, without an estimator."""
+    """Returns the costs by kind, from what `dpc classify profile --json` says. Flow: twice the static network, without an estimator."""
     flops, macs = told["paper_style_gflops"], told["macs_per_clip"]
     paper, true = told["paper_style_parameters"], told["parameters"]
     one = Cost(flops["static"], 2 * macs["static"] / 1e9, paper["static"], true["static"] / 1e6)
@@ -82,7 +82,7 @@ def costs(told: dict) -> dict[str, Cost]:
 
 
 def profile(run: Dpc, folder: Path, preset: str, backbone: str) -> dict[str, Cost]:
-    """Costs of a preset's networks on clips of 16 frames, 20 classes; measured once."""
+    """Returns the costs of a preset's networks on clips of 16 frames, 20 classes; measured once."""
     words = ["--preset", preset, "--backbone", backbone, "--frames", 16, "--classes", 20, "--json"]
     path = folder / f"profile-{preset}-{backbone}.json"
     return costs(once(path, [__version__, words], lambda: json.loads(run("classify", "profile", *words))))
@@ -90,7 +90,7 @@ def profile(run: Dpc, folder: Path, preset: str, backbone: str) -> dict[str, Cos
 
 @dataclass(frozen=True)
 class Network:
-    """The runs of one backbone and seed in a folder of their own. flow: a method of `estimate-flow`, or a folder."""
+    """Trains the networks of one backbone and seed in a folder of their own. flow: a method of `estimate-flow`, or a folder."""
 
     backbone: str
     seed: int
@@ -101,30 +101,36 @@ class Network:
 
     @property
     def place(self) -> Path:
+        """The folder of this backbone's networks."""
         return self.folder / self.backbone
 
     def cell(self, name: str, clouds: Path, *words: str):
-        setting = Setting(name, "", "", ("--backbone", self.backbone, "--frames", "16", *words), "")
+        """Returns the cell of one network, trained on the clouds by more words."""
+        setting = Setting(name, "", "", ("--set", f"backbone={self.backbone}", "--frames", "16", *words), "")
         cell = self.plan.cell(setting, self.seed, clouds, self.place)
         cell.scores = cell.folder / f"{name}.h5"
         return cell
 
     def static(self):
-        return self.cell("static", self.clouds, "--epochs-dynamic", "0")
+        """Returns the cell of the static network."""
+        return self.cell("static", self.clouds, "--set", "epochs_dynamic=0")
 
     def kinet(self):
-        return self.cell("kinet", self.clouds, "--epochs", "0", "--static-from", str(self.static().model))
+        """Returns the cell of Kinet, whose dynamic stream is trained on the static network."""
+        return self.cell("kinet", self.clouds, "--epochs", "0", "--set", f"static_from={self.static().model}")
 
     @property
     def fused(self) -> Path:
+        """The scores file of both streams of the flow baseline."""
         return self.place / f"{self.plan.preset}-two-streams-seed{self.seed}.h5"
 
     def flow_file(self) -> Path:
+        """Returns the file of the estimated flow as point clouds."""
         words = f"{self.plan.preset}-{Path(self.flow).name}"
         return self.folder / f"flow-{words}.h5"
 
     def two_streams(self, run: Dpc) -> dict | str:
-        """Accuracy of the flow baseline; the reason when one of its steps fails."""
+        """Returns the accuracy of the flow baseline; the reason when one of its steps fails."""
         clouds, still = self.flow_file(), self.static()
         words = ("--flow", self.flow, "--as-points", "--points", _NETWORK_POINTS.get(self.plan.preset, 512))
         why = attempt(
@@ -132,7 +138,7 @@ class Network:
         )
         if why:
             return why
-        moving = self.cell("flow", clouds, "--epochs-dynamic", "0")
+        moving = self.cell("flow", clouds, "--set", "epochs_dynamic=0")
         why = attempt(lambda: moving.run(run), "training or predicting on flow")
         if why:
             return why
@@ -147,7 +153,7 @@ Found = Mapping[tuple[str, str], Sequence[dict]]
 
 
 def table(known: Mapping[str, Mapping[str, dict[str, Cost]]], found: Found, about: Sequence[str]) -> str:
-    """Markdown; known: by preset and backbone, the costs; found: by row, what its runs say."""
+    """Returns markdown. known: by preset and backbone, the costs; found: by row, what its runs say."""
     header = ["model", "FLOPs (G), thesis / ours as it counts", "parameters (M), thesis / ours as it counts"]
     header += [f"FLOPs (G), parameters (M), true, preset {preset}" for preset in known]
     lines = []
@@ -177,12 +183,12 @@ def table(known: Mapping[str, Mapping[str, dict[str, Cost]]], found: Found, abou
 
 
 def _area(parameters: float) -> float:
-    """Of a mark; never too small to be seen."""
+    """Returns the area of a mark, never too small to be seen."""
     return max(30 * parameters, 25)
 
 
 def picture(cost: Mapping[str, dict[str, Cost]], found: Found, path: Path) -> None:
-    """Accuracy over operations, an area for the parameters: the thesis's hollow, ours filled where they are known."""
+    """Draws accuracy over operations, an area for the parameters: the thesis's hollow, ours filled where they are known."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8.5, 5.5), layout="constrained")
@@ -234,7 +240,7 @@ def make(
     flow: str = "icp",
     run: Dpc = dpc,
 ) -> dict[tuple[str, str], list[dict]]:
-    """Run what isn't done; a table after each network, the picture at the end. clouds: None profiles only."""
+    """Runs what isn't done; writes a table after each network, the picture at the end. clouds: None profiles only."""
     known = {
         preset: {name: profile(run, folder, preset, name) for name in backbones}
         for preset in dict.fromkeys(("thesis", plan.preset))
@@ -243,6 +249,7 @@ def make(
     reasons: dict[str, str] = {}
 
     def tell() -> None:
+        """Writes what is known so far."""
         about = _about(plan, flow, reasons)
         write_json(
             folder / "results.json",
@@ -270,6 +277,7 @@ def make(
 
 
 def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
+    """Runs the program by its words; `run` does the commands."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("raw", help="folder of MSRAction-3D; - with --clouds or --profile-only")

@@ -29,7 +29,7 @@ TITLES = {"kinet": "(a) Kinet", "flow": "(b) flow-based two streams"}
 
 
 def recalls(scores: np.ndarray, labels: np.ndarray, classes: int) -> np.ndarray:
-    """Percent of each class's videos told right, f64 (C); NaN for a class without videos. scores (S,C), labels (S)."""
+    """Returns the percent of each class's videos told right, f64 (C); NaN for a class without videos. scores (S,C), labels (S)."""
     right = np.bincount(labels[predicted_labels(scores) == labels], minlength=classes)
     count = np.bincount(labels, minlength=classes)
     with np.errstate(invalid="ignore"):
@@ -37,7 +37,7 @@ def recalls(scores: np.ndarray, labels: np.ndarray, classes: int) -> np.ndarray:
 
 
 def _of(path: Path, stream: str | None = None) -> tuple[np.ndarray, list[str], list[str]]:
-    """Recall of each class of the test videos, class names, the videos' names."""
+    """Returns the recall of each class of the test videos, class names, the videos' names."""
     reader = ScoresReader(path)
     if stream is not None and stream not in reader.streams:
         raise DataError(f"{path}: no stream {stream!r}; the file has {', '.join(reader.streams) or 'none'}")
@@ -64,7 +64,7 @@ def gains(files: Sequence[Path], static: Sequence[Path] | None = None) -> tuple[
 
 
 def table(names: Sequence[str], base: np.ndarray, found: Mapping[str, np.ndarray], about: str) -> str:
-    """Markdown, classes by Kinet's gain."""
+    """Returns markdown, classes by Kinet's gain."""
     header = ["class", "static, %"]
     for key in found:
         header += [f"{TITLES[key]}: gain, points", "thesis"]
@@ -90,7 +90,7 @@ def _number(value: float, sign: str = "") -> str:
 
 
 def picture(names: Sequence[str], found: Mapping[str, np.ndarray], path: Path) -> None:
-    """A panel each: bars sorted by gain, blue up, red down."""
+    """Draws a panel each: bars sorted by gain, blue up, red down."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(0.35 * len(names) + 2.5, 3.6 * len(found)), layout="constrained")
@@ -106,7 +106,7 @@ def picture(names: Sequence[str], found: Mapping[str, np.ndarray], path: Path) -
 
 
 def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict[str, np.ndarray]:
-    """Picture and table of scores files. flow: the flow baseline's, which hold its static scores as a stream too."""
+    """Writes picture and table of scores files. flow: the flow baseline's, which hold its static scores as a stream too."""
     names, base, own = gains(files)
     found = {"kinet": own}
     about = f"Ours: mean over {some(len(files), 'run')} (seeds)."
@@ -130,6 +130,7 @@ def make(folder: Path, files: Sequence[Path], flow: Sequence[Path] = ()) -> dict
 
 
 def main(argv: Sequence[str] | None = None) -> None:
+    """Runs the program by its words."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("scores", type=Path, nargs="+")

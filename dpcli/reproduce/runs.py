@@ -1,4 +1,4 @@
-"""What the tables' programs share: `dpc` commands one after the other, cells done once, markdown.
+"""The common parts of the tables' programs: `dpc` commands one after the other, cells done once, markdown.
 
 A cell is one trained and scored network in a folder of its own. A stopped cell continues, a finished one is passed
 over as long as it would be made from the same data by the same words.
@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from statistics import mean, stdev
 
-from dpcli.evaluate.report.thesis import thesis_tables
+from dpcli.evaluate.report.thesis_tables import thesis_tables
 from dpcli.runtime.provenance import file_digest
 from dpcli.runtime.whole_file import write_whole
 
@@ -29,7 +29,7 @@ _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
 
 
 def dpc(*words: object, threads: int | None = None) -> str:
-    """A command's stdout; ends this program with its exit code when it fails (75: stopped, run again).
+    """Returns a command's stdout; ends this program with its exit code when it fails (75: stopped, run again).
 
     A signal to this program goes on to the command, which saves its work before it ends.
     """
@@ -58,7 +58,7 @@ def dpc(*words: object, threads: int | None = None) -> str:
 
 
 def attempt(work: Callable[[], object], what: str) -> str:
-    """Do what may fail; why it failed, or nothing. Being asked to stop is no failure."""
+    """Does what may fail; returns why it failed, or nothing. Being asked to stop is no failure."""
     try:
         work()
     except SystemExit as ended:
@@ -75,11 +75,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: object) -> None:
+    """Writes a value as JSON, whole."""
     write_text(path, json.dumps(value, indent=1) + "\n")
 
 
 def kept(path: Path, key: list) -> dict | None:
-    """What `once` found before by the same key; None when it found nothing, or by another key."""
+    """Returns what `once` found before by the same key; None when it found nothing, or by another key."""
     try:
         before = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -88,7 +89,7 @@ def kept(path: Path, key: list) -> dict | None:
 
 
 def once(path: Path, key: list, work: Callable[[], dict]) -> dict:
-    """What `work` finds, from the JSON file `path` when it was found there before by the same key."""
+    """Returns what `work` finds, from the JSON file `path` when it was found there before by the same key."""
     found = kept(path, key)
     if found is None:
         found = work()
@@ -102,19 +103,22 @@ def _digest(path: Path, size: int, changed: int) -> str:
 
 
 def digest(path: Path) -> str:
-    """Of a file's bytes; read once a program."""
+    """Returns the digest of a file's bytes; read once a program."""
     told = path.stat()
     return _digest(path, told.st_size, told.st_mtime_ns)
 
 
 def counted(run: Dpc, scores: Path, split: str = "test") -> dict:
-    """{"samples": n, "correct": {stream: n}} of a scores file; `fused` is its final score."""
+    """Returns {"samples": n, "correct": {stream: n}} of a scores file; `fused` is its final score."""
     told = json.loads(run("evaluate", "classification", scores, "--split", split, "--resamples", 0, "--json"))
     return {"samples": told["denominators"]["samples"], "correct": told["denominators"]["correct"]}
 
 
 class Cell:
-    """One network: trained by `train` words on `clouds`, scored by `predict` words; what is found in `folder`/result.json."""
+    """Trains and scores one network: trained by `train` words on `clouds`, scored by `predict` words.
+
+    What is found is kept in `folder`/result.json.
+    """
 
     def __init__(self, folder: Path, clouds: Path, train: Sequence[object], predict: Sequence[object] = ()) -> None:
         self.folder, self.clouds = folder, clouds
@@ -123,7 +127,7 @@ class Cell:
         self.trains = True
 
     def scored_again(self, name: str, *words: str) -> Cell:
-        """The same network, trained by now, scored with more words; files are called `name`."""
+        """Returns the same network, trained by now, scored with more words; files are called `name`."""
         other = Cell(self.folder, self.clouds, self.train, [*self.predict, *words])
         other.scores, other.result = self.folder / f"scores-{name}.h5", self.folder / f"result-{name}.json"
         other.trains = False
@@ -131,14 +135,15 @@ class Cell:
 
     @property
     def key(self) -> list:
+        """The data and the words, which must be equal for a result to stand."""
         return [digest(self.clouds), self.train, self.predict]
 
     def known(self) -> dict | None:
-        """What was found before, without doing anything."""
+        """Returns what was found before, without doing anything."""
         return kept(self.result, self.key) if self.result.exists() else None
 
     def run(self, run: Dpc) -> dict:
-        """Train, predict and count, each only as far as it isn't done."""
+        """Trains, predicts and counts, each only as far as it isn't done."""
         return once(self.result, self.key, lambda: self._work(run))
 
     def _work(self, run: Dpc) -> dict:
@@ -160,15 +165,32 @@ class Cell:
         return counted(run, self.scores)
 
 
+def override(words: Sequence[str], more: Sequence[str]) -> list[str]:
+    """Returns the words of `dpc classify train` followed by `more`, without a `--set` that `more` gives again.
+
+    >>> override(["--set", "draws=8", "--lr", "0.1"], ["--set", "draws=0"])
+    ['--lr', '0.1', '--set', 'draws=0']
+    """
+    again = {name for name, _ in _settings(more)}
+    left_out = {at + step for name, at in _settings(words) if name in again for step in (0, 1)}
+    return [str(word) for at, word in enumerate(words) if at not in left_out] + [str(word) for word in more]
+
+
+def _settings(words: Sequence[str]) -> list[tuple[str, int]]:
+    """Returns the name of each setting that follows a `--set`, and the place of that `--set`."""
+    pairs = enumerate(zip(words, words[1:]))
+    return [(str(value).partition("=")[0], at) for at, (word, value) in pairs if word == "--set"]
+
+
 def cut(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """A program's own words, and those after `--`, which go to `dpc classify train`."""
+    """Returns a program's own words, and those after `--`, which go to `dpc classify train`."""
     words = list(sys.argv[1:] if argv is None else argv)
     where = words.index("--") if "--" in words else len(words)
     return words[:where], words[where + 1 :]
 
 
 def numbers(text: str) -> list[int]:
-    """`0,1,2` as whole numbers; ends the program with a sentence otherwise."""
+    """Returns `0,1,2` as whole numbers; ends the program with a sentence otherwise."""
     try:
         return [int(word) for word in text.replace(" ", ",").split(",") if word]
     except ValueError:
@@ -177,17 +199,17 @@ def numbers(text: str) -> list[int]:
 
 
 def shares(found: Sequence[dict], stream: str) -> list[float]:
-    """Percent right of each run that has the stream."""
+    """Returns percent right of each run that has the stream."""
     return [100 * one["correct"][stream] / one["samples"] for one in found if stream in one["correct"]]
 
 
 def some(number: int, thing: str) -> str:
-    """'1 clip', '8 clips'."""
+    """Returns a number with its thing: '1 clip', '8 clips'."""
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def spread(values: Sequence[float], digits: int = 2) -> str:
-    """`mean ± sd` over runs, n - 1 in the denominator; the value alone for one run, a dash for none."""
+    """Returns `mean ± sd` over runs, n - 1 in the denominator; the value alone for one run, a dash for none."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return DASH
@@ -196,21 +218,21 @@ def spread(values: Sequence[float], digits: int = 2) -> str:
 
 
 def beside(theirs: float | None, ours: Sequence[float]) -> str:
-    """`thesis / ours`."""
+    """Returns `thesis / ours`."""
     return f"{DASH if theirs is None else f'{theirs:.2f}'} / {spread(ours)}"
 
 
 def samples(found: Sequence[dict]) -> str:
-    """The denominator of all runs: one number, or the several that occur."""
+    """Returns the denominator of all runs: one number, or the several that occur."""
     return ", ".join(str(n) for n in sorted({one["samples"] for one in found})) or DASH
 
 
 def thesis_rows(number: str) -> tuple[dict, ...]:
-    """Rows of a table of the thesis: method, setting, values, own."""
+    """Returns the rows of a table of the thesis: method, setting, values, own."""
     return next(table.rows for table in thesis_tables() if table.number == number)
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A markdown table."""
+    """Returns a markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)

@@ -36,12 +36,12 @@ DATA = {
     "nvgesture": (EXPERIMENTS["3.2"], EXPERIMENTS["3.2"].settings[0]),
     "msraction3d": (EXPERIMENTS["3.4"], next(one for one in EXPERIMENTS["3.4"].settings if one.key == "16")),
 }
-_SWITCH = {"normals": ("--no-normals",), "weights": ("--no-weights",)}
+_SWITCH = {"normals": ("--set", "normals=false"), "weights": ("--set", "weighting=none")}
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line: which network's which stream. number: the thesis's row, or nothing for a line it doesn't have."""
+    """Holds a line: which network's which stream. number: the thesis's row, or nothing for a line it doesn't have."""
 
     number: str
     name: str
@@ -66,28 +66,41 @@ PLAIN = (
 
 
 def network(plan: Plan, setting: Setting, name: str, seed: int, clouds: Path, folder: Path, start: Path | None) -> Cell:
-    """The cell of a network by its name: `scratch` or `pretrained`, and what is switched off."""
+    """Returns the cell of a network by its name: `scratch` or `pretrained`, and what is switched off."""
     base, _, switch = name.partition("-")
     words = list(setting.words)
     if switch:
         trained = network(plan, setting, base, seed, clouds, folder, start)
-        words += ["--epochs", "0", "--static-from", str(trained.model), *_SWITCH[switch]]
+        words += ["--epochs", "0", "--set", f"static_from={trained.model}", *_SWITCH[switch]]
     elif base == "pretrained":
-        words += ["--static-from", str(start)]
+        words += ["--set", f"static_from={start}"]
     return plan.cell(Setting(name, "", setting.data, tuple(words), ""), seed, clouds, folder)
 
 
 def pretrained(modelnet: str, folder: Path, preset: str, words: Sequence[str], run: Dpc) -> Path:
-    """The static stream trained on ModelNet40's single clouds."""
+    """Trains the static stream on ModelNet40's single clouds."""
     shapes, out = folder / "modelnet40.h5", folder / f"{preset}-modelnet40"
     folder.mkdir(parents=True, exist_ok=True)
     run("prepare", "modelnet40", modelnet, "-o", shapes)
-    run("classify", "train", shapes, "-o", out, "--preset", preset, "--validation", "none", "--pretrain", *words)
+    run(
+        "classify",
+        "train",
+        shapes,
+        "-o",
+        out,
+        "--preset",
+        preset,
+        "--validation",
+        "none",
+        "--set",
+        "pretrain=true",
+        *words,
+    )
     return out
 
 
 def table(rows: Sequence[Row], found: Mapping[str, Sequence[dict]], about: Sequence[str]) -> str:
-    """Markdown; found: by network, what its runs say."""
+    """Returns markdown. found: by network, what its runs say."""
     thesis = {row["method"].partition("(")[2].rstrip(")"): row["values"][0] for row in thesis_rows("3.1")}
     lines = []
     for row in rows:
@@ -109,7 +122,7 @@ def make(
     about: Sequence[str] = (),
     run: Dpc = dpc,
 ) -> dict[str, list[dict]]:
-    """Run what isn't done, a table after every network. start: the pretrained static stream, None without."""
+    """Runs what isn't done, writes a table after every network. start: the pretrained static stream, None without."""
     rows = ROWS if start else tuple(row for row in ROWS if row.network == "scratch") + PLAIN
     notes = [*about, f"Ours: `dpc classify train --preset {plan.preset} --validation none {' '.join(plan.budget)}`."]
     if start is None:
@@ -129,6 +142,7 @@ def make(
 
 
 def main(argv: Sequence[str] | None = None, run: Dpc = dpc) -> None:
+    """Runs the program by its words; `run` does the commands."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", choices=list(DATA))

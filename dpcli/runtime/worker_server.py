@@ -1,27 +1,15 @@
-"""The server that worker processes are forked from. Imports no library: a command can start it before all else."""
+"""The server that worker processes are forked from. It imports no library."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
 from multiprocessing import forkserver, resource_tracker
 
-# One process per core is the parallelizm: libraries inside a worker must not start threads of their own.
+# One process per core is the parallelism: libraries inside a worker must not start threads of their own.
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]
-
-
-def start_early(modules: Sequence[str]) -> None:
-    """Start the server that worker processes are forked from, with `modules` imported: once for all, while this goes on.
-
-    For what every worker needs and what takes long to import; a module that fails to import is left to the workers.
-    Without effect where the server runs already. The modules must start no threads: a fork would lose them.
-    """
-    multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
-    ensure_server()
 
 
 def ensure_server() -> None:

@@ -16,7 +16,7 @@ MOTION_FIELDS = ("pose", "scene_flow")  # what may tell the true motion, the bet
 
 @dataclass(frozen=True)
 class Pair:
-    """Frames `first` and `first + 1` of a sequence; `number` counts all pairs of a source."""
+    """Names frames `first` and `first + 1` of a sequence; `number` counts all pairs of a source."""
 
     number: int
     sequence: int
@@ -25,8 +25,10 @@ class Pair:
 
 @dataclass
 class LoadedPair:
-    """points f32 (2,N,3) in units of the sequence's diameter, centered; part i64 (2,N) (-1 unknown); flow f32 (2,N,3), the
-    true one each way, None without poses and scene_flow."""
+    """Holds one pair. points f32 (2,N,3): in units of the sequence's diameter, centered; part i64 (2,N): -1 unknown.
+
+    flow f32 (2,N,3): the true one each way, None without poses and scene_flow.
+    """
 
     points: np.ndarray
     part: np.ndarray
@@ -34,20 +36,32 @@ class LoadedPair:
 
 
 def sequence_scale(frames: list[np.ndarray]) -> float:
-    """1 / (twice the largest distance of a point from its frame's mean): a sequence times this has diameter 1 or less."""
+    """Returns 1 / (twice the largest distance of a point from its frame's mean).
+
+    A sequence times this has diameter 1 or less.
+
+    >>> sequence_scale([np.array([[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]])])
+    0.25
+    """
     reach = max((float(np.linalg.norm(f - f.mean(0), axis=1).max()) for f in frames if len(f)), default=0.0)
     return 0.5 / reach if reach > 0 else 1.0
 
 
 def choose_points(count: int, wanted: int, rng: np.random.Generator) -> np.ndarray:
-    """Indices i64 (wanted) into `count` points: without repeats where there are enough, all of them and repeats else."""
+    """Returns random indices i64 (wanted) into `count` points.
+
+    No index repeats where there are enough points; else all are there, and some again.
+    """
     if count >= wanted:
         return rng.permutation(count)[:wanted]
     return np.concatenate([rng.permutation(count), rng.integers(0, count, wanted - count)])
 
 
 class PairSource:
-    """All pairs of adjacent frames with points of some sequences. A frame's points are drawn once: its flow belongs to them."""
+    """Gives all pairs of adjacent frames with points of some sequences.
+
+    A frame's points are drawn once, since its flow belongs to them. Raises DataError where there is no pair.
+    """
 
     def __init__(self, reader: CloudsReader, sequences: list[int], points: int, seed: int) -> None:
         self.reader, self.points, self.seed = reader, points, seed
@@ -68,7 +82,7 @@ class PairSource:
         self.fields = [name for name in ("part", truth) if name in reader.fields]
 
     def load(self, pair: Pair) -> LoadedPair:
-        """One pair."""
+        """Returns one pair from the file."""
         frames = [pair.first, pair.first + 1]
         sample = self.reader.read(pair.sequence, frames, self.fields)
         clouds = [sample.frame(t) for t in range(2)]
@@ -88,7 +102,7 @@ class PairSource:
     def _flow(
         self, pair: Pair, sample: CloudSequence, points: np.ndarray, parts: np.ndarray, picks: list[np.ndarray]
     ) -> np.ndarray | None:
-        """The true flow (2,N,3) of the chosen points, each way."""
+        """Returns the true flow (2,N,3) of the chosen points, each way."""
         if sample.pose is not None:
             return np.stack([true_flow(points[t], parts[t], sample.pose[t], sample.pose[1 - t]) for t in range(2)])
         if sample.scene_flow is None:
@@ -100,26 +114,32 @@ class PairSource:
 
 
 def backward_flow(points: np.ndarray, flow: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Flow (M,3) of `others`, the next frame's points, back: minus that of the point (N,3) which its flow leads nearest."""
+    """Returns the flow (M,3) of `others`, the next frame's points, back.
+
+    It is minus the flow of the point (N,3) that its flow leads nearest.
+    """
     from scipy.spatial import cKDTree
 
     return -flow[cKDTree(points + flow).query(others)[1]]
 
 
 def frame_parts(sample: CloudSequence, t: int) -> np.ndarray:
-    """Part ids i64 of frame t, -1 where unknown."""
+    """Returns the part ids i64 of frame t, -1 where unknown."""
     bounds = slice(sample.frame_offsets[t], sample.frame_offsets[t + 1])
     count = bounds.stop - bounds.start
     return np.full(count, -1) if sample.part is None else sample.part[bounds].astype(np.int64)
 
 
 def true_flow(points: np.ndarray, part: np.ndarray, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Flow (N,3) of points whose parts have the poses source (parts,4,4), to the poses target. Unknown parts move as 0."""
+    """Returns the flow (N,3) of points whose parts have the poses source (parts,4,4), to the poses target.
+
+    Points of unknown parts move as part 0.
+    """
     motion = (target @ np.linalg.inv(source))[np.clip(part, 0, None)]
     return np.einsum("nij,nj->ni", motion[:, :3, :3], points) + motion[:, :3, 3] - points
 
 
 def epoch_order(source: PairSource, epoch: int, most: int | None) -> list[Pair]:
-    """The epoch's pairs, shuffled; at most `most`, another draw each epoch."""
+    """Returns the epoch's pairs, shuffled; at most `most`, another draw each epoch."""
     order = generator(source.seed, SegmentStream.PAIR_ORDER, epoch).permutation(len(source.pairs))
     return [source.pairs[i] for i in order[:most]]

@@ -77,7 +77,7 @@ def parts_picture(
     frames: int = 4,
     look: Look | None = None,
 ) -> None:
-    """Write a contact sheet: a row per sequence, its frames as columns, points colored by `part`.
+    """Writes a contact sheet: a row per sequence, its frames as columns, points colored by `part`.
 
     truth: for each sequence the same points with their true parts, or None; drawn in a row below, in the same colors.
     At most `frames` frames are shown, spread over the sequence. DataError on sequences without parts, truth of other
@@ -159,7 +159,7 @@ def _legend(draw: Any, top: int, right: int, part: np.ndarray, look: Look) -> in
 
 
 def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look: Look | None = None) -> None:
-    """Write an animation (.gif): one turn about the upright axis, while the frames pass to the last one and back.
+    """Writes an animation (.gif): one turn about the upright axis, while the frames pass to the last one and back.
 
     Points are colored by `part`. DataError on a sequence without parts or when the file can't be written.
     """

@@ -13,7 +13,7 @@ from dpcli.errors import DataError
 from dpcli.store.file import open_store, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
-OPTIONAL = ("time", "color", "part", "track", "scene_flow", "pose")
+OPTIONAL = ("time", *POINT_FIELDS, "pose")
 
 
 class CloudsReader:

@@ -11,15 +11,21 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import STRING, write_positions, write_skipped
+from dpcli.store.schema import fields_of
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
 from dpcli.store.writing.resumable_writer import ResumableWriter
-from dpcli.store.writing.whole_chunks import WholeChunks
+from dpcli.store.writing.whole_chunks import PlainChunks, chunk_writer
 
 COMPRESSIONS = ("none", "lzf", "gzip")
 POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence
 PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
-_PER_SAMPLE = {"name": STRING, "split": STRING, "label": np.int32, "subject": np.int32, "camera": np.int32}
+_FIELD = fields_of("clouds")
+_PER_SAMPLE = {
+    name: STRING if field.kind == "str" else field.dtype
+    for name, field in _FIELD.items()
+    if field.shape == ("S",) and not field.optional
+}
 _INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
 _FIELDS = ("time", *POINT_FIELDS, "pose")  # the order in which they are made, whoever names them: equal bytes
 _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
@@ -36,6 +42,7 @@ class CloudsWriter(ResumableWriter):
     """
 
     kind = "clouds"
+    types = _FIELD
 
     def __init__(
         self,
@@ -51,16 +58,6 @@ class CloudsWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
-        super().__init__(
-            path,
-            class_names=class_names,
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        )
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
         unknown = set(fields) - set(_FIELDS)
@@ -73,15 +70,26 @@ class CloudsWriter(ResumableWriter):
         self._frames = self._points = self._unflushed = 0
         self._index: dict[str, list] = {name: [] for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
-        self._chunks: WholeChunks | None = None
+        self._chunks: PlainChunks | None = None
         self._placed: Placed | None = None
-        self._open(force)
+        super().__init__(
+            path,
+            class_names=class_names,
+            length_unit=length_unit,
+            source=source,
+            seed=seed,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        )
 
     def _create(self) -> None:
         file = self._file
         self._create_floats("points", 3)
+        if self.compression == "none":
+            self._chunks = chunk_writer(file["points"])
         for name in ("frame_offsets", "sequence_offsets"):
-            file.create_dataset(name, data=np.zeros(1, np.int64), maxshape=(None,), chunks=(4096,), **PACKED)
+            file.create_dataset(name, data=np.zeros(1, _FIELD[name].dtype), maxshape=(None,), chunks=(4096,), **PACKED)
         for name, dtype in _PER_SAMPLE.items():
             file.create_dataset(
                 name, (0,), dtype, maxshape=(None,), chunks=(1024,), **({} if dtype is STRING else PACKED)
@@ -93,11 +101,13 @@ class CloudsWriter(ResumableWriter):
         """A data set of f32 (rows, width), uncompressed unless --compression says otherwise."""
         filters = {} if self.compression == "none" else {"compression": self.compression, "shuffle": True}
         rows = max(1, POINTS_PER_CHUNK * 3 // width)
-        self._file.create_dataset(name, (0, width), np.float32, maxshape=(None, width), chunks=(rows, width), **filters)
+        self._file.create_dataset(
+            name, (0, width), self.types[name].dtype, maxshape=(None, width), chunks=(rows, width), **filters
+        )
 
     def _create_field(self, file: h5py.File, name: str) -> None:
         if name == "time":
-            file.create_dataset(name, (0,), np.float64, maxshape=(None,), chunks=(4096,), **PACKED)
+            file.create_dataset(name, (0,), _FIELD[name].dtype, maxshape=(None,), chunks=(4096,), **PACKED)
         elif name in POINT_FIELDS:
             dtype, shape = POINT_FIELDS[name]
             chunks = (POINTS_PER_CHUNK, *shape)
@@ -111,7 +121,7 @@ class CloudsWriter(ResumableWriter):
         self._note(sequence)
 
     def _note(self, sequence: CloudSequence, *said: Any) -> None:
-        """From here on the sample counts as written; `said`: what else `write` was given."""
+        """Makes the sample count as written; `said`: what else `write` was given."""
         self._record([sequence, *said], self._placed)
         self._placed = None
         self._names.add(sequence.name)
@@ -152,21 +162,16 @@ class CloudsWriter(ResumableWriter):
         if name == "pose" and name not in self._file:
             shape = values.shape[1:]
             self._file.create_dataset(
-                name, (0, *shape), np.float64, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
+                name, (0, *shape), _FIELD[name].dtype, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
             )
-        if name == "points" and self.compression == "none":
-            self._append_whole_chunks(values)
+        if name == "points" and self._chunks:
+            self._placed = self._chunks.append(values)
         else:
             self._extend(name, values)
         self._unflushed += getattr(values, "nbytes", 0)
         if self._unflushed > _FLUSH_BYTES:
             self._atomic.flush()
             self._unflushed = 0
-
-    def _append_whole_chunks(self, points: np.ndarray) -> None:
-        self._chunks = self._chunks or WholeChunks(self._file["points"])
-        places = self._chunks.append(points)
-        self._placed = (points, places) if points.dtype == np.float32 else None
 
     def _extend(self, name: str, values: np.ndarray | list) -> None:
         if name not in self._data:  # kept open: closing would write its unfinished chunk, each time

@@ -10,8 +10,10 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
 
+_FIELD = fields_of("embedding")
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
@@ -47,7 +49,7 @@ def write_embedding(
         )
         file.create_dataset("name", data=np.array(list(names), dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(list(splits), dtype=object), dtype=STRING)
-        file.create_dataset("label", data=np.asarray(labels, np.int32), **_PACKED)
+        file.create_dataset("label", data=np.asarray(labels, _FIELD["label"].dtype), **_PACKED)
         for stream, said in streams.items():
             file.create_dataset(f"features/{stream}", data=said.features)
             file.create_dataset(f"coordinates/{stream}", data=said.coordinates).attrs.update(said.values)

@@ -13,43 +13,10 @@ from dpcli import __version__
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_pipe
+from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of
 
-SCHEMA = 1
-KINDS = ("clouds", "views", "scores", "parts", "gaussians", "embedding")
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 STRING = h5py.string_dtype("utf-8")
-_SORTS = {
-    "strings": ("class_names", "provenance", "name", "split", "role", "skipped"),
-    "whole numbers": (
-        "label",
-        "subject",
-        "camera",
-        "frame_offsets",
-        "sequence_offsets",
-        "color",
-        "part",
-        "pair",
-        "pair_offsets",
-        "flow_offsets",
-        "position",
-        "skipped_position",
-    ),
-    "numbers": (
-        "scores",
-        "points",
-        "time",
-        "track",
-        "scene_flow",
-        "pose",
-        "flow",
-        "part_motion",
-        "part_probability",
-        "rgba",
-        "intrinsics",
-        "world_to_camera",
-    ),
-    "group": ("streams", "features", "coordinates", "activation"),
-}
 
 
 def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
@@ -127,20 +94,25 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
 
 
 def _check_types(file: h5py.File, path: Path) -> None:
-    """What a file of the contract has under a name is of the sort that the readers expect; other names are not looked at."""
+    """Raises DataError where a data set holds other values than its kind has under that name; unknown names pass."""
+    known = fields_of(str(file.attrs["dpc_kind"]))
     for name, item in file.items():
-        sort = next((sort for sort, names in _SORTS.items() if name in names), "")
-        if sort == "group":
-            good = isinstance(item, h5py.Group) and all(_is_numbers(one, "fiub") for one in item.values())
-        else:
-            good = not sort or _is_numbers(item, "iu" if sort == "whole numbers" else "fiub")
-        if sort == "strings":
-            good = isinstance(item, h5py.Dataset) and item.ndim > 0 and h5py.check_string_dtype(item.dtype) is not None
-        if not good:
-            expected = "data sets of numbers below it" if sort == "group" else f"a data set of {sort}"
-            raise DataError(
-                f"{path}: {name!r} holds something else, expected {expected}; another program changed it, make it again"
-            )
+        field = known.get(name)
+        if field is None or _holds(item, field):
+            continue
+        expected = f"data sets of {field.sort} below it" if field.group else f"a data set of {field.sort}"
+        raise DataError(
+            f"{path}: {name!r} holds something else, expected {expected}; another program changed it, make it again"
+        )
+
+
+def _holds(item: h5py.Group | h5py.Dataset, field: Field) -> bool:
+    """Returns whether something in a file holds the sort of values that a field has; their shape is the readers' to check."""
+    if field.group:
+        return isinstance(item, h5py.Group) and all(_is_numbers(one, "fiub") for one in item.values())
+    if field.sort == "strings":
+        return isinstance(item, h5py.Dataset) and item.ndim > 0 and h5py.check_string_dtype(item.dtype) is not None
+    return _is_numbers(item, "iu" if field.sort == "whole numbers" else "fiub")
 
 
 def _is_numbers(item: h5py.Group | h5py.Dataset, kinds: str) -> bool:

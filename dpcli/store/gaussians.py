@@ -13,32 +13,14 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import open_store, read_provenance, root_attributes, write_root
+from dpcli.store.schema import TABLES
 from dpcli.store.writing.atomic_file import AtomicFile
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _TOLERANCE = 1e-3  # of float32 unit quaternions, probabilities and rotations
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _LETTERS = {"N": "Gaussians", "T": "frames", "S": "parts", "K": "control points", "V": "cameras", "B": "SH terms"}
-LAYOUT: dict[str, tuple[type, tuple[str | int, ...]]] = {  # data set -> type, shape
-    "mean": (np.float32, ("N", 3)),
-    "log_scale": (np.float32, ("N", 3)),
-    "quaternion": (np.float32, ("N", 4)),
-    "opacity_logit": (np.float32, ("N",)),
-    "sh": (np.float32, ("N", "B", 3)),
-    "time": (np.float64, ("T",)),
-    "frame_mean": (np.float32, ("T", "N", 3)),
-    "frame_quaternion": (np.float32, ("T", "N", 4)),
-    "part": (np.int16, ("N",)),
-    "part_probability": (np.float32, ("N", "S")),
-    "part_motion": (np.float32, ("T", "S", 4, 4)),
-    "rigid_weight": (np.float32, ("T", "N")),
-    "control_point": (np.float32, ("K", 3)),
-    "control_radius": (np.float32, ("K",)),
-    "control_position": (np.float32, ("T", "K", 3)),
-    "control_quaternion": (np.float32, ("T", "K", 4)),
-    "camera_intrinsics": (np.float64, ("V", 3, 3)),
-    "camera_world_to_camera": (np.float64, ("V", 4, 4)),
-}
+LAYOUT = {field.name: (field.dtype, field.shape) for field in TABLES["gaussians"]}  # data set -> type, shape
 _QUATERNIONS = ("quaternion", "frame_quaternion", "control_quaternion")
 
 

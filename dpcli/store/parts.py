@@ -13,9 +13,11 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.clouds_writer import PACKED, CloudsWriter
+from dpcli.store.schema import fields_of
 from dpcli.store.sequence import CloudSequence
 
 _TOLERANCE = 1e-3  # of float32 probabilities and rotations
+_FIELD = fields_of("parts")
 
 
 @dataclass
@@ -111,6 +113,7 @@ class PartsWriter(CloudsWriter):
     """
 
     kind = "parts"
+    types = _FIELD
 
     def __init__(self, path: str | Path, *, num_parts: int, fields: Sequence[str] = (), **options: Any) -> None:
         if num_parts < 1:
@@ -126,10 +129,12 @@ class PartsWriter(CloudsWriter):
         self._create_floats("part_probability", self.num_parts)
         self._create_floats("flow", 3)
         file, shape = self._file, (self.num_parts, 4, 4)
-        file.create_dataset("part_motion", (0, *shape), np.float32, maxshape=(None, *shape), chunks=(64, *shape))
-        file.create_dataset("pair", (0, 2), np.int32, maxshape=(None, 2), chunks=(1024, 2), **PACKED)
+        file.create_dataset(
+            "part_motion", (0, *shape), _FIELD["part_motion"].dtype, maxshape=(None, *shape), chunks=(64, *shape)
+        )
+        file.create_dataset("pair", (0, 2), _FIELD["pair"].dtype, maxshape=(None, 2), chunks=(1024, 2), **PACKED)
         for name in ("pair_offsets", "flow_offsets"):
-            file.create_dataset(name, data=np.zeros(1, np.int64), maxshape=(None,), chunks=(4096,), **PACKED)
+            file.create_dataset(name, data=np.zeros(1, _FIELD[name].dtype), maxshape=(None,), chunks=(4096,), **PACKED)
 
     def write(  # type: ignore[override]
         self,
@@ -142,10 +147,10 @@ class PartsWriter(CloudsWriter):
         """Append one sample, whose `part` are the hard ids. DataError as `CloudsWriter.write`, `PartsSample.validate`."""
         self._check(sequence)
         said = PartsSample(
-            np.asarray(probability, np.float32),
-            np.asarray(pairs, np.int32).reshape(-1, 2),
-            np.asarray(motion, np.float32),
-            [np.asarray(one, np.float32) for one in flow],
+            np.asarray(probability, _FIELD["part_probability"].dtype),
+            np.asarray(pairs, _FIELD["pair"].dtype).reshape(-1, 2),
+            np.asarray(motion, _FIELD["part_motion"].dtype),
+            [np.asarray(one, _FIELD["flow"].dtype) for one in flow],
         )
         said.validate(sequence, self.num_parts)
         self._append_said(said)

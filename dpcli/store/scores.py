@@ -10,8 +10,10 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes
+from dpcli.store.schema import fields_of
 from dpcli.store.writing.resumable_writer import ResumableWriter
 
+_FIELD = fields_of("scores")
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 
@@ -36,6 +38,8 @@ class ScoresWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
+        self.streams = tuple(streams)
+        self._rows: list[tuple] = []
         super().__init__(
             path,
             class_names=class_names,
@@ -46,9 +50,6 @@ class ScoresWriter(ResumableWriter):
             force=force,
             resume=resume,
         )
-        self.streams = tuple(streams)
-        self._rows: list[tuple] = []
-        self._open(force)
 
     def write(
         self,
@@ -68,7 +69,9 @@ class ScoresWriter(ResumableWriter):
                 )
         if set(self.streams) != set(own):
             raise DataError(f"sample {name!r}: streams {sorted(own)}, expected {sorted(self.streams)}")
-        main, *single = (np.asarray(row, np.float32) for row in (scores, *(own[key] for key in self.streams)))
+        main, *single = (
+            np.asarray(row, _FIELD["scores"].dtype) for row in (scores, *(own[key] for key in self.streams))
+        )
         self._rows.append((name, split, int(label), main, single))
         self._record([name, split, int(label), main, single])
 
@@ -93,7 +96,7 @@ class ScoresWriter(ResumableWriter):
         names, splits, labels, scores, streams = zip(*self._rows)
         file.create_dataset("name", data=np.array(names, dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(splits, dtype=object), dtype=STRING)
-        file.create_dataset("label", data=np.array(labels, np.int32), **_PACKED)
+        file.create_dataset("label", data=np.array(labels, _FIELD["label"].dtype), **_PACKED)
         file.create_dataset("scores", data=np.stack(scores))
         for stream, rows in zip(self.streams, zip(*streams)):
             file.create_dataset(f"streams/{stream}", data=np.stack(rows))

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.store.schema import TABLES
 
 POINT_FIELDS = {
-    "color": (np.uint8, (3,)),
-    "part": (np.int16, ()),
-    "track": (np.int64, ()),
-    "scene_flow": (np.float32, (3,)),
+    field.name: (field.dtype, field.row)
+    for field in TABLES["clouds"]
+    if field.optional and field.shape[0] == "P" and not field.group
 }  # name -> dtype, shape of one point
 
 

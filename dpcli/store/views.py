@@ -12,9 +12,11 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
+from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
 
 ROLES = ("reference", "train", "test")
+_FIELD = fields_of("views")
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _RIGID = 1e-5  # how far R R^T may be from the identity: room for matrices that were once float32
 
@@ -125,8 +127,8 @@ class ViewsWriter:
         if Path(path).exists() and not force:
             raise UsageError(f"{path}: exists already; --force replaces it")
         header.validate()
-        track = None if track is None else np.asarray(track, np.float32)
-        part = None if part is None else np.asarray(part, np.int16)
+        track = None if track is None else np.asarray(track, _FIELD["track"].dtype)
+        part = None if part is None else np.asarray(part, _FIELD["part"].dtype)
         _check_truth(header.name, header.num_frames, track, part)
         self.header = header
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
@@ -153,9 +155,9 @@ class ViewsWriter:
         width, height = header.size
         picture = (height, width, 4)
         shape = (header.num_views, header.num_frames, *picture)
-        self._rgba = file.create_dataset("rgba", shape, np.uint8, chunks=(1, 1, *picture), **_PACKED)
+        self._rgba = file.create_dataset("rgba", shape, _FIELD["rgba"].dtype, chunks=(1, 1, *picture), **_PACKED)
         for key in ("intrinsics", "world_to_camera", "time"):
-            file.create_dataset(key, data=np.asarray(getattr(header, key), np.float64))
+            file.create_dataset(key, data=np.asarray(getattr(header, key), _FIELD[key].dtype))
         file.create_dataset("role", data=np.array(header.role, dtype=object), dtype=STRING)
         if track is not None:
             file.create_dataset("track", data=track)

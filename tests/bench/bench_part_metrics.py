@@ -19,7 +19,6 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dpcli.evaluate.bootstrap import replicates
-from dpcli.evaluate.compare.resampled import segmentation_weighted
 from dpcli.evaluate.segmentation.metrics import (
     Frame,
     SegmentationMetrics,
@@ -27,6 +26,7 @@ from dpcli.evaluate.segmentation.metrics import (
     segmentation_compute,
     segmentation_merge,
     segmentation_update,
+    segmentation_weighted,
 )
 
 LIMIT_S = 10.0

@@ -23,11 +23,12 @@ import torch
 from dpcli.ops import weighted_kabsch
 from dpcli.prepare.articulated.synthetic_articulated import SyntheticArticulated
 from dpcli.runtime.seeds import generator
-from dpcli.segment.commands.predict import default_model
-from dpcli.segment.flow.object_icp import object_icp
-from dpcli.segment.flow.pair_flow import pair_flow
-from dpcli.segment.network.model_file import load_model
-from dpcli.segment.prediction import Refinement, network_segmenter, predict_parts
+from dpcli.segment.flow.estimators import estimate_flow_both_ways
+from dpcli.segment.flow.object_aware_icp import object_aware_icp
+from dpcli.segment.network.model_file import default_model, load_model
+from dpcli.segment.prediction import predict_parts
+from dpcli.segment.prediction_settings import Refinement
+from dpcli.segment.segmenters import NetworkSegmenter
 from dpcli.store import CloudSequence
 from tests.support.ops_helpers import backend
 
@@ -42,8 +43,8 @@ def objects(count: int) -> list[CloudSequence]:
 
 def stages() -> dict[str, Stage]:
     """What a prediction does, alone and whole."""
-    segmenter = network_segmenter(load_model(default_model())[0], torch.device("cpu"))
-    flow = partial(pair_flow, method="icp")
+    segmenter = NetworkSegmenter(load_model(default_model())[0], torch.device("cpu"))
+    flow = partial(estimate_flow_both_ways, method="icp")
 
     def frames(sequence: CloudSequence) -> list[torch.Tensor]:
         return [torch.from_numpy(sequence.frame(t)) for t in range(sequence.num_frames)]
@@ -53,7 +54,9 @@ def stages() -> dict[str, Stage]:
         rng = torch.Generator().manual_seed(0)
         mask = torch.softmax(4 * torch.randn(*clouds.shape[:2], 8, generator=rng), -1)
         order = torch.arange(8).expand(len(clouds) - 1, -1)
-        return object_icp(clouds[:-1], clouds[1:], mask[:-1], mask[1:], torch.zeros_like(clouds[1:]), 20, 0.01, order)
+        return object_aware_icp(
+            clouds[:-1], clouds[1:], mask[:-1], mask[1:], torch.zeros_like(clouds[1:]), 20, 0.01, order
+        )
 
     def kabsch(sequence: CloudSequence) -> object:
         clouds = torch.stack(frames(sequence))
@@ -65,7 +68,7 @@ def stages() -> dict[str, Stage]:
 
     return {
         "flow of 3 pairs, ICP": flows,
-        "network, 4 frames": lambda sequence: segmenter(frames(sequence), {}),
+        "network, 4 frames": lambda sequence: segmenter.segment(frames(sequence), {}),
         "object-aware ICP, 3 pairs, 20 steps": refine,
         "weighted Kabsch, 3 pairs, 8 slots": kabsch,
         "whole prediction": lambda sequence: predict_parts(sequence, 0, segmenter, flow, Refinement(), 0)[0],

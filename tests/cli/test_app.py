@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib.util
 import math
 import os
 import signal
@@ -19,8 +18,6 @@ from typer.testing import CliRunner
 
 from dpcli.cli import app as cli
 from dpcli.errors import UsageError
-from dpcli.prepare import head_start
-from dpcli.runtime import worker_server
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.fuzz.fuzz_options import forked, is_bug, odd
 
@@ -72,64 +69,10 @@ def test_a_misspelled_command_is_told_the_right_one(words, whole):
     assert code == 2 and "Did you mean" in text
 
 
-@pytest.fixture
-def started(monkeypatch) -> list[list[str]]:
-    calls: list[list[str]] = []
-    monkeypatch.setattr(worker_server, "start_early", calls.append)
-    return calls
-
-
-@pytest.mark.parametrize(
-    "words", ["--jobs 2 --sampling=fps", "-q --sampling fps --jobs=2", "--force --sampling fps --jobs 3"]
-)
-def test_the_workers_server_is_started_before_the_words_are_parsed(words, started):
-    head_start.head_start(["-v", "prepare", "nvgesture", "raw", "-o", "out.h5", *words.split()])
-    (modules,) = started
-    assert {"dpcli.prepare.actions.nvgesture", "dpcli.prepare.one_item", "dpcli.prepare.warm_fps"} <= set(modules)
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "prepare nvgesture raw",
-        "prepare nvgesture raw -o out.h5 --help",
-        "prepare nvgesture raw -o out.h5 --check",
-        "",
-        "--help",
-        "prepare",
-        "prepare --help",
-        "prepare nvgesture raw -o out.h5 --dask local",
-        "info nvgesture -o x",
-        "prepare nvgesture raw -o out.h5 --jobs=1",
-        "prepare merge a.h5 -o out.h5",
-        "prepare unknown raw -o out.h5",
-        "prepare nvgesture raw -o out.h5 --jobs 1",
-    ],
-)
-def test_no_server_for_what_needs_none(words, started):
-    head_start.head_start(words.split())
-    assert not started
-
-
-def test_what_the_server_is_told_to_import_exists():
-    commands = {path[1] for path in PATHS if path[0] == "prepare"}
-    assert set(head_start.NEEDED) <= commands
-    assert all(importlib.util.find_spec(module) for modules in head_start.NEEDED.values() for module in modules)
-
-
-def test_the_head_start_waits_for_no_library():
-    code = (
-        "import sys, dpcli.prepare.head_start as h, dpcli.runtime.worker_server\n"
-        "print(*sorted({'typer', 'h5py', 'torch', 'numpy', 'rich'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == ""
-
-
 @pytest.mark.parametrize("reader", ["nvgesture", "msraction3d", "depth", "ntu60"])
 def test_what_every_worker_imports_is_little(reader):
     code = (
-        f"import sys, dpcli.__main__, dpcli.prepare.one_item, dpcli.prepare.{reader}\n"
+        f"import sys, dpcli.__main__, dpcli.prepare.convert_item, dpcli.prepare.actions.{reader}\n"
         "print(*sorted({'typer', 'h5py', 'torch', 'scipy', 'open3d', 'rich', 'numba'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -189,16 +132,13 @@ def test_no_option_takes_what_is_no_number():
 
 
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
-    for room, number, below in (
-        ("classify", "nan", ""),
-        ("classify", "1e+300", " below 1e+30"),
-        ("segment", "1e+300", " below 1e+30"),
+    for room, number, expected in (
+        ("classify", "nan", "a number above 0"),
+        ("classify", "1e+300", "a finite number below 1e+30"),
+        ("segment", "1e+300", "a finite number below 1e+30"),
     ):
         done = dpc_here(room, "train", "clouds.h5", "-o", "runs", "--lr", number)
-        assert (
-            done.returncode == 2
-            and done.stderr.decode() == f"dpc: error: --lr {number}: expected a finite number{below}\n"
-        )
+        assert done.returncode == 2 and done.stderr.decode() == f"dpc: error: lr = {number}: expected {expected}\n"
 
 
 @pytest.mark.parametrize(

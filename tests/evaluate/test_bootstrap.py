@@ -16,26 +16,32 @@ from dpcli.evaluate.bootstrap import (
     drawn_counts,
     interval,
     left_out_once,
+    means_of_samples,
+    ratios_of_sums,
     replicates,
     two_sided_p,
 )
-from dpcli.evaluate.classification.metrics import classification_metrics
-from dpcli.evaluate.compare.resampled import (
-    classification_weighted,
-    means,
-    motion_weighted,
-    ratios,
+from dpcli.evaluate.classification.metrics import classification_metrics, classification_weighted
+from dpcli.evaluate.segmentation.metrics import (
+    SegmentationStatistics,
+    segmentation_compute,
+    segmentation_merge,
     segmentation_weighted,
 )
-from dpcli.evaluate.segmentation.metrics import SegmentationStatistics, segmentation_compute, segmentation_merge
-from dpcli.evaluate.segmentation.motion_metrics import TAUS, MotionStatistics, motion_compute, motion_merge
+from dpcli.evaluate.segmentation.motion_metrics import (
+    TAUS,
+    MotionStatistics,
+    motion_compute,
+    motion_merge,
+    motion_weighted,
+)
 from dpcli.runtime.seeds import generator
 from dpcli.store import ScoresWriter
 from tests.support.parts_helpers import perfect, truth_sequence, write_parts, write_truth
 
 
 def mean_of(values: np.ndarray):
-    return means({"mean": np.asarray(values, float)})
+    return means_of_samples({"mean": np.asarray(values, float)})
 
 
 # ---- the interval itself ----
@@ -209,7 +215,7 @@ def random_objects(count: int, seed: int = 0, ties: bool = True) -> list[Segment
 @pytest.mark.parametrize("ties", [True, False])
 @pytest.mark.parametrize("protocol", ["dpc", "release"])
 def test_segmentation_of_resamples(protocol, ties, block, monkeypatch):
-    monkeypatch.setattr("dpcli.evaluate.compare.resampled._BLOCK", block)
+    monkeypatch.setattr("dpcli.evaluate.segmentation.average_precision._BLOCK", block)
     objects = random_objects(12, ties=ties)
     counts = counts_of(12)
     found = segmentation_weighted(objects, protocol)(counts)
@@ -262,7 +268,7 @@ def test_motion_of_resamples(batch):
 
 def test_zero_counts_are_undefined_not_nan_of_a_crash():
     """A jackknife of sequences of which one has all the truth: 0/0, not an exception."""
-    assert np.isnan(ratios({"x": np.array([1.0, 0])}, {"x": np.array([2.0, 0])})(np.array([[0.0, 1]]))["x"])
+    assert np.isnan(ratios_of_sums({"x": np.array([1.0, 0])}, {"x": np.array([2.0, 0])})(np.array([[0.0, 1]]))["x"])
     for protocol in ("dpc", "release"):
         found = segmentation_weighted(random_objects(4), protocol)(np.zeros((1, 4)))
         assert np.isnan(found["ap"]) and np.isnan(found["miou"])

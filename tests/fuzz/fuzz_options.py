@@ -16,6 +16,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ import numpy as np
 import typer
 
 from dpcli.cli import app as cli
+from dpcli.reproduce.runs import override
+from dpcli.runtime.settings.value_types import words_of
 from tests.generate4d.test_fit import toy_views
 from tests.support.commands import exit_code
 
@@ -32,11 +35,16 @@ ODD = {
     "float": ("nan", "inf", "-1", "0", "1e300"),
     "": ("", "foo", "nan", "-1", "0", ","),
 }
-LEFT_OUT = ("--help", "--output", "--force", "--json")
+LEFT_OUT = ("--help", "--output", "--force", "--json", "--set", "--config", "--help-all")
+SETTINGS = {  # commands with settings -> where their catalog is
+    "classify train": ("dpcli.classify.settings", "TRAINING"),
+    "classify profile": ("dpcli.classify.settings", "NETWORK"),
+    "classify explain pac": ("dpcli.classify.explain.pac_settings", "PAC"),
+}
 DATA = """
 prepare synthetic gestures -o gestures.h5 --videos-per-class 2 --subjects 2 --frames 18 --points 200
 prepare synthetic articulated -o objects.h5 --objects 2 --sequences-per-object 1
-classify train gestures.h5 -o model --preset tiny --epochs 1 --epochs-dynamic 1
+classify train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
 segment predict objects.h5 -o parts.h5 --flow nearest --split all
 generate4d fit views.h5 -o scene.h5 --preset tiny --size 16 --set dense_steps=1 --set sparse_steps=1
@@ -50,13 +58,13 @@ prepare depth depth.npy -o out/d.h5 --fov 60 --jobs 1
 prepare clouds clouds -o out/c.h5 --jobs 1
 prepare split gestures.h5 -o out/s.h5
 prepare merge gestures.h5 -o out/m.h5
-classify train gestures.h5 -o out/model --preset tiny --epochs 1 --epochs-dynamic 1
+classify train gestures.h5 -o out/model --preset tiny --epochs 1 --set epochs_dynamic=1
 classify predict gestures.h5 --model model -o out/p.h5 --clips-per-video 1
 classify fuse scores.h5 -o out/f.h5
 classify profile --preset tiny
 classify explain pac gestures.h5 --model model -o out/pac.h5
 classify explain tsne gestures.h5 --model model -o out/tsne.h5 --clips-per-video 1
-segment train objects.h5 -o out/parts --flow nearest --points 48 --batch 2 --epochs 1 --pairs-per-epoch 2
+segment train objects.h5 -o out/parts --flow nearest --points 48 --batch 2 --epochs 1 --set pairs_per_epoch=2
 segment predict objects.h5 -o out/parts.h5 --flow nearest
 segment flow objects.h5 -o out/flow --steps 1 --batch 1
 segment estimate-flow objects.h5 -o out/ef.h5 --flow nearest
@@ -128,6 +136,16 @@ def odd(words: Sequence[str]) -> Iterator[list[str]]:
             yield [*rest, name, *[value] * width]
 
 
+def odd_settings(words: Sequence[str]) -> Iterator[list[str]]:
+    """The command with each of its settings in turn at each odd value."""
+    line = " ".join(words)
+    for module, name in (place for begin, place in SETTINGS.items() if line.startswith(begin)):
+        for setting in getattr(import_module(module), name).settings.values():
+            kind = "float" if setting.hint is float else "int" if setting.hint is int else ""
+            for value in (*ODD[kind], *words_of(setting.hint)):
+                yield override(words, ["--set", f"{setting.name}={value}"])
+
+
 def is_bug(code: int, said: str) -> bool:
     return "a bug, or" in said or "Traceback" in said or (code < 0 and code != -signal.SIGALRM)
 
@@ -163,7 +181,7 @@ def main() -> int:
             continue
         code, said = ended(forced(line))
         assert code == 0, (line, said)
-        for words in odd(forced(line)):
+        for words in (*odd(forced(line)), *odd_settings(forced(line))):
             code, said = ended(words)
             calls += 1
             if is_bug(code, said):

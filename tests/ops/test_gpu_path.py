@@ -12,7 +12,7 @@ import torch
 
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
-from dpcli.classify.presets import find_preset
+from dpcli.classify.presets import PRESETS
 from dpcli.generate4d.optimizer import SceneOptimizer, StepResult
 from dpcli.ops.backend import reference_only
 from dpcli.runtime.mixed_precision import wanted
@@ -22,8 +22,8 @@ from dpcli.store.parts import PartsReader
 from tests.classify.commands.test_train_predict import TRAIN, gestures
 from tests.classify.network.backbones.test_backbones import tiny
 from tests.generate4d.test_fit import toy_views
-from tests.segment.commands.test_train_predict import TRAIN as TRAIN_PARTS
-from tests.segment.commands.test_train_predict import drawers
+from tests.support.drawers import TRAIN as TRAIN_PARTS
+from tests.support.drawers import drawers
 from tests.support.pretend_card import Resident, pretend_card
 
 
@@ -64,7 +64,7 @@ def test_the_card_allows_what_a_gpu_allows(card):
 
 def small(backbone: str) -> KinetConfig:
     if backbone == "pointnet2":
-        return replace(find_preset("tiny").config, num_classes=3, num_frames=4, points_per_frame=12, centroids=(16, 8))
+        return replace(PRESETS["tiny"]["network"], num_classes=3, num_frames=4, points_per_frame=12, centroids=(16, 8))
     return tiny(backbone)
 
 
@@ -110,14 +110,14 @@ def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, 
         *TRAIN,
         "--epochs",
         1,
-        "--epochs-dynamic",
-        2,
-        "--workers",
-        0,
-        "--draws",
-        1,
-        "--static-temporal-radius",
-        0,
+        "--set",
+        "epochs_dynamic=2",
+        "--set",
+        "workers=0",
+        "--set",
+        "draws=1",
+        "--set",
+        "static_temporal_radius=0",
     )
     assert done.returncode == 0 and b"training on pretend card" in done.stderr, done.stderr
     scores = []
@@ -133,7 +133,8 @@ def test_actions_are_learned_and_told_on_the_card_as_on_the_cpu(card, dpc_here, 
 
 def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, tmp_path):
     data, model = drawers(tmp_path / "clouds.h5", 3), tmp_path / "model"
-    words = [*TRAIN_PARTS, "--epochs", 1, "--pairs-per-epoch", 2]
+    words = ["pairs_per_epoch=2" if word == "pairs_per_epoch=6" else word for word in TRAIN_PARTS]
+    words += ["--epochs", 1]
     done = dpc_here("segment", "train", data, "-o", model, *words)
     assert done.returncode == 0 and b"training on cuda" in done.stderr, done.stderr
     masks = []
@@ -153,7 +154,8 @@ def test_parts_are_learned_and_found_on_the_card_as_on_the_cpu(card, dpc_here, t
             device,
             "--split",
             "all",
-            "--no-amp",
+            "--set",
+            "amp=false",
         )
         assert done.returncode == 0, done.stderr
         with PartsReader(found) as reader:

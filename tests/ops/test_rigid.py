@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dpcli.ops import apply_motions, rigid_flow, to_matrix, weighted_kabsch
+from dpcli.ops import apply_motions, motion_matrix, rigid_flow, weighted_kabsch
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -82,7 +82,7 @@ def test_recovers_each_slots_motion() -> None:
     rotation, translation = weighted_kabsch(points, points + flow, mask)
     torch.testing.assert_close(rotation, truth, rtol=0, atol=1e-5)
     torch.testing.assert_close(translation, offset, rtol=0, atol=1e-5)
-    matrices = to_matrix(rotation, translation)[0, torch.arange(60) % 3]
+    matrices = motion_matrix(rotation, translation)[0, torch.arange(60) % 3]
     ones = torch.cat([points[0], torch.ones(60, 1)], 1)
     torch.testing.assert_close((matrices @ ones[..., None])[:, :3, 0] - points[0], flow[0], rtol=0, atol=1e-5)
     assert torch.equal(matrices[:, 3], torch.tensor([0.0, 0.0, 0.0, 1.0]).double().expand(60, 4))

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DpcError, Stopped, UsageError
 from dpcli.prepare import pipeline
-from dpcli.prepare.pipeline import convert, convert_item
+from dpcli.prepare.pipeline import Conversion, convert, convert_item
 from dpcli.runtime import pool
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store import clouds_writer as writer_module
@@ -218,7 +218,7 @@ def test_a_command_spelled_otherwise_goes_on_and_another_one_is_refused(tmp_path
 
     def run(words: list[str], **more):
         monkeypatch.setattr("sys.argv", ["dpc", "prepare", *words])
-        return convert(ToyReader(), tmp_path / "a.h5", **more)
+        return convert(ToyReader(), tmp_path / "a.h5", Conversion(**more))
 
     with monkeypatch.context() as patch, pytest.raises(DpcError, match="died"):
         patch.setattr(pipeline, "ordered_map", dies_after_three)

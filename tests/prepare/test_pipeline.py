@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.prepare import pipeline
 from dpcli.prepare.actions.msraction3d import MSRAction3D
-from dpcli.prepare.pipeline import convert, convert_item
+from dpcli.prepare.pipeline import Conversion, convert, convert_item
 from dpcli.prepare.reader import drop_empty_frames, natural_key
 from dpcli.prepare.thinning import Thinning, voxel_representatives
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -86,10 +86,10 @@ def test_bytes_do_not_depend_on_the_number_of_jobs(tmp_path):
     raw = write_msr(tmp_path / "raw", [f"a{a:02}_s0{s}_e01" for a in range(1, 5) for s in (1, 6)])
     (raw / "a05_s01_e01_sdepth.bin").write_bytes(b"broken")
     for jobs in (1, 2):
-        report = convert(MSRAction3D(raw), tmp_path / f"{jobs}.h5", jobs=jobs, points=10, seed=5)
+        report = convert(MSRAction3D(raw), tmp_path / f"{jobs}.h5", Conversion(jobs=jobs, points=10, seed=5))
         assert (report.written, len(report.skipped)) == (8, 1)
     assert digest(tmp_path / "1.h5") == digest(tmp_path / "2.h5")
-    convert(MSRAction3D(raw), tmp_path / "other.h5", points=10, seed=6)
+    convert(MSRAction3D(raw), tmp_path / "other.h5", Conversion(points=10, seed=6))
     assert digest(tmp_path / "other.h5") != digest(tmp_path / "1.h5")
 
 
@@ -104,30 +104,30 @@ def test_the_file_holds_the_items_in_order(tmp_path):
 
 
 def test_a_limit_does_not_change_the_items_it_keeps(tmp_path):
-    convert(ToyReader(), tmp_path / "all.h5", points=20)
-    convert(ToyReader(), tmp_path / "two.h5", points=20, limit=2)
+    convert(ToyReader(), tmp_path / "all.h5", Conversion(points=20))
+    convert(ToyReader(), tmp_path / "two.h5", Conversion(points=20, limit=2))
     with CloudsReader(tmp_path / "all.h5") as whole, CloudsReader(tmp_path / "two.h5") as part:
         assert len(part) == 2
         np.testing.assert_array_equal(part.read(1).points, whole.read(1).points)
 
 
 def test_bad_samples_are_skipped_and_named(tmp_path):
-    report = convert(ToyReader(bad=(1, 3)), tmp_path / "a.h5", points=20)
+    report = convert(ToyReader(bad=(1, 3)), tmp_path / "a.h5", Conversion(points=20))
     assert (report.written, report.frames) == (3, 9)
     assert report.skipped == [("toy001", "toy001 is broken"), ("toy003", "toy003 is broken")]
     assert report.lines()[0] == "2 skipped:" and "toy003: toy003 is broken" in report.lines()[2]
     with CloudsReader(tmp_path / "a.h5") as skipping:
-        convert(ToyReader(), tmp_path / "b.h5", points=20)
+        convert(ToyReader(), tmp_path / "b.h5", Conversion(points=20))
         with CloudsReader(tmp_path / "b.h5") as whole:  # its neighbors' randomness is untouched
             np.testing.assert_array_equal(skipping.read(1).points, whole.read(2).points)
 
 
 def test_on_error_stop_leaves_nothing(tmp_path):
     with pytest.raises(DataError, match="toy001: toy001 is broken .*--on-error skip"):
-        convert(ToyReader(bad=(1,)), tmp_path / "a.h5", on_error="stop")
+        convert(ToyReader(bad=(1,)), tmp_path / "a.h5", Conversion(on_error="stop"))
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(UsageError, match="--on-error maybe"):
-        convert(ToyReader(), tmp_path / "a.h5", on_error="maybe")
+        convert(ToyReader(), tmp_path / "a.h5", Conversion(on_error="maybe"))
 
 
 def test_nothing_good_is_bad_data(tmp_path):
@@ -151,9 +151,9 @@ def test_unreadable_files_are_bad_samples_and_bugs_are_not(tmp_path, monkeypatch
 
 def test_running_again_says_already_complete(tmp_path):
     path = tmp_path / "a.h5"
-    convert(ToyReader(), path, points=20)
+    convert(ToyReader(), path, Conversion(points=20))
     before = (digest(path), path.stat().st_mtime_ns)
-    report = convert(ToyReader(), path, points=20)
+    report = convert(ToyReader(), path, Conversion(points=20))
     assert report.was_complete and report.written == 5
     assert (digest(path), path.stat().st_mtime_ns) == before
 
@@ -170,12 +170,12 @@ def test_running_again_says_already_complete(tmp_path):
 )
 def test_another_configuration_is_refused_unless_forced(tmp_path, reader, options, message):
     path = tmp_path / "a.h5"
-    convert(ToyReader(), path, points=20)
+    convert(ToyReader(), path, Conversion(points=20))
     before = digest(path)
     with pytest.raises(UsageError, match=message):
-        convert(reader, path, **{"points": 20, **options})
+        convert(reader, path, Conversion(**{"points": 20, **options}))
     assert digest(path) == before
-    convert(reader, path, force=True, **{"points": 20, **options})
+    convert(reader, path, Conversion(force=True, **{"points": 20, **options}))
     assert digest(path) != before
 
 
@@ -222,15 +222,15 @@ class Stopper:
 @pytest.mark.parametrize("bad", [(), (0, 2)])
 def test_a_stopped_run_is_continued_to_the_same_bytes(tmp_path, monkeypatch, number, raised, bad):
     reader, path = ToyReader(count=9, bad=bad), tmp_path / "a.h5"
-    whole = convert(reader, tmp_path / "whole.h5", points=20)
+    whole = convert(reader, tmp_path / "whole.h5", Conversion(points=20))
     with monkeypatch.context() as patch:
         Stopper(patch, 3, getattr(signal, number))
         with pytest.raises(raised):
-            convert(reader, path, points=20)
+            convert(reader, path, Conversion(points=20))
     assert {p.name for p in tmp_path.iterdir()} == {"whole.h5", ".a.h5.part", ".a.h5.new"}
     read = []
     monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
-    report = convert(reader, path, points=20)
+    report = convert(reader, path, Conversion(points=20))
     assert set(read) == set(range(9)) - ({0, 1, 2} if not bad else {1, 3, 4})  # good ones are not read again
     assert digest(path) == digest(tmp_path / "whole.h5")
     assert (report.written, report.skipped) == (whole.written, whole.skipped)
@@ -258,11 +258,11 @@ def test_a_part_of_another_configuration_is_refused_and_force_starts_over(tmp_pa
     with monkeypatch.context() as patch:
         Stopper(patch, 2, signal.SIGTERM)
         with pytest.raises(Stopped):
-            convert(ToyReader(), path, points=20)
+            convert(ToyReader(), path, Conversion(points=20))
     with pytest.raises(UsageError, match="config.points 20, now 10"):
-        convert(ToyReader(), path, points=10)
-    convert(ToyReader(), path, points=10, force=True)
-    convert(ToyReader(), tmp_path / "fresh.h5", points=10)
+        convert(ToyReader(), path, Conversion(points=10))
+    convert(ToyReader(), path, Conversion(points=10, force=True))
+    convert(ToyReader(), tmp_path / "fresh.h5", Conversion(points=10))
     assert digest(path) == digest(tmp_path / "fresh.h5")
 
 

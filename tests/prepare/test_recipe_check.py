@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from dpcli.cli.app import app
 from dpcli.errors import DataError
 from dpcli.prepare import recipe_check
-from dpcli.prepare.recipe_check import RECIPES, Tree, check_folder, check_rows, expand, read_recipe
+from dpcli.prepare.recipe_check import RECIPES, Tree, check_folder, check_rows, expand_braces, read_recipe
 from tests.support.prepare_helpers import ROOT, ToyReader, dpc, write_msr
 
 RECIPE = """
@@ -130,8 +130,8 @@ def test_what_the_index_finds_is_told(toy):
 
 
 def test_braces():
-    assert expand("a{08..11}/{x,y}") == [f"a{n}/{c}" for n in ("08", "09", "10", "11") for c in "xy"]
-    assert expand("plain[1]") == ["plain[1]"]
+    assert expand_braces("a{08..11}/{x,y}") == [f"a{n}/{c}" for n in ("08", "09", "10", "11") for c in "xy"]
+    assert expand_braces("plain[1]") == ["plain[1]"]
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def test_recipes_are_complete_and_their_command_exists(name):
 
 def test_counts_agree_with_the_readers():
     msr = tomllib.loads(RECIPES["msraction3d"].read_text())
-    names = msraction3d.published()
+    names = msraction3d.published_names()
     assert msr["checks"]["videos"] == msr["expect"]["sequences"] == len(names)
     assert msr["split"]["train"] == sum(int(name[5:7]) <= 5 for name in names)
     assert msr["split"]["train"] + msr["split"]["test"] == len(names)

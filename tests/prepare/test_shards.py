@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.merge import merge
-from dpcli.prepare.pipeline import convert
+from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.shards import Shard, describe_shard, shard_of
 from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudsReader
@@ -40,7 +40,7 @@ def digest(path: Path) -> str:
 def cut(reader: ToyReader, folder: Path, count: int, **options) -> list[Path]:
     paths = [folder / f"{index}.h5" for index in range(count)]
     for index, path in enumerate(paths):
-        convert(reader, path, shard=Shard(index, count), points=20, **options)
+        convert(reader, path, Conversion(shard=Shard(index, count), points=20, **options))
     return paths
 
 
@@ -49,7 +49,7 @@ def cut(reader: ToyReader, folder: Path, count: int, **options) -> list[Path]:
 def test_any_cut_gives_the_same_bytes(tmp_path_factory, count, bad, data):
     """Also with bad samples, with shards that have none at all, and with the files in any order."""
     folder, reader = tmp_path_factory.mktemp("cut"), ToyReader(count=7, bad=tuple(bad))
-    whole = convert(reader, folder / "whole.h5", points=20)
+    whole = convert(reader, folder / "whole.h5", Conversion(points=20))
     paths = data.draw(st.permutations(cut(reader, folder, count)))
     merged = merge(paths, folder / "all.h5")
     assert digest(folder / "all.h5") == digest(folder / "whole.h5")
@@ -61,9 +61,9 @@ def test_a_shard_tells_its_places_and_takes_every_nth(tmp_path):
     with CloudsReader(path) as reader:
         assert list(reader.names) == ["toy001"] and reader.provenance[-1]["config"]["shard"] == "1/3"
         assert read_positions(reader.file) == ([1], [4])
-    assert convert(ToyReader(count=7, bad=(4,)), path, shard=Shard(1, 3), points=20).was_complete
+    assert convert(ToyReader(count=7, bad=(4,)), path, Conversion(shard=Shard(1, 3), points=20)).was_complete
     with pytest.raises(UsageError, match="shard 1/3 \\(now 2/3\\)"):
-        convert(ToyReader(count=7, bad=(4,)), path, shard=Shard(2, 3), points=20)
+        convert(ToyReader(count=7, bad=(4,)), path, Conversion(shard=Shard(2, 3), points=20))
 
 
 @pytest.mark.parametrize("text", ["3/3", "1", "a/2", "-1/2", "0/0", "1/2/3", "0.5/2", "²/3"])
@@ -112,9 +112,9 @@ def test_shards_that_do_not_belong_together_are_refused(tmp_path):
         ([a, b, tmp_path / "longer.h5"], "items 7 and 8"),
     ):
         (tmp_path / "copy.h5").write_bytes(b.read_bytes())
-        convert(reader, tmp_path / "seed.h5", shard=Shard(2, 3), points=20, seed=1, force=True)
-        convert(reader, tmp_path / "four.h5", shard=Shard(2, 4), points=20, force=True)
-        convert(ToyReader(count=8), tmp_path / "longer.h5", shard=Shard(2, 3), points=20, force=True)
+        convert(reader, tmp_path / "seed.h5", Conversion(shard=Shard(2, 3), points=20, seed=1, force=True))
+        convert(reader, tmp_path / "four.h5", Conversion(shard=Shard(2, 4), points=20, force=True))
+        convert(ToyReader(count=8), tmp_path / "longer.h5", Conversion(shard=Shard(2, 3), points=20, force=True))
         with pytest.raises(UsageError, match=message):
             merge(paths, tmp_path / "all.h5")
     assert not (tmp_path / "all.h5").exists()

@@ -23,7 +23,7 @@ from dpcli.store import CloudSequence, CloudsWriter, ScoresReader, ScoresWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 PNG = b"\x89PNG\r\n\x1a\n"
-BUDGET = ("--points", "48", "--batch", "4", "--epochs", "1", "--epochs-dynamic", "1", "--device", "cpu")
+BUDGET = ("--points", "48", "--batch", "4", "--epochs", "1", "--set", "epochs_dynamic=1", "--device", "cpu")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -179,7 +179,7 @@ def test_a_stopped_table_keeps_what_is_done_and_goes_on(clouds, tmp_path):
     whole, shorter = (" ".join(call) for call in going_on.trained)
     assert "--validation none --epochs 3 --frames 16" in whole and "--init" not in whole
     start = tmp_path / "quick-16-seed1" / "model"
-    assert f"--epochs 3 --init {start} --epochs 15 --epochs-dynamic 40 --lr 0.0005 --frames 4" in shorter
+    assert f"--epochs 3 --init {start} --epochs 15 --set epochs_dynamic=40 --lr 0.0005 --frames 4" in shorter
     assert "from whose network of the same seed" in half
     line = next(row for row in (tmp_path / "table.md").read_text().splitlines() if row.startswith("| 16 frames"))
     assert line.split(" | ")[1:6] == ["84.30 / 84.18 ± 0.00", "– / 87.54 ± 0.00", "91.92 / 90.91 ± 0.00", "2", "297"]
@@ -241,8 +241,8 @@ def test_ablations_share_the_networks_that_the_thesis_shares(clouds, tmp_path, m
         assert "Rows ii, iv, v, vi, vii need ModelNet40" in text and "| vii. |" not in text
         return
     assert len(asked.trained) == 5  # the shapes, from scratch, pretrained, and two switches
-    assert "--pretrain" in asked.trained[0] and "tiny-modelnet40" in told["tiny-pretrained-seed0"]
-    for name, switch in (("normals", "--no-normals"), ("weights", "--no-weights")):
+    assert "pretrain=true" in asked.trained[0] and "tiny-modelnet40" in told["tiny-pretrained-seed0"]
+    for name, switch in (("normals", "normals=false"), ("weights", "weighting=none")):
         own = told[f"tiny-pretrained-{name}-seed0"]
         assert own.index("--epochs 3") < own.index("--epochs 0") and switch in own  # the last one counts
         assert "tiny-pretrained-seed0/model" in own
@@ -258,9 +258,9 @@ def test_sweeps_share_the_static_stream_of_a_fold(clouds, tmp_path):
         "--sweep",
         "reduction=0.25,0.5",
         "--sweep",
-        "group-size=2,4",
+        "group_size=2,4",
         "--sweep",
-        "temporal-radius=",
+        "temporal_radius=",
         "--sweep",
         "radius=0.5,1",
     ]
@@ -274,9 +274,10 @@ def test_sweeps_share_the_static_stream_of_a_fold(clouds, tmp_path):
         "fold:0/2",
         "fold:1/2",
     }
-    static = [call for call in done if "--static-from" not in call]
-    assert len(static) == 4 and not any("--reduction" in call or "--group-size" in call for call in static)
-    assert all(call[call.index("--epochs-dynamic") + 1] == "0" for call in static)
+    static = [call for call in map(" ".join, done) if "--set static_from=" not in call]
+    assert len(static) == 4 and not any("reduction=" in call or "group_size=" in call for call in static)
+    assert all("--set epochs_dynamic=0 " in call for call in static)
+    assert sum("--set radius=1,2 " in call for call in static) == 2  # the second stage's is twice as large
     text = (tmp_path / "table.md").read_text()
     assert "Group size 2 is left out" in text and text.count("| yes |") == 3 and "(c)" not in text
     assert (tmp_path / "figure.png").read_bytes().startswith(PNG)
@@ -284,7 +285,7 @@ def test_sweeps_share_the_static_stream_of_a_fold(clouds, tmp_path):
 
 def test_a_job_trains_its_own_folds_and_shows_everyones(clouds, tmp_path):
     words = ["msraction3d", "-", str(tmp_path), "--clouds", str(clouds), "--folds", "3", "--preset", "tiny"]
-    words += ["--sweep", "group-size=4,8", *(f"--sweep={key}=" for key in ("reduction", "temporal-radius", "radius"))]
+    words += ["--sweep", "group_size=4,8", *(f"--sweep={key}=" for key in ("reduction", "temporal_radius", "radius"))]
     second, first, everyone = Pretended(), Pretended(), Pretended()
     figure_3_5.main([*words, "--only", "1"], second)
     assert {call[call.index("--validation") + 1] for call in second.trained} == {"fold:1/3"}

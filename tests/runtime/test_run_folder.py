@@ -20,7 +20,7 @@ from tests.classify.commands.test_train_predict import gestures
 
 ROOT = Path(__file__).resolve().parents[2]
 TRAIN = ("--preset", "tiny", "--frames", "4", "--points", "64", "--batch", "4", "--seed", "3", "--validation", "none")
-SHORT = (*TRAIN, "--epochs", "1", "--epochs-dynamic", "0")
+SHORT = (*TRAIN, "--epochs", "1", "--set", "epochs_dynamic=0")
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -79,13 +79,13 @@ def test_a_command_that_fails_deletes_no_model(data, finished, tmp_path, dpc_her
     assert ".lock" not in before and "best.safetensors" in before
     for more, code, said in (
         (("--init", finished), 2, f"--init {finished}/best.safetensors: lies in the folder of -o"),
-        (("--static-from", finished / "best.safetensors"), 2, "--static-from"),
+        (("--set", f"static_from={finished / 'best.safetensors'}"), 2, "static_from = "),
         (("--init", tmp_path / "link.safetensors"), 2, "lies in the folder of -o"),
         (("--init", "nosuch"), 2, "--init nosuch: no such file"),
-        (("--static-from", "nosuch"), 2, "--static-from nosuch: no such file"),
-        (("--static-from", other), 3, "not a complete safetensors file"),
-        (("--backbone", "nosuch:Cls"), 2, "nosuch"),
-        (("--accumulate", 99), 2, "--accumulate 99"),
+        (("--set", "static_from=nosuch"), 2, "static_from = nosuch: no such file"),
+        (("--set", f"static_from={other}"), 3, "not a complete safetensors file"),
+        (("--set", "backbone=nosuch:Cls"), 2, "nosuch"),
+        (("--set", "accumulate=99"), 2, "accumulate = 99"),
         (("--seed", 2**64), 2, "--seed"),
     ):
         done = dpc_here("classify", "train", data, "-o", finished, *SHORT, "--force", *more)
@@ -108,7 +108,7 @@ def test_weights_without_a_configuration_are_not_overwritten(data, finished, dpc
 def test_a_second_training_into_a_folder_is_refused(data, tmp_path, dpc_here, more):
     """Until the first one ends, however: a kill leaves no lock that holds, and the run continues."""
     folder = tmp_path / "run"
-    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 3000, "--epochs-dynamic", 0)
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 3000, "--set", "epochs_dynamic=0")
     first = start(*words)
     try:
         wait_for((folder / "state.pt").exists, first)
@@ -144,7 +144,7 @@ def test_a_full_disk_ends_with_a_sentence_and_the_run_goes_on(data, finished, tm
 
 def test_a_disk_that_fills_up_keeps_the_last_state(data, tmp_path, dpc_here):
     folder = tmp_path / "run"
-    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 40, "--epochs-dynamic", 0)
+    words = ("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 40, "--set", "epochs_dynamic=0")
     first = start(*words)
     wait_for((folder / "state.pt").exists, first)
     first.send_signal(signal.SIGTERM)

@@ -14,15 +14,16 @@ import pytest
 # A module that takes long to import says so first; the pool must work all the same, whatever came meanwhile.
 SLOW = "import pathlib, time\npathlib.Path('importing').touch()\ntime.sleep(1.5)\n"
 PROGRAM = """
-import signal, sys, time
+import multiprocessing, signal, sys, time
 from dpcli.runtime.pool import ordered_map
-from dpcli.runtime.worker_server import start_early
+from dpcli.runtime.worker_server import ensure_server
 
 if __name__ == "__main__":
     seen = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: seen.append(number))
-    start_early(["slow_import"])
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["slow_import"])
+    ensure_server()
     while not seen:
         time.sleep(0.01)
     print([result for _, result in ordered_map(abs, [-1, 2], 2)], *map(int, seen))
@@ -54,9 +55,9 @@ def test_a_signal_to_all_while_it_imports_reaches_the_command_only(tmp_path: Pat
 
 def test_ctrl_c_while_libraries_load_is_a_sentence() -> None:
     code = (
-        "import dpcli.__main__, dpcli.prepare.head_start as first\n"
-        "def interrupted(words): raise KeyboardInterrupt\n"
-        "first.head_start = interrupted\n"
+        "import dpcli.__main__, dpcli.standard_streams as first\n"
+        "def interrupted(): raise KeyboardInterrupt\n"
+        "first.ready_streams = interrupted\n"
         "dpcli.__main__.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -9,8 +9,11 @@ import pytest
 import torch
 
 from dpcli.segment.network.part_network import FrameParts
-from dpcli.segment.prediction import Refinement, network_segmenter, predict_parts
+from dpcli.segment.prediction import predict_parts
+from dpcli.segment.prediction_settings import Refinement
+from dpcli.segment.segmenters import NetworkSegmenter
 from dpcli.store import CloudSequence
+from tests.support.segmenters import FunctionSegmenter
 
 
 @pytest.fixture
@@ -59,20 +62,20 @@ def test_flows_and_network_meet(two_threads) -> None:
         meet("flow", "network")
         return to_center(first, second)
 
-    predict(network_segmenter(network, torch.device("cpu")), estimate)
+    predict(NetworkSegmenter(network, torch.device("cpu")), estimate)
     assert set(threads) == {1} and torch.get_num_threads() == 2
 
 
 def test_the_result_is_that_of_one_after_the_other(two_threads) -> None:
-    network = network_segmenter(halves, torch.device("cpu"))
+    network = NetworkSegmenter(halves, torch.device("cpu"))
     labels, sample = predict(network, to_center)
     seen = []
 
     def afterwards(frames, flows):
         seen.extend(flows)
-        return network(frames, flows)
+        return network.segment(frames, flows)
 
-    same, again = predict(afterwards, to_center)
+    same, again = predict(FunctionSegmenter(afterwards), to_center)
     assert sorted(seen) == [(0, 1), (1, 0), (1, 2), (2, 1)]
     assert np.array_equal(labels, same) and np.array_equal(sample.motion, again.motion)
     assert np.array_equal(sample.probability, again.probability) and len(np.unique(labels)) == 2
@@ -85,7 +88,7 @@ def test_an_error_in_either_comes_out(two_threads, broken: str) -> None:
 
     with pytest.raises(ValueError, match=broken):
         predict(
-            network_segmenter(fail if broken == "network" else halves, torch.device("cpu")),
+            NetworkSegmenter(fail if broken == "network" else halves, torch.device("cpu")),
             fail if broken == "flow" else to_center,
         )
     assert torch.get_num_threads() == 2

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 
-from dpcli.segment.commands.predict import default_model
-from dpcli.segment.network.model_file import SHIPPED, load_model
+from dpcli.segment.network.model_file import SHIPPED, default_model, load_model
 
 
 def test_every_shipped_model_loads_has_a_card_and_names_no_machine():

@@ -321,7 +321,7 @@ with CloudsWriter({str(tmp_path / "a.h5")!r}) as writer:
         writer.write(CloudSequence.from_frames(f"s{{i}}", [np.ones((5000, 3), np.float32)]))
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert run.returncode != 0 and "DpcError" in run.stderr and "file size limit" in run.stderr
+    assert run.returncode != 0 and "DiskFull" in run.stderr and "file size limit" in run.stderr
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,17 +1,18 @@
-"""`dpc classify fuse`: the weighted mean of the scores of several models, or of one file's streams (thesis A.1.5).
-
-Arithmetic as the thesis writes it, or geometric, which is the mean of logits that the published code takes.
-"""
+"""`dpc classify fuse`: the weighted mean of the scores of several models, or of one file's streams."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
 from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from dpcli.classify.commands.scores_made import already_scored
+from dpcli.classify.fusion import MEANS, geometric_weights, likelihood_weights, mean_scores, parse_weights
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import short_names
 from dpcli.runtime import provenance
@@ -20,41 +21,35 @@ from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 from dpcli.store.pipes import refuse_repeats
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
-MEANS = ("arithmetic", "geometric")
-_STEPS = 10_000  # of expectation-maximization; some hundred are usual
-_POWER = 100.0  # scores are taken to no higher power: where every model is right, none would be high enough
 _OFF = 1e-2  # how far from 1 the sum of a sample's probabilities may be: 16-bit numbers of another program
-_LEAST = 1e-12  # the probability a score of 0 is taken for: one sure mistake must not decide alone
 
 
-def run_fusion(
+@dataclass(frozen=True)
+class Fusion:
+    """Says how many videos were fused by which weights, by stream; `complete` where an earlier run had done it all."""
+
+    videos: int
+    weights: dict[str, float]
+    complete: bool = False
+
+
+def fuse(
     inputs: Sequence[str],
     output: str,
     *,
-    weights: str | None,
-    force: bool,
+    weights: str | None = None,
+    force: bool = False,
     weights_from: str | None = None,
     mean: str = "arithmetic",
-) -> None:
-    """Scores files of the same videos, in any order, become one whose `streams` are its inputs; of one file, its streams
-    get another mean.
+) -> Fusion:
+    """Joins scores files of the same videos, in any order, into one whose `streams` are these; of one file, averages its
+    streams anew.
 
     weights: `parse_weights`; weights_from: scores files with commas between, as many as inputs and of other, labeled
-    videos, on which `likelihood_weights` chooses; mean: `pooled`.
+    videos, on which `likelihood_weights` chooses; mean: `mean_scores`. Raises UsageError for words that don't fit, DataError
+    for files of different data.
     """
-    if mean not in MEANS:
-        raise UsageError(f"--mean {mean}: expected {' or '.join(MEANS)}")
-    if weights is not None and weights_from is not None:
-        raise UsageError("--weights says them and --weights-from chooses them; give one of the two")
-    judges = weights_from.split(",") if weights_from is not None else []
-    if weights_from is not None and len(judges) != len(inputs):
-        raise UsageError(
-            f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order"
-        )
-    if list(inputs).count("-") > 1:
-        raise UsageError("-: stdin is one file; name the others")
-    refuse_repeats([*inputs, output])
-    refuse_repeats([*judges, output])
+    judges = _judges(inputs, output, weights, weights_from, mean)
     called = [str(Path(name)) if name != "-" else "stdin" for name in inputs]
     if len(called) > 1:  # one file's streams are known only once it is read
         parse_weights(weights, stream_names(short_names(called)))
@@ -68,17 +63,11 @@ def run_fusion(
             held = [ScoresReader(name) for name in judges]
             _tell_other_models(held, judges, readers, called)
             shares = _chosen_weights(held, judges, streams, sources[0], mean)
-        config = {
-            "fuse": streams,
-            "mean": mean,
-            "weights": shares.tolist(),
-            "sources": [reader.provenance for reader in readers],
-        }
-        if judges:
-            config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
+        config = _record(streams, mean, shares, readers, judges)
         entry = provenance.record(config, 0, dict(zip(stream_names(short_names(called)), paths)))
-        if not force and _already_there(target, entry):
-            return
+        fusion = Fusion(len(sources[0].names), dict(zip(streams, shares.tolist())))
+        if not force and already_scored(target, entry):
+            return Fusion(fusion.videos, fusion.weights, complete=True)
         with ScoresWriter(
             target,
             class_names=sources[0].class_names,
@@ -88,16 +77,46 @@ def run_fusion(
             force=force,
         ) as writer:
             _write(writer, sources, rows, streams, shares, mean)
-    if output != "-":
-        said = "" if np.ptp(shares) == 0 else f", weights {', '.join(f'{n} {w:.3g}' for n, w in zip(streams, shares))}"
-        kind = "mean" if mean == "arithmetic" else f"{mean} mean"
-        print(f"{output}: {kind} of {len(streams)} scores of {len(writer)} videos{said}")
+    return fusion
+
+
+def _judges(inputs: Sequence[str], output: str, weights: str | None, weights_from: str | None, mean: str) -> list[str]:
+    """Returns the files that choose the weights. Raises UsageError when the words of the command don't fit together."""
+    if mean not in MEANS:
+        raise UsageError(f"--mean {mean}: expected {' or '.join(MEANS)}")
+    if weights is not None and weights_from is not None:
+        raise UsageError("--weights says them and --weights-from chooses them; give one of the two")
+    judges = weights_from.split(",") if weights_from is not None else []
+    if weights_from is not None and len(judges) != len(inputs):
+        raise UsageError(
+            f"--weights-from {weights_from}: {len(judges)} files for {len(inputs)}; one for each, in the same order"
+        )
+    if list(inputs).count("-") > 1:
+        raise UsageError("-: stdin is one file; name the others")
+    refuse_repeats([*inputs, output])
+    refuse_repeats([*judges, output])
+    return judges
+
+
+def _record(
+    streams: list[str], mean: str, shares: np.ndarray, readers: Sequence[ScoresReader], judges: Sequence[str]
+) -> dict[str, Any]:
+    """Returns what shapes the scores, for the file's provenance."""
+    config: dict[str, Any] = {
+        "fuse": streams,
+        "mean": mean,
+        "weights": shares.tolist(),
+        "sources": [reader.provenance for reader in readers],
+    }
+    if judges:
+        config["weights_from"] = [provenance.file_digest(Path(name)) for name in judges]
+    return config
 
 
 def _streams(
     readers: Sequence[ScoresReader], called: Sequence[str]
 ) -> tuple[list[str], list[ScoresReader], list[np.ndarray]]:
-    """What is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
+    """Returns what is averaged: names, scores, and where each has the videos of the first. Of one file these are its streams."""
     for reader, name in zip(readers, called):
         for stream, scores in (("scores", reader.scores), *reader.streams.items()):
             bad = np.flatnonzero((scores < 0).any(1) | (np.abs(scores.sum(1, dtype=np.float64) - 1) > _OFF))
@@ -119,94 +138,14 @@ def _streams(
 
 
 def _labels(sources: Sequence[ScoresReader], rows: Sequence[np.ndarray]) -> np.ndarray:
-    """i32 (S): a label that only some files know is taken from them."""
+    """Returns the labels i32 (S); one that only some files know is taken from them."""
     return np.max([source.labels[at] for source, at in zip(sources, rows)], axis=0)
-
-
-def parse_weights(text: str | None, names: Sequence[str], named: bool = False) -> np.ndarray:
-    """Weights f64 (K) that sum to 1, from `0.5,0.5` or `static=0.3,dynamic=0.7`; None weighs all alike.
-
-    named: names are needed, as streams have no order to go by. UsageError when they don't fit.
-    """
-    if text is None:
-        return np.full(len(names), 1 / len(names))
-    words = text.split(",")
-    if named or "=" in text:
-        pairs = dict(word.partition("=")[::2] for word in words)
-        if set(pairs) != set(names) or len(pairs) != len(words):
-            raise UsageError(f"--weights {text}: expected {','.join(f'{name}=NUMBER' for name in names)}")
-        words = [pairs[name] for name in names]
-    try:
-        values = np.array([float(word) for word in words])
-    except ValueError:
-        raise UsageError(f"--weights {text}: expected numbers with commas, such as 0.5,0.5") from None
-    if len(values) != len(names):
-        raise UsageError(f"--weights {text}: {len(values)} weights for {len(names)} files; one for each")
-    if not np.isfinite(values).all() or values.min() < 0 or not 0 < values.sum() < np.inf:
-        raise UsageError(f"--weights {text}: expected numbers from 0 up, not all of them 0")
-    return values / values.sum()
-
-
-def pooled(scores: np.ndarray, weights: np.ndarray, mean: str) -> np.ndarray:
-    """Mean f64 (S,C) of what K models say, scores (K,S,C), by weights (K) of sum 1; the models' order makes no difference.
-
-    geometric: the product of the scores to the power of their weights, normalized to sum 1: softmax of the mean of logits. A
-    class needs every model's consent, where arithmetic lets the surest one decide.
-    """
-    if mean == "arithmetic":
-        return np.sort(scores * weights[:, None, None], axis=0).sum(0)
-    from scipy.special import softmax
-
-    return softmax(np.sort(_logits(scores) * weights[:, None, None], axis=0).sum(0), -1)
-
-
-def _logits(scores: np.ndarray) -> np.ndarray:
-    return np.log(np.clip(np.asarray(scores, np.float64), _LEAST, None))
-
-
-def geometric_weights(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Weights f64 (K), sum 1, of the geometric mean of scores (K,S,C) for labels i (S), by likelihood.
-
-    Fitted as powers from 0 up whose sum is free, as that says how sure the mean is and not which class it names: a convex
-    problem (multinomial regression without an intercept), solved by L-BFGS.
-    """
-    from scipy.optimize import minimize
-    from scipy.special import logsumexp, softmax
-
-    logits = _logits(scores)
-    true = logits[:, np.arange(len(labels)), labels]  # (K,S)
-
-    def loss(powers: np.ndarray) -> tuple[float, np.ndarray]:
-        mixed = np.tensordot(powers, logits, 1)
-        expected = np.einsum("ksc,sc->ks", logits, softmax(mixed, -1))
-        return float((logsumexp(mixed, -1) - powers @ true).mean()), (expected - true).mean(1)
-
-    start = np.full(len(logits), 1 / len(logits))
-    found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=[(0, _POWER)] * len(logits)).x
-    return found / found.sum() if found.sum() > 0 else start
-
-
-def likelihood_weights(probabilities: np.ndarray) -> np.ndarray:
-    """Weights f64 (K), sum 1, of the arithmetic mean that gives labeled samples the greatest likelihood.
-
-    probabilities: (K,S), what each of K models gives the true class of each sample. The logarithm of the likelihood, sum_s log
-    sum_k w_k p_ks, is concave in w, so expectation-maximization from equal weights ends at its maximum.
-    """
-    found = np.clip(np.asarray(probabilities, np.float64), _LEAST, None)
-    weights = np.full(len(found), 1 / len(found))
-    for _ in range(_STEPS):
-        shares = weights[:, None] * found
-        new = (shares / shares.sum(0)).mean(1)
-        if np.abs(new - weights).max() < 1e-10:
-            break
-        weights = new
-    return new
 
 
 def _tell_other_models(
     held: Sequence[ScoresReader], judges: Sequence[str], readers: Sequence[ScoresReader], called: Sequence[str]
 ) -> None:
-    """A warning where weights come from another model's scores: fair for a twin trained on fewer videos, else an accident."""
+    """Warns where weights come from another model's scores: fair for a twin trained on fewer videos, else an accident."""
     for theirs, judge, reader, name in zip(held, judges, readers, called):
         one, other = _model_digest(theirs), _model_digest(reader)
         if one and other and one != other:
@@ -216,7 +155,7 @@ def _tell_other_models(
 
 
 def _model_digest(reader: ScoresReader) -> str | None:
-    """Of the model that made the scores, where their last record says it."""
+    """Returns the digest of the model that made the scores, where their last record says it."""
     config = reader.provenance[-1].get("config") if reader.provenance else None
     return config.get("weights") if isinstance(config, dict) and "model" in config else None
 
@@ -224,7 +163,7 @@ def _model_digest(reader: ScoresReader) -> str | None:
 def _chosen_weights(
     held: Sequence[ScoresReader], judges: Sequence[str], streams: Sequence[str], fused: ScoresReader, mean: str
 ) -> np.ndarray:
-    """Weights chosen on labeled videos that are not among the fused ones. DataError when they don't fit."""
+    """Returns weights chosen on labeled videos that are not among the fused ones. Raises DataError when they don't fit."""
     names, sources, rows = _streams(held, judges)
     if len(judges) == 1 and names != list(streams):
         raise DataError(f"{judges[0]}: streams {', '.join(names)}; expected {', '.join(streams)}, as in what is fused")
@@ -246,7 +185,7 @@ def _chosen_weights(
 
 
 def stream_names(wanted: Sequence[str]) -> list[str]:
-    """The names wanted, numbered (`points`, `points-2`) where another has it already."""
+    """Returns the names wanted, numbered (`points`, `points-2`) where another has it already."""
     names: list[str] = []
     for stem in wanted:
         number, name = 1, stem
@@ -258,9 +197,9 @@ def stream_names(wanted: Sequence[str]) -> list[str]:
 
 
 def matching_rows(sources: Sequence[ScoresReader], called: Sequence[str]) -> list[np.ndarray]:
-    """Where each file has the videos of the first one, i64 (S) each.
+    """Returns where each file has the videos of the first one, i64 (S) each.
 
-    DataError unless all hold the same classes and videos and, where known (label >= 0, split not empty), the same labels
+    Raises DataError unless all hold the same classes and videos and, where known (label >= 0, split not empty), the same labels
     and splits; it names the first difference.
     """
     first, found = sources[0], []
@@ -314,14 +253,6 @@ def _same_truth(
             )
 
 
-def _already_there(target: Path, entry: dict) -> bool:
-    if not target.exists():
-        return False
-    from dpcli.classify.commands.predict import _already_scored  # imports torch, which nothing else here needs
-
-    return _already_scored(target, entry)
-
-
 def _write(
     writer: ScoresWriter,
     sources: Sequence[ScoresReader],
@@ -330,9 +261,9 @@ def _write(
     shares: np.ndarray,
     mean: str,
 ) -> None:
-    """In the first file's order; unknown labels and splits are taken from the files that know them."""
+    """Writes the videos in the first file's order; unknown labels and splits are taken from the files that know them."""
     own = np.stack([source.scores[at] for source, at in zip(sources, rows)])  # (files, S, C)
-    main = pooled(own, shares, mean)
+    main = mean_scores(own, shares, mean)
     labels = _labels(sources, rows)
     for row, name in enumerate(sources[0].names):
         split = next((s.splits[at[row]] for s, at in zip(sources, rows) if s.splits[at[row]]), "")

@@ -1,161 +1,126 @@
-"""`dpc classify predict` and `profile`, from options to files."""
+"""`dpc classify predict`: class scores of every video of a file."""
 
 from __future__ import annotations
 
-import json
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import torch
-
+from dpcli.classify.commands.model_task import ModelTask
+from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.videos import check_classes, report_short, select_videos
-from dpcli.classify.network.kinet import STREAMS, Kinet
-from dpcli.classify.network.model_file import find_model, load_model
-from dpcli.classify.settings import network_config
-from dpcli.classify.video_scores import predict_videos
+from dpcli.classify.network.kinet import STREAMS
+from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.video_scores import VideoScores, predict_videos
 from dpcli.errors import DataError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.store import CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
-from dpcli.store.writing.already_made import WORK, already_made
-
-OTHER_SCORES = "holds scores of another model, data or choice; use another -o, or --force to replace it"
+from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
 
 
-def run_prediction(
-    data: str,
-    model_name: str,
-    output: str,
-    *,
-    split: str,
-    clips_per_video: int | None,
-    drop_short: bool,
-    batch: int,
-    seed: int,
-    device: str,
-    force: bool,
-    backbone: str | None = None,
-) -> None:
-    """`dpc classify predict`."""
-    chosen = choose_device(device)
-    weights = find_model(model_name)
-    model, info = load_model(weights, backbone)
-    streams = tuple(info.notes.get("streams", STREAMS))
-    with input_file(data) as path, output_file(output) as target:
+@dataclass(frozen=True)
+class Prediction:
+    """Says how many videos were scored in how many classes; `complete` where an earlier run had done it all."""
+
+    videos: int
+    classes: int
+    complete: bool = False
+
+
+def predict(
+    task: ModelTask, clips_per_video: int | None = None, drop_short: bool = False, batch: int = 8
+) -> Prediction:
+    """Scores the videos and writes a scores file; goes on where a stopped run ended.
+
+    clips_per_video: spread evenly over a video, None takes every start. Raises UsageError when the output holds something
+    else, DataError when data and model don't fit.
+    """
+    device = choose_device(task.device)
+    weights = find_model(task.model)
+    model, info = load_model(weights, task.backbone)
+    with input_file(task.data) as path, output_file(task.output) as target:
         reader = CloudsReader(path)
-        check_classes(reader, info, model_name)
-        sequences = select_videos(reader, split, info, model_name)
-        source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=seed)
+        check_classes(reader, info, task.model)
+        sequences = select_videos(reader, task.split, info, task.model)
+        source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
         report_short(source, info.config.num_frames)
-        config = {
-            "split": split,
-            "clips_per_video": clips_per_video,
-            "drop_short": drop_short,
-            "dropped": source.dropped,
-            "model": info.notes,
-            "weights": provenance.file_digest(weights),
-            "fusion": info.config.fusion,
-        }
-        history = [*reader.provenance, provenance.record(config, seed, {"clouds": path})]
-        if not force and _already_scored(target, history[-1]):
-            return
+        config = _record(task, weights, info, source, clips_per_video)
+        history = [*reader.provenance, provenance.record(config, task.seed, {"clouds": path})]
+        if not task.force and already_scored(target, history[-1]):
+            return Prediction(len(source.sequences), len(info.class_names), complete=True)
         keep_freed_memory()
-        with ScoresWriter(
-            target,
-            class_names=info.class_names,
-            seed=seed,
-            source=reader.path.name if data != "-" else "stdin",
-            provenance=history,
-            streams=streams,
-            force=force,
-            resume=output != "-",
-        ) as writer:
-            try:
-                _score(
-                    model.to(chosen),
-                    source,
-                    writer,
-                    streams,
-                    clips_per_video,
-                    batch,
-                    chosen,
-                    split if split == "validation" else None,
-                )
-            except Exception as error:
-                writer.keep = not isinstance(error, DataError)  # too little memory says nothing about what was scored
-                raise
-    if output != "-":
-        print(f"{output}: scores of {len(writer)} videos in {len(info.class_names)} classes")
+        with _writer(task, target, info, history) as writer:
+            done = _done(source, writer)
+            videos = predict_videos(model.to(device), source, clips_per_video, batch, device, writer.streams, done)
+            _write(videos, source, writer, len(done), task.split if task.split == "validation" else None)
+    return Prediction(len(writer), len(info.class_names))
 
 
-def _already_scored(target: Path, entry: dict) -> bool:
-    """Returns whether `target` holds the scores of this very work, and says so; UsageError when it holds something else."""
-    if not already_made(target, entry, ScoresReader, OTHER_SCORES, WORK):
-        return False
-    log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
-    print(f"{target}: complete")
-    return True
+def _record(
+    task: ModelTask, weights: Path, info: ModelInfo, source: ClipSource, clips_per_video: int | None
+) -> dict[str, Any]:
+    """Returns what shapes the scores, for the file's provenance."""
+    return {
+        "split": task.split,
+        "clips_per_video": clips_per_video,
+        "drop_short": source.drop_short,
+        "dropped": source.dropped,
+        "model": info.notes,
+        "weights": provenance.file_digest(weights),
+        "fusion": info.config.fusion,
+    }
 
 
-def _score(
-    model: Kinet,
-    source: ClipSource,
-    writer: ScoresWriter,
-    streams: tuple[str, ...],
-    count: int | None,
-    batch: int,
-    device: torch.device,
-    split: str | None,
-) -> None:
-    """split: what to call the videos' split; None: as their file does."""
-    reader, before = source.reader, set(writer.written_names)
-    done = {i for i in source.sequences if reader.names[i] in before}
+@contextmanager
+def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict]) -> Iterator[ScoresWriter]:
+    """Opens the scores file. What was scored is kept for the next run when this one fails, unless the data are bad: too
+    little memory says nothing about what was scored."""
+    with ScoresWriter(
+        target,
+        class_names=info.class_names,
+        seed=task.seed,
+        source=task.source,
+        provenance=history,
+        streams=tuple(info.notes.get("streams", STREAMS)),
+        force=task.force,
+        resume=task.output != "-",
+    ) as writer:
+        try:
+            yield writer
+        except Exception as error:
+            writer.keep = not isinstance(error, DataError)
+            raise
+
+
+def _done(source: ClipSource, writer: ScoresWriter) -> set[int]:
+    """Returns the sequences that an earlier run has scored."""
+    before = set(writer.written_names)
+    done = {i for i in source.sequences if source.reader.names[i] in before}
     if done:
         log.info(f"continuing: {len(done)} of {len(source.sequences)} videos were scored before")
-    with stop_requested() as stop, Progress("classify predict", len(source.sequences), "video") as bar:
-        bar.skip(len(done))
-        for video in predict_videos(model, source, count, batch, device, streams, done):
+    return done
+
+
+def _write(
+    videos: Iterator[VideoScores], source: ClipSource, writer: ScoresWriter, done: int, split: str | None
+) -> None:
+    """Writes the scores as they come. done: videos scored before; split: what to call the videos' split, None: as their
+    file does."""
+    reader, total = source.reader, len(source.sequences)
+    with stop_requested() as stop, Progress("classify predict", total, "video") as bar:
+        bar.skip(done)
+        for video in videos:
             i = video.sequence
-            writer.write(
-                reader.names[i],
-                video.fused,
-                label=int(reader.labels[i]),
-                split=split or reader.splits[i],
-                streams=video.streams,
-            )
+            label, own = int(reader.labels[i]), split or reader.splits[i]
+            writer.write(reader.names[i], video.fused, label=label, split=own, streams=video.streams)
             bar.advance(1, clips=video.clips)
             if writer.resume:
-                stop.check(f"{len(writer)} of {len(source.sequences)} videos are kept")
+                stop.check(f"{len(writer)} of {total} videos are kept")
             else:  # a pipe
                 stop.check("nothing was kept", again="to start over")
-
-
-def run_profile(
-    model_name: str | None,
-    *,
-    preset: str,
-    variant: str | None,
-    classes: int,
-    frames: int | None,
-    points: int | None,
-    steps: bool,
-    device: str,
-    json_output: bool,
-    backbone: str | None = None,
-) -> None:
-    """`dpc classify profile`."""
-    from dpcli.classify import cost as profile
-
-    chosen = choose_device(device)
-    if model_name:
-        model = load_model(model_name, backbone)[0]
-    else:
-        model = Kinet(
-            network_config(preset, variant, {"num_frames": frames, "points_per_frame": points}, classes, backbone)
-        ).eval()
-    result = profile.measure(model.to(chosen), chosen, steps)
-    print(json.dumps(result) if json_output else profile.render(result), file=sys.stdout)

@@ -4,135 +4,162 @@ from __future__ import annotations
 
 import json
 from contextlib import nullcontext
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from dpcli.classify.data.augment import find_augmentation
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.validation_split import carve_validation, class_table, default_rule
 from dpcli.classify.data.videos import report_short
-from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
-from dpcli.classify.presets import find_preset
-from dpcli.classify.settings import network_config, training_schedule
+from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
-from dpcli.runtime.device import choose_device
+from dpcli.runtime.device import choose_device, cpu_count
 from dpcli.runtime.distributed import Processes, from_environment, process_group
+from dpcli.runtime.mixed_precision import wanted
 from dpcli.runtime.progress import log
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.settings.catalog import Given
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import write_whole
 from dpcli.store import CloudsReader, input_file
 
-# A single cloud a video: what a static stream learns shapes from.
-_PRETRAINING = {"num_frames": 1, "temporal_radius": 0}
+SETTINGS_FILE = "settings.toml"
 
 
-def run_training(
-    data: str,
-    output: str,
-    *,
-    preset: str,
-    backbone: str | None,
-    variant: str | None,
-    network: dict,
-    schedule: dict,
-    augment: str | None,
-    timing: str,
-    drop_short: bool,
-    validation: str | None,
-    static_from: str | None,
-    init: str | None,
-    pretrain: bool,
-    seed: int,
-    device: str,
-    force: bool,
-) -> None:
-    """`dpc classify train`, alone or as one of torchrun's processes."""
-    if timing not in ("clips", "uniform"):
-        raise UsageError(f"--timing {timing}: expected clips or uniform")
-    if static_from and init:
-        raise UsageError("--init starts both streams, --static-from the static one: give one of them")
+@dataclass(frozen=True)
+class Training:
+    """Names the weights that a training left, and says how well its validation videos are classified, by stream."""
+
+    weights: Path
+    videos: int  # for validation
+    accuracy: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Videos:
+    """Holds the training and validation clips of a file, and what the run's records say of it."""
+
+    training: ClipSource
+    validation: ClipSource | None
+    counts: tuple[int, int]  # videos of both, those too short for a clip included
+    class_names: list[str]
+    digest: str
+
+
+def train(
+    data: str, output: str, given: Given, *, seed: int = 0, device: str = "auto", force: bool = False
+) -> Training | None:
+    """Trains a network on a clouds file, alone or as one of torchrun's processes; continues a stopped run.
+
+    data: a file, or `-` for stdin. output: the folder. given: the preset and the changes over it. Returns None in all
+    processes but the first. Raises UsageError for settings that don't fit together or a folder with another run, DataError
+    for data that can't be learned from.
+    """
+    settings = training_settings(given)
     if data == "-" and from_environment().count > 1:
         raise UsageError("several processes can't share a pipe: give a file instead of -")
-    if pretrain:
-        network, schedule = _pretraining(network, schedule)
     chosen = choose_device(device)
-    augmentation = find_augmentation(augment) if augment is not None else find_preset(preset).augmentation
-    plan = training_schedule(preset, schedule, chosen)
-    if augmentation.speed and (timing == "uniform" or plan.clips_per_video is None):
-        raise UsageError(
-            f"--augment {augment}: speed changes random clips of consecutive frames; leave it out with --timing uniform"
-            " or --clips-per-video 0"
-        )
+    settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
     with input_file(data) as path, process_group(chosen) as processes:
-        chosen = processes.place(chosen)
-        reader = CloudsReader(path)
-        config = network_config(preset, variant, network, len(class_table(reader)), backbone)
-        rule = validation or default_rule(reader)
-        parts = carve_validation(reader, rule, seed)
-        _check_labels(reader, *parts)
-        record = {
-            "network": json.loads(config.to_json()),
-            "schedule": _content(plan),
-            "augmentation": asdict(augmentation),
-            "timing": timing,
-            "validation": rule,
-            "drop_short": drop_short,
-            "seed": seed,
-            "static_from": static_from,
-            "init": init,
-            "data": provenance.file_digest(path),
-        }
-        plan.share(processes.count)
-        folder = RunFolder(output, json.loads(json.dumps(record)), force, columns=COLUMNS, curves=draw_curves)
-        options = {"timing": timing, "drop_short": drop_short, "seed": seed}
-        training = ClipSource(reader, parts[0], config, augmentation=augmentation, **options)
-        held = ClipSource(reader, parts[1], config, **options) if parts[1] else None
-        check_shares(len(training.epoch(0, plan.clips_per_video)), plan, processes.count)
-        report_short(training, config.num_frames)
-        torch.manual_seed(seed)
-        model = _new_model(config, static_from, init, backbone, folder).to(chosen)
-        notes = {
-            "command": provenance.command_line(),
-            "data": record["data"],
-            "seed": seed,
-            "validation": rule,
-            "trained_on": f"{len(parts[0])} videos",
-        }
-        info = ModelInfo(config, class_table(reader), timing, notes)
-        _announce(chosen, processes, len(parts[0]), len(parts[1]), rule, plan)
-        keep_freed_memory()
-        with (
-            folder if processes.first else nullcontext(),
-            stop_requested() as stop,
-        ):  # last: --force deletes an earlier model
-            processes.wait()  # the others find the folder as it is to be
-            trainer = Trainer(model, info, folder, plan, training, held, chosen, stop, processes)
-            trainer.run()
-        summary = trainer.validate() if held is not None else {}
-    if processes.first:
-        _print_outcome(folder, summary, len(parts[1]))
+        return _train(path, output, settings, seed, processes.place(chosen), force, processes)
 
 
-def _pretraining(network: dict, schedule: dict) -> tuple[dict, dict]:
-    """Options of a static stream alone on single clouds. UsageError when they contradict."""
-    if network["num_frames"] not in (None, 1) or schedule["epochs"][1]:
-        raise UsageError(
-            "--pretrain: trains the static stream on clips of one frame; leave out --frames and --epochs-dynamic"
-        )
-    return {**network, **_PRETRAINING}, {**schedule, "epochs": (schedule["epochs"][0], 0)}
+def _train(
+    path: Path,
+    output: str,
+    settings: TrainingSettings,
+    seed: int,
+    device: torch.device,
+    force: bool,
+    processes: Processes,
+) -> Training | None:
+    settings, videos = _videos(path, settings, seed)
+    schedule, run = settings.schedule, settings.run
+    schedule.share(processes.count)
+    folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
+    check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
+    report_short(videos.training, settings.network.num_frames)
+    torch.manual_seed(seed)
+    model = _new_model(settings, folder).to(device)
+    info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
+    _announce(device, processes, videos, settings)
+    keep_freed_memory()
+    with (
+        folder if processes.first else nullcontext(),
+        stop_requested() as stop,
+    ):  # last: --force deletes an earlier model
+        if processes.first:
+            write_whole(folder.file(SETTINGS_FILE), settings.to_toml(f"classify train --seed {seed}").encode())
+        processes.wait()  # the others find the folder as it is to be
+        trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
+        trainer.run()
+    accuracy = trainer.validate() if videos.validation is not None else {}
+    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy) if processes.first else None
+
+
+def _for_device(schedule: Schedule, device: torch.device) -> Schedule:
+    """Returns the schedule with what depends on the device chosen: on a CPU clips are loaded in the same process."""
+    workers = schedule.workers
+    if workers is None:
+        workers = 0 if device.type == "cpu" else min(4, cpu_count())
+    return replace(schedule, workers=workers, amp=wanted(schedule.amp, device))
+
+
+def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[TrainingSettings, _Videos]:
+    """Returns the settings with the file's classes and rule of validation, and its clips. Raises DataError where nothing can
+    be learned."""
+    reader = CloudsReader(path)
+    settings = with_classes(settings, len(class_table(reader)))
+    run = settings.run
+    rule = default_rule(reader) if run.validation == "auto" else run.validation
+    settings = replace(settings, run=replace(run, validation=rule))
+    training, validation = carve_validation(reader, rule, seed)
+    _check_labels(reader, training, validation)
+    options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
+    source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
+    held = ClipSource(reader, validation, settings.network, **options) if validation else None
+    counts = len(training), len(validation)
+    return settings, _Videos(source, held, counts, class_table(reader), provenance.file_digest(path))
+
+
+def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:
+    """Returns what shapes the result, for `config.json`: not how many processes load clips."""
+    schedule = {key: value for key, value in asdict(settings.schedule).items() if key != "workers"}
+    run = {key: getattr(settings.run, key) for key in ("timing", "validation", "drop_short", "static_from", "init")}
+    record = {
+        "network": asdict(settings.network),
+        "schedule": schedule,
+        "augmentation": asdict(settings.augmentation),
+        **run,
+        "seed": seed,
+        "data": digest,
+    }
+    return json.loads(json.dumps(record))
+
+
+def _notes(videos: _Videos, rule: str, seed: int) -> dict[str, Any]:
+    """Returns what a weights file says of its making."""
+    return {
+        "command": provenance.command_line(),
+        "data": videos.digest,
+        "seed": seed,
+        "validation": rule,
+        "trained_on": f"{videos.counts[0]} videos",
+    }
 
 
 def _check_labels(reader: CloudsReader, training: list[int], validation: list[int]) -> None:
-    """Something must be there to tell apart; classes that training never sees are named."""
+    """Raises DataError where there is nothing to tell apart; names the classes that training never sees."""
     names = class_table(reader)
     seen = {int(reader.labels[i]) for i in training}
     if len(seen) < 2:
@@ -147,42 +174,39 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
         )
 
 
-def check_shares(clips: int, plan: Schedule, processes: int) -> None:
-    """Each process divides its gradient by its own clips: their mean is the whole batch's only where shares are equal."""
-    if processes > 1 and clips < plan.batch:
+def check_shares(clips: int, schedule: Schedule, processes: int) -> None:
+    """Raises UsageError where processes get unequal shares of a batch: each divides its gradient by its own clips, and the
+    mean of these is the whole batch's only where shares are equal."""
+    if processes > 1 and clips < schedule.batch:
         raise UsageError(
-            f"--batch {plan.batch}: an epoch has {clips} clips, which {processes} processes can't share evenly; take a smaller batch,"
-            " more --clips-per-video or one process"
+            f"batch = {schedule.batch}: an epoch has {clips} clips, which {processes} processes can't share evenly; take a"
+            " smaller batch, more clips_per_video or one process"
         )
 
 
-def _content(plan: Schedule) -> dict:
-    """What of the schedule shapes the result: not how many processes load clips."""
-    return {key: value for key, value in asdict(plan).items() if key != "workers"}
-
-
-def _new_model(
-    config: KinetConfig, static_from: str | None, init: str | None, backbone: str | None, folder: RunFolder
-) -> Kinet:
-    """A fresh network, or one that starts from a trained one's static stream or from all of it, as far as shapes agree."""
+def _new_model(settings: TrainingSettings, folder: RunFolder) -> Kinet:
+    """Returns a fresh network, or one that starts from a trained one's static stream or from all of it, as far as shapes
+    agree."""
+    config, run = settings.network, settings.run
     model = Kinet(config)
-    for name, option, mine in ((static_from, "--static-from", model.static), (init, "--init", model)):
+    for name, option, mine in ((run.static_from, "static_from =", model.static), (run.init, "--init", model)):
         if not name:
             continue
         weights = find_model(name, option)
         folder.refuse_inside(option, weights)
-        other, _ = load_model(weights, backbone)
-        theirs = other.static if option == "--static-from" else other
+        other, _ = load_model(weights, config.backbone)
+        theirs = other.static if mine is model.static else other
         _copy_fitting(mine, theirs, f"{option} {name}")
         if other.config.num_frames > 1 and other.config.static_radius != config.static_radius:
             log.warn(
                 f"{option} {name}: its static stream learned from neighbors up to {other.config.static_radius} frames away, here"
-                f" {config.static_radius}; --static-temporal-radius {other.config.static_radius} goes on as it was"
+                f" {config.static_radius}; --set static_temporal_radius={other.config.static_radius} goes on as it was"
             )
     return model
 
 
 def _copy_fitting(mine: torch.nn.Module, theirs: torch.nn.Module, what: str) -> None:
+    """Copies the weights whose names and shapes agree. Raises UsageError when those are fewer than half."""
     own, others = mine.state_dict(), theirs.state_dict()
     fitting = {key: value for key, value in others.items() if key in own and value.shape == own[key].shape}
     left = sorted(set(own) - set(fitting))
@@ -191,26 +215,21 @@ def _copy_fitting(mine: torch.nn.Module, theirs: torch.nn.Module, what: str) -> 
         key = next((key for key in weights if key not in fitting), "?")
         shape = tuple(others[key].shape) if key in others else "absent"
         raise UsageError(
-            f"{what}: another network ({key}: {shape}, here {tuple(own[key].shape)}); give the same --preset and --backbone"
+            f"{what}: another network ({key}: {shape}, here {tuple(own[key].shape)}); give the same --preset and backbone"
         )
     mine.load_state_dict({**own, **fitting})
     log.info(f"{what}: {len(fitting)} of {len(own)} tensors taken" + (f"; fresh: {', '.join(left)}" if left else ""))
 
 
-def _announce(
-    device: torch.device, processes: Processes, training: int, validation: int, rule: str, plan: Schedule
-) -> None:
+def _announce(device: torch.device, processes: Processes, videos: _Videos, settings: TrainingSettings) -> None:
+    schedule = settings.schedule
     threads = f"{device} ({torch.get_num_threads()} threads)"
     where = threads if device.type == "cpu" else torch.cuda.get_device_name(device)
     if processes.count > 1:
-        where = f"{processes.count} processes, each on {where}, {plan.batch // processes.count} clips of a batch each"
+        where = (
+            f"{processes.count} processes, each on {where}, {schedule.batch // processes.count} clips of a batch each"
+        )
     log.info(
-        f"training on {where}: {training} videos, {validation} for validation ({rule}); epochs {plan.epochs[0]} + {plan.epochs[1]}"
+        f"training on {where}: {videos.counts[0]} videos, {videos.counts[1]} for validation ({settings.run.validation});"
+        f" epochs {schedule.epochs} + {schedule.epochs_dynamic}"
     )
-
-
-def _print_outcome(folder: RunFolder, summary: dict[str, float], videos: int) -> None:
-    print(folder.file("best.safetensors"))
-    if summary:
-        scores = ", ".join(f"{key} {100 * value:.1f} %" for key, value in summary.items())
-        print(f"{videos} validation videos: {scores}")

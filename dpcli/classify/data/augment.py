@@ -1,48 +1,72 @@
-"""Random changes of a training clip that don't change what is done in it."""
+"""Random changes of a training clip that don't change what is done in it (data augmentation)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dpcli.errors import UsageError
-
-_LIMITS = {"scale": 1, "dropout": 1, "crop": 1, "speed": 10}  # what a range must stay below
+from dpcli.runtime.settings.fields import check, setting
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Ranges of the random changes; 0 switches one off. One draw a clip, so motion within it stays as it is.
+    """Holds the ranges of the random changes, 0 switches one off; called with a clip, changes it. One draw a clip, so that
+    motion within it stays as it is.
 
     The defaults are ours (chosen on a validation subject: docs/experiments/classify.md). `PEERS` scales the axes only, from the
-    camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does.
+    camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does. Raises UsageError for
+    values out of range.
     """
 
-    scale: float = 0.2  # factor U(1-s, 1+s)
-    per_axis: bool = True  # a factor for each axis
-    turn: float = 0.4  # rad, U(-t, t) about the camera's vertical axis y
-    tilt: float = 0.1  # rad, standard deviation of small rotations about all axes, clipped at 3 of them
-    shift: float = 0.1  # length units, U(-s, s) for each axis
-    jitter: float = 0.002  # length units, standard deviation for each point
-    dropout: float = 0.2  # largest share of points replaced by their predecessor
-    crop: float = 0.2  # largest share of a video's frames left out at its ends, with --timing uniform
-    speed: float = (
-        0.0  # with --timing clips, random clips: up to 1+s times as fast or slow (frames left out or repeated)
+    scale: float = setting(0.2, "Factor of the size, from 1-s to 1+s.", least=0, below=1, name="augment_scale")
+    per_axis: bool = setting(True, "A factor of its own for each axis.", name="augment_per_axis")
+    turn: float = setting(
+        0.4, "Largest turn about the camera's vertical axis y, in radians.", least=0, name="augment_turn"
     )
-    origin: bool = (
-        False  # scale and turn about the camera, so that a far body moves by meters; else about the clip's mean
+    tilt: float = setting(
+        0.1,
+        "Standard deviation of small turns about all axes, in radians, at most 3 of them.",
+        least=0,
+        name="augment_tilt",
+    )
+    shift: float = setting(0.1, "Largest shift along each axis, in length units.", least=0, name="augment_shift")
+    jitter: float = setting(
+        0.002, "Standard deviation of each point's own shift, in length units.", least=0, name="augment_jitter"
+    )
+    dropout: float = setting(
+        0.2, "Largest share of points replaced by their predecessor.", least=0, below=1, name="augment_dropout"
+    )
+    crop: float = setting(
+        0.2,
+        "Largest share of a video's frames left out at its ends, with timing = uniform.",
+        least=0,
+        below=1,
+        name="augment_crop",
+    )
+    speed: float = setting(
+        0.0,
+        "0.3 shows random clips of consecutive frames up to 1.3 times as fast or slow, frames left out or repeated.",
+        least=0,
+        below=10,
+        name="augment_speed",
+    )
+    origin: bool = setting(
+        False,
+        "Scale and turn about the camera, so that a far body moves by meters; false: about the clip's mean.",
+        name="augment_origin",
     )
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, limit = getattr(self, field.name), _LIMITS.get(field.name, np.inf)
-            if not 0 <= value < limit:
-                up = f"to below {limit}" if field.name in _LIMITS else "up"
-                raise UsageError(f"--augment {field.name}={value}: expected a finite number from 0 {up}")
+        check(self)
 
     def __call__(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """points f32 (T,P,3) -> the same shape, a new array."""
+        """Returns the clip f32 (T,P,3), changed as drawn from the generator, in a new array of the same shape.
+
+        >>> clip = np.ones((2, 4, 3), np.float32)
+        >>> bool((NONE(clip, np.random.default_rng(0)) == clip).all())
+        True
+        """
         linear = np.diag(rng.uniform(1 - self.scale, 1 + self.scale, 3 if self.per_axis else 1) * np.ones(3))
         angles = np.clip(rng.normal(0, 1, 3), -3, 3) * self.tilt
         angles[1] += rng.uniform(-self.turn, self.turn)
@@ -56,7 +80,8 @@ class Augmentation:
         return self._drop(moved, rng)
 
     def frame_steps(self, frames: int, rng: np.random.Generator) -> np.ndarray:
-        """int (frames): a clip's frames counted from its first, at a random speed; 0, 1, 2, … without `speed`."""
+        """Returns the numbers int (frames) of a clip's frames counted from its first, at a random speed; 0, 1, 2 ... without
+        `speed`."""
         if not self.speed:
             return np.arange(frames)
         fastest = np.log1p(self.speed)
@@ -72,37 +97,14 @@ class Augmentation:
         return np.take_along_axis(points, source[..., None], 1)
 
 
-NONE = Augmentation(0, False, 0, 0, 0, 0, 0, 0)
-PEERS = Augmentation(0.1, True, 0, 0, 0, 0, 0, 0, origin=True)
-RELEASE = Augmentation(0.1, False, 0, 0.06, 0, 0, 0.2, 0)
-PRESETS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
-
-
-def find_augmentation(text: str) -> Augmentation:
-    """A preset and changes to it: `ours`, or `peers,turn=0.4,speed=0.3`. UsageError lists what there is."""
-    preset, *changes = text.split(",")
-    known = [field.name for field in fields(Augmentation)]
-    if preset not in PRESETS:
-        raise UsageError(
-            f"--augment {preset}: expected one of {', '.join(PRESETS)}, then changes such as ours,speed=0.3"
-        )
-    values: dict[str, float | bool] = {}
-    for change in changes:
-        name, _, number = change.partition("=")
-        try:
-            values[name] = float(number)
-        except ValueError:
-            raise UsageError(f"--augment {change}: expected NAME=NUMBER, with a name of {', '.join(known)}") from None
-        if name not in known:
-            raise UsageError(f"--augment {change}: expected one of {', '.join(known)}")
-    for name in ("per_axis", "origin"):
-        if name in values:
-            values[name] = bool(values[name])
-    return replace(PRESETS[preset], **values)
+NONE = Augmentation(0.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+PEERS = replace(NONE, scale=0.1, per_axis=True, origin=True)
+RELEASE = replace(NONE, scale=0.1, tilt=0.06, dropout=0.2)
+AUGMENTATIONS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
 
 
 def _rotation(angles: np.ndarray) -> np.ndarray:
-    """Rz @ Ry @ Rx for three angles in radians."""
+    """Returns the matrix f64 (3,3) of Rz @ Ry @ Rx for three angles in radians."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(angles), np.sin(angles)
     x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])

@@ -1,4 +1,4 @@
-"""From a `clouds` file to clips: which frames, which points of them, in which coordinates."""
+"""Clips of a `clouds` file: their frames, the points drawn of each, and the points' coordinates."""
 
 from __future__ import annotations
 
@@ -16,14 +16,18 @@ from dpcli.store import CloudsReader
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames of one sequence, by number; a number repeats where a short video is padded."""
+    """Names frames of one sequence by number; a number repeats where a short video is padded."""
 
     sequence: int
     frames: tuple[int, ...]
 
 
 def clip_starts(length: int, frames: int, count: int | None) -> list[int]:
-    """First frames of the clips of a video: every one (stride 1), or `count` of them spread evenly."""
+    """Returns the first frames of the clips of a video: every one (stride 1), or `count` of them spread evenly.
+
+    >>> clip_starts(length=10, frames=4, count=3)
+    [0, 3, 6]
+    """
     last = max(length - frames, 0)
     if count is None or count > last:
         return list(range(last + 1))
@@ -33,21 +37,28 @@ def clip_starts(length: int, frames: int, count: int | None) -> list[int]:
 
 
 def clip_frames(length: int, frames: int, start: int) -> tuple[int, ...]:
-    """`frames` consecutive frames from `start`; the last frame is held where the video is too short."""
+    """Returns `frames` consecutive frames from `start`; the last frame is held where the video is too short.
+
+    >>> clip_frames(length=5, frames=4, start=3)
+    (3, 4, 4, 4)
+    """
     return tuple(min(start + t, length - 1) for t in range(frames))
 
 
 def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, ...]:
-    """`frames` frames over the whole video: int((j + phase) * length / frames), phase in [0, 1).
+    """Returns `frames` frames over the whole video: int((j + phase) * length / frames), phase in [0, 1).
 
     Phase 0 is what the gesture benchmarks take. Training draws one phase a clip: one for each j would shake the
     time between frames, and with it every speed.
+
+    >>> uniform_frames(length=10, frames=4)
+    (0, 2, 5, 7)
     """
     return tuple(int(t) for t in np.minimum((np.arange(frames) + phase) * length // frames, length - 1))
 
 
 class ClipSource:
-    """Clips of some sequences of a `clouds` file as arrays a network takes. Picklable, for DataLoader workers.
+    """Loads clips of some sequences of a `clouds` file as arrays that a network takes. Picklable, for DataLoader workers.
 
     `timing` is `clips` (consecutive frames, as MSR-Action3D's peers) or `uniform` (frames spread over the whole video).
     `dropped` lists the videos left out because they are shorter than a clip (only with `drop_short`).
@@ -65,7 +76,7 @@ class ClipSource:
         seed: int = 0,
     ) -> None:
         self.reader, self.config, self.timing = reader, config, timing
-        self.augmentation, self.seed = augmentation, seed
+        self.augmentation, self.drop_short, self.seed = augmentation, drop_short, seed
         lengths = reader.frame_counts
         short = [s for s in sequences if lengths[s] < config.num_frames]
         self.dropped = [reader.names[s] for s in short] if drop_short else []
@@ -77,7 +88,7 @@ class ClipSource:
             )
 
     def clips(self, count: int | None) -> list[Clip]:
-        """The clips of every video, for prediction: every start, or `count` a video."""
+        """Returns the clips of every video, for prediction: every start, or `count` a video."""
         return [clip for s in self.sequences for clip in self._video_clips(s, count)]
 
     def _video_clips(self, sequence: int, count: int | None) -> list[Clip]:
@@ -87,7 +98,7 @@ class ClipSource:
         return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
 
     def epoch(self, number: int, per_video: int | None) -> list[Clip]:
-        """The clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
+        """Returns the clips of one training epoch in random order: every start of every video, or `per_video` random ones."""
         rng = generator(self.seed, ClassifyStream.CLIPS, number)
         if per_video is None and self.timing == "clips":
             clips = self.clips(None)
@@ -107,7 +118,7 @@ class ClipSource:
         return Clip(sequence, tuple(shown[step] for step in steps))
 
     def load(self, clip: Clip, *key: int) -> np.ndarray:
-        """The clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
+        """Returns the clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
         rng = generator(self.seed, ClassifyStream.POINTS, *key)
         sequence = self.reader.read(clip.sequence, clip.frames, fields=())
         points = np.stack(
@@ -118,7 +129,7 @@ class ClipSource:
 
 
 def sample_points(frame: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """`count` points of a frame in random order: without replacement, or whole copies and a random remainder if it has fewer.
+    """Returns `count` points of a frame in random order, drawn without replacement, or whole copies and a random remainder if it has fewer.
 
     An empty frame gives `count` points at the origin.
     """
@@ -135,7 +146,7 @@ DEVIATION = 0.27  # length units, of y, under `height`: as of a body 1.1 tall, w
 
 
 def normalize(points: np.ndarray, rule: str) -> np.ndarray:
-    """A clip's coordinates (T,P,3) as the configuration's `normalize` says.
+    """Returns a clip's coordinates (T,P,3) as the configuration's `normalize` says.
 
     `height` makes bodies equally tall, whatever the unit: y, the vertical, deviates by `DEVIATION` in the median frame. One
     factor a clip, so that who crouches or rises within it still does. `image` is the gesture benchmarks' rule for (row,

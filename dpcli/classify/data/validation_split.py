@@ -1,5 +1,5 @@
-"""Which videos train and which choose: validation is what the file says it is, or carved from the training videos; never
-the test ones."""
+"""The division of a file's videos into those that train and those that validate: what the file says, or carved from the
+training videos; never the test ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dpcli.store import CloudsReader
 
 
 def labeled(reader: CloudsReader, split: str) -> list[int]:
-    """Sequences of this split that have a label. DataError when there are none."""
+    """Returns the sequences of this split that have a label. Raises DataError when there are none."""
     chosen = [i for i, name in enumerate(reader.splits) if name == split and reader.labels[i] >= 0]
     if not chosen:
         raise DataError(f"{reader.path}: no labeled sample of split {split!r}; {_instead(reader)}")
@@ -19,7 +19,7 @@ def labeled(reader: CloudsReader, split: str) -> list[int]:
 
 
 def _instead(reader: CloudsReader) -> str:
-    """What a file without training samples has, and how it comes by some."""
+    """Returns a sentence about what a file without training samples has, and how it comes by some."""
     if reader.labels.max(initial=-1) < 0:
         return "none has a label: prepare them with --labels TABLE or, where a folder is a class, --label-from-folder"
     if not any(reader.splits):
@@ -29,7 +29,7 @@ def _instead(reader: CloudsReader) -> str:
 
 
 def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[int], list[int]]:
-    """(training, validation) sequences, from the split `train` but for the rule `split`.
+    """Returns the training and the validation sequences, both of the split `train` but for the rule `split`.
 
     `rule`: `none`; `split` (the file's own split `validation`); `subject` (the training subject with the highest number);
     `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
@@ -85,7 +85,7 @@ def _stratified(reader: CloudsReader, chosen: list[int], share: float, seed: int
 
 
 def folds(labels: np.ndarray, subjects: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """Which of `count` folds each video is in, i64 (N), for cross-validation (figure 3.5 of the thesis).
+    """Returns the number of the fold, of `count`, that each video is in, i64 (N), for cross-validation (thesis, figure 3.5).
 
     labels, subjects: i32 (N). Whole subjects share a fold where all are known and there are at least `count` of them,
     as FlickerNet leaves subjects out; else each class is spread over the folds, whose sizes differ by at most one.
@@ -121,7 +121,7 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
 
 
 def default_rule(reader: CloudsReader) -> str:
-    """`split` when the file has labeled validation videos, `subject` when the training videos have several known subjects,
+    """Returns `split` when the file has labeled validation videos, `subject` when the training videos have several known subjects,
     else 15 % of each class."""
     if any(name == "validation" and label >= 0 for name, label in zip(reader.splits, reader.labels)):
         return "split"
@@ -130,7 +130,7 @@ def default_rule(reader: CloudsReader) -> str:
 
 
 def class_table(reader: CloudsReader) -> list[str]:
-    """Class names; numbers where the file has labels but no names."""
+    """Returns the class names; numbers where the file has labels but no names."""
     if reader.class_names:
         return reader.class_names
     return [str(i) for i in range(int(np.max(reader.labels)) + 1)]

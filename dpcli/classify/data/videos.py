@@ -1,4 +1,4 @@
-"""Which videos of a file a command works on, and what it says of them."""
+"""The choice of the videos that a command works on, and the messages about them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from dpcli.store import CloudsReader
 
 
 def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name: str) -> list[int]:
-    """Sequences of a split, of all for `all`; `auto` is the test split where there is one, `validation` is `held_out` where
-    no sample bears that name. DataError when there are none."""
+    """Returns the sequences of a split, of all for `all`; `auto` is the test split where there is one, `validation` is
+    `held_out` where no sample bears that name. Raises DataError when there are none."""
     wanted = split
     if split == "validation" and split not in reader.splits:
         return held_out(reader, info, model_name)
@@ -28,9 +28,9 @@ def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name:
 
 
 def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int]:
-    """The training videos that the model's training held out for validation, by the rule and seed in its notes.
+    """Returns the training videos that the model's training held out for validation, by the rule and seed in its notes.
 
-    UsageError when it held none out; DataError when the rule needs the file it was trained on and this is another.
+    Raises UsageError when it held none out; raises DataError when the rule needs the file it was trained on and this is another.
     """
     rule = str(info.notes.get("validation", "none"))
     if rule == "none":
@@ -46,7 +46,7 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
 
 
 def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> None:
-    """DataError that names the first class in which the file and the model differ."""
+    """Raises DataError, which names the first class in which the file and the model differ."""
     if reader.class_names and reader.class_names != info.class_names:
         pairs = zip(reader.class_names + [""] * 99, info.class_names + [""] * 99)
         index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
@@ -56,7 +56,7 @@ def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> Non
 
 
 def report_short(source: ClipSource, frames: int) -> None:
-    """Name the videos that are dropped or padded, with a message each."""
+    """Names the videos that are dropped or padded, with a message each."""
     for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
         if names:
             log.info(

@@ -1,4 +1,4 @@
-"""Where explanations look into a network: the features of a stage's centroids, and the vector before the last layer.
+"""The places where explanations look into a network: the features of a stage's centroids, and the vector before the last layer.
 
 Forward hooks find both in any backbone, so none has to offer more than the three methods of `classify.backbone`.
 """
@@ -20,7 +20,7 @@ _TINY = 1e-30  # a following ReLU passes the gradient of this, not that of 0
 
 @dataclass
 class Layer:
-    """Features (M,C) of the centroids of one stage of one clip, the centroids' places (M,3) and frames (M) in the network's
+    """Holds the features (M,C) of the centroids of one stage of one clip, the centroids' places (M,3) and frames (M) in the network's
     coordinates, and the gradient (M,C) of a class's logit with respect to the features, where one was asked for."""
 
     centers: Tensor
@@ -31,18 +31,18 @@ class Layer:
 
 @dataclass
 class _Call:
-    """The n-th call of a module in a pass."""
+    """Names the n-th call of a module in a pass."""
 
     module: nn.Module
     number: int
 
 
 def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, target: int | None) -> Layer:
-    """The features of a stage (0 the first, None the last) of stream `static` or `dynamic` on one clip (1,T,P,3).
+    """Returns the features of a stage (0 the first, None the last) of stream `static` or `dynamic` on one clip (1,T,P,3).
 
     Without `target`: the last layer's activations before pooling, at their largest over each neighborhood; in the dynamic
     stream the merged feature after that layer's fit, which has one vector a centroid. With `target`, a class: the features
-    after pooling and the gradient of that class's logit. The network must be in eval mode. UsageError when it lacks the stage.
+    after pooling and the gradient of that class's logit. The network must be in eval mode. Raises UsageError when it lacks the stage.
     """
     with torch.no_grad():
         groups = model.group(points)
@@ -51,7 +51,7 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
     count = len(stages)
     chosen = count - 1 if stage is None else stage
     if not 0 <= chosen < count:
-        raise UsageError(f"--stage {chosen + 1}: this network has {count} stages, expected 1..{count}")
+        raise UsageError(f"stage = {chosen + 1}: this network has {count} stages, expected 1..{count}")
     grouping = stages[chosen].grouping
     where = grouping.centers[0].detach(), grouping.center_times[0].detach()
     if stream == "static" and target is None:
@@ -65,7 +65,7 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
     else:
         if chosen < count - 1 and sizes[chosen] in sizes[chosen + 1 :]:
             raise UsageError(
-                f"--stage {chosen + 1}: later stages have as many centroids; only --stage {count} can be told"
+                f"stage = {chosen + 1}: later stages have as many centroids; only stage = {count} can be told"
             )
         values, gradient = _seen(_last_call(getattr(model, stream), run, sizes[chosen]), run, target)
     shape = (sizes[chosen], -1)
@@ -73,11 +73,12 @@ def stage_layer(model: Kinet, points: Tensor, stream: str, stage: int | None, ta
 
 
 def _last_call(network: nn.Module, run: Callable[[], Tensor], rows: int) -> _Call:
-    """The last module whose output has one feature for each of the centroids: (1,M,C), or else (M,C)."""
+    """Returns the last module whose output has one feature for each of the centroids: (1,M,C), or else (M,C)."""
     calls: dict[nn.Module, int] = {}
     found: dict[int, _Call] = {}
 
     def note(module: nn.Module, _: object, output: object) -> None:
+        """Notes each call whose output has the wanted shape."""
         calls[module] = calls.get(module, -1) + 1
         if isinstance(output, Tensor) and output.is_floating_point() and output.shape[:-1] in ((1, rows), (rows,)):
             found[output.dim()] = _Call(module, calls[module])
@@ -92,11 +93,12 @@ def _last_call(network: nn.Module, run: Callable[[], Tensor], rows: int) -> _Cal
 def _seen(
     call: _Call, run: Callable[[], Tensor], target: int | None, make: Callable[[Tensor], Tensor] = lambda output: output
 ) -> tuple[Tensor, Tensor | None]:
-    """What a call gives (after `make`), and with `target` the gradient of that logit with respect to it."""
+    """Returns the output of a call (after `make`), and with `target` the gradient of that logit with respect to it."""
     seen: list[Tensor] = []
     count = -1
 
     def note(_: nn.Module, __: object, output: Tensor) -> Tensor | None:
+        """Replaces the output of the wanted call by a copy that gradients reach."""
         nonlocal count
         count += 1
         if count != call.number:
@@ -115,13 +117,13 @@ def _seen(
 def _merged(
     model: Kinet, run: Callable[[], Tensor], level: int, stage: int, target: int | None
 ) -> tuple[Tensor, Tensor | None]:
-    """A feature inside the merge, after the ReLU of level `level`, the last of `stage`."""
+    """Returns a feature inside the merge, after the ReLU of level `level`, the last of `stage`."""
     merge = model.dynamic.merge
     if hasattr(merge, "norms"):
         return _seen(_Call(merge.norms[level], 0), run, target, lambda output: output.clamp(min=_TINY))
     if target is not None or not hasattr(merge, "current"):
         raise UsageError(
-            f"--stage {stage + 1}: the dynamic stream of this network can be explained at its last stage only"
+            f"stage = {stage + 1}: the dynamic stream of this network can be explained at its last stage only"
         )
     current, last = (_seen(_Call(m, 0), run, None)[0] for m in (merge.current[-1][stage], merge.last[stage]))
     return torch.relu(current) + torch.relu(last), None
@@ -138,9 +140,9 @@ def _hooked(modules, note: Callable) -> Iterator[None]:
 
 
 class ClipVectors:
-    """The vectors that the last layers of both streams read: `vectors(points)` -> {stream: (B,D)} for clips (B,T,P,3).
+    """Finds the vectors that the last layers of both streams read: `vectors(points)` -> {stream: (B,D)} for clips (B,T,P,3).
 
-    The last layer is the module whose output is the stream's logits. UsageError when there is none.
+    The last layer is the module whose output is the stream's logits. Raises UsageError when there is none.
     """
 
     def __init__(self, model: Kinet, points: Tensor) -> None:
@@ -148,6 +150,7 @@ class ClipVectors:
         candidates: list[tuple[nn.Module, Tensor]] = []
 
         def note(module: nn.Module, inputs: tuple, output: object) -> None:
+            """Notes each call that has one tensor for input and one for output."""
             if isinstance(output, Tensor) and len(inputs) == 1 and isinstance(inputs[0], Tensor):
                 candidates.append((module, output))
 
@@ -165,9 +168,11 @@ class ClipVectors:
 
     @torch.no_grad()
     def vectors(self, points: Tensor) -> dict[str, Tensor]:
+        """Returns the vectors {stream: (B,D)} of clips (B,T,P,3)."""
         seen: dict[nn.Module, Tensor] = {}
 
         def note(module: nn.Module, inputs: tuple, _: Tensor) -> None:
+            """Notes what the last layer reads."""
             seen[module] = inputs[0].flatten(1)
 
         with _hooked(set(self.layers.values()), note):

@@ -23,7 +23,7 @@ _RATE = 6  # images per second of an animation
 def activation_sheet(
     path: Path, clouds: Sequence[ActivationCloud], class_names: Sequence[str], axes: np.ndarray, frames: int = 8
 ) -> None:
-    """A row per sample and stream (streams one under another), at most `frames` frames as columns; red acts most, blue least."""
+    """Draws a row per sample and stream (streams one under another), at most `frames` frames as columns; red acts most, blue least."""
     blocks = []
     for cloud in clouds:
         shown = spread_evenly(cloud.sequence.num_frames, frames)
@@ -36,7 +36,7 @@ def activation_sheet(
 def activation_animation(
     path: Path, clouds: Sequence[ActivationCloud], class_names: Sequence[str], axes: np.ndarray
 ) -> None:
-    """The clips' frames one after another, six a second: a row per sample, streams side by side."""
+    """Draws the clips' frames one after another, six a second: a row per sample, streams side by side."""
     drawers = [_drawer(cloud, axes) for cloud in clouds]
     images = []
     for t in range(max(cloud.sequence.num_frames for cloud in clouds)):
@@ -50,9 +50,10 @@ def activation_animation(
 
 
 def title(cloud: ActivationCloud, class_names: Sequence[str]) -> str:
-    """Who it is, what it is, what the network says, and which class is explained."""
+    """Returns the words above a sample: its name, its class, what the network says, and which class is explained."""
 
     def name(label: int) -> str:
+        """Returns the name of a class, or its number where it has none."""
         return class_names[label] if 0 <= label < len(class_names) else str(label)
 
     parts = [cloud.sequence.name]
@@ -73,6 +74,7 @@ def _drawer(cloud: ActivationCloud, axes: np.ndarray) -> Callable[[str, int], np
     offsets = cloud.sequence.frame_offsets
 
     def draw(stream: str, t: int) -> np.ndarray:
+        """Returns the cell of a stream and a frame."""
         span = slice(int(offsets[t]), int(offsets[t + 1]))
         colors, side = heat_colors(cloud.activation[stream][span]), 3 if span.stop - span.start < 3000 else 2
         return draw_dots(seen[span], colors, raster, side, relief=False)
@@ -114,7 +116,7 @@ def plane_picture(
     class_names: Sequence[str],
     captions: dict[str, str],
 ) -> None:
-    """A panel per stream with a dot per video (S,2), colored by class, gray where there is no label; one legend."""
+    """Draws a panel per stream with a dot per video (S,2), colored by class, gray where there is no label; one legend."""
     from matplotlib.figure import Figure
 
     present = sorted(set(labels[labels >= 0].tolist()))
@@ -146,7 +148,7 @@ def plane_picture(
 
 
 def _style(place: int, count: int) -> tuple[tuple[float, ...], str]:
-    """Ten hues a marker (twenty classes: circles and squares), so that neighbors in the legend differ."""
+    """Returns color and marker of a class, ten hues a marker (20 classes: circles, squares), so that neighbors differ."""
     from matplotlib import colormaps
 
     return colormaps["tab10"](place % 10)[:3], _MARKERS[place // 10 % len(_MARKERS)]

@@ -29,7 +29,7 @@ _FIRST = {"activation": 0, "gradient": None}  # the stage looked at by default; 
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of a clip. rule: activation or gradient; stage: 0 the first, None the rule's own;
+    """Says what is asked of a clip. rule: activation or gradient; stage: 0 the first, None the rule's own;
     target: predicted, label or a class's number, for the rule gradient."""
 
     rule: str = "activation"
@@ -38,12 +38,12 @@ class Question:
 
     def __post_init__(self) -> None:
         if self.rule not in RULES:
-            raise UsageError(f"--rule {self.rule}: expected {' or '.join(RULES)}")
+            raise UsageError(f"rule = {self.rule}: expected {' or '.join(RULES)}")
 
 
 @dataclass
 class ActivationCloud:
-    """The frames of one clip with an activation for each point.
+    """Holds the frames of one clip with an activation for each point.
 
     sequence: all points of the clip's frames as the file has them; frames: their numbers in the video; activation: stream
     -> f32 (P) in 0..1; target: the class asked about (-1 with the rule activation); predicted: the clip's class;
@@ -61,12 +61,12 @@ class ActivationCloud:
 def activation_cloud(
     model: Kinet, source: ClipSource, clip: Clip, streams: tuple[str, ...], question: Question, device: torch.device
 ) -> ActivationCloud:
-    """The activation of every point of a clip's frames, by stream: `streams` of static, dynamic, fused.
+    """Returns the activation of every point of a clip's frames, by stream: `streams` of static, dynamic, fused.
 
     A point takes the inverse-squared-distance mean of the three centroids nearest in space and time (see `carry`). Then
     each stream's values are mapped linearly such that the clip's smallest is 0 and its largest 1 (all 0 where they are
     equal). `fused` is the mean of both streams' maps.
-    DataError on target `label` for a video without one, and on a clip without points.
+    Raises DataError on target `label` for a video without one, and on a clip without points.
     """
     fields = [field for field in source.reader.fields if field != "scene_flow"]  # its next frame may not be the clip's
     sequence = source.reader.read(clip.sequence, clip.frames, fields)
@@ -103,7 +103,7 @@ def activation_cloud(
 
 @torch.no_grad()
 def _probability(model: Kinet, points: Tensor, only_static: bool) -> Tensor:
-    """(C) of both streams, or of the static one where the other isn't asked for (it may not have been trained)."""
+    """Returns the probabilities (C) of both streams, or of the static one where the other, perhaps untrained, isn't asked for."""
     if only_static:
         return torch.softmax(model.static_logits(points), -1)[0]
     return fuse(*model(points), model.config.fusion)[0]
@@ -114,26 +114,26 @@ def _target(wanted: str | int, predicted: int, sequence: CloudSequence) -> int:
         return predicted
     if wanted == "label":
         if sequence.label < 0:
-            raise DataError(f"sample {sequence.name!r} has no label; --class predicted explains what the network sees")
+            raise DataError(f"sample {sequence.name!r} has no label; class = predicted explains what the network sees")
         return sequence.label
     return int(wanted)
 
 
 def channel_weights(layer: Layer) -> Tensor:
-    """Grad-CAM's weight of each channel (C): the mean over centroids of the class logit's gradient."""
+    """Returns Grad-CAM's weight of each channel (C): the mean over centroids of the class logit's gradient."""
     assert layer.gradient is not None
     return layer.gradient.mean(0)
 
 
 def centroid_activation(layer: Layer) -> Tensor:
-    """One value (M) a centroid: eq. A.2's maximum over channels, or Grad-CAM's weighted sum where there is a gradient."""
+    """Returns one value (M) a centroid: eq. A.2's maximum over channels, or Grad-CAM's weighted sum where there is a gradient."""
     if layer.gradient is None:
         return layer.values.amax(-1)
     return torch.relu(layer.values @ channel_weights(layer))
 
 
 def carry(layer: Layer, values: Tensor, queries: list[np.ndarray], frame_length: float) -> list[np.ndarray]:
-    """Values (M) of the centroids at the points (N_t,3) of each frame t, f32 (N_t): inverse-squared-distance mean of the
+    """Returns values (M) of the centroids at the points (N_t,3) of each frame t, f32 (N_t): inverse-squared-distance mean of the
     three nearest centroids in space and time, where a frame counts as `frame_length`.
 
     As `ops.three_nn_interpolate` in four dimensions (of equally near centroids any may be taken). With the frame's own
@@ -159,19 +159,19 @@ def _interpolated(query: Tensor, known: Tensor, values: Tensor) -> Tensor:
 
 
 def frame_length(config: KinetConfig) -> float:
-    """A frame as a length, in the network's unit: such that a neighborhood of the first stage ends as far off in time (one
+    """Returns a frame as a length, in the network's unit: such that a neighborhood of the first stage ends as far off in time (one
     frame beyond its temporal radius) as in space."""
     return config.radii[0] / (config.temporal_radius + 1)
 
 
 def rescaled(values: np.ndarray) -> np.ndarray:
-    """f32 values mapped linearly to 0..1; zeros where all are equal."""
+    """Returns f32 values mapped linearly to 0..1; zeros where all are equal."""
     low, high = float(values.min()), float(values.max())
     return ((values - low) / (high - low)).astype(np.float32) if high > low else np.zeros(len(values), np.float32)
 
 
 def raw_points(source: ClipSource, clip: Clip) -> np.ndarray:
-    """The points f32 (T,P,3) that prediction draws from a clip, in the file's coordinates."""
+    """Returns the points f32 (T,P,3) that prediction draws from a clip, in the file's coordinates."""
     plain = ClipSource(
         source.reader, [clip.sequence], source.config.changed(normalize="none"), timing=source.timing, seed=source.seed
     )
@@ -179,7 +179,7 @@ def raw_points(source: ClipSource, clip: Clip) -> np.ndarray:
 
 
 def _in_network_coordinates(sequence: CloudSequence, drawn: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """All points of each frame, f32 (N_t,3), moved as normalization moved the drawn ones: an affine map of each axis."""
+    """Returns all points of each frame, f32 (N_t,3), moved as normalization moved the drawn ones: an affine map of each axis."""
     before, after = drawn.reshape(-1, 3).astype(np.float64), points.reshape(-1, 3).astype(np.float64)
     ends = before.argmin(0), before.argmax(0)
     axes = np.arange(3)

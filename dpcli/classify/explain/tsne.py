@@ -26,7 +26,7 @@ _FEWEST = 4  # videos
 def video_features(
     model: Kinet, source: ClipSource, clips_per_video: int | None, batch: int, device: torch.device
 ) -> dict[str, np.ndarray]:
-    """The mean over each video's clips of the vector before the last layer, f32 (S,D) by stream, in `source.sequences`' order.
+    """Returns the mean over each video's clips of the vector before the last layer, f32 (S,D) by stream, in `source.sequences`' order.
 
     The points drawn are those of prediction, so the batch makes no difference beyond rounding.
     """
@@ -48,14 +48,20 @@ def video_features(
     return {stream: (total / counts[:, None]).astype(np.float32) for stream, total in sums.items()}
 
 
-def joined(features: dict[str, np.ndarray]) -> np.ndarray:
-    """Both streams' vectors, each of unit length, side by side: f32 (S,D1+D2)."""
+def joined_features(features: dict[str, np.ndarray]) -> np.ndarray:
+    """Returns both streams' vectors, each of unit length, side by side: f32 (S,D1+D2)."""
     norms = [np.maximum(np.linalg.norm(features[s], axis=1, keepdims=True), 1e-12) for s in ("static", "dynamic")]
     return np.concatenate([features[s] / n for s, n in zip(("static", "dynamic"), norms)], axis=1).astype(np.float32)
 
 
 def chosen_perplexity(wanted: float | None, videos: int) -> float:
-    """`wanted`, or 30 and at most a third of the others. DataError below four videos, UsageError on one out of range."""
+    """Returns `wanted`, or without it 30 and at most a third of the others.
+
+    Raises DataError below four videos, UsageError for a perplexity out of range.
+
+    >>> chosen_perplexity(None, videos=31)
+    10.0
+    """
     if videos < _FEWEST:
         raise DataError(
             f"{videos} videos are too few for a map, expected at least {_FEWEST}; take another --split, or all"
@@ -68,7 +74,7 @@ def chosen_perplexity(wanted: float | None, videos: int) -> float:
 
 
 def plane(features: np.ndarray, perplexity: float, seed: int) -> np.ndarray:
-    """Coordinates f32 (S,2) by t-SNE of features (S,D): Euclidean distances, started from the first two principal components."""
+    """Returns coordinates f32 (S,2) by t-SNE of features (S,D): Euclidean distances, started from the first two principal components."""
     from sklearn.manifold import TSNE
 
     if np.ptp(features, axis=0).max(initial=0) == 0:
@@ -93,7 +99,7 @@ def _method(videos: int) -> str:
 
 
 def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBORS) -> float | None:
-    """Share of the labeled videos whose k nearest other labeled ones vote for their class; None where it says nothing.
+    """Returns the share of the labeled videos whose k nearest other labeled ones vote for their class; None where it says nothing.
 
     Euclidean distances in float64, ties to the lower index; a tied vote goes to the tied class with the nearest member.
     Fewer than k+1 videos: all others vote. None with fewer than two videos or classes.
@@ -109,7 +115,7 @@ def neighbor_accuracy(features: np.ndarray, labels: np.ndarray, k: int = NEIGHBO
 
 
 def _vote(labels: np.ndarray) -> int:
-    """The most frequent label; of equally frequent ones the first."""
+    """Returns the most frequent label; of equally frequent ones the first."""
     values, first, counts = np.unique(labels, return_index=True, return_counts=True)
     best = counts == counts.max()
     return int(values[best][first[best].argmin()])
@@ -122,7 +128,7 @@ def _distances(vectors: np.ndarray) -> np.ndarray:
 
 
 def silhouette(features: np.ndarray, labels: np.ndarray) -> float | None:
-    """Mean over labeled videos of (b - a) / max(a, b), -1..1 (Rousseeuw, 1987): a the mean Euclidean distance to the own
+    """Returns the mean over labeled videos of (b - a) / max(a, b), -1..1 (Rousseeuw, 1987): a the mean Euclidean distance to the own
     class, b to the nearest other one; 0 for a class of one. None unless there are two classes, one with two videos."""
     from sklearn.metrics import silhouette_score
 

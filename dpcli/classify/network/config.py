@@ -1,105 +1,142 @@
-"""Every choice that shapes a Kinet, in one value that travels with the weights."""
+"""The settings of a Kinet's network and input: every choice that shapes it, in one value that travels with the weights."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, fields, replace
+from typing import Literal
 
 from dpcli.errors import DataError, UsageError
-
-VARIANTS = ("thesis", "release")
+from dpcli.runtime.settings.fields import check, setting
 
 
 @dataclass(frozen=True)
 class KinetConfig:
-    """Network and input of a Kinet. Defaults are the thesis's text, but for `static_temporal_radius` (0 there, which the preset
-    says; models made before it was a choice have None); `release()` is the published code's choices.
+    """Holds the settings of a Kinet. The defaults are the thesis's text, but for `static_temporal_radius`: the preset `thesis`
+    says 0, and models made before it was a choice have None. `release()` gives the published code's choices.
 
-    Lengths are in the input's unit after normalization, times in frames.
+    Lengths are in the input's unit after normalization, times in frames. Raises UsageError for values that don't fit.
     """
 
-    num_classes: int = 20
-    num_frames: int = 16
-    points_per_frame: int = 2048
-    normalize: str = (  # none | center (subtract the clip's mean) | height (and make bodies equally tall)
-        "none"  # | unit (center, and divide by the largest radius) | image
+    num_classes: int = 20  # follows from the data, so that it is no setting
+    num_frames: int = setting(16, "Frames per clip.", least=1, name="frames")
+    points_per_frame: int = setting(2048, "Points drawn per frame.", least=1, name="points")
+    normalize: Literal["none", "center", "height", "unit", "image"] = setting(
+        "none",
+        "Coordinates of a clip: as they are (none); their mean at 0 (center); and every body equally tall, y upright (height);"
+        " or within radius 1 (unit); or rows, columns and depth of gestures (image).",
     )
-    variant: str = "thesis"
-    backbone: str = "pointnet2"  # pointnet2 | dgcnn | spidercnn | module:Class of the user's
-    centroids: tuple[int, int] = (1024, 512)
-    neighbors: int = 64
-    radii: tuple[float, float] = (0.5, 1.0)  # at time distance 0
-    temporal_radius: int = 1  # frames
-    static_temporal_radius: int | None = (
-        None  # of the static stream's own neighborhoods; None: one set serves both streams
+    variant: Literal["thesis", "release"] = setting(
+        "thesis",
+        "Whose choices hold where the thesis and its published code disagree: changes group_size, xyz_group, time_input,"
+        " weighting, merge, guard, fusion and grouping together.",
     )
-    grouping: str = (
-        "balanced"  # which neighbors within the radius: first | nearest | balanced (equal shares of each frame)
+    backbone: str = setting(
+        "pointnet2",
+        "Static network: pointnet2, dgcnn, spidercnn, or your own as module:Class (docs/backbones.md). Another than the"
+        " preset's brings sizes of its own.",
     )
-    widths: tuple[tuple[int, ...], ...] = ((64, 128), (128, 256), (512, 1024))  # the backbone's own, a tuple a stage
-    # dynamic branch
-    head: tuple[int, int] | None = None  # widths of its head; None: the last of `widths`
-    group_size: int = 4  # d of eq. 3.5
-    reduction: float = 0.5  # c relative to the static width
-    xyz_group: bool = False  # one more group: the neighbor's relative coordinates
-    time_input: bool = False  # frame index beside the static feature, into the reduction
-    weighting: str = "deviation"  # deviation (eq. 3.8) | projection (release) | none (Table 3.1 vi)
-    normals: bool = True  # False: Table 3.1 v, the reduced features are pooled instead of fitted
-    merge: str = "residual"  # residual (thesis) | cross (release: both scales exchanged by 3-NN interpolation)
-    merge_norm: bool = False  # batch norm in the residual merge (ours: trains in a fraction of the epochs)
-    solver: str = "inverse"  # inverse (A.1.1) | ridge (ours: relative Tikhonov term, no guard needed)
-    guard: str = "signed"  # what a small determinant becomes: signed | release
-    fusion: str = "softmax"  # softmax | logits, averaged
-    dropout: float = 0.0  # before the last layer of each head
+    centroids: tuple[int, int] = setting(
+        (1024, 512),
+        "Neighborhoods of a clip in the two stages of pointnet2. No weight depends on it: train with few, then go on by --init"
+        " with the preset's.",
+        least=1,
+    )
+    neighbors: int = setting(
+        64, "Points of a neighborhood. No weight depends on it, except with the backbone spidercnn.", least=1
+    )
+    radii: tuple[float, float] = setting(
+        (0.5, 1.0),
+        "Spatial radii of the neighborhoods in the two stages at time distance 0, in the input's unit.",
+        above=0,
+        name="radius",
+    )
+    temporal_radius: int = setting(1, "Frames before and after that count as neighbors.", least=0)
+    static_temporal_radius: int | None = setting(
+        None,
+        "Frames before and after that count as neighbors in the static stream alone (pointnet2): 0 keeps its neighborhoods"
+        " within a frame, so that it sees no motion; none: as temporal_radius, with one set of neighborhoods for both streams.",
+        least=0,
+    )
+    grouping: Literal["first", "nearest", "balanced"] = setting(
+        "balanced",
+        "Neighbors taken within the radius: the first found, the nearest, or equal shares of each frame (balanced).",
+    )
+    widths: tuple[tuple[int, ...], ...] = setting(
+        ((64, 128), (128, 256), (512, 1024)), "Widths of the backbone's layers, a group for each stage.", least=1
+    )
+    head: tuple[int, int] | None = setting(
+        None, "Widths of the dynamic branch's head; none: the last group of widths.", least=1
+    )
+    group_size: int = setting(4, "Features per fitted surface, d of eq. 3.5.", least=1)
+    reduction: float = setting(
+        0.5, "Width of the fitted features as a share of the static layer's width.", above=0, most=1
+    )
+    xyz_group: bool = setting(False, "Fit one more surface, to the neighbors' relative coordinates.")
+    time_input: bool = setting(False, "Reduce the frame's number together with the static feature.")
+    weighting: Literal["deviation", "projection", "none"] = setting(
+        "deviation",
+        "Weights of the neighbors in a fit: by eq. 3.8 (deviation), as in the published code (projection), or all 1 (none;"
+        " row vi of table 3.1).",
+    )
+    normals: bool = setting(
+        True, "Fit surfaces; false (row v of table 3.1) pools the reduced features instead, without weights."
+    )
+    merge: Literal["residual", "cross"] = setting(
+        "residual",
+        "How surface normals of all layers become one feature: as in figure 3.4 (residual), or exchanged between both stages"
+        " by interpolation, as in the published code (cross).",
+    )
+    merge_norm: bool = setting(
+        False, "Batch norm in the residual merge; not in the thesis, trains in a fraction of the epochs."
+    )
+    solver: Literal["inverse", "ridge"] = setting(
+        "inverse",
+        "Solver of the surface fit: the closed form of A.1.1 (inverse), or with a term on the diagonal that needs no guard"
+        " (ridge).",
+    )
+    guard: Literal["signed", "release"] = setting(
+        "signed",
+        "What replaces a determinant near 0 in the closed form: 1e-6 with its sign, or as in the published code.",
+    )
+    fusion: Literal["softmax", "logits"] = setting(
+        "softmax", "What is averaged over both streams: probabilities (softmax, the thesis), or logits."
+    )
+    dropout: float = setting(0.0, "Dropout before each head's last layer.", least=0, below=1)
 
     def __post_init__(self) -> None:
-        for name, legal in _LEGAL.items():
-            if getattr(self, name) not in legal:
-                raise UsageError(f"{name} = {getattr(self, name)!r}: expected one of {', '.join(map(str, legal))}")
-        for name, (least, called) in _LEAST.items():
-            if getattr(self, name) < least:
-                raise UsageError(f"{called} {getattr(self, name)}: expected at least {least}")
-        self._check_ranges()
-        self._check_sizes()
-
-    def _check_ranges(self) -> None:
-        if not 0 < self.reduction <= 1:
-            raise UsageError(f"reduction = {self.reduction}: expected a ratio in (0, 1]")
-        if not 0 <= self.dropout < 1:
-            raise UsageError(f"--dropout {self.dropout}: expected a probability in [0, 1)")
-        if not all(0 < radius < float("inf") for radius in self.radii):
-            raise UsageError(f"--radius {self.radii[0]}: expected a number above 0")
-
-    def _check_sizes(self) -> None:
+        if self.num_classes < 1:
+            raise UsageError(f"number of classes {self.num_classes}: expected at least 1")
+        check(self)
         if self.backbone == "pointnet2":
             self._check_centroids()
         if self.xyz_group and self.group_size < 3:
             raise UsageError(
-                f"--group-size {self.group_size}: one group holds the three coordinates (presets quick, tiny, release);"
+                f"group_size = {self.group_size}: one group holds the three coordinates (presets quick, tiny, release);"
                 " expected at least 3, or --preset thesis"
             )
         if self.own_static_groups and self.backbone != "pointnet2":
             raise UsageError(
-                f"--static-temporal-radius {self.static_radius}: {self.backbone}'s one graph serves both streams; leave it out"
+                f"static_temporal_radius = {self.static_radius}: {self.backbone}'s one graph serves both streams; leave it out"
             )
-        self._check_reach("--temporal-radius", self.temporal_radius)
-        self._check_reach("--static-temporal-radius", self.static_radius)
+        self._check_reach("temporal_radius", self.temporal_radius)
+        self._check_reach("static_temporal_radius", self.static_radius)
 
-    def _check_reach(self, option: str, radius: int) -> None:
-        """Whether the frames of a neighborhood have a slot each, and points for all slots."""
+    def _check_reach(self, name: str, radius: int) -> None:
+        """Raises UsageError unless the frames of a neighborhood have a slot each, and points for all slots."""
         reach = 2 * radius + 1
         if self.grouping == "balanced" and self.neighbors < reach:
             raise UsageError(
-                f"{option} {radius}: balanced grouping shares {self.neighbors} neighbors among {reach} frames"
+                f"{name} = {radius}: balanced grouping shares {self.neighbors} neighbors among {reach} frames"
             )
         near = min(reach, self.num_frames) * self.points_per_frame
         if self.neighbors > near:
-            raise UsageError(f"--neighbors {self.neighbors}: the frames within {option} {radius} hold {near} points")
+            raise UsageError(f"neighbors = {self.neighbors}: the frames within {name} = {radius} hold {near} points")
 
     def _check_centroids(self) -> None:
         first, second = self.centroids
-        if not 1 <= second <= first:
-            raise UsageError(f"--centroids {first} {second}: expected two counts, the second not above the first")
+        if second > first:
+            raise UsageError(f"centroids = {first},{second}: expected two counts, the second not above the first")
         have = self.points_per_frame * self.num_frames
         if have < first:
             raise UsageError(
@@ -108,22 +145,23 @@ class KinetConfig:
 
     @property
     def static_radius(self) -> int:
-        """Frames before and after that the static stream's neighborhoods reach."""
+        """The number of frames before and after that the static stream's neighborhoods reach."""
         return self.temporal_radius if self.static_temporal_radius is None else self.static_temporal_radius
 
     @property
     def own_static_groups(self) -> bool:
-        """Whether the static stream has neighborhoods of its own."""
+        """True where the static stream has neighborhoods of its own."""
         return self.static_radius != self.temporal_radius
 
     @property
     def dynamic_head(self) -> tuple[int, int]:
-        """Widths of the dynamic branch's head."""
+        """The widths of the two layers of the dynamic branch's head."""
         return self.head or self.widths[-1]
 
     @classmethod
     def release(cls, **changes: object) -> KinetConfig:
-        """The released code: groups of 3, a raw xyz group, absolute time, projection weights, cross-scale merge, logits."""
+        """Returns the published code's choices, with changes over them: groups of 3 features, a group of raw coordinates, absolute
+        time, weights by projection, a merge across scales, averaged logits."""
         choices = {
             "variant": "release",
             "group_size": 3,
@@ -138,25 +176,29 @@ class KinetConfig:
         return cls(**{**choices, **changes})
 
     def changed(self, **changes: object) -> KinetConfig:
+        """Returns a copy with some fields changed. Raises UsageError where they don't fit."""
         return replace(self, **changes)
 
     def radius_table(self, stage: int, reach: int) -> tuple[float, ...]:
-        """Radius per |dt| = 0..reach: r(d) = 0.5 + 0.1 d / (T-1), doubled in stage 2 (as the release)."""
+        """Returns the spatial radius at each time distance d = 0..reach, r (1 + 0.2 d / (T-1)) with r of the stage, as the published
+        code does."""
         growth = 0.2 * self.radii[stage] / max(self.num_frames - 1, 1)
         return tuple(self.radii[stage] + growth * d for d in range(reach + 1))
 
     def groups(self, width: int) -> int:
-        """Number of feature groups fitted at a layer of this width, the xyz group included."""
+        """Returns the number of feature groups that are fitted at a layer of this width, the group of coordinates included."""
         if self.xyz_group:
             return int(width * self.reduction / self.group_size) + 1
         return max(1, round(width * self.reduction / self.group_size))
 
     def to_json(self) -> str:
+        """Returns all fields as JSON text with sorted keys, as weights files hold them."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> KinetConfig:
-        """Back from `to_json`; DataError on unknown keys, so that a newer file isn't silently misread."""
+        """Returns the configuration that `to_json` wrote. Raises DataError on unknown keys, so that a newer file isn't silently
+        misread, and UsageError for values that don't fit."""
         values = json.loads(text)
         known = {field.name for field in fields(cls)}
         unknown = sorted(set(values) - known)
@@ -168,24 +210,3 @@ class KinetConfig:
             values["head"] = tuple(values["head"])
         values["widths"] = tuple(tuple(pair) for pair in values["widths"])
         return cls(**values)
-
-
-_LEAST = {
-    "num_classes": (1, "number of classes"),
-    "num_frames": (1, "--frames"),
-    "points_per_frame": (1, "--points"),
-    "neighbors": (1, "--neighbors"),
-    "group_size": (1, "--group-size"),
-    "temporal_radius": (0, "--temporal-radius"),
-    "static_radius": (0, "--static-temporal-radius"),
-}
-_LEGAL = {
-    "variant": VARIANTS,
-    "normalize": ("none", "center", "height", "unit", "image"),
-    "grouping": ("first", "nearest", "balanced"),
-    "weighting": ("deviation", "projection", "none"),
-    "merge": ("residual", "cross"),
-    "solver": ("inverse", "ridge"),
-    "guard": ("signed", "release"),
-    "fusion": ("softmax", "logits"),
-}

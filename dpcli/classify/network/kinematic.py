@@ -24,19 +24,25 @@ from dpcli.ops import gather_points
 
 
 class DeviationWeights(nn.Module):
-    """Logits of neighbor weights from deviations by one linear map over groups (eq. 3.8)."""
+    """Computes logits of neighbor weights from deviations by one linear map over groups (eq. 3.8)."""
 
     def __init__(self, previous: int, groups: int) -> None:
         super().__init__()
         self.linear = nn.Linear(previous, groups)
 
     def forward(self, deviations: Tensor) -> Tensor:
-        """deviations (B,M,n,K') -> logits (B,M,n,K); the weights are their sigmoid."""
+        """Returns logits (B,M,n,K) of deviations (B,M,n,K'); the weights are their sigmoid.
+
+        >>> _ = torch.manual_seed(0)
+        >>> weigh = DeviationWeights(previous=2, groups=3)
+        >>> torch.sigmoid(weigh(torch.zeros(1, 5, 4, 2))).shape
+        torch.Size([1, 5, 4, 3])
+        """
         return self.linear(deviations)
 
 
 class ProjectionWeights(nn.Module):
-    """The released form: over groups, then over the projected deviation vector (d+1 -> 2d -> 1)."""
+    """Computes the logits as the published code does: over groups, then over the projected deviation vector (d+1 -> 2d -> 1)."""
 
     def __init__(self, previous: int, groups: int, group_size: int) -> None:
         super().__init__()
@@ -45,21 +51,21 @@ class ProjectionWeights(nn.Module):
         self.out = nn.Linear(2 * group_size, 1)
 
     def forward(self, deviations: Tensor) -> Tensor:
-        """deviations (B,M,n,K',d+1) -> logits (B,M,n,K)."""
+        """Returns logits (B,M,n,K) of deviations (B,M,n,K',d+1)."""
         mixed = torch.relu(self.over_groups(deviations.transpose(-1, -2))).transpose(-1, -2)
         return self.out(torch.relu(self.hidden(mixed)))[..., 0]
 
 
 @dataclass
 class Surface:
-    """What a unit found: normals (B,M,K*(d+1)), or pooled features for Table 3.1 v; deviations (B,M,n,K[,d+1]) or None."""
+    """Holds what a unit found: normals (B,M,K*(d+1)), or pooled features for Table 3.1 v; deviations (B,M,n,K[,d+1]) or None."""
 
     normals: Tensor
     deviations: Tensor | None
 
 
 class KinematicUnit(nn.Module):
-    """One tapped layer: reduce (D_l), group, weight (H_l), fit, normal."""
+    """Fits surfaces to one tapped layer: reduce (D_l), group, weight (H_l), fit, normal (thesis, figure 3.4)."""
 
     def __init__(self, config: KinetConfig, width: int, previous: int) -> None:
         super().__init__()
@@ -76,7 +82,7 @@ class KinematicUnit(nn.Module):
 
     @property
     def channels(self) -> int:
-        """Width of `Surface.normals`."""
+        """The width of `Surface.normals`."""
         return self.groups * (self.config.group_size + 1)
 
     def forward(
@@ -88,8 +94,11 @@ class KinematicUnit(nn.Module):
         previous: Tensor | None,
         last: bool = False,
     ) -> Surface:
-        """activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous deviations; last: nobody
-        wants this unit's deviations."""
+        """Returns the surfaces through the neighbors.
+
+        activation (B,M,n,w), relative (B,M,n,3), times (B,M,n), center_times (B,M), previous: deviations of the unit before;
+        last: no unit follows that wants deviations.
+        """
         config = self.config
         values = torch.cat([activation, times[..., None]], -1) if config.time_input else activation
         if not config.normals:
@@ -107,7 +116,7 @@ class KinematicUnit(nn.Module):
         return Surface(surface_normal(surface).flatten(2), away)
 
     def _pooled(self, values: Tensor, relative: Tensor) -> Surface:
-        """Table 3.1 v: the reduced features' maximum, and the coordinates', in place of normals."""
+        """Returns the reduced features' maximum, and the coordinates', in place of normals (row v of table 3.1)."""
         features = torch.relu(self.reduce(values))
         if self.config.xyz_group:
             features = torch.cat([features, relative], -1)
@@ -116,7 +125,7 @@ class KinematicUnit(nn.Module):
 
 
 class Kinematics(nn.Module):
-    """The dynamic branch over a frozen backbone's stages: a unit for each tapped layer, merge, head."""
+    """Classifies by motion: the dynamic branch over a frozen backbone's stages, with a unit for each tapped layer, merge, head."""
 
     def __init__(self, config: KinetConfig, tap_widths: Sequence[Sequence[int]]) -> None:
         super().__init__()
@@ -131,11 +140,11 @@ class Kinematics(nn.Module):
         he_init(self)
 
     def forward(self, stages: list[Stage]) -> Tensor:
-        """Class logits (B,C) from the backbone's neighborhoods and activations."""
+        """Returns class logits (B,C) from the backbone's neighborhoods and activations."""
         return self.head(stages[-1].grouping.centers, self.features(stages))
 
     def features(self, stages: list[Stage]) -> Tensor:
-        """The merged dynamic feature of every centroid of the last stage, (B,M,C)."""
+        """Returns the merged dynamic feature of every centroid of the last stage, (B,M,C)."""
         surfaces: list[Surface] = []
         previous, units, before = None, iter(self.units), None
         for stage in stages:
@@ -153,7 +162,7 @@ class Kinematics(nn.Module):
         return self.merge([stage.grouping for stage in stages], [surface.normals for surface in surfaces])
 
     def _to_next_stage(self, deviations: Tensor, before: Grouping, group: Grouping) -> Tensor:
-        """Deviations of the next stage's neighbors: those are centroids here, each with a deviation of its own.
+        """Returns the deviations of the next stage's neighbors: those are centroids here, each with a deviation of its own.
 
         The release takes slot 0, whatever point that is; the text means the point itself: the slot nearest to the centroid.
         """

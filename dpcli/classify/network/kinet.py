@@ -13,7 +13,7 @@ STREAMS = ("static", "dynamic")
 
 
 class Kinet(nn.Module):
-    """Both streams. `static_logits` trains the first, `dynamic_logits` the second, `forward` gives both in one pass."""
+    """Holds both streams. `static_logits` trains the first, `dynamic_logits` the second, `forward` gives both in one pass."""
 
     def __init__(self, config: KinetConfig) -> None:
         super().__init__()
@@ -22,18 +22,20 @@ class Kinet(nn.Module):
         self.dynamic = Kinematics(config, self.static.tap_widths)
 
     def group(self, points: Tensor) -> list[Grouping]:
-        """Neighborhoods of a batch of clips: points (B,T,P,3), frame after frame."""
+        """Returns the neighborhoods of a batch of clips: points (B,T,P,3), frame after frame."""
         return self.static.group(*clip_points(points))
 
     def static_logits(self, points: Tensor) -> Tensor:
+        """Returns the static stream's logits (B,C) of clips (B,T,P,3)."""
         return self.static(self.group(points))
 
     def dynamic_logits(self, points: Tensor, groups: list[Grouping] | None = None) -> Tensor:
-        """Gradients reach the dynamic branch only; the static network must be in eval mode. groups: where they are known."""
+        """Returns the dynamic stream's logits (B,C). Gradients reach the dynamic branch only; the static network must be in eval
+        mode. groups: the neighborhoods, where they are known."""
         return self.dynamic(self._stages(points, groups)[0])
 
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """(static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
+        """Returns (static, dynamic) logits, each (B,C), from one pass of the frozen static network."""
         stages, static = self._stages(points)
         return static, self.dynamic(stages)
 
@@ -42,12 +44,12 @@ class Kinet(nn.Module):
         return self.static.taps(self.group(points) if groups is None else groups)
 
     def freeze_static(self) -> None:
-        """Stop the static stream's gradients and keep its batch norms at their running statistics."""
+        """Stops the static stream's gradients and keeps its batch norms at their running statistics."""
         self.static.requires_grad_(False).eval()
 
 
 def fuse(static: Tensor, dynamic: Tensor, rule: str) -> Tensor:
-    """Class probabilities of both streams together: mean of softmax scores (thesis), or softmax of mean logits (release)."""
+    """Returns the class probabilities of both streams together: mean of softmax scores (thesis), or softmax of mean logits (release)."""
     if rule == "logits":
         return torch.softmax((static + dynamic) / 2, -1)
     return (torch.softmax(static, -1) + torch.softmax(dynamic, -1)) / 2

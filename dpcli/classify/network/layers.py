@@ -11,7 +11,7 @@ from dpcli.ops.grouped_mlp import Norm, grouped_mlp
 
 
 class SharedLayers(nn.Module):
-    """Two linear layers shared by all neighbors, each with batch norm and ReLU, over [relative xyz, feature]."""
+    """Applies two linear layers shared by all neighbors, each with batch norm and ReLU, over [relative xyz, feature]."""
 
     def __init__(self, inputs: int, widths: tuple[int, int]) -> None:
         super().__init__()
@@ -29,7 +29,7 @@ class SharedLayers(nn.Module):
         return Norm(norm.weight, norm.bias, mean, var, norm.eps)
 
     def pool(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
-        """Maximum over the neighbors, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
+        """Returns the maximum over the neighbors, (B,M,C2); arguments as `grouped_mlp`. Training updates the running statistics."""
         if self.training and isinstance(self.norm1, SyncNorm):
             return self._pool_together(points, centers, idx, features)
         pooled, statistics = grouped_mlp(points, centers, idx, features, *self._arguments())
@@ -38,7 +38,7 @@ class SharedLayers(nn.Module):
         return pooled
 
     def _pool_together(self, points: Tensor, centers: Tensor, idx: Tensor, features: Tensor | None) -> Tensor:
-        """`pool` layer by layer: between layers the processes of a shared run exchange their statistics."""
+        """Computes `pool` layer by layer: between layers the processes of a shared run exchange their statistics."""
         values = gather_points(points, idx) - centers[:, :, None]
         if features is not None:
             values = torch.cat([values, gather_points(features, idx)], -1)
@@ -54,7 +54,7 @@ class SharedLayers(nn.Module):
 
 
 class GlobalHead(SharedLayers):
-    """[xyz, feature] of every centroid -> two shared layers -> max over the clip -> class logits."""
+    """Computes class logits: [xyz, feature] of every centroid -> two shared layers -> max over the clip -> linear."""
 
     def __init__(self, inputs: int, widths: tuple[int, int], classes: int, dropout: float) -> None:
         super().__init__(inputs, widths)
@@ -62,7 +62,7 @@ class GlobalHead(SharedLayers):
         self.classify = nn.Linear(widths[1], classes)
 
     def embed(self, centers: Tensor, features: Tensor) -> Tensor:
-        """The clip's feature vector, (B, widths[1])."""
+        """Returns the clip's feature vector, (B, widths[1])."""
         batch, count = centers.shape[:2]
         if self.training:  # as one group: its center is the origin, its neighbors are all centroids
             everyone = torch.arange(count, device=centers.device).expand(batch, 1, count)
@@ -72,11 +72,13 @@ class GlobalHead(SharedLayers):
         return torch.relu_(self.norm2(self.linear2(hidden))).view(batch, count, -1).amax(1)
 
     def forward(self, centers: Tensor, features: Tensor) -> Tensor:
+        """Returns the class logits (B,C) of centers (B,M,3) with features (B,M,F)."""
         return self.classify(self.dropout(self.embed(centers, features)))
 
 
 def he_init(module: nn.Module) -> None:
-    """Variance-scaling initialization of every linear layer (fan-in, factor 2, truncated normal), zero biases."""
+    """Gives every linear layer a variance-scaling initialization (fan-in, factor 2, truncated normal; He et al., 2015) and zero
+    biases."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.trunc_normal_(layer.weight, std=(2 / layer.in_features) ** 0.5)

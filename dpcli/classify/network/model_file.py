@@ -17,7 +17,7 @@ from dpcli.runtime.weights import find_weights, load_state, load_weights, save_w
 
 @dataclass
 class ModelInfo:
-    """What a model file says of itself beside the weights."""
+    """Holds what a model file says of itself beside the weights."""
 
     config: KinetConfig
     class_names: list[str]
@@ -30,7 +30,7 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
-    """Weights as float32; configuration, class names and notes in the header."""
+    """Writes the weights as float32; configuration, class names and notes in the header."""
     header = {
         "format": _FORMAT,
         "config": info.config.to_json(),
@@ -42,15 +42,16 @@ def save_model(path: Path, model: nn.Module, info: ModelInfo) -> None:
 
 
 def find_model(name: str | Path, option: str = "--model") -> Path:
-    """Returns a model's file, as `find_weights`: of a path, a training folder or a shipped name. UsageError if there is none."""
+    """Returns a model's file: a path, `best.safetensors` of a training folder, or a shipped name. Raises UsageError when there is none."""
     return find_weights(name, SHIPPED, _MAKER, option)
 
 
 def load_model(name: str | Path, backbone: str | None = None) -> tuple[Kinet, ModelInfo]:
     """Returns a Kinet in eval mode; name: what `find_model` found or takes.
 
-    DataError when the file is not one of ours or its weights don't fit its configuration. A model
-    on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
+    Raises DataError when the file is not one of ours or its weights don't fit its configuration.
+
+    A model on a user's own backbone (`module:Class`) needs that name typed again: a weights file must not have code run.
     """
     path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)

@@ -1,4 +1,4 @@
-"""How the units' normals become one feature per stage-2 centroid: as the thesis says, or as the released code does."""
+"""The merge of all units' normals into one feature per stage-2 centroid: as the thesis says, or as the published code does."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from dpcli.ops import gather_mean, three_nn_interpolate
 
 
 class ResidualMerge(nn.Module):
-    """h_l = relu(C_l n_l + R_l h_{l-1}) (thesis figure 3.4).
+    """Computes h_l = relu(C_l n_l + R_l h_{l-1}) (thesis, figure 3.4).
 
     Where a unit's centroids are the next stage's neighbors, h is averaged over the neighborhood first: a single normal
     is noisy, and a maximum would pick the noise. With `norm` the sum is batch-normalized before the ReLU.
@@ -30,6 +30,7 @@ class ResidualMerge(nn.Module):
         self.channels = widths[-1]
 
     def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
+        """Returns the merged feature (B,M,C) of the last stage's centroids. normals: those of each unit, (B,M,K*(d+1))."""
         state = self._activate(0, self.abstract[0](normals[0]))
         for level in range(1, len(normals)):
             stage = self.stage_of[level]
@@ -43,7 +44,7 @@ class ResidualMerge(nn.Module):
 
 
 class CrossMerge(nn.Module):
-    """The released code: at each level both stages see their own and, by 3-NN interpolation, the other's features.
+    """Merges as the published code does: at each level both stages see their own and, by 3-NN interpolation, the other's features.
 
     Every input carries its centroid's frame number as one more channel. Only stage 2's last output is used, so the weights
     `cross.1.0` never act; they stay because the released model has (and counts) them.
@@ -60,6 +61,7 @@ class CrossMerge(nn.Module):
         self.channels = second[-1]
 
     def forward(self, groups: list[Grouping], normals: list[Tensor]) -> Tensor:
+        """Returns the merged feature (B,M,C) of the last stage's centroids. normals: those of each unit, (B,M,K*(d+1))."""
         times = [group.center_times[..., None] for group in groups]
         states: list[Tensor] = []
         for level in range(2):
@@ -79,11 +81,11 @@ class CrossMerge(nn.Module):
 def build_merge(
     config: KinetConfig, tap_widths: Sequence[Sequence[int]], channels: list[int]
 ) -> ResidualMerge | CrossMerge:
-    """The merge that `config.merge` names, for units with these normal widths."""
+    """Returns the merge that `config.merge` names, for units with these normal widths."""
     if config.merge == "residual":
         return ResidualMerge(channels, tap_widths, config.merge_norm)
     if [len(stage) for stage in tap_widths] != [2, 2]:
         raise UsageError(
-            f"--variant release with --backbone {config.backbone}: its merge pairs two stages of two layers; use --variant thesis"
+            f"merge = cross with backbone = {config.backbone}: it pairs two stages of two layers; leave it out"
         )
     return CrossMerge(channels)

@@ -17,7 +17,7 @@ from torch import Tensor
 from dpcli.classify.network.st_surface import deviations, fit_surface, solve_rule
 from dpcli.ops.backend import chosen_backend
 from dpcli.ops.cpu.cache_blocks import TASKS, ranges, share_tasks, steps
-from dpcli.ops.small_inverses import KERNEL_SIZE
+from dpcli.ops.small_inverses import GUARDS, KERNEL_SIZE, mend_guarded_gradients
 from dpcli.runtime.mixed_precision import is_reduced
 
 _PIECE = 1 << 20  # bytes of reduced features
@@ -27,7 +27,7 @@ _NOTHING = np.empty(0, np.float32)
 
 @dataclass(frozen=True)
 class Fit:
-    """How planes are fitted: groups of `size` features, and `fit_surface`'s solver and guard."""
+    """Says how planes are fitted: groups of `size` features, and `fit_surface`'s solver and guard."""
 
     size: int
     solver: str = "inverse"
@@ -43,7 +43,7 @@ def fit_reduced(
     logits: Tensor | None,  # (B,M,n,K)
     fit: Fit,
 ) -> tuple[Tensor, Tensor | None]:
-    """Planes A f + b = t through K groups of d features f of each centroid's n neighbors (thesis eq. 3.5, 3.6).
+    """Fits planes A f + b = t through K groups of d features f of each centroid's n neighbors (thesis eq. 3.5, 3.6).
 
     f = relu(W a + b') of the activation a, in L groups; with `relative` one more, the neighbor's coordinates (and zeros,
     where d > 3). A neighbor weighs sigmoid(logits), or 1. Returns the coefficients [A, b] (B,M,K,d+1) and the deviations
@@ -73,7 +73,7 @@ def fit_reduced_reference(
     logits: Tensor | None,
     fit: Fit,
 ) -> tuple[Tensor, Tensor | None]:
-    """`fit_reduced` layer by layer."""
+    """Computes `fit_reduced` layer by layer."""
     features = torch.relu(torch.nn.functional.linear(activation, *linear))
     if relative is not None:
         padding = relative.new_zeros(*relative.shape[:-1], fit.size - 3)
@@ -100,15 +100,17 @@ class _Layout:
 
     @property
     def used(self) -> int:
+        """The number of groups that hold something."""
         return self.learned + self.coordinates
 
     @property
     def groups(self) -> int:
+        """The number of groups, those included that only fill up."""
         return -(-self.used // _LANES) * _LANES
 
     @property
     def width(self) -> int:
-        """Of a row of features."""
+        """The number of columns of a row of features."""
         return self.size * self.groups
 
     @property
@@ -124,14 +126,14 @@ class _Layout:
 
     @cached_property
     def floor(self) -> np.ndarray:
-        """What a feature of each group is at least: ReLU's 0, or for coordinates anything."""
+        """Returns the least value that a feature of each group may have: ReLU's 0, or for coordinates any."""
         floor = np.zeros(self.groups, np.float32)
         floor[self.learned : self.used] = np.finfo(np.float32).min
         return floor
 
     @cached_property
     def places(self) -> np.ndarray:
-        """Where a fit's normal matrix (d+1,d+1) and right side (d+1) stand among its entries: (d+1,d+2) i64."""
+        """Returns the places where a fit's normal matrix (d+1,d+1) and right side (d+1) stand among its entries: (d+1,d+2) i64."""
         size = self.size
         starts = np.cumsum([0, *(a + 3 for a in range(size))])  # a's products with 0..a, with 1, with the time
         places = np.empty((size + 1, size + 2), np.int64)
@@ -144,7 +146,7 @@ class _Layout:
 
 
 class _Case:
-    """A call's inputs and sizes, and what is made of the inputs on the way to the planes."""
+    """Holds a call's inputs and sizes, and what is made of the inputs on the way to the planes."""
 
     def __init__(self, tensors: tuple[Tensor | None, ...], neighbors: int, layout: _Layout, fit: Fit) -> None:
         from dpcli.ops.cpu import small_inverses as kernels_linalg
@@ -162,23 +164,23 @@ class _Case:
         self.sizes = (layout.size, layout.groups, neighbors)
 
     def rows(self, low: int, high: int) -> slice:
-        """The rows of centroids low..high-1."""
+        """Returns the rows of centroids low..high-1."""
         return slice(low * self.neighbors, high * self.neighbors)
 
     def made(self, centroids: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Room for the features, weights and moments of so many centroids."""
+        """Returns room for the features, weights and moments of so many centroids."""
         rows, groups = centroids * self.neighbors, self.layout.groups
         weights = torch.empty(rows if len(self.logits) else 0, groups)
         return torch.empty(rows, self.layout.width), weights, torch.empty(centroids, self.layout.entries, groups)
 
     def parts(self, made: tuple[Tensor, Tensor, Tensor], low: int, high: int) -> tuple[Tensor, Tensor, Tensor]:
-        """What was made of centroids low..high-1."""
+        """Returns what was made of centroids low..high-1."""
         features, weights, moments = made
         rows = self.rows(low, high)
         return features[rows], weights[rows], moments[low:high]
 
     def begin(self, low: int, high: int, made: tuple[Tensor, Tensor, Tensor]) -> None:
-        """Activated features, weights and moments of a piece, into its part of `made`."""
+        """Writes the activated features, weights and moments of a piece into its part of `made`."""
         rows, groups = self.rows(low, high), self.layout.groups
         torch.mm(self.activation[rows], self.weight, out=made[0])
         features, weights, moments = map(_flat, made)
@@ -195,22 +197,35 @@ class _Case:
             *self.sizes,
         )
 
+    def mend(self, moment: np.ndarray, to_plane: np.ndarray, to_matrix: np.ndarray, moved: np.ndarray) -> None:
+        """Sets the gradients of the fits of a piece whose determinant the guard moved."""
+        groups, size = self.layout.groups, self.layout.size + 1
+        mend_guarded_gradients(
+            moment.reshape(-1, self.layout.entries, groups),
+            self.layout.places,
+            (self.rule[3], GUARDS[self.rule[4]]),
+            to_plane.reshape(-1, size, groups),
+            to_matrix.reshape(-1, size, size, groups),
+            moved.reshape(-1, groups),
+        )
+
 
 def _flat(tensor: Tensor) -> np.ndarray:
     return tensor.contiguous().numpy().reshape(-1)
 
 
 def _cut(flat: np.ndarray, rows: slice, width: int) -> np.ndarray:
-    """Some rows of a flat array; nothing of nothing."""
+    """Returns some rows of a flat array; nothing of nothing."""
     return flat[rows.start * width : rows.stop * width]
 
 
 class _SurfaceFit(torch.autograd.Function):
-    """activation (R,C), weight (width,C), bias (width), near (R,3), times (R), logits (R,groups) -> planes (M,d+1,groups)
+    """Maps activation (R,C), weight (width,C), bias (width), near (R,3), times (R), logits (R,groups) -> planes (M,d+1,groups)
     and deviations (R,groups), or (0)."""
 
     @staticmethod
     def forward(ctx, activation, weight, bias, near, times, logits, neighbors, layout, fit):
+        """Computes the result, and keeps what the gradient needs."""
         tensors = tuple(
             None if one is None else one.detach() for one in (activation, weight, bias, near, times, logits)
         )
@@ -221,6 +236,7 @@ class _SurfaceFit(torch.autograd.Function):
         kept = case.made(case.count) if any(ctx.needs_input_grad) else None
 
         def work(_: int, piece: tuple[int, int], room: tuple[Tensor, Tensor, Tensor] | None) -> None:
+            """Goes through a piece of the centroids in a thread."""
             made = case.parts(room or kept, *((0, piece[1] - piece[0]) if room else piece))
             case.begin(*piece, made)
             found, rows = _flat(planes[slice(*piece)]), case.rows(*piece)
@@ -239,6 +255,7 @@ class _SurfaceFit(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad_planes, grad_away):
+        """Returns the gradients of the inputs."""
         *tensors, planes, features, weights, moments = ctx.saved_tensors
         case, layout, made = _Case(tuple(tensors), *ctx.rest), ctx.rest[1], (features, weights, moments)
         to_planes, to_away = _flat(grad_planes), _NOTHING if grad_away is None else _flat(grad_away)
@@ -248,16 +265,18 @@ class _SurfaceFit(torch.autograd.Function):
         sums = [(torch.zeros_like(tensors[1]), torch.zeros(1, layout.width)) for _ in tasks]
 
         def work(number: int, task: tuple[int, int], room: _Gradients) -> None:
+            """Goes through a piece of the centroids in a thread."""
             to_weight, to_bias = sums[number]
             for low, high in steps(*task, case.step):
                 rows, (some, weight, moment) = case.rows(low, high), map(_flat, case.parts(made, low, high))
                 plane = slice(*(end * (layout.size + 1) * layout.groups for end in (low, high)))
                 away = _cut(to_away, rows, layout.groups)
-                to_plane, to_matrix, to_right = room.of_fits(high - low)
+                to_plane, to_matrix, to_right, moved = room.of_fits(high - low)
                 to_plane[:] = to_planes[plane]
                 if len(away):
                     case.row_kernels.deviation_back(some, away, to_plane, *case.sizes)
-                case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right)
+                case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right, moved)
+                case.mend(moment, to_plane, to_matrix, moved)
                 to_features = room.features[: rows.stop - rows.start]
                 case.row_kernels.fit_back(
                     some,
@@ -280,19 +299,22 @@ class _SurfaceFit(torch.autograd.Function):
 
 
 class _Gradients:
-    """Where a thread puts the gradients of its piece."""
+    """Holds the gradients of a thread's piece."""
 
     def __init__(self, case: _Case) -> None:
         rows, self.size = case.step * case.neighbors, (case.layout.size + 1) * case.layout.groups
         self.features, self.ones = torch.empty(rows, case.layout.width), torch.ones(1, rows)
         self.planes, self.right = (np.empty(case.step * self.size, np.float32) for _ in range(2))
         self.matrix = np.empty(case.step * self.size * (case.layout.size + 1), np.float32)
+        self.moved, self.groups = np.empty(case.step * case.layout.groups, np.bool_), case.layout.groups
 
-    def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For so many centroids: of their planes, normal matrices and right sides."""
+    def of_fits(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Returns room for the gradients of so many centroids' planes, normal matrices and right sides, and for which of
+        their determinants a guard moved."""
         numbers = count * self.size
         return (
             self.planes[:numbers],
             self.matrix[: numbers * len(self.matrix) // len(self.planes)],
             self.right[:numbers],
+            self.moved[: count * self.groups],
         )

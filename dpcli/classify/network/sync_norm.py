@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 
 class SyncNorm(nn.BatchNorm1d):
-    """BatchNorm1d whose training statistics are those of all processes' rows together: (R,C), (B,C,L) or (B,C,H,W)."""
+    """Normalizes as a BatchNorm1d whose training statistics are those of all processes' rows together: (R,C), (B,C,L) or (B,C,H,W)."""
 
     def forward(self, values: Tensor) -> Tensor:
+        """Returns the normalized values, of the same shape."""
         if not self.training:
             return nn.functional.batch_norm(
                 values, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps
@@ -36,16 +37,18 @@ class SyncNorm(nn.BatchNorm1d):
 
 
 class _Sum(torch.autograd.Function):
-    """Sum over processes; its gradient is the sum of the processes' gradients."""
+    """Computes a sum over processes; its gradient is the sum of the processes' gradients."""
 
     @staticmethod
     def forward(ctx, values: Tensor) -> Tensor:
+        """Computes the result, and keeps what the gradient needs."""
         total = values.clone()
         dist.all_reduce(total)
         return total
 
     @staticmethod
     def backward(ctx, gradient: Tensor) -> Tensor:
+        """Returns the gradients of the inputs."""
         total = gradient.clone()
         dist.all_reduce(total)
         return total
@@ -56,7 +59,7 @@ def _summed(values: Tensor) -> Tensor:
 
 
 def synchronize_norms(module: nn.Module) -> nn.Module:
-    """Replace every batch norm inside by one over all processes, with the same parameters, statistics and names."""
+    """Replaces every batch norm inside by one over all processes, with the same parameters, statistics and names."""
     for name, child in module.named_children():
         if isinstance(child, nn.modules.batchnorm._BatchNorm) and not isinstance(child, SyncNorm):
             shared = SyncNorm(child.num_features, child.eps, child.momentum).train(child.training)

@@ -25,7 +25,7 @@ _RECIPE = "expected frames written one after another by numpy.save(pipe, points)
 
 @dataclass(frozen=True)
 class CloudFiles:
-    """How to read the files of a folder: which suffixes, in which order, and the points (N,3) of one."""
+    """Says how to read the files of a folder: which suffixes, in which order, and the points (N,3) of one."""
 
     suffixes: tuple[str, ...]
     order: Callable[[Path], list]
@@ -33,7 +33,7 @@ class CloudFiles:
 
 
 def open_frames(argument: str, follow: float, files: CloudFiles) -> Iterator[np.ndarray]:
-    """Frames f32 (P,3) of `-` (stdin), a file or a folder, each as soon as it is whole.
+    """Yields frames f32 (P,3) of `-` (stdin), a file or a folder, each as soon as it is whole.
 
     `follow`: seconds to wait for more at the end of a file or folder; a pipe ends when its writer closes it. Raises
     UsageError or DataError at once for what can't be read, DataError from the iterator for a bad frame.
@@ -60,7 +60,7 @@ def _file_frames(path: Path, follow: float) -> Iterator[np.ndarray]:
 
 
 class _Bytes:
-    """A descriptor as the `read(count)` numpy's header parser wants. Unbuffered: a buffer's lock would be held while
+    """Reads a descriptor with the `read(count)` that numpy's header parser wants. Unbuffered: a buffer's lock would be held while
     waiting, and the interpreter can't end while another thread holds stdin's."""
 
     def __init__(self, descriptor: int, follow: float) -> None:
@@ -68,7 +68,7 @@ class _Bytes:
         self.follow = follow if stat.S_ISREG(os.fstat(descriptor).st_mode) else 0.0
 
     def read(self, count: int) -> bytes:
-        """`count` bytes; fewer, with `ended` set, when no more came for `follow` seconds."""
+        """Returns `count` bytes; fewer, with `ended` set, when no more came for `follow` seconds."""
         pieces, missing, last = [], count, time.monotonic()
         while missing and not self.ended:
             piece = os.read(self.descriptor, min(missing, _PIECE))
@@ -85,7 +85,7 @@ class _Bytes:
 
 
 def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.ndarray]:
-    """The arrays of a concatenation of `.npy` files as frames f32 (P,3); DataError names the frame and what is wrong."""
+    """Yields the arrays of a concatenation of `.npy` files as frames f32 (P,3); raises DataError names the frame and what is wrong."""
     source, number = _Bytes(descriptor, follow), 0
     while True:
         where, start = f"{name}: frame {number}", source.position
@@ -105,7 +105,7 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.
 
 
 def _header(source: _Bytes, magic: bytes, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Shape, Fortran order and dtype of the array that follows, checked before any of it is read."""
+    """Returns shape, Fortran order and dtype of the array that follows, checked before any of it is read."""
     _check_whole(source, where)
     if magic[6:] != b"\x01\x00":  # later versions are for headers of more than 64 kB, which no plain array has
         raise DataError(f"{where}: .npy version {magic[6]}.{magic[7]}, expected 1.0; {_RECIPE}")
@@ -129,7 +129,7 @@ def _check_whole(source: _Bytes, where: str) -> None:
 
 
 def as_frame(points: np.ndarray, where: str) -> np.ndarray:
-    """Points as f32 (P,3) of their own; DataError unless they are finite."""
+    """Returns points as f32 (P,3) of their own. Raises DataError unless they are finite."""
     with np.errstate(over="ignore"):
         frame = np.array(points, np.float32, order="C")
     bad = int((~np.isfinite(frame)).any(1).sum())
@@ -139,7 +139,7 @@ def as_frame(points: np.ndarray, where: str) -> np.ndarray:
 
 
 def _folder_frames(folder: Path, follow: float, files: CloudFiles) -> Iterator[np.ndarray]:
-    """Files in name order, the newest once it has settled; ends when none came for `follow` seconds."""
+    """Yields files in name order, the newest once it has settled; ends when none came for `follow` seconds."""
     taken, last, since, told = 0, None, time.monotonic(), False
     while True:
         paths = [p for p in folder.iterdir() if p.suffix.lower() in files.suffixes and not p.name.startswith(".")]
@@ -159,7 +159,7 @@ def _folder_frames(folder: Path, follow: float, files: CloudFiles) -> Iterator[n
 
 
 def _settled(path: Path, deadline: float) -> bool:
-    """Whether the file is not empty and stays as it is for a moment; after the deadline it is taken as it is."""
+    """Returns whether the file is not empty and stays as it is for a moment; after the deadline it is taken as it is."""
     before = path.stat()
     time.sleep(_SETTLED)
     after = path.stat()

@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.runtime.signals import StopRequest
 
 
-class Feed:
+class ReadAhead:
     """Reads frames in a thread of its own, at most `room` ahead; then the writer is held back. Nothing is dropped."""
 
     def __init__(self, frames: Iterator[np.ndarray], room: int) -> None:
@@ -43,7 +43,7 @@ class Feed:
         return self._queue.qsize()
 
     def frames(self, stop: StopRequest) -> Iterator[tuple[np.ndarray, float]]:
-        """(points, time.monotonic() at arrival) until the stream ends or a stop is asked for."""
+        """Yields (points, time.monotonic() at arrival) until the stream ends or a stop is asked for."""
         while not stop.requested:
             try:
                 item = self._queue.get(timeout=0.1)
@@ -56,4 +56,5 @@ class Feed:
             yield item
 
     def close(self) -> None:
+        """Ends the thread once it looks up; what it has read is dropped."""
         self._closed.set()

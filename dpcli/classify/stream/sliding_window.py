@@ -20,7 +20,7 @@ from dpcli.store import CloudSequence
 
 
 class Window:
-    """The last `size` frames of one video without end, read by number as from a `clouds` file: what ClipSource asks for."""
+    """Holds the last `size` frames of one video without end, read by number as from a `clouds` file: what ClipSource asks for."""
 
     names, path = ("stream",), Path("stream")
 
@@ -30,7 +30,7 @@ class Window:
         self.count = 0  # frames so far
 
     def append(self, points: np.ndarray) -> None:
-        """The next frame, f32 (P,3); the oldest one leaves."""
+        """Takes the next frame, f32 (P,3); the oldest one leaves."""
         self._frames.append(points)
         self.count += 1
 
@@ -39,17 +39,18 @@ class Window:
 
     @property
     def frame_counts(self) -> list[int]:
+        """The frames of each video, as a reader says them: of this one, those so far."""
         return [self.count]
 
     def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
-        """Frames by their number in the stream; they must still be in the window."""
+        """Returns frames by their number in the stream; they must still be in the window."""
         first = self.count - len(self._frames)
         return CloudSequence.from_frames(self.names[sequence], [self._frames[t - first] for t in frames])
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """After frame number `frame` (from 0): probabilities f32 (1+S,C) of the window and their mean over all clips so far.
+    """Holds, after frame number `frame` (from 0), the probabilities f32 (1+S,C) of the window and their mean over all clips.
 
     Rows: fused, then each of the S streams that were trained.
     """
@@ -61,7 +62,10 @@ class Prediction:
 
 
 def window_size(info: ModelInfo, window: int | None) -> int:
-    """Frames looked back at: a clip for a model of consecutive frames, else `window`, over which its frames are spread."""
+    """Returns how many frames to look back at: a clip for a model of consecutive frames, else `window`, over which its frames spread.
+
+    Raises UsageError for a window that the model can't use.
+    """
     needed = info.config.num_frames
     if info.timing != "uniform":
         if window not in (None, needed):
@@ -78,7 +82,7 @@ def window_size(info: ModelInfo, window: int | None) -> int:
 
 
 class StreamPredictor:
-    """Frames in, a Prediction every `hop` frames out, the first when the window is full. Memory does not grow.
+    """Predicts every `hop` frames, first when the window is full. Memory does not grow.
 
     The points drawn depend on the seed and the frames' numbers, as in `ClipSource.load` for a file's first video: with hop 1
     these are the clips that batch prediction takes, and the last `mean` is the video's score.
@@ -104,27 +108,27 @@ class StreamPredictor:
         self._sum = np.zeros((1 + len(self.streams), info.config.num_classes))
 
     def warm_up(self) -> None:
-        """One made-up clip: loading kernels takes a second that the first prediction need not wait for."""
+        """Predicts one made-up clip: loading kernels takes a second that the first prediction need not wait for."""
         shape = (1, self.info.config.num_frames, self.info.config.points_per_frame, 3)
         self._scores(torch.from_numpy(generator(0).random(shape, np.float32)))
 
     def add(self, points: np.ndarray) -> Prediction | None:
-        """Take a frame f32 (P,3); the prediction when one is due."""
+        """Takes a frame f32 (P,3); returns the prediction when one is due."""
         self.window.append(points)
         since_full = self.window.count - self.window.size
         return self._predict() if since_full >= 0 and since_full % self.hop == 0 else None
 
     def finish(self) -> Prediction | None:
-        """At the end: the prediction of a stream too short for one window, its last frame held as batch prediction does."""
+        """Returns, at the end, the prediction of a stream too short for one window, its last frame held as batch prediction does."""
         return self._predict() if self.window.count and not self.clips else None
 
     @property
     def mean(self) -> np.ndarray:
-        """Probabilities f32 (1+S,C) averaged over all clips so far."""
+        """The probabilities f32 (1+S,C) averaged over all clips so far."""
         return (self._sum / max(self.clips, 1)).astype(np.float32)
 
     def clip(self) -> Clip:
-        """The clip that ends at the newest frame, by frame numbers."""
+        """Returns the clip that ends at the newest frame, by frame numbers."""
         count, frames = self.window.count, self.info.config.num_frames
         first = count - len(self.window)
         if self.info.timing == "uniform":

@@ -1,7 +1,7 @@
 """Neighborhoods of clips that training comes back to: searched once, then read from a nameless file of the run folder.
 
 A static network is frozen while the dynamic stream learns, and what it groups follows from a clip's points alone. Where an
-epoch shows one of a few fixed draws of every clip (`train --draws`), its neighborhoods are those of the draw's first time.
+epoch shows one of a few fixed draws of every clip (the setting `draws`), its neighborhoods are those of the draw's first time.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Search = Callable[[Tensor], list[Grouping]]
 
 
 class NeighborCache:
-    """What `search` finds for each of `clips` numbered clips of one shape: centroids and indices of neighbors, on disk.
+    """Keeps what `search` finds for each of `clips` numbered clips of one shape: centroids and indices of neighbors, on disk.
 
     Memory: a byte a clip. The file has no name and goes with the process, killed or not; a run that is continued fills a new
-    one. DiskFull (with a sentence) at the first batch when `folder` has no room for it.
+    one. Raises DiskFull (with a sentence) at the first batch when `folder` has no room for it.
     """
 
     def __init__(self, search: Search, folder: Path, clips: int) -> None:
@@ -37,7 +37,7 @@ class NeighborCache:
         self._records = np.empty(0)
 
     def __call__(self, points: Tensor, clips: Tensor) -> list[Grouping]:
-        """Neighborhoods of a batch, points (B,T,P,3) and clips i64 (B), their numbers: equal to `search(points)`."""
+        """Returns the neighborhoods of a batch, points (B,T,P,3) and clips i64 (B), their numbers: equal to `search(points)`."""
         numbers = clips.cpu().numpy()
         new = np.flatnonzero(~self._known[numbers])
         if len(new):
@@ -82,7 +82,7 @@ class NeighborCache:
 
 @dataclass(frozen=True)
 class _Source:
-    """Where a stage's points come from (the clip, else the stage before), and whether each of them is a centroid."""
+    """Says whether a stage's points come from the clip (else from the stage before), and whether each of them is a centroid."""
 
     of_clip: bool
     all_points: bool
@@ -95,8 +95,8 @@ def _sources(cloud: tuple[Tensor, Tensor], groups: list[Grouping]) -> list[_Sour
         own, centers = (group.points, group.times), (group.centers, group.center_times)
         if not (_same(own, cloud) or (before is not None and _same(own, before))):
             raise UsageError(
-                "--draws: this backbone groups points that are neither the clip's nor the centroids of the stage before,"
-                " so its neighborhoods can't be kept; leave out --draws"
+                "draws: this backbone groups points that are neither the clip's nor the centroids of the stage before,"
+                " so its neighborhoods can't be kept; leave it out"
             )
         found.append(_Source(_same(own, cloud), _same(centers, own)))
         before = centers
@@ -108,7 +108,7 @@ def _same(some: tuple[Tensor, Tensor], others: tuple[Tensor, Tensor]) -> bool:
 
 
 def _stored(groups: list[Grouping], sources: list[_Source]) -> dict[str, tuple[Tensor, str]]:
-    """What of the groups is kept, by field, and as what type: indices in two bytes where they fit."""
+    """Returns what of the groups is kept, by field, and as what type: indices in two bytes where they fit."""
     fields: dict[str, tuple[Tensor, str]] = {}
     for stage, (group, source) in enumerate(zip(groups, sources)):
         if not source.all_points:

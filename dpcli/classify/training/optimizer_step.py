@@ -1,4 +1,4 @@
-"""One optimizer step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
+"""An optimizer step of a stage: parts of a batch, mixed precision, several processes, a loss that runs away."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from dpcli.classify.network.sync_norm import synchronize_norms
 from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.schedule import Schedule
 from dpcli.runtime.distributed import Processes
-from dpcli.runtime.mixed_precision import reduced_products
+from dpcli.runtime.mixed_precision import reduced_products, wanted
 
 _PATIENCE = 5  # steps without a finite loss or gradient before a run counts as lost
 _RUNAWAY = 10  # times the loss of guessing
 
 
 class _Logits(nn.Module):
-    """The branch that a stage trains, as one module whose parameters are that branch's alone."""
+    """Computes the logits of the branch that a stage trains, as one module whose parameters are that branch's alone."""
 
     def __init__(self, model: Kinet, stage: int) -> None:
         super().__init__()
@@ -31,6 +31,7 @@ class _Logits(nn.Module):
         self._logits = [model.static_logits if stage == 0 else model.dynamic_logits]  # in a list: not a submodule
 
     def forward(self, points: Tensor, *groups: list[Grouping]) -> Tensor:
+        """Returns the logits (b,C) of points (b,T,P,3), by groups where they are known."""
         return self._logits[0](points, *groups)
 
 
@@ -43,7 +44,7 @@ class LossWatch:
     mean: float = field(default=math.nan)
 
     def see(self, loss: float, stepped: bool) -> str | None:
-        """After each step; a sentence once it is time to stop. stepped: the gradient was finite."""
+        """Takes the loss after each step; returns a sentence once it is time to stop. stepped: the gradient was finite."""
         self.lost = 0 if stepped and math.isfinite(loss) else self.lost + 1
         if self.lost >= _PATIENCE:
             return f"no finite loss or gradient in {_PATIENCE} steps on end"
@@ -58,7 +59,7 @@ class LossWatch:
 
 
 class StageStep:
-    """Optimizer and forward pass of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
+    """Takes optimizer steps of one stage (0 static, 1 dynamic); called with a process's clips of a batch."""
 
     def __init__(
         self,
@@ -70,7 +71,7 @@ class StageStep:
         neighbors: NeighborCache | None = None,
     ) -> None:
         self.schedule, self.device, self.processes = schedule, device, processes
-        self.neighbors = neighbors
+        self.amp, self.neighbors = wanted(schedule.amp, device), neighbors
         module = _Logits(model, stage)
         if processes.count > 1:
             synchronize_norms(module)
@@ -83,7 +84,8 @@ class StageStep:
     def __call__(
         self, points: Tensor, labels: Tensor, rate: float, clips: Tensor | None = None
     ) -> tuple[float, int, bool]:
-        """points (b,T,P,3), labels (b), learning rate -> (sum of losses, rightly classified, whether weights were changed).
+        """Takes a step on points (b,T,P,3) with labels (b) at a learning rate; returns the sum of losses, how many are rightly
+        classified, and whether weights were changed.
 
         clips i64 (b): numbers by which `neighbors` knows them.
         """
@@ -107,7 +109,7 @@ class StageStep:
 
     def _backward(self, points: Tensor, labels: Tensor, which: list[Tensor], clips: int) -> tuple[float, int]:
         groups = [self.neighbors(points, *which)] if self.neighbors is not None and which else []
-        with reduced_products(self.device, self.schedule.amp):
+        with reduced_products(self.device, self.amp):
             logits = self.module(points, *groups).float()
         loss = nn.functional.cross_entropy(
             logits, labels, label_smoothing=self.schedule.label_smoothing, reduction="sum"
@@ -116,12 +118,12 @@ class StageStep:
         return float(loss.detach()), int((logits.argmax(-1) == labels).sum())
 
     def _without_exchange(self, on: bool) -> contextlib.AbstractContextManager:
-        """Gradients are exchanged once a step: not after its earlier parts."""
+        """Keeps gradients to the process: they are exchanged once a step, not after its earlier parts."""
         return self.module.no_sync() if on and self.processes.count > 1 else contextlib.nullcontext()
 
 
 def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -> nn.Module:
-    """The module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
+    """Returns the module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
     config = model.config  # some switches leave parameters without a gradient
     unused = (stage == 1 and (config.merge == "cross" or not config.normals)) or config.backbone not in BACKBONES
     where = [device.index] if device.type == "cuda" else None

@@ -1,41 +1,30 @@
-"""`dpc classify explain`: where in a clip, and how far apart videos are."""
+"""`dpc classify explain`: where in a clip a network acts, and how far apart videos are."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from dpcli.classify.explain.pac_settings import PAC
+from dpcli.cli.classify.options import Data, Model, Split, Stream
 from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
+from dpcli.cli.settings_options import options_of
 from dpcli.errors import UsageError
+from dpcli.runtime.settings.catalog import Given
 
 app = typer.Typer(no_args_is_help=True, help="Look into a model: activations of points (pac), maps of videos (tsne).")
 
-Data = Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")]
-Model = Annotated[
-    str, typer.Option("--model", help="A .safetensors file, a folder made by train, or a shipped model's name.")
-]
-Split = Annotated[
-    str,
-    typer.Option(
-        help="Which samples: a split's name, all, auto (test where there is one), or validation: the training videos that"
-        " the model's training held out."
-    ),
-]
-Stream = Annotated[
-    str | None,
-    typer.Option(
-        "--stream", help="One or more of static, dynamic, fused, with commas between. Default: static,dynamic."
-    ),
-]
-
 
 @app.command()
+@options_of(PAC)
 def pac(
     data: Data,
     model: Model,
     output: Output,
+    given: Given,
     picture: Annotated[
         Path | None, typer.Option("--picture", help="Write a picture (.png): rows samples and streams, columns frames.")
     ] = None,
@@ -48,51 +37,24 @@ def pac(
     ] = "4",
     split: Split = "auto",
     stream: Stream = None,
-    rule: Annotated[
-        str,
-        typer.Option(
-            help="activation (thesis A.1.4: the largest activation, whatever the class) or gradient (Grad-CAM)."
-        ),
-    ] = "activation",
-    target: Annotated[
-        str | None,
-        typer.Option("--class", help="With --rule gradient: a class's name or number, predicted (default) or label."),
-    ] = None,
-    stage: Annotated[
-        int | None,
-        typer.Option(min=1, help="Stage of the network, from 1. Default: 1 for activation, the last for gradient."),
-    ] = None,
-    frames: Annotated[int, typer.Option(min=1, max=60, help="Columns of the picture: frames of the clip.")] = 8,
-    view: Annotated[
-        str | None, typer.Option(help="Axes that point right, down and away in pictures, such as xyz or x-zy (z up).")
-    ] = None,
     backbone: TrustedBackbone = None,
     seed: Seed = 0,
     device: Device = "auto",
     force: Force = False,
 ) -> None:
-    """Point activation clouds: each point of a video's middle clip with its activation, 0 to 1 over the clip."""
-    from dpcli.classify.commands.explain import run_pac
+    """Write point activation clouds: each point of a video's middle clip with its activation, 0 to 1 over the clip.
 
-    run_pac(
-        data,
-        model,
-        output,
-        picture=picture,
-        animation=animation,
-        samples=samples,
-        split=split,
-        stream=stream,
-        rule=rule,
-        target=target,
-        stage=stage,
-        frames=frames,
-        view=view,
-        seed=seed,
-        device=device,
-        force=force,
-        backbone=backbone,
-    )
+    Settings (--set): rule=activation|gradient, class, stage, frames and view of the picture.
+    """
+    from dpcli.classify.commands.explain_pac import PacRequest, explain_pac
+    from dpcli.classify.commands.model_task import ModelTask
+    from dpcli.classify.explain.pac_settings import PacSettings
+
+    settings = PAC.resolve({"pac": PacSettings()}, given)["pac"]
+    task = ModelTask(data, model, output, backbone, split, seed, device, force)
+    done = explain_pac(task, PacRequest(samples, stream, settings, picture, animation))
+    if output != "-":
+        typer.echo(f"{output}: activations of {done.points:,} points in {done.clips} clips of {done.frames} frames")
 
 
 @app.command()
@@ -117,24 +79,18 @@ def tsne(
     force: Force = False,
     json_output: Json = False,
 ) -> None:
-    """Videos in the plane by t-SNE of the vectors before the last layer; beside it, how well neighbors and classes agree."""
+    """Map videos into the plane by t-SNE of the vectors before the last layer; say how well neighbors and classes agree."""
     if batch < 1:
         raise UsageError(f"--batch {batch}: expected at least 1")
-    from dpcli.classify.commands.explain import run_tsne
+    from dpcli.classify.commands.explain_tsne import TsneRequest, explain_tsne
+    from dpcli.classify.commands.model_task import ModelTask
+    from dpcli.runtime.progress import log
 
-    run_tsne(
-        data,
-        model,
-        output,
-        picture=picture,
-        stream=stream,
-        split=split,
-        perplexity=perplexity,
-        clips_per_video=clips_per_video or None,
-        batch=batch,
-        seed=seed,
-        device=device,
-        force=force,
-        json_output=json_output,
-        backbone=backbone,
-    )
+    task = ModelTask(data, model, output, backbone, split, seed, device, force)
+    result = explain_tsne(task, TsneRequest(stream, perplexity, clips_per_video or None, batch, picture))
+    if json_output and output != "-":
+        typer.echo(json.dumps(result.report()))
+        return
+    show = log.info if output == "-" else typer.echo
+    for line in result.lines():
+        show(line)

@@ -1,42 +1,75 @@
-"""What the commands of `dpc evaluate` share: options, and forms of output."""
+"""Prints what the commands of `dpc evaluate` found: tables, markdown, or one JSON object."""
 
 from __future__ import annotations
 
 import json
 import sys
-from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError
+from dpcli.standard_streams import printable
 
-Markdown = Annotated[bool, typer.Option("--markdown", help="Print markdown tables.")]
-Intersect = Annotated[bool, typer.Option("--intersect", help="Compare what both sides have, list the rest.")]
-Confidence = Annotated[float, typer.Option("--confidence", help="Of the intervals, between 0 and 1.")]
-Resamples = Annotated[int, typer.Option("--resamples", min=0, help="For bootstrap intervals; 0 for none.")]
+if TYPE_CHECKING:
+    from rich.table import Table
 
+    from dpcli.cli.evaluate.options import FormOptions
+    from dpcli.evaluate.results import Result
+    from dpcli.evaluate.text_tables import TextTable
 
-def check_output(as_object: bool, as_markdown: bool, picture: Path | None) -> None:
-    """Wrong output options are said before the work."""
-    if as_object and as_markdown:
-        raise UsageError("--json and --markdown: choose one form of output")
-    if picture is not None:
-        from dpcli.evaluate.classification.confusion_picture import check_picture
-
-        check_picture(picture)
+_PIPE_WIDTH = 250  # columns when nobody's terminal sets a limit
 
 
-def print_object(found: dict[str, Any]) -> None:
-    """One JSON object on a line."""
-    typer.echo(json.dumps(found, allow_nan=False))
+def print_result(result: Result, form: FormOptions) -> None:
+    """Prints a result in the form asked for. Raises DataError afterwards where something that was asked for is missing."""
+    if form.as_object:
+        print_object(result.data)
+    elif form.as_markdown:
+        from dpcli.evaluate.text_tables import markdown_tables
 
-
-def print_tables(tables: list[Any], notes: list[str], as_markdown: bool) -> None:
-    """Tables for a person, or as markdown."""
-    from dpcli.evaluate.classification import tables as forms
-
-    if as_markdown:
-        typer.echo(forms.markdown_tables(tables, notes))
+        typer.echo(markdown_tables(result.tables, result.notes))
     else:
-        forms.print_tables(tables, notes, sys.stdout)
+        print_tables(result.tables, result.notes, sys.stdout)
+    if result.incomplete:
+        raise DataError(result.incomplete)
+
+
+def print_object(data: dict[str, Any]) -> None:
+    """Prints one JSON object on a line."""
+    typer.echo(json.dumps(data, allow_nan=False))
+
+
+def print_tables(tables: list[TextTable], notes: list[str], stream: TextIO) -> None:
+    """Writes tables, then notes, to a terminal, or plainly to a file; a hint stands for a table wider than the terminal."""
+    from rich.console import Console
+
+    console = Console(file=stream, highlight=False, width=None if stream.isatty() else _PIPE_WIDTH)
+    for table in tables:
+        if table.width > console.width:
+            console.print(f"{table.title}: {table.width} columns wide; widen the terminal, or use --picture.\n")
+        else:
+            console.print(_rich_table(table), "")
+    for note in notes:
+        console.print(printable(note), markup=False)
+
+
+def _rich_table(table: TextTable) -> Table:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    made = Table(
+        title=Text(table.title),
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1),
+        pad_edge=False,
+        title_style="bold",
+        show_edge=False,
+    )
+    for position, name in enumerate(table.header):
+        made.add_column(Text(name), justify="left" if position == 0 else "right", no_wrap=True)
+    for row in table.rows:
+        made.add_row(*(Text(cell) for cell in row))
+    return made

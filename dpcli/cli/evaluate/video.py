@@ -1,113 +1,97 @@
-"""`dpc evaluate video`: options in, one call, tables out."""
+"""`dpc evaluate video`."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dpcli.cli.evaluate.output import (
-    Confidence,
-    Intersect,
-    Markdown,
-    Resamples,
-    check_output,
-    print_object,
-    print_tables,
+from dpcli.cli.evaluate.options import Intersect, IntervalOptions, PictureOptions, word_option
+from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
+from dpcli.cli.options import Device
+from dpcli.evaluate.choices import (
+    BACKGROUNDS,
+    FVD_VARIANTS,
+    LPIPS_NETWORKS,
+    VIDEO_METRICS,
+    VIDEO_PROTOCOLS,
+    parse_video_metrics,
 )
-from dpcli.cli.options import Device, Json, Picture, Seed
-from dpcli.errors import DataError
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to `dpc evaluate`."""
-    app.command("video")(video)
+@dataclass(frozen=True)
+class ProtocolOptions:
+    """Says what the numbers of a video stand for."""
+
+    protocol: Annotated[
+        str,
+        word_option(
+            "--protocol", VIDEO_PROTOCOLS, "Which views, sizes, colors and networks: those of this publication."
+        ),
+    ] = "dpc"
+    background: Annotated[
+        str | None, word_option("--background", tuple(BACKGROUNDS), "Color behind the object. Default: the protocol's.")
+    ] = None
+    lpips: Annotated[
+        str | None, word_option("--lpips", LPIPS_NETWORKS, "Network of LPIPS. Default: the protocol's.")
+    ] = None
+    fvd: Annotated[
+        str | None, word_option("--fvd", FVD_VARIANTS, "Published variant of FVD. Default: the protocol's.")
+    ] = None
+    every: Annotated[
+        int, typer.Option("--every", min=1, help="Start a window of FVD and FID-VID at each so many frames.")
+    ] = 1
 
 
+@with_option_groups
 def video(
     predicted: Annotated[
-        str, typer.Argument(help="Views or gaussians file (- for a pipe), folder of images, .npy, or video file.")
+        str, typer.Argument(help="Views or gaussians file (- for a pipe), folder of images, .npy array, or video file.")
     ],
-    truth: Annotated[Path, typer.Option("--truth", help="The true video; a views file for a gaussians file.")],
+    truth: Annotated[
+        Path, typer.Option("--truth", help="The true video, of any of these kinds; a views file for a gaussians file.")
+    ],
+    *,
+    choices: ProtocolOptions,
     metrics: Annotated[
         str | None,
         typer.Option(
             "--metrics",
-            help="Of psnr, psnr_foreground, ssim, ms_ssim, lpips, clip, clip_spherical, clip_views, clip_temporal, fvd, "
-            "fid_vid_r3d50, fid_vid_inception, warping, parts, tracks. Default: PSNR, SSIM, and what the files allow of "
+            metavar="NAME,...",
+            parser=lambda text: ",".join(parse_video_metrics(text)),
+            help=f"Some of {', '.join(VIDEO_METRICS)}. Default: psnr, ssim, and what the files allow of psnr_foreground, "
             "parts and tracks.",
         ),
     ] = None,
-    protocol: Annotated[
-        str,
-        typer.Option("--protocol", help="dpc, thesis, consistent4d, disco or torchmetrics: all choices in one word."),
-    ] = "dpc",
-    background: Annotated[
-        str | None, typer.Option("--background", help="white or black behind the object. Default: the protocol's.")
-    ] = None,
     intersect: Intersect = False,
-    lpips: Annotated[str | None, typer.Option("--lpips", help="alex, vgg or squeeze. Default: the protocol's.")] = None,
-    fvd: Annotated[
-        str | None, typer.Option("--fvd", help="styleganv, videogpt, disco or consistent4d. Default: the protocol's.")
-    ] = None,
-    every: Annotated[
-        int, typer.Option("--every", min=1, help="Windows of FVD and FID-VID start at each so many frames.")
-    ] = 1,
     weights: Annotated[
-        Path | None, typer.Option("--weights", help="Folder of networks. Default: $DPC_WEIGHTS, else the user's cache.")
+        Path | None,
+        typer.Option(
+            "--weights", help="Folder of the networks' weights. Default: $DPC_WEIGHTS, else the user's cache."
+        ),
     ] = None,
-    confidence: Confidence = 0.95,
-    resamples: Resamples = 2000,
     device: Device = "auto",
-    seed: Seed = 0,
-    as_markdown: Markdown = False,
-    as_object: Json = False,
-    picture: Picture = None,
+    intervals: IntervalOptions,
+    output: PictureOptions,
 ) -> None:
-    """PSNR, SSIM, learned metrics of a video or a 4D scene; a scene's parts and tracks where the truth has them."""
-    check_output(as_object, as_markdown, picture)
-    from dpcli.evaluate.bootstrap import Resampling
-    from dpcli.evaluate.video.comparison import evaluate_video
-    from dpcli.evaluate.video.difference_strip import Strip
-    from dpcli.evaluate.video.protocol import BACKGROUNDS, check_picture_of, parse_metrics, video_protocol
-    from dpcli.evaluate.video.tables import video_json, video_notes, video_tables
-    from dpcli.store import input_file
+    """Evaluate a video or a 4D scene: PSNR, SSIM, LPIPS, CLIP, FVD, warping error, and a scene's parts and tracks."""
+    from dpcli.evaluate.commands.video import run_video
+    from dpcli.evaluate.video.protocol import video_protocol
 
-    names, chosen = parse_metrics(metrics), video_protocol(protocol, background, lpips=lpips, fvd=fvd, every=every)
-    check_picture_of(names, picture)
-    strip = Strip(BACKGROUNDS[chosen.background]) if picture is not None else None
-    with input_file(predicted) as path:
-        report = evaluate_video(
-            path,
-            truth,
-            metrics=names,
-            protocol=chosen,
-            intersect=intersect,
-            seed=seed,
-            watch=strip,
-            weights=weights,
-            device=_device(names, device),
-            resampling=Resampling(resamples, confidence, seed),
-        )
-        if strip is not None:
-            strip.save(picture)
-        if as_object:
-            print_object(video_json(report, predicted))
-        else:
-            print_tables(video_tables(report), video_notes(report), as_markdown)
-    if report.missing:
-        name, reason = next(iter(report.missing.items()))
-        more = f" ({', '.join(list(report.missing)[1:])} neither)" if len(report.missing) > 1 else ""
-        raise DataError(f"{name} not computed{more}: {reason}")
-
-
-def _device(names: tuple[str, ...] | None, asked: str) -> str:
-    """torch is loaded for the learned metrics only."""
-    from dpcli.evaluate.video.network_metrics import LEARNED
-
-    if not set(names or ()) & set(LEARNED) - {"warping"}:
-        return "cpu"
-    from dpcli.runtime.device import choose_device
-
-    return str(choose_device(asked))
+    result = run_video(
+        predicted,
+        truth,
+        metrics=parse_video_metrics(metrics),
+        protocol=video_protocol(
+            choices.protocol, choices.background, lpips=choices.lpips, fvd=choices.fvd, every=choices.every
+        ),
+        intersect=intersect,
+        weights=weights,
+        device=device,
+        resampling=intervals.resampling,
+        picture=output.picture,
+    )
+    print_result(result, output)

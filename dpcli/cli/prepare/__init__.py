@@ -1,4 +1,4 @@
-"""This folder holds the options of `dpc prepare`, one module per kind of raw data.
+"""This folder holds the options of `dpc prepare`: a folder for each kind of data, and what the commands share.
 
 What a command does lives in the room `prepare`.
 """

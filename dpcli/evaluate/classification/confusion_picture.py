@@ -6,17 +6,11 @@ from pathlib import Path
 
 from dpcli.draw.confusion_matrix import draw_confusion
 from dpcli.evaluate.classification.protocol import ClassificationReport
-from dpcli.evaluate.classification.tables import percent
-from dpcli.runtime.whole_file import FIGURES, check_target
+from dpcli.evaluate.text_tables import percent
 
 
-def check_picture(path: Path) -> None:
-    """`check_target` for the figures of this package."""
-    check_target(path, "--picture", FIGURES)
-
-
-def confusion_picture(report: ClassificationReport, path: Path) -> None:
-    """Draw the confusion matrix of the main scores: color = share of the row's truth, number = samples."""
+def draw_confusion_matrix(report: ClassificationReport, path: Path) -> None:
+    """Draws the confusion matrix of the main scores: color = share of the row's truth, number = samples."""
     draw_confusion(report.main.confusion, report.class_names, _headline(report), path)
 
 

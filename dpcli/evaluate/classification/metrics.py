@@ -1,4 +1,8 @@
-"""Classification metrics: scores -> sufficient statistics -> metrics, so the statistics of shards add up exactly."""
+"""Classification metrics: scores -> sufficient statistics -> metrics, so the statistics of shards add up exactly.
+
+`classification_compute` gives the metrics of all samples, `classification_weighted` those of many resamples at once;
+both take balanced accuracy and macro F1 from the same functions.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +12,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.proportions import divide, mean_defined, wilson_interval
+from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
+from dpcli.evaluate.proportions import divide, mean_defined, mean_defined_rows, wilson_interval
 
 TOP_K = 5
 
 
 @dataclass(frozen=True)
 class ClassificationStatistics:
-    """All that the metrics need: confusion i64 (C,C), rows truth, columns prediction; hits within the k best scores."""
+    """Holds all that the metrics need of some samples.
+
+    confusion: the confusion matrix i64 (C,C), rows truth, columns prediction. top_hits: samples whose true class is
+    among the `top_k` best scores.
+    """
 
     confusion: np.ndarray
     top_hits: int
     top_k: int = TOP_K
 
     def __add__(self, other: ClassificationStatistics) -> ClassificationStatistics:
-        """Statistics of both sets of samples together; ValueError when they are of different classes or k."""
+        """Returns the statistics of both sets of samples together; ValueError for different classes or k."""
         if self.confusion.shape != other.confusion.shape or self.top_k != other.top_k:
             raise ValueError(
                 f"cannot add statistics of {len(self.confusion)} and {len(other.confusion)} classes, "
@@ -33,11 +42,12 @@ class ClassificationStatistics:
 
 @dataclass(frozen=True)
 class ClassificationMetrics:
-    """Shares lie in [0, 1]; NaN = undefined (0/0). Per-class arrays have shape (C,), in the order of the labels.
+    """Holds shares in [0, 1], NaN = undefined (0/0), and per-class arrays (C,) in the order of the labels.
 
-    accuracy: correct / samples, with `interval` its 95 % Wilson interval. balanced_accuracy: mean recall over the
-    classes that occur. recall is what papers call per-class accuracy. macro_f1: mean over the classes that occur or
-    were predicted. top_accuracy: truth among the `top_k` best scores; None when there are not more classes than that.
+    accuracy: correct / samples, with `interval` its Wilson interval. balanced_accuracy: mean recall over the classes
+    that occur. recall: what papers call per-class accuracy. macro_f1: mean over the classes that occur or were
+    predicted. top_accuracy: truth among the `top_k` best scores; None when there are not more classes than that.
+    support, predicted, hits: samples of each class, predictions of it, and right ones.
     """
 
     samples: int
@@ -58,15 +68,23 @@ class ClassificationMetrics:
 
 
 def predicted_labels(scores: np.ndarray) -> np.ndarray:
-    """Best class of each row of scores (S,C), i64 (S); a tie goes to the lowest label."""
+    """Returns the best class of each row of scores f (S,C), i64 (S); a tie goes to the lowest label.
+
+    >>> predicted_labels(np.array([[0.1, 0.9], [0.5, 0.5]])).tolist()
+    [1, 0]
+    """
     return np.asarray(scores).argmax(axis=1)
 
 
 def classification_update(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> ClassificationStatistics:
-    """Statistics of some samples: scores f (S,C), labels i (S) in 0..C-1.
+    """Returns the statistics of some samples: scores f (S,C), labels i (S) in 0..C-1.
 
     Ties between equal scores go to the lower label, for the best class and for the k best.
     Raises DataError when there are no samples, shapes disagree, a score is not finite or a label is out of range.
+
+    >>> found = classification_update(np.array([[0.9, 0.1], [0.2, 0.8], [0.7, 0.3]]), np.array([0, 1, 1]))
+    >>> found.confusion.tolist()
+    [[1, 0], [1, 1]]
     """
     scores, labels = np.asarray(scores), np.asarray(labels)
     _check(scores, labels)
@@ -77,12 +95,18 @@ def classification_update(scores: np.ndarray, labels: np.ndarray, top_k: int = T
 
 
 def top_hits(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> np.ndarray:
-    """Whether the true class is among the `top_k` best scores of each row, bool (S); ties go to the lower label."""
-    return _ranks(scores, labels) < top_k
+    """Returns whether the true class is among the `top_k` best scores of each row, bool (S).
+
+    scores f (S,C), labels i (S); a tie goes to the lower label.
+
+    >>> top_hits(np.array([[0.5, 0.3, 0.2], [0.5, 0.3, 0.2]]), np.array([1, 2]), top_k=2).tolist()
+    [True, False]
+    """
+    return _true_ranks(scores, labels) < top_k
 
 
-def _ranks(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """How many classes come before the true one in each row, i64 (S)."""
+def _true_ranks(scores: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Returns how many classes come before the true one in each row, i64 (S)."""
     own = np.take_along_axis(scores, labels[:, None].astype(np.int64), axis=1)
     before = (scores > own) | ((scores == own) & (np.arange(scores.shape[1]) < labels[:, None]))
     return before.sum(axis=1)
@@ -106,26 +130,41 @@ def _check(scores: np.ndarray, labels: np.ndarray) -> None:
 
 
 def classification_merge(parts: Iterable[ClassificationStatistics]) -> ClassificationStatistics:
-    """Statistics of all parts together, equal to those of all samples at once. DataError without parts."""
+    """Returns the statistics of all parts together, equal to those of all samples at once. DataError without parts."""
     parts = list(parts)
     if not parts:
         raise DataError("no statistics to merge: evaluate at least one shard")
     return sum(parts[1:], parts[0])
 
 
-def classification_compute(statistics: ClassificationStatistics) -> ClassificationMetrics:
-    """Metrics from statistics. recall = hits / support, precision = hits / predicted, F1 their harmonic mean."""
+def class_recall(hits: np.ndarray, support: np.ndarray) -> np.ndarray:
+    """Returns the share of each class's samples that were recognized, f64 (...,C); NaN for a class that doesn't occur."""
+    return divide(hits, support)
+
+
+def class_f1(hits: np.ndarray, support: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Returns the F1 score of each class, f64 (...,C): the harmonic mean of its recall and precision.
+
+    It is 0 for a class that occurs and was never predicted, NaN for one that neither occurs nor was predicted.
+
+    >>> class_f1(np.array([1, 0]), np.array([1, 2]), np.array([3, 0])).tolist()
+    [0.5, 0.0]
+    """
+    return divide(2 * hits, support + predicted)
+
+
+def classification_compute(statistics: ClassificationStatistics, confidence: float = 0.95) -> ClassificationMetrics:
+    """Returns the metrics that statistics stand for; confidence: of the Wilson interval of the accuracy."""
     confusion = statistics.confusion
     support, predicted, hits = confusion.sum(axis=1), confusion.sum(axis=0), confusion.diagonal()
     samples, correct = int(support.sum()), int(hits.sum())
-    f1 = divide(2 * hits, support + predicted)  # defined, 0, for a class that occurs but was never predicted
-    recall = divide(hits, support)
+    recall, f1 = class_recall(hits, support), class_f1(hits, support, predicted)
     ranked = len(confusion) > statistics.top_k
     return ClassificationMetrics(
         samples=samples,
         correct=correct,
         accuracy=float(divide(correct, samples)),
-        interval=wilson_interval(correct, samples),
+        interval=wilson_interval(correct, samples, confidence),
         balanced_accuracy=mean_defined(recall),
         macro_f1=mean_defined(f1),
         top_k=statistics.top_k,
@@ -140,6 +179,44 @@ def classification_compute(statistics: ClassificationStatistics) -> Classificati
     )
 
 
-def classification_metrics(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> ClassificationMetrics:
-    """Update and compute in one: scores f (S,C), labels i (S) in 0..C-1. Raises as `classification_update`."""
-    return classification_compute(classification_update(scores, labels, top_k))
+def classification_metrics(
+    scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K, confidence: float = 0.95
+) -> ClassificationMetrics:
+    """Returns the metrics of scores f (S,C) and labels i (S) in 0..C-1. Raises as `classification_update`.
+
+    >>> found = classification_metrics(np.array([[0.9, 0.1], [0.2, 0.8], [0.7, 0.3]]), np.array([0, 1, 1]))
+    >>> found.correct, found.samples, found.balanced_accuracy
+    (2, 3, 0.75)
+    >>> [round(end, 3) for end in found.interval]
+    [0.208, 0.939]
+    """
+    return classification_compute(classification_update(scores, labels, top_k), confidence)
+
+
+def classification_weighted(scores: np.ndarray, labels: np.ndarray, top_k: int = TOP_K) -> WeightedMetric:
+    """Returns the metrics of scores f (S,C) and labels i (S) as functions of how often each sample counts.
+
+    They are accuracy, balanced_accuracy, macro_f1 and, where there are more classes than `top_k`, top-k accuracy.
+    """
+    classes = scores.shape[1]
+    best = predicted_labels(scores)
+    # samples of equal truth and prediction are alike: counts are summed over these cells, then over classes
+    cells, order = np.unique(labels.astype(np.int64) * classes + best, return_inverse=True)
+    of_truth, of_prediction = np.eye(classes)[cells // classes], np.eye(classes)[cells % classes]
+    right = of_truth * of_prediction
+    sort = np.argsort(order, kind="stable")
+    starts = np.searchsorted(order[sort], np.arange(len(cells)))
+    shares = {"accuracy": best == labels}
+    if classes > top_k:
+        shares[f"top{top_k}_accuracy"] = top_hits(scores, labels, top_k)
+    share_of_samples = means_of_samples({key: hit.astype(np.float64) for key, hit in shares.items()})
+
+    def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
+        summed = np.add.reduceat(counts[:, sort], starts, axis=1)
+        support, predicted, hits = summed @ of_truth, summed @ of_prediction, summed @ right
+        return share_of_samples(counts) | {
+            "balanced_accuracy": mean_defined_rows(class_recall(hits, support)),
+            "macro_f1": mean_defined_rows(class_f1(hits, support, predicted)),
+        }
+
+    return metric

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Interval
-from dpcli.evaluate.classification.protocol import samples_json
-from dpcli.evaluate.compare.sample_metrics import Measured, Question, history_seed, is_pictures, measure
+from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, history_seed
+from dpcli.evaluate.compare.measure_file import measure_file
+from dpcli.evaluate.results import samples_json
+from dpcli.evaluate.video.sources.open_source import is_media
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change
@@ -22,7 +24,7 @@ _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators 
 
 @dataclass(frozen=True)
 class Run:
-    """Metrics of one run, None = undefined; `identity`: what must be equal in all runs, most telling first."""
+    """Holds the metrics of one run, None = undefined; `identity`: what must be equal in all runs, most telling first."""
 
     title: str
     source: str
@@ -34,7 +36,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Spread:
-    """Over runs: mean, standard deviation (n - 1 in the denominator) and t interval of the mean; NaN = undefined."""
+    """Holds over runs the mean, standard deviation (n - 1 in the denominator) and t interval of the mean; NaN = undefined."""
 
     mean: float
     sd: float
@@ -43,7 +45,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class RunsReport:
-    """Runs of one task on the same samples: `number` of `kind` ("" where the files don't say)."""
+    """Holds runs of one task on the same samples: `number` of `kind` ("" where the files don't say)."""
 
     task: str
     runs: list[Run]
@@ -54,18 +56,24 @@ class RunsReport:
 
     @property
     def spreads(self) -> dict[str, Spread]:
-        """By metric; undefined where a run has no number."""
+        """The spread over runs of each metric; undefined where a run has no number."""
         columns = {key: [run.metrics[key] for run in self.runs] for key in self.units}
         return {
-            key: spread([math.nan if v is None else v for v in column], self.confidence, self.units[key] == "fraction")
+            key: mean_with_t_interval(
+                [math.nan if v is None else v for v in column], self.confidence, self.units[key] == "fraction"
+            )
             for key, column in columns.items()
         }
 
 
-def spread(values: Sequence[float], confidence: float = 0.95, share: bool = False) -> Spread:
-    """Mean, sd (ddof 1) and Student's t interval of the mean of independent runs; one run has no sd and no interval.
+def mean_with_t_interval(values: Sequence[float], confidence: float = 0.95, share: bool = False) -> Spread:
+    """Returns mean, standard deviation (ddof 1) and Student's t interval of the mean of independent runs.
 
-    share: the interval of values from 0 to 1 ends there, as their mean does.
+    share: the interval of values from 0 to 1 ends there, as their mean does. One run has no deviation and no interval.
+
+    >>> found = mean_with_t_interval([0.8, 0.9, 1.0])
+    >>> round(found.mean, 3), round(found.sd, 3), round(found.interval.low, 3), round(found.interval.high, 3)
+    (0.9, 0.1, 0.652, 1.148)
     """
     column = np.asarray(values, np.float64)
     mean = float(column.mean())
@@ -82,9 +90,9 @@ def spread(values: Sequence[float], confidence: float = 0.95, share: bool = Fals
 
 
 def evaluate_runs(
-    paths: Sequence[Path], question: Question, confidence: float = 0.95, sources: Sequence[str] | None = None
+    paths: Sequence[Path], options: EvaluationOptions, confidence: float = 0.95, sources: Sequence[str] | None = None
 ) -> RunsReport:
-    """The same question on each file: scores files, parts files, or files of JSON objects, one a line, that
+    """Evaluates several files in the same way: scores files, parts files, or files of JSON objects, one a line, that
     `dpc evaluate ... --json` printed.
 
     DataError when they are of different kinds, tasks, protocols, units or samples.
@@ -92,10 +100,10 @@ def evaluate_runs(
     runs = [
         run
         for path, source in zip(paths, sources or map(str, paths), strict=True)
-        for run in (_file_runs if is_pictures(path) or _is_hdf5(path) else _json_runs)(path, source, question)
+        for run in (_file_runs if is_media(path) or _is_hdf5(path) else _json_runs)(path, source, options)
     ]
     for run in runs[1:]:
-        _same_experiment(runs[0], run)
+        _check_same_experiment(runs[0], run)
     runs = _distinct_titles(runs)
     samples = runs[0].identity.get("samples") or {}
     return RunsReport(
@@ -111,8 +119,8 @@ def _is_hdf5(path: Path) -> bool:
         raise DataError(f"{path}: {error.strerror or error}") from None
 
 
-def _file_runs(path: Path, source: str, question: Question) -> list[Run]:
-    found = measure(path, source, question)
+def _file_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]:
+    found = measure_file(path, source, options)
     values = {key: value for one in found for key, value in one.values().items()}
     units = {key: unit for one in found for key, unit in one.units.items()}
     identity = {"kind": "file", "samples": samples_json(found[0].kind, found[0].names), **_facts(found)}
@@ -121,14 +129,14 @@ def _file_runs(path: Path, source: str, question: Question) -> list[Run]:
     return [Run(title, source, " and ".join(one.task for one in found), metrics, units, identity)]
 
 
-def _facts(found: Sequence[Measured]) -> dict[str, Any]:
-    facts = {key: value for one in found for key, value in one.same.items()}
+def _facts(found: Sequence[FileMetrics]) -> dict[str, Any]:
+    facts = {key: value for one in found for key, value in one.must_equal.items()}
     return facts | {
-        what: dict(zip(one.names, own, strict=True)) for one in found for what, own in one.of_sample.items()
+        what: dict(zip(one.names, own, strict=True)) for one in found for what, own in one.must_equal_by_sample.items()
     }
 
 
-def _json_runs(path: Path, source: str, question: Question) -> list[Run]:
+def _json_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]:
     try:
         lines = [line for line in path.read_text().splitlines() if line.strip()]
         objects = [json.loads(line) for line in lines]
@@ -140,19 +148,19 @@ def _json_runs(path: Path, source: str, question: Question) -> list[Run]:
     if not objects:
         raise DataError(f"{source}: empty; the command that should have filled it failed")
     return [
-        _json_run(own, source if len(objects) == 1 else f"{source}:{row}", question.metrics)
+        _json_run(own, source if len(objects) == 1 else f"{source}:{row}", options.metrics)
         for row, own in enumerate(objects, 1)
     ]
 
 
-def _json_run(own: Any, source: str, wanted: Sequence[str] | None) -> Run:
+def _json_run(own: Any, source: str, asked: Sequence[str] | None) -> Run:
     if not isinstance(own, dict) or not all(isinstance(own.get(key), dict) for key in ("metrics", "units", "protocol")):
         raise DataError(f"{source}: not an object of `dpc evaluate ... --json` (no metrics, units and protocol)")
     metrics = {key: own["metrics"][key] for key in own["units"] if _is_number(own["metrics"].get(key, ""))}
-    missing = [key for key in wanted or () if key not in metrics]
+    missing = [key for key in asked or () if key not in metrics]
     if missing:
         raise UsageError(f"--metrics {missing[0]}: {source} has {', '.join(metrics) or 'none'}")
-    metrics = {key: metrics[key] for key in wanted or metrics}
+    metrics = {key: metrics[key] for key in asked or metrics}
     if not metrics:
         raise DataError(f"{source}: no metric in it is a number")
     bad = [key for key, value in metrics.items() if value is not None and not math.isfinite(value)]
@@ -185,7 +193,7 @@ def _title(own: dict[str, Any], source: str) -> str:
     return f"seed {seed}" if seed is not None else Path(str(own.get("input", source))).stem
 
 
-def _same_experiment(first: Run, other: Run) -> None:
+def _check_same_experiment(first: Run, other: Run) -> None:
     for what, one, two in (
         ("task", first.task, other.task),
         ("metrics", list(first.units), list(other.units)),
@@ -200,7 +208,7 @@ def _same_experiment(first: Run, other: Run) -> None:
 
 
 def _differing(one: Any, two: Any) -> str:
-    """The first entry in which two values differ."""
+    """Returns the first entry in which two values differ, in words."""
     if isinstance(one, dict) and isinstance(two, dict):
         key = next(key for key in [*one, *two] if one.get(key) != two.get(key))
         return f"{key} {_short(two.get(key))}, not {_short(one.get(key))}"
@@ -213,40 +221,9 @@ def _short(value: Any) -> str:
 
 
 def _distinct_titles(runs: Sequence[Run]) -> list[Run]:
-    """Runs of equal titles are told apart by their place."""
+    """Returns the runs, those of equal titles numbered by their place."""
     titles = [run.title for run in runs]
     return [
-        run
-        if titles.count(run.title) == 1
-        else Run(f"{run.title} #{place}", run.source, run.task, run.metrics, run.units, run.identity)
+        run if titles.count(run.title) == 1 else replace(run, title=f"{run.title} #{place}")
         for place, run in enumerate(runs, 1)
     ]
-
-
-def runs_json(report: RunsReport) -> dict[str, Any]:
-    """One object for `--json`; under `metrics`, for each metric its mean, sd, interval and the values of the runs."""
-    first = report.runs[0]
-    metrics = {}
-    for key, own in report.spreads.items():
-        shown = {name: None if math.isnan(value) else value for name, value in (("mean", own.mean), ("sd", own.sd))}
-        ends = [own.interval.low, own.interval.high] if own.interval.defined else None
-        metrics[key] = shown | {
-            "n": len(report.runs),
-            "interval": ends,
-            "values": [run.metrics[key] for run in report.runs],
-        }
-    return {
-        "task": "runs",
-        "input": [run.source for run in report.runs],
-        "runs": [run.title for run in report.runs],
-        "protocol": {
-            "of": report.task,
-            "sd": "over runs, n - 1 in the denominator",
-            "interval": f"of the mean, Student's t, {100 * report.confidence:.4g} %",
-        }
-        | ({"each": first.identity["protocol"]} if "protocol" in first.identity else {}),
-        "metrics": metrics,
-        "samples": first.identity.get("samples"),
-        "units": report.units,
-        "denominators": {"runs": len(report.runs), **({report.kind: report.number} if report.number else {})},
-    }

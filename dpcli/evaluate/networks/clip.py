@@ -1,4 +1,4 @@
-"""CLIP ViT-B/32 picture embeddings (Radford et al. 2021), and what is made of them."""
+"""CLIP ViT-B/32 picture embeddings (Radford et al. 2021), and the CLIP scores made of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.networks import full_precision
-from dpcli.evaluate.networks.weights import check, fill, find, load_state, named
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors
+from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
 
 VARIANTS = {"openai": "clip-openai", "laion": "clip-laion"}
 MEAN, DEVIATION = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -18,7 +19,7 @@ _OUTSIDE = 0.01  # how far from 0..1 a float may lie
 
 
 class Clip:
-    """The vision half of CLIP. side: of the square it looks at. width: of an embedding."""
+    """Embeds pictures by the vision half of CLIP. side: of the square it looks at, in pixels. width: of an embedding."""
 
     def __init__(self, model: Any, device: str = "cpu"):
         self.model = model.eval().requires_grad_(False).to(device)
@@ -26,26 +27,26 @@ class Clip:
 
     @classmethod
     def load(cls, folder: Path, variant: str = "openai", device: str = "cpu") -> Clip:
-        """`openai`, or `laion` (trained on LAION-2B), from the weights folder.
+        """Loads `openai`, or `laion` (trained on LAION-2B), from the weights folder.
 
         DataError when the files are absent or damaged; DpcError without `transformers`; UsageError for another variant.
         """
         if variant not in VARIANTS:
             raise UsageError(f"CLIP variant {variant!r}: expected one of {', '.join(VARIANTS)}")
-        weights, path = named(VARIANTS[variant]), find(VARIANTS[variant], folder)
-        found = check(path, weights, digest=False)
+        weights, path = weights_named(VARIANTS[variant]), find_weights(VARIANTS[variant], folder)
+        found = check_file(path, weights, digest=False)
         if found.state != "present":
-            raise DataError(f"{path}: damaged weights ({found.said}); delete it and fetch it again")
+            raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
         return cls.open(path.parent, device)
 
     @classmethod
     def open(cls, folder: Path, device: str = "cpu") -> Clip:
-        """Any CLIP in the layout of Hugging Face: config.json and model.safetensors or pytorch_model.bin. Local only."""
+        """Loads any CLIP in the layout of Hugging Face: config.json and model.safetensors or pytorch_model.bin. Local only."""
         path = next((folder / name for name in _FILES if (folder / name).is_file()), None)
         if path is None or not (folder / "config.json").is_file():
             raise DataError(f"{folder}: expected config.json and {' or '.join(_FILES)}")
         model = _model(folder)
-        fill(model, load_state(path), path)
+        fill_module(model, load_tensors(path), path)
         return cls(model, device)
 
     def embed(
@@ -54,7 +55,7 @@ class Clip:
         *,
         bgr: bool = False,
     ) -> np.ndarray:  # f32 [B, width]
-        """Unit embeddings of RGB pictures; floats in 0..1 are rounded to 8 bits, as CLIP's preprocessing sees files.
+        """Returns unit embeddings of RGB pictures; floats in 0..1 are rounded to 8 bits, as CLIP's preprocessing sees files.
 
         bgr: swap red and blue first, as 4DGen's reader did by mistake. DataError as `preprocess`.
         """
@@ -85,7 +86,7 @@ def preprocess(
     pictures: np.ndarray,  # u8 or floats [B, H, W, 3]
     side: int = 224,
 ) -> np.ndarray:  # f32 [B, 3, side, side]
-    """CLIP's view of RGB pictures: short side to `side` (Pillow's bicubic), center square, colors normalized.
+    """Returns RGB pictures as CLIP sees them: short side to `side` (Pillow's bicubic), center square, colors normalized.
 
     DataError for floats that are not finite or not in 0..1; ValueError for another shape.
     """
@@ -124,14 +125,18 @@ def _center(picture: np.ndarray, side: int) -> np.ndarray:
 
 
 def cosines(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Cosine of each pair of embeddings (..., D) -> f64 (...). DataError for one without direction, or not finite."""
+    """Returns the cosine of each pair of embeddings f (...,D), f64 (...). DataError for one without direction, or not finite.
+
+    >>> cosines(np.array([[1.0, 0.0]]), np.array([[3.0, 4.0]])).round(3).tolist()
+    [0.6]
+    """
     if predicted.shape != truth.shape:
         raise ValueError(f"embeddings of shapes {predicted.shape} and {truth.shape}; expected equal ones")
     return np.clip((_unit(predicted) * _unit(truth)).sum(-1), -1, 1)
 
 
 def spherical(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """2 asin(|x - y| / 2)^2 of unit embeddings (..., D) -> f64 (...): half the squared angle, as 4DGen measures it."""
+    """Returns 2 asin(|x - y| / 2)^2 of unit embeddings f (...,D), f64 (...): half the squared angle, as 4DGen measures it."""
     if predicted.shape != truth.shape:
         raise ValueError(f"embeddings of shapes {predicted.shape} and {truth.shape}; expected equal ones")
     chord = np.linalg.norm(_unit(predicted) - _unit(truth), axis=-1)
@@ -139,19 +144,19 @@ def spherical(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def clip_similarity(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Mean cosine of frames with their truth, embeddings (T,D): Consistent4D's CLIP score. DataError for no frames."""
+    """Returns Consistent4D's CLIP score: the mean cosine of frames with their truth, embeddings f (T,D). DataError for no frames."""
     return float(cosines(*_some(predicted, truth)).mean())
 
 
 def clip_spherical(predicted: np.ndarray, truth: np.ndarray) -> float:
-    """Mean spherical distance of frames to their truth, embeddings (T,D): 4DGen's CLIP score. DataError for no frames."""
+    """Returns 4DGen's CLIP score: the mean spherical distance of frames to their truth, embeddings f (T,D). DataError for none."""
     return float(spherical(*_some(predicted, truth)).mean())
 
 
 def clip_across_views(
     embeddings: np.ndarray,  # [V, T, D]
 ) -> float:
-    """Mean cosine over all pairs of views at the same time (thesis, section C.1.4). DataError for less than two views."""
+    """Returns the mean cosine over all pairs of views at the same time (thesis, section C.1.4). DataError for less than two views."""
     views = len(embeddings)
     if embeddings.ndim != 3 or views < 2 or embeddings.shape[1] < 1:
         raise DataError(f"CLIP across views needs two views or more, (V,T,D), but was given {embeddings.shape}")
@@ -162,7 +167,7 @@ def clip_across_views(
 def clip_temporal(
     embeddings: np.ndarray,  # [T, D]
 ) -> float:
-    """Mean cosine of consecutive frames of one view. DataError for less than two frames."""
+    """Returns the mean cosine of consecutive frames of one view. DataError for less than two frames."""
     if embeddings.ndim != 2 or len(embeddings) < 2:
         raise DataError(f"CLIP over time needs two frames or more, (T,D), but was given {embeddings.shape}")
     return float(cosines(embeddings[1:], embeddings[:-1]).mean())
@@ -175,7 +180,7 @@ def _some(predicted: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _unit(embeddings: np.ndarray) -> np.ndarray:
-    """(..., D) -> f64 of length 1."""
+    """Returns embeddings f (...,D) as f64 of length 1."""
     embeddings = np.asarray(embeddings, np.float64)
     lengths = np.linalg.norm(embeddings, axis=-1, keepdims=True)
     if not np.isfinite(lengths).all() or not lengths.all():

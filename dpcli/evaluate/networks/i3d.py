@@ -37,7 +37,7 @@ POOLS = {
 
 
 def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
-    """TensorFlow's SAME: zeros before and behind an axis so that its length becomes ceil(size / stride).
+    """Returns TensorFlow's SAME padding: zeros before and behind an axis so that its length becomes ceil(size / stride).
 
     The odd one goes behind.
     """
@@ -46,18 +46,18 @@ def same_padding(size: int, kernel: int, stride: int) -> tuple[int, int]:
 
 
 def pad_same(x: torch.Tensor, kernel: tuple[int, ...], stride: tuple[int, ...]) -> torch.Tensor:
-    """`x` (B,C,T,H,W) with `same_padding` on its last three axes."""
+    """Returns `x` f32 (B,C,T,H,W) with `same_padding` on its last three axes."""
     sides = [same_padding(size, k, s) for size, k, s in zip(x.shape[2:], kernel, stride, strict=True)]
     return F.pad(x, [side for pair in reversed(sides) for side in pair])
 
 
 def pool_same(x: torch.Tensor, kernel: tuple[int, ...], stride: tuple[int, ...]) -> torch.Tensor:
-    """Largest value of each window; the zeros around are never larger than activations behind a ReLU."""
+    """Returns the largest value of each window; the zeros around are never larger than activations behind a ReLU."""
     return F.max_pool3d(pad_same(x, kernel, stride), kernel, stride)
 
 
 class Unit(nn.Module):
-    """Convolution with SAME padding, batch norm, ReLU."""
+    """Applies a convolution with SAME padding, batch norm and ReLU."""
 
     def __init__(self, inside: int, outside: int, kernel: int, stride: int = 1, bn_eps: float = 1e-5) -> None:
         super().__init__()
@@ -65,12 +65,13 @@ class Unit(nn.Module):
         self.bn = nn.BatchNorm3d(outside, eps=bn_eps)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,T,H,W)."""
         padded = pad_same(x, self.conv3d.kernel_size, self.conv3d.stride)
         return self.bn(self.conv3d(padded)).relu_()
 
 
 class Mixed(nn.Module):
-    """Inception block: four branches side by side."""
+    """Applies an Inception block: four branches side by side."""
 
     def __init__(self, inside: int, widths: tuple[int, ...], bn_eps: float) -> None:
         super().__init__()
@@ -82,23 +83,25 @@ class Mixed(nn.Module):
         self.b3b = Unit(inside, widths[5], 1, bn_eps=bn_eps)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,T,H,W)."""
         pooled = pool_same(x, (3, 3, 3), (1, 1, 1))
         return torch.cat([self.b0(x), self.b1b(self.b1a(x)), self.b2b(self.b2a(x)), self.b3b(pooled)], dim=1)
 
 
 class Logits(nn.Module):
-    """The last 1x1x1 convolution, with a bias and nothing behind it."""
+    """Applies the last 1x1x1 convolution, with a bias and nothing behind it."""
 
     def __init__(self, inside: int, classes: int) -> None:
         super().__init__()
         self.conv3d = nn.Conv3d(inside, classes, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,T,H,W)."""
         return self.conv3d(x)
 
 
 class I3D(nn.Module):
-    """400 logits, before the softmax, averaged over time.
+    """Computes 400 logits, before the softmax, averaged over time.
 
     avg_pool: frames of the last average pool, 2 (VideoGPT, TF) or 1 (DisCo). bn_eps: 1e-5 (VideoGPT) or 1e-3 (DisCo).
     """
@@ -115,7 +118,7 @@ class I3D(nn.Module):
         self.eval()
 
     def stages(self, x: torch.Tensor) -> Iterator[tuple[str, torch.Tensor]]:
-        """Name and output of every stage up to Mixed_5c (B,1024,ceil(T/8),7,7)."""
+        """Yields name and output of every stage up to Mixed_5c (B,1024,ceil(T/8),7,7)."""
         for name, stage in self.named_children():
             if name == "logits":
                 return
@@ -125,7 +128,7 @@ class I3D(nn.Module):
             yield name, x
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`x` f32 (B,3,T,224,224) in -1..1 -> (B,400). T of 9 frames at least where avg_pool is 2, else 1."""
+        """Returns the logits (B,400) of `x` f32 (B,3,T,224,224) in -1..1. T of 9 frames at least where avg_pool is 2, else 1."""
         for _, found in self.stages(x):
             x = found
         x = F.avg_pool3d(x, self.avg_pool, stride=1)
@@ -133,7 +136,7 @@ class I3D(nn.Module):
 
 
 class ScriptedI3D(nn.Module):
-    """i3d_torchscript.pt (StyleGAN-V): its own code, asked for logits of pictures that are prepared already."""
+    """Runs i3d_torchscript.pt (StyleGAN-V), its own code, asked for logits of pictures that are prepared already."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -143,5 +146,5 @@ class ScriptedI3D(nn.Module):
             raise DataError(f"{path}: not a TorchScript file ({str(error).splitlines()[0][:150]})") from None
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`x` f32 (B,3,T,224,224) in -1..1 -> (B,400)."""
+        """Returns the logits (B,400) of `x` f32 (B,3,T,224,224) in -1..1."""
         return self.script(x, rescale=False, resize=False, return_features=True)

@@ -18,7 +18,7 @@ Size = int | tuple[int, int]
 
 
 class Conv(nn.Module):
-    """Convolution, batch norm (eps 1e-3), ReLU."""
+    """Applies a convolution, batch norm (eps 1e-3) and ReLU."""
 
     def __init__(
         self,
@@ -33,6 +33,7 @@ class Conv(nn.Module):
         self.bn = nn.BatchNorm2d(outside, eps=1e-3)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,H,W)."""
         return self.bn(self.conv(x)).relu_()
 
 
@@ -41,7 +42,7 @@ def _mean_around(x: torch.Tensor) -> torch.Tensor:
 
 
 class BlockA(nn.Module):
-    """35 x 35: 1x1; 5x5; two 3x3; pool."""
+    """Applies the block at 35 x 35 pixels: 1x1; 5x5; two 3x3; pool."""
 
     def __init__(self, inside: int, pooled: int) -> None:
         super().__init__()
@@ -54,13 +55,14 @@ class BlockA(nn.Module):
         self.branch_pool = Conv(inside, pooled, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,H,W)."""
         double = self.branch3x3dbl_3(self.branch3x3dbl_2(self.branch3x3dbl_1(x)))
         pooled = self.branch_pool(_mean_around(x))
         return torch.cat([self.branch1x1(x), self.branch5x5_2(self.branch5x5_1(x)), double, pooled], dim=1)
 
 
 class BlockB(nn.Module):
-    """35 x 35 -> 17 x 17."""
+    """Applies the block that goes from 35 x 35 to 17 x 17 pixels."""
 
     def __init__(self, inside: int) -> None:
         super().__init__()
@@ -70,12 +72,13 @@ class BlockB(nn.Module):
         self.branch3x3dbl_3 = Conv(96, 96, 3, stride=2)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,H,W)."""
         double = self.branch3x3dbl_3(self.branch3x3dbl_2(self.branch3x3dbl_1(x)))
         return torch.cat([self.branch3x3(x), double, F.max_pool2d(x, 3, 2)], dim=1)
 
 
 class BlockC(nn.Module):
-    """17 x 17: 1x1; 7x7 in two lines; twice that; pool."""
+    """Applies the block at 17 x 17 pixels: 1x1; 7x7 as a row and a column; twice that; pool."""
 
     def __init__(self, inside: int, width: int) -> None:
         super().__init__()
@@ -91,6 +94,7 @@ class BlockC(nn.Module):
         self.branch_pool = Conv(inside, 192, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,H,W)."""
         single = self.branch7x7_3(self.branch7x7_2(self.branch7x7_1(x)))
         double = self.branch7x7dbl_3(self.branch7x7dbl_2(self.branch7x7dbl_1(x)))
         double = self.branch7x7dbl_5(self.branch7x7dbl_4(double))
@@ -98,7 +102,7 @@ class BlockC(nn.Module):
 
 
 class BlockD(nn.Module):
-    """17 x 17 -> 8 x 8."""
+    """Applies the block that goes from 17 x 17 to 8 x 8 pixels."""
 
     def __init__(self, inside: int) -> None:
         super().__init__()
@@ -110,13 +114,14 @@ class BlockD(nn.Module):
         self.branch7x7x3_4 = Conv(192, 192, 3, stride=2)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,H,W)."""
         seven = self.branch7x7x3_2(self.branch7x7x3_1(x))
         seven = self.branch7x7x3_4(self.branch7x7x3_3(seven))
         return torch.cat([self.branch3x3_2(self.branch3x3_1(x)), seven, F.max_pool2d(x, 3, 2)], dim=1)
 
 
 class BlockE(nn.Module):
-    """8 x 8; its branches fork. pool: of the last branch, mean or max."""
+    """Applies the block at 8 x 8 pixels, whose branches fork. pool: of the last branch, mean or max."""
 
     def __init__(self, inside: int, pool: str) -> None:
         super().__init__()
@@ -132,6 +137,7 @@ class BlockE(nn.Module):
         self.branch_pool = Conv(inside, 192, 1)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,H,W)."""
         single = self.branch3x3_1(x)
         double = self.branch3x3dbl_2(self.branch3x3dbl_1(x))
         pooled = _mean_around(x) if self.pool == "mean" else F.max_pool2d(x, 3, stride=1, padding=1)
@@ -141,7 +147,7 @@ class BlockE(nn.Module):
 
 
 class FidInception(nn.Module):
-    """2048 features: the last block averaged over space."""
+    """Computes 2048 features: the last block averaged over space."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -159,7 +165,7 @@ class FidInception(nn.Module):
         self.eval()
 
     def stages(self, x: torch.Tensor) -> Iterator[tuple[str, torch.Tensor]]:
-        """Name and output of every stage up to Mixed_7c (B,2048,8,8)."""
+        """Yields name and output of every stage up to Mixed_7c (B,2048,8,8)."""
         for name, stage in self.named_children():
             if name in ("Conv2d_3b_1x1", "Mixed_5b"):
                 x = F.max_pool2d(x, 3, 2)
@@ -167,14 +173,14 @@ class FidInception(nn.Module):
             yield name, x
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`x` f32 (B,3,299,299) in -1..1, as `inception_input` makes it -> (B,2048)."""
+        """Returns the features (B,2048) of `x` f32 (B,3,299,299) in -1..1, as `inception_input` makes it."""
         for _, found in self.stages(x):
             x = found
         return x.mean(dim=(2, 3))
 
 
 def inception_input(picture: torch.Tensor, antialias: bool = True) -> torch.Tensor:
-    """Pictures (B,3,H,W) of 0..255 -> f32 (B,3,299,299), (x - 128) / 128, as torchmetrics makes them.
+    """Returns pictures (B,3,H,W) of 0..255 as f32 (B,3,299,299), (x - 128) / 128, as torchmetrics makes them.
 
     Bilinear, align_corners False; antialias False as pytorch-fid, which scales by x / 127.5 - 1 instead.
     """

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks import full_precision
-from dpcli.evaluate.networks.trunks import alexnet, squeezenet, vgg16
-from dpcli.evaluate.networks.weights import fill, find, load_state, state_of
+from dpcli.evaluate.networks.lpips_trunks import alexnet, squeezenet, vgg16
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
+from dpcli.evaluate.networks.weights import find_weights
 
 HEADS = Path(__file__).parent / "heads"  # the linear weights, BSD-2, see LPIPS.md there
 NETS = {"alex": (alexnet, "alexnet"), "vgg": (vgg16, "vgg16"), "squeeze": (squeezenet, "squeezenet")}
@@ -21,7 +22,7 @@ _OUTSIDE = 0.01  # how far from 0..1 a value may lie: renderers overshoot a litt
 
 
 class Lpips(nn.Module):
-    """The distance, 0 for equal pictures; a trained head weighs the squared difference of each unit feature.
+    """Computes the distance, 0 for equal pictures; a trained head weighs the squared difference of each unit feature.
 
     A new object has random trunk weights (for tests) and the published heads; `Lpips.load` has both published.
     Values of different nets are on different scales: never mix them. UsageError for an unknown net.
@@ -40,10 +41,10 @@ class Lpips(nn.Module):
 
     @classmethod
     def load(cls, net: str, folder: Path) -> Lpips:
-        """With the published trunk from the weights folder. DataError when it is absent, damaged or another network's."""
+        """Loads the published trunk from the weights folder. DataError when it is absent, damaged or another network's."""
         made = cls(net)
         name = NETS[net][1]
-        fill(made.trunk, state_of(name, folder), find(name, folder))
+        fill_module(made.trunk, load_weights(name, folder), find_weights(name, folder))
         return made
 
     @torch.no_grad()
@@ -55,7 +56,7 @@ class Lpips(nn.Module):
         spatial: bool = False,
         range01_mistake: bool = False,
     ) -> Tensor:  # [B], or [B, H, W] when spatial
-        """LPIPS of pairs of RGB pictures in 0..1.
+        """Returns LPIPS of pairs of RGB pictures in 0..1.
 
         spatial: a map of the pictures' size (each layer's, bilinear) instead of the sum of the layers' means.
         range01_mistake: DisCo's evaluation gives the network 0..1 where it expects -1..1; for its published numbers.
@@ -75,7 +76,7 @@ class Lpips(nn.Module):
         *,
         range01_mistake: bool = False,
     ) -> list[Tensor]:  # of [B, h, w]
-        """Each layer's share of the distance, pixel by pixel; arguments and errors as `distance`."""
+        """Returns each layer's share of the distance, pixel by pixel; arguments and errors as `distance`."""
         if a.shape != b.shape:
             raise ValueError(f"pictures of shapes {tuple(a.shape)} and {tuple(b.shape)}; expected equal ones")
         features = [self.feature_maps(x, range01_mistake=range01_mistake) for x in (a, b)]
@@ -90,7 +91,7 @@ class Lpips(nn.Module):
         *,
         range01_mistake: bool = False,
     ) -> list[Tensor]:  # of [B, C, h, w]
-        """The trunk's maps of RGB pictures in 0..1, before they are made unit vectors."""
+        """Returns the trunk's maps of RGB pictures in 0..1, before they are made unit vectors."""
         self._check(pictures)
         pictures = pictures.to(self.shift)
         pictures = pictures if range01_mistake else 2 * pictures - 1
@@ -116,9 +117,9 @@ class Lpips(nn.Module):
 
 
 def load_heads(net: str, channels: tuple[int, ...]) -> list[nn.Parameter]:
-    """The published non-negative weights of each layer's channels, f32 (1,C,1,1), as they came with `lpips` 0.1.4."""
+    """Returns the published non-negative weights of each layer's channels, f32 (1,C,1,1), as they came with `lpips` 0.1.4."""
     path = HEADS / f"lpips-v0.1-{net}.safetensors"
-    state = load_state(path)
+    state = load_tensors(path)
     heads = [state[f"lin{layer}.model.1.weight"] for layer in range(len(channels))]
     if tuple(head.shape[1] for head in heads) != channels:
         raise DataError(f"{path}: not the heads of {net}")
@@ -126,5 +127,5 @@ def load_heads(net: str, channels: tuple[int, ...]) -> list[nn.Parameter]:
 
 
 def _unit(features: Tensor) -> Tensor:
-    """Each pixel's feature divided by its length."""
+    """Returns each pixel's feature divided by its length."""
     return features / (features.square().sum(1, keepdim=True).sqrt() + EPSILON)

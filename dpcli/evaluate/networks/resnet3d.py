@@ -16,7 +16,7 @@ BLOCKS = (3, 4, 6, 3)
 
 
 class Bottleneck(nn.Module):
-    """1x1x1, 3x3x3, 1x1x1 convolutions beside a shortcut, projected where its shape changes (type B)."""
+    """Applies 1x1x1, 3x3x3, 1x1x1 convolutions beside a shortcut, projected where its shape changes (type B)."""
 
     def __init__(self, inside: int, width: int, stride: int) -> None:
         super().__init__()
@@ -31,6 +31,7 @@ class Bottleneck(nn.Module):
             self.downsample = nn.Sequential(nn.Conv3d(inside, outside, 1, stride, bias=False), nn.BatchNorm3d(outside))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Returns the output of `x` f32 (B,C,T,H,W)."""
         shortcut = self.downsample(x) if hasattr(self, "downsample") else x
         x = self.bn1(self.conv1(x)).relu_()
         x = self.bn2(self.conv2(x)).relu_()
@@ -38,7 +39,7 @@ class Bottleneck(nn.Module):
 
 
 class ResNet3D50(nn.Module):
-    """2048 features: the last stage averaged over time and space."""
+    """Computes 2048 features: the last stage averaged over time and space."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,7 +55,7 @@ class ResNet3D50(nn.Module):
         self.eval()
 
     def stages(self, x: torch.Tensor) -> Iterator[tuple[str, torch.Tensor]]:
-        """Name and output of the stem and of each of the four stages."""
+        """Yields name and output of the stem and of each of the four stages."""
         x = self.bn1(self.conv1(x)).relu_()
         x = F.max_pool3d(x, 3, 2, padding=1)
         yield "stem", x
@@ -63,7 +64,7 @@ class ResNet3D50(nn.Module):
             yield f"layer{stage}", x
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """`x` f32 (B,3,16,112,112), 0..255 less the mean color -> (B,2048)."""
+        """Returns the features (B,2048) of `x` f32 (B,3,16,112,112), 0..255 less the mean color."""
         for _, found in self.stages(x):
             x = found
         return x.mean(dim=(2, 3, 4))

@@ -1,4 +1,4 @@
-"""Downloading the weights of learned metrics, when the user asks for them and never otherwise."""
+"""Downloads the weights of learned metrics, when the user asks for them and never otherwise."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from urllib.error import HTTPError, URLError
 from urllib.request import Request, urlopen
 
 from dpcli.errors import DataError, DpcError
-from dpcli.evaluate.networks.weights import Checked, Weights, check
+from dpcli.evaluate.networks.weights import Checked, Weights, check_file
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.whole_file import whole_file
 
@@ -17,8 +17,8 @@ _TIMEOUT = 30.0  # seconds without a byte
 _AGENT = {"User-Agent": "dpc"}  # some hosts refuse urllib's own
 
 
-def fetch(weights: Weights, folder: Path) -> list[Path]:
-    """Download an entry's files into `folder`, each beside its place, checked, then renamed; whole ones are kept.
+def fetch_weights(weights: Weights, folder: Path) -> list[Path]:
+    """Downloads an entry's files into `folder`, each beside its place, checked, then renamed; whole ones are kept.
 
     DpcError when a file can't be had (no network, refused); DataError when what came isn't the published file.
     """
@@ -28,7 +28,7 @@ def fetch(weights: Weights, folder: Path) -> list[Path]:
 
 
 def _fetch_file(weights: Weights, path: Path) -> None:
-    if check(path, weights).state == "present":
+    if check_file(path, weights).state == "present":
         log.info(f"{path}: already there")
         return
     if weights.by_hand:
@@ -39,7 +39,7 @@ def _fetch_file(weights: Weights, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path) as part:
         _download(weights, part)
-        log.info(f"{path}: {_checked(weights, part).said}")
+        log.info(f"{path}: {_check_download(weights, part).finding}")
 
 
 def _download(weights: Weights, part: Path) -> None:
@@ -48,7 +48,7 @@ def _download(weights: Weights, part: Path) -> None:
             expected = int(answer.headers.get("Content-Length") or 0)
             received = _copy(answer, file, weights, expected)
     except (URLError, http.client.HTTPException, OSError) as error:
-        raise DpcError(_why(weights, error, part)) from None
+        raise DpcError(_explain_failure(weights, error, part)) from None
     if expected and received != expected:
         raise DpcError(f"{weights.url}: only {received} of {expected} bytes came; try again")
 
@@ -63,7 +63,7 @@ def _copy(answer: http.client.HTTPResponse, file, weights: Weights, expected: in
     return received
 
 
-def _why(weights: Weights, error: Exception, part: Path) -> str:
+def _explain_failure(weights: Weights, error: Exception, part: Path) -> str:
     if isinstance(error, HTTPError):
         reason = f"the server says {error.code} {error.reason}"
     elif isinstance(error, URLError | http.client.HTTPException | TimeoutError | ConnectionError):
@@ -76,13 +76,13 @@ def _why(weights: Weights, error: Exception, part: Path) -> str:
     )
 
 
-def _checked(weights: Weights, part: Path) -> Checked:
-    """What came, if it is the published file; a host that asks to log in or to confirm answers with a page."""
+def _check_download(weights: Weights, part: Path) -> Checked:
+    """Returns what came, if it is the published file; a host that asks to log in or to confirm answers with a page."""
     with part.open("rb") as file:
         page = file.read(100).lstrip()[:1] == b"<"
     if page:
         raise DataError(f"{weights.url}: a web page came instead of {weights.file}; download it by hand")
-    found = check(part, weights)
+    found = check_file(part, weights)
     if found.state != "present":
-        raise DataError(f"{weights.url}: not the published file ({found.said}); nothing was kept")
+        raise DataError(f"{weights.url}: not the published file ({found.finding}); nothing was kept")
     return found

@@ -1,4 +1,4 @@
-"""What a report is made of: tables whose cells know how they sort, figures, and sections that hold them."""
+"""The blocks of a report: tables whose cells know how they sort, figures, and sections that hold them."""
 
 from __future__ import annotations
 
@@ -8,41 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 MISSING = "-"
-TITLES = {
-    "ap": "AP",
-    "pq": "PQ",
-    "f1": "F1",
-    "pre": "Pre",
-    "rec": "Rec",
-    "miou": "mIoU",
-    "ri": "RI",
-    "epe3d": "EPE3D",
-    "epe3d_no_motion": "EPE3D of no motion",
-    "accs": "AccS",
-    "accr": "AccR",
-    "outlier": "Outlier",
-    "psnr": "PSNR",
-    "psnr_foreground": "PSNR on object",
-    "ssim": "SSIM",
-    "ms_ssim": "MS-SSIM",
-    "lpips": "LPIPS",
-    "fvd": "FVD",
-    "fid_vid": "FID-VID",
-    "clip": "CLIP",
-    "macro_f1": "macro F1",
-    "top5_accuracy": "top-5 accuracy",
-    "sd": "sd",
-    "p": "p",
-    "adjusted_rand_index": "adjusted Rand index",
-    "epe": "EPE",
-    "tau": "tau",
-}
 _DIGITS = {"dB": 2, "degree": 2, "percent": 2}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A table's cell. `sort`: number it sorts by, None = by its text, or last when that is "-"; `share`: bar in 0..1."""
+    """Holds a table's cell. sort: number it sorts by, None = by its text, or last when that is "-"; share: bar in 0..1."""
 
     text: str
     sort: float | None = None
@@ -53,7 +24,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows under a header, the first cell of each its name; `key`: what the table is, for those who look for it."""
+    """Holds rows under a header, the first cell of each its name; key: what the table is, for code that looks for it."""
 
     title: str
     header: tuple[str, ...]
@@ -64,7 +35,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """Markup made by ours, all text from files escaped: what only a page can show."""
+    """Holds markup that only a page can show, made here, with all text from files escaped."""
 
     title: str
     html: str
@@ -73,7 +44,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Headline:
-    """The one number a result is known by: metric, value and interval as text, what it is a share or mean of."""
+    """Holds the one number a result is known by: metric, value and interval as text, what it is a share or mean of."""
 
     metric: str
     value: Cell
@@ -83,7 +54,7 @@ class Headline:
 
 @dataclass
 class Section:
-    """One result: its headline, tables and figures, and all that its numbers depend on."""
+    """Holds one result: its headline, tables and figures, and all that its numbers depend on."""
 
     anchor: str
     title: str
@@ -98,7 +69,7 @@ class Section:
 
 @dataclass
 class Report:
-    """All of the page; `beside` holds the tables with the thesis's rows, `left_out` what was given but isn't shown."""
+    """Holds all of the page. beside: tables with the thesis's rows; left_out: what was given but isn't shown."""
 
     title: str
     summary: Table
@@ -108,18 +79,17 @@ class Report:
     version: str
 
 
-def title_of(key: str) -> str:
-    """A metric's name as people write it."""
-    return TITLES.get(key, str(key).replace("_", " "))
-
-
 def is_number(value: Any) -> bool:
-    """A number, not a truth value."""
+    """Returns whether a value is a number, and not a truth value."""
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def text_of(value: Any, unit: str = "") -> str:
-    """`0.9351`, fraction -> `93.5 %`; two digits for dB, degrees and percent, four significant ones for the rest."""
+    """Returns a value as text: a fraction in percent, two decimals for dB, degrees and percent, else four digits.
+
+    >>> text_of(0.9351, "fraction"), text_of(25.0, "dB"), text_of(0.0123456)
+    ('93.5 %', '25.00', '0.01235')
+    """
     if value is None:
         return MISSING
     if not is_number(value):
@@ -132,7 +102,7 @@ def text_of(value: Any, unit: str = "") -> str:
 
 
 def cell(value: Any, unit: str = "", *, bar: bool = False, mark: str = "") -> Cell:
-    """A cell of a value that is a number, a text, or missing (None)."""
+    """Returns a cell of a value that is a number, a text, or missing (None)."""
     if not is_number(value):
         return Cell(text_of(value), mark=mark)
     share = min(max(float(value), 0.0), 1.0) if bar else None
@@ -140,7 +110,7 @@ def cell(value: Any, unit: str = "", *, bar: bool = False, mark: str = "") -> Ce
 
 
 def interval_of(found: Any) -> tuple[float, float] | None:
-    """[low, high] of an interval, however it is written; None when it is none."""
+    """Returns low and high of an interval, however it is written; None when it is none."""
     if isinstance(found, dict):
         found = found.get("interval", [found.get("low"), found.get("high")])
     if isinstance(found, (list, tuple)) and len(found) == 2 and all(is_number(end) for end in found):
@@ -149,7 +119,11 @@ def interval_of(found: Any) -> tuple[float, float] | None:
 
 
 def interval_text(found: Any, unit: str = "") -> str:
-    """`89.6 - 96.0 %`; "" without an interval."""
+    """Returns an interval in words, "" without one.
+
+    >>> interval_text([0.896, 0.96], "fraction")
+    '89.6 to 96.0 %'
+    """
     ends = interval_of(found)
     if ends is None:
         return ""
@@ -158,7 +132,11 @@ def interval_text(found: Any, unit: str = "") -> str:
 
 
 def sort_key(text: str) -> float | None:
-    """The number a text begins with, `93.5 %` -> 93.5, `1,024` -> 1024; None for others and missing ones."""
+    """Returns the number a text begins with; None for other texts.
+
+    >>> sort_key("93.5 %"), sort_key("1,024"), sort_key("-")
+    (93.5, 1024.0, None)
+    """
     head = text.strip().replace(",", "").replace("\u2212", "-").split(" ")[0].rstrip("%\u00b0")
     try:
         value = float(head)
@@ -170,6 +148,6 @@ def sort_key(text: str) -> float | None:
 def table(
     title: str, header: Sequence[str], rows: Sequence[Sequence[Cell | str]], note: str = "", key: str = ""
 ) -> Table:
-    """A table from cells and plain texts, which sort by the number they begin with, if any."""
+    """Returns a table of cells and plain texts, which sort by the number they begin with, if any."""
     made = [[own if isinstance(own, Cell) else Cell(own, sort_key(own)) for own in row] for row in rows]
     return Table(title, tuple(header), made, note, key)

@@ -17,7 +17,7 @@ _DEEP = 0.55  # share from which a cell's text is drawn light
 
 
 def histogram(values: Sequence[float], unit: str = "", bins: int = _BINS) -> str:
-    """How values are spread, with their median marked; fractions over 0..1, others over their own range."""
+    """Returns a histogram of values as SVG, with their median marked; fractions over 0..1, others over their own range."""
     data = np.asarray(values, np.float64)
     low, high = (0.0, 1.0) if unit == "fraction" and data.min() >= 0 and data.max() <= 1 else (data.min(), data.max())
     counts, edges = np.histogram(data, bins, (low, high if high > low else low + 1))
@@ -38,7 +38,7 @@ def histogram(values: Sequence[float], unit: str = "", bins: int = _BINS) -> str
 
 
 def curve(name: str, values: Sequence[float | None], unit: str = "") -> str:
-    """A value for each frame; gaps where it is None."""
+    """Returns a curve of a value for each frame as SVG, with gaps where it is None."""
     known = [value for value in values if value is not None]
     low, high = min(known), max(known)
     place, span = _scale(0, max(len(values) - 1, 1)), (high - low) or 1.0
@@ -91,7 +91,10 @@ def _caption(words: str) -> str:
 
 
 def confusion_grid(confusion: np.ndarray, names: Sequence[str], unit: str = "samples") -> str:
-    """Counts i64 (C,C), rows truth, as a table colored by the share of the row; a line of words for the cell in focus."""
+    """Returns a confusion matrix, counts i64 (C,C), rows truth, as a table colored by the share of the row.
+
+    A line of words below it tells of the cell in focus.
+    """
     shares = np.nan_to_num(divide(confusion, confusion.sum(axis=1, keepdims=True)))
     titles = [f"{label} {name}".strip() for label, name in enumerate(names)]
     head = "".join(f'<th scope="col" title="{escape(title)}">{label}</th>' for label, title in enumerate(titles))

@@ -7,13 +7,13 @@ from html import escape
 from importlib.resources import files
 
 from dpcli.evaluate.report.blocks import MISSING, Cell, Figure, Report, Section, Table
-from dpcli.evaluate.report.clouds import palette_words
+from dpcli.evaluate.report.error_clouds import palette_words
 
 _LONG, _LONG_NAME = 44, 26  # characters from which a cell, a row's name, may break into lines
 
 
 def report_html(report: Report) -> str:
-    """The page. Texts from files are escaped; equal reports give equal pages."""
+    """Returns the page. Texts from files are escaped; equal reports give equal pages."""
     source = files(__package__)
     script = source.joinpath("report.js").read_text("utf-8").replace("<!--PALETTE-->", palette_words())
     count = f"{len(report.sections)} result{'s' if len(report.sections) != 1 else ''}"
@@ -60,7 +60,7 @@ def _section(section: Section) -> str:
 
 
 def _figures_in_pairs(blocks: Sequence[Table | Figure]) -> str:
-    """Blocks in order; charts that follow one another stand side by side where there is room."""
+    """Returns blocks in order; charts that follow one another stand side by side where there is room."""
     made, row = [], []
     for block in [*blocks, None]:
         if isinstance(block, Figure) and block.html.startswith("<svg"):
@@ -94,7 +94,7 @@ def _table(table: Table) -> str:
 
 
 def _is_words(table: Table, place: int) -> bool:
-    """Whether a column holds texts, not numbers; it then stands on the left."""
+    """Returns whether a column holds texts, not numbers; it then stands on the left."""
     found = [row[place] for row in table.rows if row[place].text != MISSING]
     return bool(found) and all(own.sort is None for own in found)
 

@@ -1,28 +1,29 @@
-"""Segmentation and motion by class, as bars."""
+"""Draws segmentation and motion metrics by class, as bars."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from dpcli.draw.bars import Bars, Histogram, draw_panels
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import SegmentationReport
-from dpcli.evaluate.segmentation.tables import TITLES, class_rows
+from dpcli.evaluate.segmentation.tables import class_rows
 
 _SHOWN = ("ap", "pq", "f1", "miou", "ri")
 
 
-def segmentation_picture(report: SegmentationReport, path: Path) -> None:
-    """Draw the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
+def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
+    """Draws the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
     rows = class_rows(report.main, report.classes, report.class_names)
-    values = {TITLES[key]: [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
+    values = {title_of(key): [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
     bars = Bars([f"{title} ({own.objects})" for title, own in rows], values, "%", 100)
     spread = Histogram(100 * report.objects.object_iou, "mIoU of a sequence, %", "sequences")
     draw_panels([bars, spread], len(rows), f"Parts, protocol {report.protocol}, split {report.split}", path)
 
 
-def motion_picture(report: MotionReport, path: Path) -> None:
-    """Draw the end-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
+def draw_motion_bars(report: MotionReport, path: Path) -> None:
+    """Draws the end-point error of each class and of all sequences beside that of predicting no motion, and the shares."""
     rows = class_rows(report.main, report.classes, report.class_names)
     titles = [f"{title} ({own.pairs})" for title, own in rows]
     errors = {"EPE3D": [own.epe3d for _, own in rows], "predicting no motion": [own.still for _, own in rows]}

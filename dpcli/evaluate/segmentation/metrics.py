@@ -1,24 +1,31 @@
-"""Segmentation metrics: frames -> sufficient statistics -> metrics, so the statistics of shards add up exactly."""
+"""Segmentation metrics: frames -> sufficient statistics -> metrics, so the statistics of shards add up exactly.
+
+`segmentation_compute` gives the metrics of all sequences, `segmentation_weighted` those of many resamples at once; both
+take panoptic quality, F1, precision and recall from `part_scores`, and average precision from `average_precision.py`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.evaluate.bootstrap import WeightedMetric, means_of_samples
+from dpcli.evaluate.choices import PARTS_PROTOCOLS
 from dpcli.evaluate.proportions import divide, mean_defined
-from dpcli.evaluate.segmentation.part_matching import FrameMatch, match_parts, mean_iou, rand_index
+from dpcli.evaluate.segmentation.average_precision import RankedPredictions, average_precision
+from dpcli.evaluate.segmentation.part_matching import FrameMatch, match_parts, mean_iou
+from dpcli.evaluate.segmentation.rand_index import rand_index
 
-PROTOCOLS = ("dpc", "release")
-RECALLS = np.linspace(0, 1, 101)
-FLOOR = 1e-10  # of the published denominators
+_RELEASE_FLOOR = 1e-10  # of the published denominators
+Ratio = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame: true ids i (N), -1 = unknown; predicted hard ids i (N), -1 = none; probability f (N,K)."""
+    """Holds one frame: true ids i (N), -1 = unknown; predicted hard ids i (N), -1 = none; probability f (N,K)."""
 
     truth: np.ndarray
     part: np.ndarray
@@ -27,7 +34,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class SegmentationStatistics:
-    """All that the metrics need, concatenated over objects in the order they came.
+    """Holds all that the metrics need, concatenated over objects (sequences) in the order they came.
 
     iou f64, matched bool, confidence f64 (P): the predictions that count; object_iou, object_rand f64 (O): mean over
     the frames of each object, NaN where no frame counts; truth_parts, frames, skipped: counted true parts and frames,
@@ -46,13 +53,13 @@ class SegmentationStatistics:
     unknown: int
 
     def __add__(self, other: SegmentationStatistics) -> SegmentationStatistics:
-        """Statistics of both sets of objects together."""
+        """Returns the statistics of both sets of objects together."""
         return segmentation_merge([self, other])
 
 
 @dataclass(frozen=True)
 class SegmentationMetrics:
-    """Shares lie in [0, 1] (with the published matching, recall and F1 can exceed 1); NaN = undefined (0/0).
+    """Holds shares in [0, 1] (with the published matching, recall and F1 can exceed 1); NaN = undefined (0/0).
 
     ap: average precision, pq: panoptic quality, f1, pre(cision), rec(all): at IoU 0.5, pooled over all frames.
     miou, ri (Rand index): mean over the frames of an object, then over objects.
@@ -78,10 +85,10 @@ class SegmentationMetrics:
 def segmentation_update(
     frames: Iterable[Frame], *, ignore_below: int = 0, protocol: str = "dpc"
 ) -> SegmentationStatistics:
-    """Statistics of one object, given its frames. Parts of fewer than `ignore_below` points are ignored.
+    """Returns the statistics of one object, given its frames. True parts of fewer than `ignore_below` points are ignored.
 
-    Frames without a true part that counts are skipped; protocol `release` (see `match_parts`, `mean_iou`) can't:
-    DataError.
+    Frames without a true part that counts are skipped; protocol `release` (see `match_parts`, `mean_iou`) can't skip
+    them: DataError. ValueError for another protocol.
     """
     options = {"ignore_below": ignore_below, "release": _is_release(protocol)}
     matches: list[FrameMatch] = []
@@ -111,13 +118,13 @@ def segmentation_update(
 
 
 def _is_release(protocol: str) -> bool:
-    if protocol not in PROTOCOLS:
-        raise ValueError(f"protocol {protocol!r}: expected one of {', '.join(PROTOCOLS)}")
+    if protocol not in PARTS_PROTOCOLS:
+        raise ValueError(f"protocol {protocol!r}: expected one of {', '.join(PARTS_PROTOCOLS)}")
     return protocol == "release"
 
 
 def segmentation_merge(parts: Iterable[SegmentationStatistics]) -> SegmentationStatistics:
-    """Statistics of all parts together, equal to those of all objects at once. DataError without parts."""
+    """Returns the statistics of all parts together, equal to those of all objects at once. DataError without parts."""
     parts = list(parts)
     if not parts:
         raise DataError("no statistics to merge: evaluate at least one sequence")
@@ -127,24 +134,62 @@ def segmentation_merge(parts: Iterable[SegmentationStatistics]) -> SegmentationS
     )
 
 
-def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dpc") -> SegmentationMetrics:
-    """Metrics from statistics: F1 = 2 TP / (predictions + true parts), PQ = sum of TP's IoU / their mean number.
+def panoptic_quality(
+    iou_sum: np.ndarray, predictions: np.ndarray, truth_parts: np.ndarray, ratio: Ratio = divide
+) -> np.ndarray:
+    """Returns PQ: the sum of the found parts' IoU over the mean number of predictions and true parts (Kirillov et al. 2019).
 
-    `release` keeps the order of the predictions where confidences are equal (`dpc` counts them together) and takes
-    0/0 as 0.
+    All arguments are numbers or arrays of one shape. ratio: how to divide, and what 0/0 is.
+
+    >>> float(panoptic_quality(0.8 + 0.9, 3, 2))
+    0.68
+    """
+    return ratio(iou_sum, (predictions + truth_parts) / 2)
+
+
+def part_scores(
+    true_positives: np.ndarray,
+    predictions: np.ndarray,
+    iou_sum: np.ndarray,  # of the true positives
+    truth_parts: np.ndarray,
+    protocol: str = "dpc",
+) -> dict[str, np.ndarray]:
+    """Returns PQ, F1, precision and recall from counts, which are numbers or arrays of one shape.
+
+    F1 = 2 TP / (predictions + true parts). Protocol `release` takes F1 from precision and recall, and 0/0 as 0.
+
+    >>> {key: round(float(value), 3) for key, value in part_scores(2, 3, 1.7, 2).items()}
+    {'pq': 0.68, 'f1': 0.8, 'pre': 0.667, 'rec': 1.0}
     """
     release = _is_release(protocol)
+    ratio = _floored_ratio if release else divide
+    precision, recall = ratio(true_positives, predictions), ratio(true_positives, truth_parts)
+    return {
+        "pq": panoptic_quality(iou_sum, predictions, truth_parts, ratio),
+        "f1": ratio(2 * precision * recall, precision + recall)
+        if release
+        else ratio(2 * true_positives, predictions + truth_parts),
+        "pre": precision,
+        "rec": recall,
+    }
+
+
+def _floored_ratio(top: np.ndarray, bottom: np.ndarray) -> np.ndarray:
+    return top / np.maximum(bottom, _RELEASE_FLOOR)
+
+
+def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dpc") -> SegmentationMetrics:
+    """Returns the metrics that statistics stand for. ValueError for an unknown protocol.
+
+    `release` keeps the order of the predictions where confidences are equal (`dpc` counts them together), and takes 0/0
+    as 0 (see `part_scores`).
+    """
     matched, truth = statistics.matched, statistics.truth_parts
     hits, count = int(matched.sum()), len(matched)
-    ap = average_precision(statistics.confidence, matched, truth, keep_order=release)
-    ratio = (lambda top, bottom: top / max(bottom, FLOOR)) if release else (lambda a, b: float(divide(a, b)))
-    precision, recall = ratio(hits, count), ratio(hits, truth)
+    scores = part_scores(hits, count, float(statistics.iou[matched].sum()), truth, protocol)
     return SegmentationMetrics(
-        ap=ap,
-        pq=ratio(float(statistics.iou[matched].sum()), (count + truth) / 2),
-        f1=ratio(2 * precision * recall, precision + recall) if release else ratio(2 * hits, count + truth),
-        pre=precision,
-        rec=recall,
+        ap=average_precision(statistics.confidence, matched, truth, keep_order=_is_release(protocol)),
+        **{key: float(value) for key, value in scores.items()},
         miou=mean_defined(statistics.object_iou),
         ri=mean_defined(statistics.object_rand),
         predictions=count,
@@ -158,21 +203,24 @@ def segmentation_compute(statistics: SegmentationStatistics, protocol: str = "dp
     )
 
 
-def average_precision(
-    confidence: np.ndarray, matched: np.ndarray, truth_parts: int, *, keep_order: bool = False
-) -> float:
-    """Mean of the precision envelope at recall 0, 0.01, ..., 1 (the 101 points of COCO); NaN without true parts.
+def segmentation_weighted(sequences: Sequence[SegmentationStatistics], protocol: str = "dpc") -> WeightedMetric:
+    """Returns ap, pq, f1, pre, rec, miou and ri as functions of how often each sequence counts.
 
-    confidence f (P), matched bool (P). Predictions of equal confidence enter together, so their order doesn't matter;
-    with `keep_order` one after the other in the given order, as the published code.
+    sequences: the statistics of each one. ValueError for an unknown protocol.
     """
-    if truth_parts == 0:
-        return np.nan
-    order = np.argsort(-confidence, kind="stable")
-    hits = np.cumsum(matched[order])
-    recall, precision = hits / truth_parts, hits / np.arange(1, len(hits) + 1)
-    if not keep_order:
-        ends = np.append(np.diff(confidence[order]) != 0, True)[: len(hits)]
-        recall, precision = recall[ends], precision[ends]
-    envelope = np.append(np.maximum.accumulate(precision[::-1])[::-1], 0.0)
-    return float(envelope[np.searchsorted(recall, RECALLS, side="left")].mean())
+    whole = segmentation_merge(sequences)
+    sequence = np.repeat(np.arange(len(sequences)), [len(one.iou) for one in sequences])
+    hits, predictions, iou = (
+        np.bincount(sequence, weights, len(sequences)) for weights in (whole.matched, None, whole.iou * whole.matched)
+    )
+    truth_parts = [one.truth_parts for one in sequences]
+    sums = np.stack([hits, predictions, iou, truth_parts], axis=1).astype(np.float64)
+    over_sequences = means_of_samples({"miou": whole.object_iou, "ri": whole.object_rand})
+    ranked = RankedPredictions(whole.confidence, whole.matched, sequence, keep_order=_is_release(protocol))
+
+    def metric(counts: np.ndarray) -> dict[str, np.ndarray]:
+        totals = (counts @ sums).T
+        precision = ranked.average_precision(counts, totals[3])
+        return {"ap": precision, **part_scores(*totals, protocol), **over_sequences(counts)}
+
+    return metric

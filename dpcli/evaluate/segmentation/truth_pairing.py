@@ -1,4 +1,4 @@
-"""A parts file beside its truth: the same sequences, frames and points on both sides, or an error that says where not."""
+"""Pairs a parts file with its truth: the same sequences, frames and points on both sides, or an error that says where not."""
 
 from __future__ import annotations
 
@@ -9,27 +9,27 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.classification.protocol import LeftOut, listing
+from dpcli.evaluate.results import LeftOut, counted_split, list_names
 from dpcli.runtime.progress import Progress
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
 
 
 @dataclass(frozen=True)
-class Compared:
-    """One sequence: truth and prediction with the same points, and what is said of its parts."""
+class SequencePair:
+    """Holds one sequence: truth and prediction with the same points, and the predicted probabilities, motions and flow."""
 
     truth: CloudSequence
     predicted: CloudSequence
-    said: PartsSample
+    parts: PartsSample
 
 
-class Comparison:
-    """Sequences of a parts file that count, each beside its truth, in the order of the parts file.
+class PairedSequences:
+    """Yields the sequences of a parts file that count, each beside its truth, in the order of the parts file.
 
-    `split`: only sequences of this split of the truth; "all" every one; None = "test" if there are any. Sequences on
-    one side only are an error, with `intersect` they are left out and listed. `fields` names what the truth needs,
-    `instead` what serves as well where it lacks some of them; the attribute `fields` tells which of the two it is.
-    DataError when the truth lacks a field or nothing is left to compare.
+    split: only sequences of this split of the truth; "all" every one; None = "test" if there are any. Sequences on
+    one side only are an error, with `intersect` they are left out and listed. fields: what the truth needs; instead:
+    what serves as well where it lacks some of them; the attribute `fields` tells which of the two it is.
+    Raises DataError when the truth lacks a field or nothing is left to compare.
     """
 
     def __init__(
@@ -52,13 +52,13 @@ class Comparison:
                 "`dpc prepare` writes them for data sets that have them"
             )
         self.fields = tuple(instead if missing else fields)
-        self._same_unit()
-        self.split = split or ("test" if "test" in self.truth.splits else "all")
+        self._check_unit()
+        self.split = counted_split(split, self.truth.splits)
         self.left_out: list[LeftOut] = []
-        self.rows = self._match(intersect)
+        self.rows = self._match_names(intersect)
 
-    def _same_unit(self) -> None:
-        """A unit that a file doesn't name may be any."""
+    def _check_unit(self) -> None:
+        """Raises DataError for two units; one that a file doesn't name may be any."""
         unit, other = self.predicted.length_unit, self.truth.length_unit
         if unit and other and unit != other:
             raise DataError(
@@ -66,23 +66,23 @@ class Comparison:
                 "predict again from that file"
             )
 
-    def _match(self, intersect: bool) -> list[tuple[int, int]]:
-        """(index in the parts file, index in the truth) of what counts."""
-        where = {name: index for index, name in enumerate(self.truth.names)}
+    def _match_names(self, intersect: bool) -> list[tuple[int, int]]:
+        """Returns (index in the parts file, index in the truth) of what counts."""
+        row_of = {name: index for index, name in enumerate(self.truth.names)}
         names = self.predicted.names
-        unknown = [name for name in names if name not in where]
-        said = set(names)
-        wanted = [
+        unknown = [name for name in names if name not in row_of]
+        predicted = set(names)
+        of_split = [
             name for name, own in zip(self.truth.names, self.truth.splits, strict=True) if self.split in ("all", own)
         ]
-        unsaid = [name for name in wanted if name not in said]
+        not_predicted = [name for name in of_split if name not in predicted]
         if not intersect:
-            self._same_names(unknown, unsaid)
-        counted = set(wanted)
+            self._check_names(unknown, not_predicted)
+        counted = set(of_split)
         self._leave_out("the truth doesn't have", unknown)
-        self._leave_out("not predicted", unsaid)
-        self._leave_out(f"not of split {self.split!r}", [n for n in names if n in where and n not in counted])
-        rows = [(index, where[name]) for index, name in enumerate(names) if name in counted]
+        self._leave_out("not predicted", not_predicted)
+        self._leave_out(f"not of split {self.split!r}", [n for n in names if n in row_of and n not in counted])
+        rows = [(index, row_of[name]) for index, name in enumerate(names) if name in counted]
         if not rows:
             raise DataError(
                 f"{self.predicted.path}: no sequence of split {self.split!r} of {self.truth.path}; "
@@ -90,15 +90,15 @@ class Comparison:
             )
         return rows
 
-    def _same_names(self, unknown: list[str], unsaid: list[str]) -> None:
+    def _check_names(self, unknown: list[str], not_predicted: list[str]) -> None:
         if unknown:
             raise DataError(
-                f"{self.truth.path}: has no {listing(unknown)}, which {self.predicted.path} has; "
+                f"{self.truth.path}: has no {list_names(unknown)}, which {self.predicted.path} has; "
                 "was it predicted from another? --intersect compares what both have"
             )
-        if unsaid:
+        if not_predicted:
             raise DataError(
-                f"{self.predicted.path}: has no {listing(unsaid)} of split {self.split!r} of "
+                f"{self.predicted.path}: has no {list_names(not_predicted)} of split {self.split!r} of "
                 f"{self.truth.path}; predict them too, or --intersect compares what both have"
             )
 
@@ -106,17 +106,17 @@ class Comparison:
         if names:
             self.left_out.append(LeftOut(reason, names))
 
-    def __iter__(self) -> Iterator[Compared]:
-        """One sequence in memory at a time. DataError at the first point in which the two files differ."""
+    def __iter__(self) -> Iterator[SequencePair]:
+        """Yields one sequence at a time, so that one is in memory. DataError at the first point in which the two files differ."""
         with Progress("evaluate", len(self.rows), "sequence") as progress:
             for own, other in self.rows:
                 truth = self.truth.read(other, fields=self.fields)
                 predicted = self.predicted.read(own, fields=("part",))
-                self._same_points(truth, predicted)
-                yield Compared(truth, predicted, self.predicted.read_parts(own))
+                self._check_points(truth, predicted)
+                yield SequencePair(truth, predicted, self.predicted.read_parts(own))
                 progress.advance()
 
-    def _same_points(self, truth: CloudSequence, predicted: CloudSequence) -> None:
+    def _check_points(self, truth: CloudSequence, predicted: CloudSequence) -> None:
         where = f"{self.predicted.path}: {truth.name!r} has"
         again = f"in {self.truth.path}; predict again from that file"
         if truth.num_frames != predicted.num_frames:
@@ -134,10 +134,11 @@ class Comparison:
             raise DataError(f"{where} point {point} of frame {frame} at {ours}, but {theirs} {again}")
 
     def close(self) -> None:
+        """Closes both files."""
         self.predicted.close()
         self.truth.close()
 
-    def __enter__(self) -> Comparison:
+    def __enter__(self) -> PairedSequences:
         return self
 
     def __exit__(self, *exc: object) -> None:

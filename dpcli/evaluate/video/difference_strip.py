@@ -1,4 +1,4 @@
-"""Truth, prediction and their difference side by side, some instants of each view, as one picture."""
+"""Draws truth, prediction and their difference side by side, some instants of each view, as one picture."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import numpy as np
 
 from dpcli.draw.sheet import SheetRow, contact_sheet, save_picture
 from dpcli.errors import DataError
-from dpcli.evaluate.video.sources import Picture, View
+from dpcli.evaluate.video.sources.source import Picture, View
 
 _INSTANTS, _MOST_VIEWS = 6, 8
 _SIDE = 160  # pixels of a cell
 
 
-class Strip:
+class DifferenceStrip:
     """Collects small cells while a video is scored (`evaluate_video`'s `watch`), and writes them as one picture.
 
     For each of the first eight views three rows: truth, prediction, and four times the absolute difference.
@@ -34,7 +34,7 @@ class Strip:
         self.rows.setdefault(title, []).append((frame, np.concatenate([theirs, ours, apart])))
 
     def save(self, path: Path) -> None:
-        """Write the picture. DataError when there is nothing to show, or it can't be written."""
+        """Writes the picture. DataError when there is nothing to show, or it can't be written."""
         if not self.rows:
             raise DataError(f"--picture {path}: no pictures were compared")
         rows = [
@@ -47,7 +47,7 @@ class Strip:
 
 
 def _small(colors: np.ndarray) -> np.ndarray:
-    """f32 (3,H,W) in 0..1 -> f32 (S,S,3), the longer side filling the cell."""
+    """Returns a picture f32 (3,H,W) in 0..1 as f32 (S,S,3), the longer side filling the cell."""
     from PIL import Image
 
     image = Image.fromarray((np.nan_to_num(colors).transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8))

@@ -15,7 +15,7 @@ _REACH = TAPS // 2
 
 @arithmetic_kernel
 def composite(rgba, background, out):
-    """Straight-alpha rgba u8 (H,W,4) over background f32 (3) -> out f32 (3,H,W); all colors in 0..1."""
+    """Writes straight-alpha rgba u8 (H,W,4) over background f32 (3) to out f32 (3,H,W); all colors in 0..1."""
     height, width, _ = rgba.shape
     for channel in range(3):
         behind = background[channel]
@@ -28,7 +28,7 @@ def composite(rgba, background, out):
 
 @arithmetic_kernel
 def squared_errors(predicted, truth, mask):
-    """Sums of squared differences of f32 (C,H,W) pictures: over all values, and over the pixels of mask u8 (H,W)."""
+    """Returns the sums of squared differences of f32 (C,H,W) pictures: over all values, and over the pixels of mask u8 (H,W)."""
     channels, height, width = predicted.shape
     whole, inside = np.zeros(width), np.zeros(width)  # a sum per column: float64, and still a vector loop
     for channel in range(channels):
@@ -42,7 +42,7 @@ def squared_errors(predicted, truth, mask):
 
 @arithmetic_kernel
 def _across(line, taps, out):
-    """Horizontal pass: out f32 (W-10) of line f32 (W), with the window's six different weights."""
+    """Computes the horizontal pass: out f32 (W-10) of line f32 (W), with the window's six different weights."""
     a, b, c, d, e, f = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     for x in range(len(out)):
         out[x] = (
@@ -57,7 +57,7 @@ def _across(line, taps, out):
 
 @arithmetic_kernel
 def _down(ring, first, taps, out):
-    """Vertical pass: out f32 (W) of ring f32 (11,W), whose oldest row is `first`."""
+    """Computes the vertical pass: out f32 (W) of ring f32 (11,W), whose oldest row is `first`."""
     a, b, c, d, e, f = taps[0], taps[1], taps[2], taps[3], taps[4], taps[5]
     r0, r1, r2 = ring[first], ring[(first + 1) % TAPS], ring[(first + 2) % TAPS]
     r3, r4, r5 = ring[(first + 3) % TAPS], ring[(first + 4) % TAPS], ring[(first + 5) % TAPS]
@@ -76,7 +76,7 @@ def _down(ring, first, taps, out):
 
 @arithmetic_kernel
 def _lines(predicted, truth, pad, center, lines):
-    """A row's difference, its square, centered sum, its square -> lines f32 (4,W+2 pad), mirrored at the edges."""
+    """Writes a row's difference, its square, centered sum and its square to lines f32 (4,W+2 pad), mirrored at the edges."""
     width = len(predicted)
     for x in range(width):
         apart = predicted[x] - truth[x]
@@ -91,7 +91,7 @@ def _lines(predicted, truth, pad, center, lines):
 
 @arithmetic_kernel
 def _similarity(moments, center, c1, c2, whole, contrast):
-    """Add the similarity and its contrast-structure factor at each column to whole, contrast f64 (W).
+    """Adds the similarity and its contrast-structure factor at each column to whole, contrast f64 (W).
 
     With d = p - t and s = p + t: luminance 1 - E[d]^2 / (E[p]^2 + E[t]^2 + c1), contrast-structure
     1 - Var d / ((Var s + Var d) / 2 + c2): equal to the usual form, but what is subtracted from 1 is itself exact to
@@ -111,7 +111,7 @@ def _similarity(moments, center, c1, c2, whole, contrast):
 
 @arithmetic_kernel
 def similarity_sums(predicted, truth, taps, pad, center, c1, c2):
-    """Sums over all windows of f32 (C,H,W) pictures of the similarity and of its contrast-structure factor.
+    """Returns the sums over all windows of f32 (C,H,W) pictures of the similarity and of its contrast-structure factor.
 
     taps f32 (6): the window's weights from its edge to its middle. pad 0: windows inside the picture only; 5: one
     window per pixel, the picture mirrored at its edges (which are not repeated). center: about the mean value, taken
@@ -138,7 +138,7 @@ def similarity_sums(predicted, truth, taps, pad, center, c1, c2):
 
 @arithmetic_kernel
 def halve(picture, out):
-    """Means of 2 x 2 pixels: f32 (C,H,W) -> out f32 (C,H//2,W//2)."""
+    """Writes the means of 2 x 2 pixels of f32 (C,H,W) to out f32 (C,H//2,W//2)."""
     channels, height, width = out.shape
     for channel in range(channels):
         for row in range(height):

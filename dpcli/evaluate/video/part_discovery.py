@@ -1,4 +1,4 @@
-"""Part discovery and surface tracks: a Gaussian scene against true surface points that know their bone and their path."""
+"""Part discovery and surface tracks: a Gaussian scene against surface points whose true parts and paths are known."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.proportions import divide
-from dpcli.evaluate.segmentation.part_matching import overlap
+from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index
 from dpcli.runtime.seeds import scikit_learn_state
 from dpcli.store.gaussians import GaussianScene
 
@@ -19,7 +19,7 @@ SOLID = 0.1  # opacity of a Gaussian that may carry a surface; fainter ones floa
 
 @dataclass(frozen=True)
 class PartScore:
-    """Adjusted Rand index of the discovered parts at true surface points, and of two trivial answers.
+    """Holds the adjusted Rand index (ARI) of the discovered parts at true surface points, and of two trivial answers.
 
     ari_one_part: everything one part (0 unless the truth is one part too). ari_kmeans: k-means on the positions in the
     first frame, k = true_parts, which the scene isn't told. points: that count; unknown: left out, no true part.
@@ -37,7 +37,7 @@ class PartScore:
 
 @dataclass(frozen=True)
 class TrackScore:
-    """Mean distance between carried and true surface points over all frames but the first, in the truth's length unit.
+    """Holds the mean distance between carried and true surface points over all frames but the first, in the truth's length unit.
 
     static: that of points which stay where they are. diameter: diagonal of the points' bounding box in the first frame.
     points, frames: whose product is the denominator.
@@ -50,25 +50,10 @@ class TrackScore:
     frames: int
 
 
-def adjusted_rand_index(truth: np.ndarray, part: np.ndarray) -> float:
-    """Rand index less its expectation under random labels, over its largest value less that (Hubert & Arabie 1985).
-
-    Ids i (N) each; points with truth below 0 are taken out, predicted -1 is one more group. 1 for equal groupings, also
-    where both are one group or all single points (0/0); NaN without points.
-    """
-    known = truth >= 0
-    if not known.any():
-        return np.nan
-    found = overlap(truth[known], part[known].astype(np.int64) + 1)
-    together, rows, columns = (float((n * (n - 1)).sum()) for n in (found.shared, found.truth_sizes, found.sizes))
-    every = float(known.sum()) * (float(known.sum()) - 1)
-    expected = rows * columns / every if every else 0.0
-    largest = 0.5 * (rows + columns)
-    return 1.0 if largest == expected else float((together - expected) / (largest - expected))
-
-
-def attach(points: np.ndarray, means: np.ndarray, opacity: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Indices i64 (M,k) of the k nearest solid Gaussians of points f (M,3), and their weights f64 (M,k), sum 1.
+def nearest_gaussians(
+    points: np.ndarray, means: np.ndarray, opacity: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns indices i64 (M,k) of the k nearest solid Gaussians of points f (M,3), and their weights f64 (M,k), sum 1.
 
     Weight = opacity / distance: a Gaussian that a point lies on decides alone. Where fewer than k Gaussians have an
     opacity of at least SOLID, all may be found. k is at most the number of Gaussians.
@@ -86,11 +71,12 @@ def attach(points: np.ndarray, means: np.ndarray, opacity: np.ndarray, k: int) -
 
 
 def surface_parts(scene: GaussianScene, points: np.ndarray, time: float) -> np.ndarray:
-    """Part i64 (M) of surface points at `time`: the one with the largest weight among its nearest Gaussians.
+    """Returns the part i64 (M) of surface points f (M,3) at `time`, in seconds.
 
-    -1 where those have none; a tie goes to the lowest id.
+    It is the part with the largest weight among the nearest Gaussians; -1 where those have none; a tie goes to the
+    lowest id.
     """
-    index, weight = attach(points, scene.at(time)[0], scene.opacity, PART_NEIGHBORS)
+    index, weight = nearest_gaussians(points, scene.at(time)[0], scene.opacity, PART_NEIGHBORS)
     votes = np.zeros((len(points), scene.num_parts + 1))
     rows = np.arange(len(points))[:, None]
     np.add.at(votes, (rows, scene.part[index].astype(np.int64) + 1), weight)
@@ -106,7 +92,7 @@ def part_score(
     *,
     seed: int = 0,
 ) -> PartScore:
-    """How well a scene's parts are those of the truth. DataError when no point has a true part."""
+    """Scores how well a scene's parts are those of the truth. DataError when no point has a true part."""
     known = part >= 0
     if not known.any():
         raise DataError("parts: no surface point of the truth has a known part (all are -1)")
@@ -116,7 +102,7 @@ def part_score(
     return PartScore(
         ari=adjusted_rand_index(part, found),
         ari_one_part=adjusted_rand_index(part, np.zeros(len(part), int)),
-        ari_kmeans=adjusted_rand_index(part, _clusters(points, true_parts, seed)),
+        ari_kmeans=adjusted_rand_index(part, _kmeans_parts(points, true_parts, seed)),
         points=len(part),
         unknown=int((~known).sum()),
         true_parts=true_parts,
@@ -124,21 +110,21 @@ def part_score(
     )
 
 
-def _clusters(points: np.ndarray, count: int, seed: int) -> np.ndarray:
+def _kmeans_parts(points: np.ndarray, count: int, seed: int) -> np.ndarray:
     from sklearn.cluster import KMeans
 
     count = min(count, len(np.unique(points, axis=0)))
     return KMeans(count, n_init=10, random_state=scikit_learn_state(seed)).fit_predict(points.astype(np.float64))
 
 
-def carry(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Positions f64 (T,M,3) of surface points f (M,3) of times[0] at every time, moved by their nearest Gaussians.
+def carry_points(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Returns the positions f64 (T,M,3) of surface points f (M,3) of times[0] at every time, moved by their nearest Gaussians.
 
     Each of the four moves a point rigidly, by its own shift and turn since times[0]; the weighted mean counts. Points
     of a rigidly moving scene are carried exactly.
     """
     means, turns = scene.at(float(times[0]))
-    index, weight = attach(points, means, scene.opacity, TRACK_NEIGHBORS)
+    index, weight = nearest_gaussians(points, means, scene.opacity, TRACK_NEIGHBORS)
     back = np.swapaxes(_rotations(turns), 1, 2)
     local = np.einsum("mkij,mkj->mki", back[index], points[:, None].astype(np.float64) - means[index])
     carried = np.empty((len(times), *points.shape))
@@ -150,7 +136,7 @@ def carry(scene: GaussianScene, points: np.ndarray, times: np.ndarray) -> np.nda
 
 
 def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """f64 (N,3,3) of unit quaternions w x y z (N,4)."""
+    """Returns rotations f64 (N,3,3) of unit quaternions w x y z (N,4)."""
     w, x, y, z = quaternions.astype(np.float64).T
     rows = [
         1 - 2 * (y * y + z * z),
@@ -167,7 +153,7 @@ def _rotations(quaternions: np.ndarray) -> np.ndarray:
 
 
 def track_score(scene: GaussianScene, track: np.ndarray, times: np.ndarray) -> TrackScore:
-    """How far a scene carries true surface points f (T,M,3) from where they are at `times`, seconds (T).
+    """Measures how far a scene carries true surface points f (T,M,3) from where they are at `times`, seconds (T).
 
     NaN errors when there is only one frame. DataError without points.
     """
@@ -175,7 +161,7 @@ def track_score(scene: GaussianScene, track: np.ndarray, times: np.ndarray) -> T
     if points == 0:
         raise DataError("tracks: the truth has no surface points")
     truth = track.astype(np.float64)
-    carried = carry(scene, truth[0], times)
+    carried = carry_points(scene, truth[0], times)
     count = (frames - 1) * points
     errors = (
         np.linalg.norm(guess[1:] - truth[1:], axis=-1).sum()

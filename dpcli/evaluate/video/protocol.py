@@ -9,25 +9,36 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.video.image_metrics import PSNR_CAP, PictureStatistics, picture_update
-from dpcli.evaluate.video.network_metrics import LEARNED, Networks
-from dpcli.evaluate.video.sources import Picture
+from dpcli.evaluate.choices import BACKGROUNDS, FVD_VARIANTS, LPIPS_NETWORKS, PICTURE_METRICS
+from dpcli.evaluate.video.picture_statistics import PictureStatistics, picture_update
+from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.sources.source import Picture
 
-PICTURE_METRICS = ("psnr", "psnr_foreground", "ssim", "ms_ssim")
-SCENE_METRICS = ("parts", "tracks")
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
-LPIPS_NETS = ("alex", "vgg", "squeeze")
-FVD_VARIANTS = ("styleganv", "videogpt", "disco", "consistent4d")
 SMALLEST = {"ssim": 11, "ms_ssim": 176}  # pixels a side
 
 
 @dataclass(frozen=True)
-class VideoProtocol:
-    """views: which of the truth's are compared, all | reference | test (all when there is no test view).
+class Networks:
+    """Says which published network stands for a metric. every: windows of FVD and FID-VID start at each so many frames.
 
+    lpips_range01: LPIPS gets colors in 0..1 where it expects -1..1, as DisCo's evaluation does.
+    """
+
+    lpips: str = "alex"
+    lpips_range01: bool = False
+    fvd: str = "consistent4d"
+    clip: str = "openai"
+    every: int = 1
+
+
+@dataclass(frozen=True)
+class VideoProtocol:
+    """Holds all choices that a number of a video stands for.
+
+    views: which of the truth's are compared, all | reference | test (all when there is no test view).
     size: side that both pictures are resized to by PIL's default (bicubic), None = as they are, and equal. eight_bit:
     colors are rounded to 0..255 after compositing. data_range: None = of each frame, as torchmetrics without one: the
-    truth's largest less smallest value for PSNR, the wider of both pictures' for SSIM. border: as `image_metrics.ssim`.
+    truth's largest less smallest value for PSNR, the wider of both pictures' for SSIM. border: as `ssim.ssim`.
     gray: SSIM of luminance instead of each color. networks: those of the learned metrics; learned_views: which of the
     truth's they compare, if others than `views`.
     """
@@ -71,16 +82,16 @@ PROTOCOLS = {
 def video_protocol(
     name: str, background: str | None = None, *, lpips: str | None = None, fvd: str | None = None, every: int = 1
 ) -> VideoProtocol:
-    """A protocol by its name, over another background or with other networks when they are given.
+    """Returns a protocol by its name, over another background or with other networks when they are given.
 
-    lpips: alex | vgg | squeeze; fvd: a variant of `video_features.VARIANTS`; every: its windows start each so many
+    lpips: alex | vgg | squeeze; fvd: a variant of `frechet/variants.py`; every: its windows start each so many
     frames. UsageError for names there aren't.
     """
     if name not in PROTOCOLS:
         raise UsageError(f"--protocol {name}: expected {', '.join(PROTOCOLS)}")
     if background is not None and background not in BACKGROUNDS:
         raise UsageError(f"--background {background}: expected {' or '.join(BACKGROUNDS)}")
-    for option, value, known in (("lpips", lpips, LPIPS_NETS), ("fvd", fvd, FVD_VARIANTS)):
+    for option, value, known in (("lpips", lpips, LPIPS_NETWORKS), ("fvd", fvd, FVD_VARIANTS)):
         if value is not None and value not in known:
             raise UsageError(f"--{option} {value}: expected {', '.join(known)}")
     found = PROTOCOLS[name]
@@ -89,30 +100,14 @@ def video_protocol(
     return replace(found, networks=networks, background=background or found.background)
 
 
-def parse_metrics(text: str | None) -> tuple[str, ...] | None:
-    """`psnr,ssim` -> names in the order they are shown; None stays None. UsageError for metrics there aren't."""
-    if text is None:
-        return None
-    known, asked = (
-        (*PICTURE_METRICS, *LEARNED, *SCENE_METRICS),
-        {name.strip() for name in text.split(",") if name.strip()},
-    )
-    unknown = sorted(asked - set(known))
-    if unknown or not asked:
-        raise UsageError(
-            f"--metrics {text}: {unknown[0] if unknown else 'nothing'}; expected some of {','.join(known)}"
-        )
-    return tuple(name for name in known if name in asked)
-
-
 def check_picture_of(metrics: Sequence[str] | None, picture: object) -> None:
-    """UsageError when a picture is wanted, but only metrics that compare none."""
+    """Raises UsageError when a picture is asked for, but only metrics that compare none."""
     if picture is not None and metrics is not None and not set(metrics) & set(PICTURE_METRICS):
         raise UsageError(f"--picture shows pictures: ask for one of {','.join(PICTURE_METRICS)}, or leave it out")
 
 
 def comparable(picture: Picture, protocol: VideoProtocol) -> np.ndarray:
-    """Colors f32 (3,H,W) of a picture as the protocol compares them: in 0..1, or 0..255 when it rounds to 8 bits."""
+    """Returns the colors f32 (3,H,W) of a picture as the protocol compares them: in 0..1, or 0..255 when it rounds to 8 bits."""
     colors = picture.over(BACKGROUNDS[protocol.background])
     if not protocol.eight_bit:
         return colors
@@ -131,7 +126,7 @@ def _resized(image: np.ndarray, side: int | None, nearest: bool = False) -> np.n
 def score_frame(
     frame: int, predicted: Picture, truth: Picture, protocol: VideoProtocol, metrics: Sequence[str]
 ) -> PictureStatistics:
-    """Statistics of one frame. The mask of psnr_foreground is the truth's object, alpha of one half or more."""
+    """Returns the statistics of one frame. The mask of psnr_foreground is the truth's object, alpha of one half or more."""
     ours, theirs = comparable(predicted, protocol), comparable(truth, protocol)
     mask = _resized(truth.mask(), protocol.size, nearest=True) if "psnr_foreground" in metrics else None
     peak = own = protocol.data_range
@@ -149,18 +144,18 @@ def score_frame(
 
 
 def _luminance(colors: np.ndarray) -> np.ndarray:
-    """RGB f32 (3,H,W) -> f32 (1,H,W), with scikit-image's weights."""
+    """Returns RGB f32 (3,H,W) as luminance f32 (1,H,W), with scikit-image's weights."""
     return np.tensordot(np.float32([0.2125, 0.7154, 0.0721]), colors, 1)[None]
 
 
 def scaled(picture: Picture, protocol: VideoProtocol) -> np.ndarray:
-    """`comparable` colors f32 (3,H,W), always in 0..1: what the learned metrics look at."""
+    """Returns `comparable` colors f32 (3,H,W), always in 0..1: what the learned metrics look at."""
     colors = comparable(picture, protocol)
     return colors / np.float32(255) if protocol.eight_bit else colors
 
 
 def check_size(size: tuple[int, int], protocol: VideoProtocol, metrics: Sequence[str], where: str) -> None:
-    """DataError when pictures of this (width, height) are too small for a metric."""
+    """Raises DataError when pictures of this (width, height) are too small for a metric."""
     side = protocol.size or min(size)
     for name, least in SMALLEST.items():
         if name in metrics and side < least:
@@ -170,8 +165,8 @@ def check_size(size: tuple[int, int], protocol: VideoProtocol, metrics: Sequence
             )
 
 
-def choices(protocol: VideoProtocol) -> dict[str, Any]:
-    """Every choice of a protocol in words, for a result that stands alone."""
+def describe_protocol(protocol: VideoProtocol) -> dict[str, Any]:
+    """Returns every choice of a protocol in words, for a result that stands alone."""
     ranges = "of each frame: truth's max - min (PSNR), the wider of both pictures' (SSIM)"
     borders = {"valid": "windows inside the picture", "reflect": "a window per pixel, picture mirrored at its edges"}
     of = "of luminance" if protocol.gray else "of each color"

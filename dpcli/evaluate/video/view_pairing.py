@@ -1,89 +1,90 @@
-"""Which view of a prediction shows the same as which view of the truth: by camera, or by name."""
+"""Pairs the views of a prediction with those of the truth that show the same: by camera, or by name."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.classification.protocol import LeftOut, listing
+from dpcli.evaluate.results import LeftOut, list_names
 from dpcli.evaluate.video.protocol import VideoProtocol
-from dpcli.evaluate.video.sources import SceneSource, Source
+from dpcli.evaluate.video.sources.source import Source
+from dpcli.evaluate.video.sources.stored import SceneSource
 
 _SAME_CAMERA = 1e-4  # relative: cameras that went through float32 still are the same
 
 
 def match_views(
-    said: Source, real: Source, protocol: VideoProtocol, intersect: bool, left_out: list[LeftOut]
+    predicted: Source, truth: Source, protocol: VideoProtocol, intersect: bool, left_out: list[LeftOut]
 ) -> list[tuple[int, int]]:
-    """(view of the prediction, view of the truth) of what is compared, in the truth's order.
+    """Returns (view of the prediction, view of the truth) of what is compared, in the truth's order.
 
     The protocol says which views of the truth; the others of either side go to `left_out`. DataError when one lacks a
     partner and `intersect` is off, or none has.
     """
-    wanted = [i for i, view in enumerate(real.views) if protocol.views in ("all", view.role)]
-    if not wanted and protocol.views == "test" or len(real.views) == 1:
-        wanted = list(range(len(real.views)))
-    if not wanted:
-        raise DataError(f"{real.path}: no {protocol.views} view, which protocol {protocol.name} compares")
-    found = {i: _partner(said, real, i) for i in wanted}
-    unsaid = [real.views[i].title for i in wanted if found[i] is None]
-    used = {_partner(said, real, i) for i in range(len(real.views))}
-    unknown = [view.title for i, view in enumerate(said.views) if i not in used]
-    if unsaid and not intersect:
+    compared = [i for i, view in enumerate(truth.views) if protocol.views in ("all", view.role)]
+    if not compared and protocol.views == "test" or len(truth.views) == 1:
+        compared = list(range(len(truth.views)))
+    if not compared:
+        raise DataError(f"{truth.path}: no {protocol.views} view, which protocol {protocol.name} compares")
+    partners = {i: _partner_view(predicted, truth, i) for i in compared}
+    not_predicted = [truth.views[i].title for i in compared if partners[i] is None]
+    used = {_partner_view(predicted, truth, i) for i in range(len(truth.views))}
+    unknown = [view.title for i, view in enumerate(predicted.views) if i not in used]
+    if not_predicted and not intersect:
         raise DataError(
-            f"{said.path}: has no view {listing(unsaid)} of {real.path}; its views are "
-            f"{listing([v.title for v in said.views])}; --intersect compares what both have"
+            f"{predicted.path}: has no view {list_names(not_predicted)} of {truth.path}; its views are "
+            f"{list_names([v.title for v in predicted.views])}; --intersect compares what both have"
         )
     if unknown and not intersect and protocol.views == "all":
         raise DataError(
-            f"{real.path}: has no view {listing(unknown)}, which {said.path} has; --intersect compares what both have"
+            f"{truth.path}: has no view {list_names(unknown)}, which {predicted.path} has; --intersect compares what both have"
         )
     left_out += [
         LeftOut(reason, names)
-        for reason, names in (("views not predicted", unsaid), ("views the truth doesn't have", unknown))
+        for reason, names in (("views not predicted", not_predicted), ("views the truth doesn't have", unknown))
         if names
     ]
-    pairs = [(found[i], i) for i in wanted if found[i] is not None]
+    pairs = [(partners[i], i) for i in compared if partners[i] is not None]
     if not pairs:
         raise DataError(
-            f"{said.path} and {real.path} have no view in common; the truth's are "
-            f"{listing([view.title for view in real.views])}"
+            f"{predicted.path} and {truth.path} have no view in common; the truth's are "
+            f"{list_names([view.title for view in truth.views])}"
         )
     if not intersect:
-        _same_cameras(said, real, pairs)
+        _check_cameras(predicted, truth, pairs)
     return pairs
 
 
-def _partner(said: Source, real: Source, index: int) -> int | None:
-    """The prediction's view that shows the same as the truth's `index`: by camera between views files, else by name."""
-    if len(said.views) == len(real.views) == 1:
+def _partner_view(predicted: Source, truth: Source, index: int) -> int | None:
+    """Returns the prediction's view that shows the same as the truth's `index`: by camera between views files, else by name."""
+    if len(predicted.views) == len(truth.views) == 1:
         return 0
-    if said.header is not None and real.header is not None:
-        if index < len(said.views) and _same_camera(said, real, index, index):
+    if predicted.header is not None and truth.header is not None:
+        if index < len(predicted.views) and _same_camera(predicted, truth, index, index):
             return index
-        same = [i for i in range(len(said.views)) if _same_camera(said, real, i, index)]
+        same = [i for i in range(len(predicted.views)) if _same_camera(predicted, truth, i, index)]
         return same[0] if same else None
-    names = [name.lower() for name in real.views[index].names]  # its own name counts before the others
-    others = [{name.lower() for name in view.names} for view in said.views]
+    names = [name.lower() for name in truth.views[index].names]  # its own name counts before the others
+    others = [{name.lower() for name in view.names} for view in predicted.views]
     return next((i for name in names for i, own in enumerate(others) if name in own), None)
 
 
-def _same_camera(said: Source, real: Source, ours: int, theirs: int) -> bool:
-    pose = np.abs(said.header.world_to_camera[ours] - real.header.world_to_camera[theirs]).max()
-    scale = np.diag([1 / said.header.size[0], 1 / said.header.size[1], 1])  # the same camera at another size
-    other = np.diag([1 / real.header.size[0], 1 / real.header.size[1], 1])
-    lens = np.abs(scale @ said.header.intrinsics[ours] - other @ real.header.intrinsics[theirs]).max()
-    reach = max(1.0, np.abs(real.header.world_to_camera[theirs]).max())
+def _same_camera(predicted: Source, truth: Source, ours: int, theirs: int) -> bool:
+    pose = np.abs(predicted.header.world_to_camera[ours] - truth.header.world_to_camera[theirs]).max()
+    scale = np.diag([1 / predicted.header.size[0], 1 / predicted.header.size[1], 1])  # the same camera at another size
+    other = np.diag([1 / truth.header.size[0], 1 / truth.header.size[1], 1])
+    lens = np.abs(scale @ predicted.header.intrinsics[ours] - other @ truth.header.intrinsics[theirs]).max()
+    reach = max(1.0, np.abs(truth.header.world_to_camera[theirs]).max())
     return bool(pose <= _SAME_CAMERA * reach and lens <= _SAME_CAMERA)
 
 
-def _same_cameras(said: Source, real: Source, pairs: list[tuple[int, int]]) -> None:
-    """A lone view is compared whatever it is called, but not with another camera's."""
-    if said.header is None or real.header is None or isinstance(said, SceneSource):
+def _check_cameras(predicted: Source, truth: Source, pairs: list[tuple[int, int]]) -> None:
+    """Raises DataError for a lone view of another camera; whatever it is called, it is compared."""
+    if predicted.header is None or truth.header is None or isinstance(predicted, SceneSource):
         return
     for ours, theirs in pairs:
-        if not _same_camera(said, real, ours, theirs):
+        if not _same_camera(predicted, truth, ours, theirs):
             raise DataError(
-                f"{said.path}: view {said.views[ours].title!r} has another camera than view "
-                f"{real.views[theirs].title!r} of {real.path}; the first that differs"
+                f"{predicted.path}: view {predicted.views[ours].title!r} has another camera than view "
+                f"{truth.views[theirs].title!r} of {truth.path}; the first that differs"
             )

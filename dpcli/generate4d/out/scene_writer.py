@@ -8,9 +8,9 @@ from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import SH0
 from dpcli.generate4d.scene.model import Model4D
-from dpcli.generate4d.scene.quaternion import normalize
 from dpcli.generate4d.targets import Targets
 from dpcli.ops.rigid import weighted_kabsch
+from dpcli.ops.rotations import normalize_quaternion
 from dpcli.store.gaussians import GaussianScene
 
 
@@ -27,12 +27,12 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
     return GaussianScene(
         mean=_array(gaussians.mean),
         log_scale=_array(gaussians.log_scale),
-        quaternion=_array(normalize(gaussians.quaternion)),
+        quaternion=_array(normalize_quaternion(gaussians.quaternion)),
         opacity_logit=_array(gaussians.opacity_logit),
         sh=_array((gaussians.color[:, None] - 0.5) / SH0),
         time=targets.seconds,
         frame_mean=_array(frame_mean),
-        frame_quaternion=_array(normalize(motion["quaternion"])),
+        frame_quaternion=_array(normalize_quaternion(motion["quaternion"])),
         part=probability.argmax(1).numpy().astype(np.int16),
         part_probability=_array(probability),
         part_motion=_part_motion(gaussians.mean, frame_mean, probability, gaussians.opacity_logit.sigmoid()),
@@ -40,7 +40,7 @@ def to_scene(model: Model4D, targets: Targets, metrics: dict) -> GaussianScene:
         control_point=_array(torch.zeros(0, 3) if control is None else control.position),
         control_radius=_array(torch.zeros(0) if control is None else control.log_radius.exp()),
         control_position=_array(motion["control"]),
-        control_quaternion=_array(normalize(motion["turn"])),
+        control_quaternion=_array(normalize_quaternion(motion["turn"])),
         camera_intrinsics=targets.intrinsics,
         camera_world_to_camera=targets.world_to_camera,
         size=targets.size,

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from dpcli.generate4d.config import FitConfig
 from dpcli.generate4d.scene.control_points import mean_neighbor_distance
-from dpcli.generate4d.scene.quaternion import normalize, rotate
+from dpcli.ops.rotations import normalize_quaternion, rotate_by_quaternion
 
 SH0 = 0.28209479177387814  # value of the constant spherical harmonic
 _SPLIT = 0.47  # log 1.6: how much smaller the halves of a split Gaussian are (Kerbl et al. 2023)
@@ -67,7 +67,7 @@ class CanonicalGaussians(nn.Module):
         size = self.log_scale.max(1).values
         split = new[size[new] > size.median()]
         offset = torch.randn(len(new), 3, generator=rng).to(self.mean.device) * self.log_scale[new].exp()
-        offset = rotate(normalize(self.quaternion[new]), offset)
+        offset = rotate_by_quaternion(normalize_quaternion(self.quaternion[new]), offset)
         self._keep_rows(optimizer, torch.cat([old, new]), fresh=len(new))
         row_now = torch.full((before,), -1, dtype=torch.long, device=old.device)
         row_now[old] = torch.arange(len(old), device=old.device)

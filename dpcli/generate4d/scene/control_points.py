@@ -7,9 +7,9 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from dpcli.generate4d.scene.motion import Motion
-from dpcli.generate4d.scene.quaternion import multiply, normalize, to_matrix
 from dpcli.ops.farthest_point_sampling import fps
 from dpcli.ops.nearest_neighbors import knn
+from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix
 
 
 class ControlPoints(nn.Module):
@@ -48,7 +48,7 @@ class ControlPoints(nn.Module):
         The motion's quaternions must lie in one hemisphere (w >= 0), as `MotionField` gives them, so that they can be averaged.
         """
         weights = self.weights(points, nearest)
-        matrix = to_matrix(motion.quaternion)  # [B, K, 3, 3]
+        matrix = quaternion_to_matrix(motion.quaternion)  # [B, K, 3, 3]
         shift = self.position + motion.displacement - (matrix @ self.position[..., None]).squeeze(-1)
         table = torch.cat([matrix.flatten(-2), shift, motion.quaternion], -1)  # [B, K, 16]
         count = len(table)
@@ -58,7 +58,7 @@ class ControlPoints(nn.Module):
         blended = blended.reshape(-1, count, 16).transpose(0, 1)
         matrix, shift, turn = blended.split([9, 3, 4], -1)
         moved = (matrix.unflatten(-1, (3, 3)) * points[:, None]).sum(-1) + shift
-        return moved, normalize(turn)
+        return moved, normalize_quaternion(turn)
 
 
 def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [N]
@@ -72,4 +72,4 @@ def mean_neighbor_distance(points: Tensor, count: int) -> Tensor:  # [N, 3] -> [
 
 def turn_frames(turn: Tensor, quaternion: Tensor) -> Tensor:  # [B, N, 4], [N, 4] -> [B, N, 4]
     """Returns the quaternions of Gaussians after a turn."""
-    return multiply(turn, normalize(quaternion).expand_as(turn))
+    return multiply_quaternions(turn, normalize_quaternion(quaternion).expand_as(turn))

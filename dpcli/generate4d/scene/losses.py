@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
+from dpcli.ops.rotations import nearest_rotation
 
 
 def picture_loss(
@@ -33,15 +34,8 @@ def arap_loss(
     after = moved[:, neighbors] - moved[:, :, None]  # [B, N, H, 3]
     with torch.no_grad():
         covariance = torch.einsum("bnhi,nhj->bnij", after, before)
-        rotation = _nearest_rotation(covariance)
+        rotation = nearest_rotation(covariance)
     return (after - torch.einsum("bnij,nhj->bnhi", rotation, before)).square().sum(-1).mean()
-
-
-def _nearest_rotation(matrix: Tensor) -> Tensor:  # [..., 3, 3]
-    """U diag(1, 1, det) V^T."""
-    u, _, vh = torch.linalg.svd(matrix)
-    u = torch.cat([u[..., :2], u[..., 2:] * torch.det(u @ vh)[..., None, None]], -1)
-    return u @ vh
 
 
 def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dpcli.generate4d.scene.quaternion import multiply, normalize, rotate, to_matrix
+from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix, rotate_by_quaternion
 
 _POINT_FREQUENCIES, _TIME_FREQUENCIES = 10, 6  # thesis 5.5.1
 
@@ -30,7 +30,7 @@ class Motion:
     def part_matrix(self) -> Tensor:  # [B, S, 4, 4]
         """Returns T_s^tau, which takes canonical positions of a part to those at the time."""
         matrix = torch.eye(4).to(self.part_translation).expand(*self.part_translation.shape[:2], 4, 4).clone()
-        matrix[..., :3, :3], matrix[..., :3, 3] = to_matrix(self.part_quaternion), self.part_translation
+        matrix[..., :3, :3], matrix[..., :3, 3] = quaternion_to_matrix(self.part_quaternion), self.part_translation
         return matrix
 
 
@@ -136,7 +136,7 @@ class MotionField(nn.Module):
         hidden = self.movement(encode(times[:, None], _TIME_FREQUENCIES))
         turn = _quaternion(self.movement_turn(hidden).reshape(len(times), self.parts, 3))
         shift = self.movement_shift(hidden).reshape(len(times), self.parts, 3)
-        return turn, self.center - rotate(turn, self.center) + shift
+        return turn, self.center - rotate_by_quaternion(turn, self.center) + shift
 
     def forward(self, points: Tensor, times: Tensor) -> Motion:
         """Returns the motion of canonical points (N,3) at times (B) in 0..1."""
@@ -148,8 +148,8 @@ class MotionField(nn.Module):
         if not self.rigid:
             weight = torch.zeros(*rest.shape[:2], 1).to(rest)
             return Motion(rest, turn, part, weight, part_turn, part_shift)
-        moved = torch.einsum("bns,bsij,nj->bni", part, to_matrix(part_turn), points) + part @ part_shift
-        rigid, rigid_turn = moved - points, normalize(part @ part_turn)
+        moved = torch.einsum("bns,bsij,nj->bni", part, quaternion_to_matrix(part_turn), points) + part @ part_shift
+        rigid, rigid_turn = moved - points, normalize_quaternion(part @ part_turn)
         if self.fusion:
             weight = self.weighing_head(self.weighing(code)).sigmoid()
             displacement, both = blend_motions(rigid, rigid_turn, rest, turn, weight)
@@ -170,15 +170,14 @@ def blend_motions(
 
     The thesis writes R x + t, a position, in place of the displacement. Quaternions must lie in one hemisphere.
     """
-    both = normalize(
-        weight * rigid_turn + (1 - weight) * turn
-    )  # first: the order of gradients' sums follows that of terms
+    # the turn first: gradients of a shared term are summed in the order of its uses, and the sums are kept to the bit
+    both = normalize_quaternion(weight * rigid_turn + (1 - weight) * turn)
     return weight * rigid + (1 - weight) * rest, both
 
 
 def add_motions(rigid: Tensor, rigid_turn: Tensor, rest: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the sum of both displacements (...,3), eq. 5.5, and the product of both turns (...,4), w >= 0."""
-    both = multiply(turn, rigid_turn)
+    both = multiply_quaternions(turn, rigid_turn)
     return rigid + rest, torch.where(both[..., :1] < 0, -both, both)
 
 
@@ -189,4 +188,4 @@ def _join_codes(space: Tensor, time: Tensor) -> Tensor:  # [N, D], [B, E] -> [B,
 
 def _quaternion(vector: Tensor) -> Tensor:  # [..., 3] -> [..., 4]
     """Returns the unit quaternion (1, v) / norm: the identity at zero, of one sign only, turns below 180 degrees."""
-    return normalize(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))
+    return normalize_quaternion(torch.cat([torch.ones_like(vector[..., :1]), vector], -1))

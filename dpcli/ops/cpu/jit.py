@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 
 import numba
 
 from dpcli.runtime.tuning import load_numba_without_blas
 
 load_numba_without_blas()
+
+_FOLDER = Path(__file__).parent
+_SHARED = (Path(__file__), _FOLDER / "simd.py", _FOLDER.parent / "splatting" / "cpu_simd.py")
+# A digest of what is compiled into kernels of other files: an edit there makes their cached code stale.
+SHARED_CODE = hashlib.sha256(b"".join(path.read_bytes() for path in _SHARED)).hexdigest()
 
 # No NaN ever enters (callers check), and a zero's sign never matters: this lets minima vectorize. Nothing that changes
 # a value is allowed, neither reassociation nor fused multiply-add: indices must equal the reference's, ties included.
@@ -21,7 +28,7 @@ def kernel(function: Callable) -> Callable:
 
     Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
     mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process. Helpers belong
-    in the file of the kernel that calls them: numba's cache looks for changes in that file only.
+    in the file of the kernel that calls them: the cache looks for changes in that file and in the lanes' files only.
     """
     return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy")
 
@@ -38,9 +45,12 @@ def arithmetic_kernel(function: Callable) -> Callable:
 
 def _compiled(function: Callable, **options: object) -> Callable:
     try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:
+        kernel = numba.njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder for the cache
         return numba.njit(**options)(function)
+    file = kernel._cache._cache_file
+    file._source_stamp = (file._source_stamp, SHARED_CODE)  # numba's own stamp is of the kernel's file alone
+    return kernel
 
 
 def parallel_kernel(function: Callable) -> Callable:

@@ -2,7 +2,7 @@
 
 Numba's loops become vector code only where LLVM proves that no two arrays overlap, which it can't in a kernel that
 reads and writes many; a value of type `lanes` needs no such proof. LLVM maps it to the machine's registers: one on
-AVX, two on SSE or NEON. Numba's cache doesn't see changes to this file: touch the kernels' file after an edit.
+AVX, two on SSE or NEON. The kernels' cache takes note of changes to this file (`jit.SHARED_CODE`).
 
 In a kernel: `lanes(x)` repeats a scalar, `load(array, i)` and `store(array, i, v)` move 8 values of a C-contiguous
 float32 vector from element i, `ramp()` is 0..7, `+ - *` are elementwise (multiply-add may contract), `lower(a, b)` and

@@ -10,7 +10,6 @@ import numpy as np
 from dpcli.ops.cpu.jit import arithmetic_kernel
 
 TILE = 64  # matrices per tile: an 8x8 tile of float32 is 16 kB
-SCRATCH = 25  # of 4x4 that `guarded_gradient` works in
 _SIGNED, _NONE = 0, 2  # positions in linalg.GUARDS
 
 
@@ -211,189 +210,6 @@ def inverse_gradient_kernel(inverse, grad, out, first, last):
 
 
 @arithmetic_kernel
-def _product(a, b, out, shape, turned_a, turned_b):
-    """out = a b, or with a or b transposed, for shape (p,r,q): p x r times r x q. Leading parts of larger arrays."""
-    for i in range(shape[0]):
-        for j in range(shape[2]):
-            total = 0.0
-            for k in range(shape[1]):
-                left = a[k, i] if turned_a else a[i, k]
-                right = b[j, k] if turned_b else b[k, j]
-                total += left * right
-            out[i, j] = total
-
-
-@arithmetic_kernel
-def _guarded_inverse(a, n, reciprocal, most, out, scratch):
-    """Adjugate (by Cayley and Hamilton) over guarded determinant of the leading n x n, n <= 4; whether the guard acted, and
-    the determinant. reciprocal: one over what the tile divided by, `most` where the guard acted: rounding may have made its sign."""
-    square, cube = scratch[0], scratch[1]
-    _product(a, a, square, (n, n, n), False, False)
-    _product(a, square, cube, (n, n, n), False, False)
-    t1 = t2 = t3 = 0.0
-    for i in range(n):
-        t1, t2, t3 = t1 + a[i, i], t2 + square[i, i], t3 + cube[i, i]
-    c2, c3 = (t1 * t1 - t2) / 2, (t1 * t1 * t1 - 3 * t1 * t2 + 2 * t3) / 6
-    for i in range(n):
-        for j in range(n):
-            one = 1.0 if i == j else 0.0
-            if n == 1:
-                out[i, j] = one
-            elif n == 2:
-                out[i, j] = t1 * one - a[i, j]
-            elif n == 3:
-                out[i, j] = square[i, j] - t1 * a[i, j] + c2 * one
-            else:
-                out[i, j] = -cube[i, j] + t1 * square[i, j] - c2 * a[i, j] + c3 * one
-    acted, det = abs(reciprocal) >= most, 0.0
-    if acted:
-        det = 1 / reciprocal
-    else:
-        for j in range(n):
-            det += a[0, j] * out[j, 0]
-    for i in range(n):
-        for j in range(n):
-            out[i, j] /= det
-    return acted, det
-
-
-@arithmetic_kernel
-def _guarded_gradient(a, inverse, grad, n, acted, det, out, scratch):
-    """The gradient at `a` from that at `_guarded_inverse`: -X' G X', or of the adjugate alone where the guard acted."""
-    part = scratch[0]
-    if not acted:
-        _product(inverse, grad, part, (n, n, n), True, False)
-        _product(part, inverse, out, (n, n, n), False, True)
-        for i in range(n):
-            for j in range(n):
-                out[i, j] = -out[i, j]
-        return
-    square, left, right, middle = scratch[1], scratch[2], scratch[3], scratch[4]
-    _product(a, a, square, (n, n, n), False, False)
-    t1 = t2 = trace = along = along2 = 0.0
-    for i in range(n):
-        t1, t2, trace = t1 + a[i, i], t2 + square[i, i], trace + grad[i, i]
-        for j in range(n):
-            along, along2 = along + grad[i, j] * a[i, j], along2 + grad[i, j] * square[i, j]
-    c2 = (t1 * t1 - t2) / 2
-    _product(grad, a, part, (n, n, n), False, True)
-    _product(a, grad, middle, (n, n, n), True, False)
-    for i in range(n):
-        for j in range(n):
-            part[i, j] += middle[i, j]  # G A' + A' G
-    if n == 4:
-        _product(grad, square, left, (n, n, n), False, True)
-        _product(square, grad, right, (n, n, n), True, False)
-        turned = scratch[5]
-        _product(middle, a, turned, (n, n, n), False, True)
-        for i in range(n):
-            for j in range(n):
-                left[i, j] += right[i, j] + turned[i, j]  # G A2' + A' G A' + A2' G
-    for i in range(n):
-        for j in range(n):
-            one, value = (1.0 if i == j else 0.0), 0.0
-            if n == 2:
-                value = trace * one - grad[i, j]
-            elif n == 3:
-                value = part[i, j] - along * one - t1 * grad[i, j] + trace * (t1 * one - a[j, i])
-            elif n == 4:
-                value = t1 * part[i, j] - left[i, j] + along2 * one - c2 * grad[i, j] - along * (t1 * one - a[j, i])
-                value += trace * (c2 * one - t1 * a[j, i] + square[j, i])
-            out[i, j] = value / det
-
-
-@arithmetic_kernel
-def _block(m, row, column, rows, columns, out):
-    for i in range(rows):
-        for j in range(columns):
-            out[i, j] = m[row + i, column + j]
-
-
-@arithmetic_kernel
-def guarded_gradient(m, grad, n, reciprocals, min_det, out, scratch):
-    """The gradient at m (n,n), n <= 8, from that at its guarded inverse, all float64: where a tile's guard acted.
-
-    reciprocals (2): one over both blocks' determinants, as the tile has them. scratch (SCRATCH,4,4).
-
-    Follows the partition of `_invert`: X11 = A^ + R S^ L, X12 = -R S^, X21 = -S^ L, X22 = S^ with R = A^ B, L = C A^ and
-    S = D - L B.
-    """
-    p = n if n <= 4 else (n + 1) // 2
-    q, most = n - p, (1 - 1e-6) / min_det
-    a, a_inverse, grad_a, g11 = scratch[6], scratch[7], scratch[8], scratch[9]
-    _block(m, 0, 0, p, p, a)
-    a_acted, a_det = _guarded_inverse(a, p, reciprocals[0], most, a_inverse, scratch)
-    _block(grad, 0, 0, p, p, g11)
-    if q == 0:
-        _guarded_gradient(a, a_inverse, g11, p, a_acted, a_det, out, scratch)
-        return
-    b, c, s, s_inverse, grad_s = scratch[10], scratch[11], scratch[12], scratch[13], scratch[14]
-    g12, g21, g22, to_s, to_left, to_right = (
-        scratch[15],
-        scratch[16],
-        scratch[17],
-        scratch[18],
-        scratch[19],
-        scratch[20],
-    )
-    left, right, x, y = scratch[21], scratch[22], scratch[23], scratch[24]
-    _block(m, 0, p, p, q, b)
-    _block(m, p, 0, q, p, c)
-    _block(m, p, p, q, q, s)
-    _block(grad, 0, p, p, q, g12)
-    _block(grad, p, 0, q, p, g21)
-    _block(grad, p, p, q, q, g22)
-    _product(c, a_inverse, left, (q, p, p), False, False)
-    _product(a_inverse, b, right, (p, p, q), False, False)
-    _product(left, b, x, (q, p, q), False, False)
-    for i in range(q):
-        for j in range(q):
-            s[i, j] -= x[i, j]
-    s_acted, s_det = _guarded_inverse(s, q, reciprocals[1], most, s_inverse, scratch)
-    _product(g11, left, x, (p, p, q), False, True)  # (G11 L' - G12) S^'
-    for i in range(p):
-        for j in range(q):
-            x[i, j] -= g12[i, j]
-    _product(x, s_inverse, to_right, (p, q, q), False, True)
-    _product(right, x, to_s, (q, p, q), True, False)  # R' (G11 L' - G12) - G21 L' + G22
-    _product(g21, left, y, (q, p, q), False, True)
-    for i in range(q):
-        for j in range(q):
-            to_s[i, j] += g22[i, j] - y[i, j]
-    _guarded_gradient(s, s_inverse, to_s, q, s_acted, s_det, grad_s, scratch)
-    _product(right, g11, y, (q, p, p), True, False)  # S^' (R' G11 - G21) - dS B'
-    for i in range(q):
-        for j in range(p):
-            y[i, j] -= g21[i, j]
-    _product(s_inverse, y, to_left, (q, q, p), True, False)
-    _product(grad_s, b, y, (q, q, p), False, True)
-    for i in range(q):
-        for j in range(p):
-            to_left[i, j] -= y[i, j]
-    _product(to_right, b, x, (p, q, p), False, True)
-    _product(c, to_left, y, (p, q, p), True, False)
-    for i in range(p):
-        for j in range(p):
-            g11[i, j] += x[i, j] + y[i, j]
-    _guarded_gradient(a, a_inverse, g11, p, a_acted, a_det, grad_a, scratch)
-    for i in range(p):
-        for j in range(p):
-            out[i, j] = grad_a[i, j]
-    for i in range(q):
-        for j in range(q):
-            out[p + i, p + j] = grad_s[i, j]
-    _product(a_inverse, to_right, x, (p, p, q), True, False)
-    _product(left, grad_s, y, (p, q, q), True, False)
-    for i in range(p):
-        for j in range(q):
-            out[i, p + j] = x[i, j] - y[i, j]
-    _product(to_left, a_inverse, x, (q, p, p), False, True)
-    for i in range(q):
-        for j in range(p):
-            out[p + i, j] = x[i, j]
-
-
-@arithmetic_kernel
 def _load_planes(moments, places, first, size, groups, tile, right, ridge):
     """A tile (n,n,W) of normal matrices and one (n,W) of right sides of fits first..first+size-1, centroid after centroid;
     the identity behind them. places (n,n+1): which of a fit's entries; ridge: the share of the mean diagonal added to it."""
@@ -477,22 +293,17 @@ def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
 
 
 @arithmetic_kernel
-def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad_matrix, grad_right):
+def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad_matrix, grad_right, moved):
     """The gradient of `solve_planes`: grad (centroids*n*groups) at the planes -> grad_matrix (centroids*n*n*groups), G + G',
-    and grad_right (centroids*n*groups)."""
+    and grad_right (centroids*n*groups). moved (centroids*groups): the fits whose determinant the guard moved, and on whose
+    plane something depends; their grad_matrix is the caller's to mend (`ops.small_inverses.mend_guarded_gradients`)."""
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2
-    tile, kept, out = (
-        np.empty((n, n, TILE), np.float32),
-        np.empty((n, n, TILE), np.float32),
-        np.empty((n, n, TILE), np.float32),
-    )
+    tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)
     left, right = np.empty((n - half, half, TILE), np.float32), np.empty((half, n - half, TILE), np.float32)
     det, acted, side = np.empty((2, TILE), np.float32), np.empty(TILE, np.bool_), np.empty((n, TILE), np.float32)
     given, both_sides = np.empty((n, TILE), np.float32), np.empty((2, n, TILE), np.float32)
-    x, u = both_sides[0], both_sides[1]
-    one, one_grad, one_out, both = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(2)
-    scratch, count = np.empty((SCRATCH, 4, 4)), grad.size // n
+    x, u, count = both_sides[0], both_sides[1], grad.size // n
     for low in range(0, count, TILE):
         size = min(TILE, count - low)
         _load_planes(moments, places, low, size, groups, tile, side, np.float32(ridge))
@@ -507,10 +318,6 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
                     x[i, w], u[i, w] = side[i, w], given[i, w]
             _eliminate(tile, both_sides)
         else:
-            for i in range(n):
-                for j in range(n):
-                    for w in range(TILE):  # a slice assignment would compile an error message for 4 s
-                        kept[i, j, w] = tile[i, j, w]
             _invert(tile, out, left, right, det, acted, np.float32(min_det), guard)
             x[:] = 0
             u[:] = 0
@@ -526,16 +333,7 @@ def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad
                 grad_right[(p * n + i) * groups + k] = u[i, w]
                 trace -= u[i, w] * x[i, w]
                 asked |= given[i, w] != 0
-            if acted[w] and asked:  # of a plane that nothing depends on, often a dead feature's, all gradients are 0
-                for i in range(n):
-                    for j in range(n):
-                        one[i, j], one_grad[i, j] = kept[i, j, w], np.float64(given[i, w]) * side[j, w]
-                both[0], both[1] = det[0, w], det[1, w]
-                guarded_gradient(one, one_grad, n, both, min_det, one_out, scratch)
-                for i in range(n):
-                    for j in range(n):
-                        grad_matrix[((p * n + i) * n + j) * groups + k] = one_out[i, j] + one_out[j, i]
-                continue
+            moved[low + w] = acted[w] and asked  # a plane that nothing depends on is often a dead feature's
             for i in range(n):
                 for j in range(n):
                     value = -(u[i, w] * x[j, w] + u[j, w] * x[i, w])

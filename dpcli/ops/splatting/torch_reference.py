@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from dpcli.ops.rotations import normalize_quaternion, quaternion_to_matrix
+
 MIN_ALPHA = 1 / 255  # what contributes less is skipped
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4  # a pixel stops before the Gaussian that would take it to this or below
@@ -61,7 +63,7 @@ def project_torch(
     ty = z * _clamped(y / z, -cy / fy, (height - cy) / fy, height / fy)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * tx / z**2, zero, fy / z, -fy * ty / z**2], -1).unflatten(-1, (2, 3))
-    root = jacobian @ rotation @ rotations(quats) * scales[..., None, :]
+    root = jacobian @ rotation @ quaternion_to_matrix(normalize_quaternion(quats, 1e-12)) * scales[..., None, :]
     covariance = root @ root.mT
     xx, xy, yy = covariance[..., 0, 0] + eps2d, covariance[..., 0, 1], covariance[..., 1, 1] + eps2d
     det = xx * yy - xy * xy
@@ -84,23 +86,6 @@ def _radii(means2d, xx, yy, opacities, valid, width: int, height: int, radius_cl
     size = radii.new_tensor([width, height])
     seen = ((means2d + radii > 0) & (means2d - radii < size)).all(-1) & (radii > radius_clip).any(-1) & valid
     return torch.where(seen[..., None], radii, 0).clamp(max=1 << 30).to(torch.int32)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices (...,3,3) of quaternions (...,4) w x y z of any length; of zero the identity."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
 
 
 def sh_colors(coefficients: Tensor, means: Tensor, viewmats: Tensor, degree: int) -> Tensor:

@@ -15,7 +15,7 @@ from dpcli.path_names import as_utf8
 from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, has_images, read_depth_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
 
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
@@ -25,7 +25,7 @@ _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it ta
 
 
 def background_depth(depth: np.ndarray, kind: str) -> np.ndarray:
-    """Depth of the still scene. depth (T,H,W), 0 = nothing seen -> (H,W), 0 = never seen there.
+    """Returns the depth of the still scene, (H,W), 0 where nothing was ever seen, of depth (T,H,W), 0 = nothing seen.
 
     ``median``: per pixel, the lower median of the frames in which something was seen; ``first``: the first frame.
     """
@@ -38,9 +38,12 @@ def background_depth(depth: np.ndarray, kind: str) -> np.ndarray:
     return np.take_along_axis(ordered, np.minimum(middle, len(some) - 1)[None], axis=0)[0]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthVideos:
-    """Options of the reader. Lengths in meters, focal lengths and centers in pixels, the field of view in degrees."""
+    """Reads anybody's depth videos.
+
+    Lengths in meters, focal lengths and centers in pixels, the field of view in degrees.
+    """
 
     inputs: tuple[Path, ...]
     intrinsics: Intrinsics | None = None
@@ -55,7 +58,6 @@ class DepthVideos:
     stride: int = 1
     labels: Path | None = None
     label_from_folder: bool = False
-    chooses: ClassVar[bool] = True
     length_unit: ClassVar[str] = "m"
     fields: ClassVar[tuple[str, ...]] = ("time",)
 
@@ -75,10 +77,12 @@ class DepthVideos:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return self._table.class_names if self._table else []
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         values = {k: v for k, v in asdict(self).items() if k not in ("inputs", "labels", "label_from_folder", "far")}
         folders = {"label_from_folder": True} if self.label_from_folder else {}
         return {**values, "far": self.far if np.isfinite(self.far) else None, **folders}
@@ -101,18 +105,18 @@ class DepthVideos:
         return list(items.values())
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         return self._table.apply(self._found) if self._table else self._found
 
-    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         video = read_depth_video(item.path, self.stride)
         depth, unit = self._raw(video.frames, item.path)
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
-        points, counts = back_project(
-            depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far, choose=choose
-        )
+        points, counts = back_project(depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far)
         kept, notes = drop_empty_frames(str(item.path), counts)
         rate = (self.fps or video.fps or DEFAULT_FPS) / self.stride
         return Sample(
@@ -120,7 +124,7 @@ class DepthVideos:
         )
 
     def _raw(self, frames: np.ndarray, path: Path) -> tuple[np.ndarray, float]:
-        """Depth (T,H,W) as the sensor counts it, 0 = nothing seen, and how many meters one count is."""
+        """Returns depth (T,H,W) as the sensor counts it, 0 = nothing seen, and how many meters one count is."""
         kind = frames.dtype
         if kind.kind == "f" and not np.isfinite(frames).all():
             frames = np.nan_to_num(frames, nan=0, posinf=0, neginf=0)  # the usual marks for "no return"
@@ -140,6 +144,7 @@ class DepthVideos:
         return Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
         if not self.intrinsics and self.fov is None:
             lines.append(
@@ -152,7 +157,9 @@ class DepthVideos:
 
 
 def find_videos(path: Path) -> list[Path]:
-    """The depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of images)."""
+    """Returns the depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of
+    images).
+    """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
     if not path.is_dir() or has_images(path):

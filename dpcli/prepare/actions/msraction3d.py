@@ -12,7 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
-from dpcli.prepare.reader import Choose, Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
 
 CLASS_NAMES = (
@@ -46,14 +46,14 @@ ABSENT = (
 )
 
 
-def published() -> list[str]:
+def published_names() -> list[str]:
     """Names ``aAA_sSS_eEE`` of the 567 videos that the authors published (of 20 x 10 x 3 recorded)."""
     every = [(a, s, e) for a in range(1, 21) for s in range(1, 11) for e in range(1, 4)]
     return [f"a{a:02}_s{s:02}_e{e:02}" for a, s, e in every if not {(a, s, e), (a, s, 0)} & set(ABSENT)]
 
 
 def read_bin(path: Path) -> tuple[np.ndarray, dict[str, int]]:
-    """Official binary -> depth uint32 (T,H,W) in raw units, 0 = background.
+    """Reads the official binary form: depth uint32 (T,H,W) in raw units, 0 = background, and notes.
 
     Little-endian uint32: number of frames, width, height, then frames x height x width depths, row by row.
     """
@@ -73,7 +73,7 @@ def read_bin(path: Path) -> tuple[np.ndarray, dict[str, int]]:
 
 
 def read_mat(path: Path) -> np.ndarray:
-    """MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3 -> depth (T,H,W), C order."""
+    """Reads a MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3, as depth (T,H,W), C order."""
     with path.open("rb") as file:
         is_hdf5 = b"MATLAB 7.3" in file.read(20)
     depth = _read_mat73(path) if is_hdf5 else _read_mat5(path)
@@ -114,7 +114,7 @@ def _read_mat73(path: Path) -> np.ndarray:
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:
-    """DataError unless there is at least one frame of a believable size (a wrong header shows itself here)."""
+    """Raises DataError unless there is at least one frame of a believable size (a wrong header shows itself here)."""
     if frames == 0:
         raise DataError(f"{path}: an empty video: 0 frames; expected at least 1")
     if not (0 < height <= 8192 and 0 < width <= 8192):
@@ -123,13 +123,12 @@ def check_shape(path: Path, frames: int, height: int, width: int) -> None:
 
 @dataclass(frozen=True)
 class MSRAction3D:
-    """Options of the reader; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
+    """Reads MSR-Action3D; defaults are those of the published point-cloud protocols (MeteorNet, PSTNet, Kinet)."""
 
     raw: Path
     focal: float = 280.0  # pixels; a guess of the MeteorNet authors, no calibration was published
     scale: float = 300.0  # raw depth units per unit of length in the output
     train_subjects: tuple[int, ...] = (1, 2, 3, 4, 5)
-    chooses: ClassVar[bool] = True
     fields: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -138,17 +137,21 @@ class MSRAction3D:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         return f"{self.scale:g} raw depth units" if self.scale != 1 else "raw depth unit"
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k != "raw"}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "MSR-Action3D files named aAA_sSS_eEE_sdepth.bin or .mat"
         folder = require_folder(self.raw, expected)
         found: dict[str, Item] = {}
@@ -174,21 +177,23 @@ class MSRAction3D:
             split="train" if subject in self.train_subjects else "test",
         )
 
-    def read(self, item: Item, rng: np.random.Generator, choose: Choose = None) -> Sample:
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         notes: dict[str, int] = {}
         if item.path.suffix.lower() == ".bin":
             depth, notes = read_bin(item.path)
         else:
             depth = read_mat(item.path)
         height, width = depth.shape[1:]
-        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2), choose=choose)
+        points, counts = back_project(depth, Intrinsics(self.focal, self.focal, width / 2, height / 2))
         kept, dropped = drop_empty_frames(str(item.path), counts)
         points *= np.float32(1 / self.scale)
         sequence = CloudSequence(item.name, points, offsets(counts[kept]), **describe(item))
         return Sample(sequence, {**notes, **dropped})
 
     def summary(self, items: list[Item]) -> list[str]:
-        expected, names = published(), {item.name for item in items}
+        """Returns lines for the log about what the index holds and lacks."""
+        expected, names = published_names(), {item.name for item in items}
         lines = [f"{len(names & set(expected))} of the {len(expected)} published videos found"]
         train = {name for name in expected if int(name[5:7]) in self.train_subjects}
         for split, wanted in (("train", train), ("test", set(expected) - train)):

@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode import zip_index
-from dpcli.prepare.decode.depth_png import decode_depth_png, folder_files, leads_out
+from dpcli.prepare.decode import zip_folders
+from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
 from dpcli.store import CloudSequence
 
@@ -97,7 +98,7 @@ _RANGES = {"setup": (1, 17), "camera": (1, 3), "person": (1, 40), "repetition": 
 
 
 def named_intrinsics(text: str) -> Intrinsics:
-    """``peers``, ``kinect2``, or the name of a JSON file with fx fy cx cy."""
+    """Returns the intrinsics called ``peers`` or ``kinect2``, or those of a JSON file with fx fy cx cy."""
     if text in INTRINSICS:
         return INTRINSICS[text]
     if not Path(text).suffix:
@@ -105,14 +106,26 @@ def named_intrinsics(text: str) -> Intrinsics:
     return Intrinsics.from_json(Path(text))
 
 
-def split_of(protocol: str, subject: int, camera: int) -> str:
-    """``train`` or ``test`` under cross-subject (xsub) or cross-view (xview)."""
-    train = subject in TRAIN_SUBJECTS if protocol == "xsub" else camera in TRAIN_CAMERAS
-    return "train" if train else "test"
+def cross_subject_split(subject: int) -> str:
+    """Returns ``train`` or ``test`` of a video under the cross-subject protocol (xsub): 20 of the 40 subjects train.
+
+    >>> cross_subject_split(1), cross_subject_split(3)
+    ('train', 'test')
+    """
+    return "train" if subject in TRAIN_SUBJECTS else "test"
+
+
+def cross_view_split(camera: int) -> str:
+    """Returns ``train`` or ``test`` of a video under the cross-view protocol (xview): cameras 2 and 3 train.
+
+    >>> [cross_view_split(camera) for camera in (1, 2, 3)]
+    ['test', 'train', 'train']
+    """
+    return "train" if camera in TRAIN_CAMERAS else "test"
 
 
 def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
-    """The item of a video called SsssCcccPpppRrrrAaaa; a number out of range is its problem."""
+    """Returns the item of a video called SsssCcccPpppRrrrAaaa; a number out of range becomes its problem."""
     numbers = [int(v) for v in NAME.fullmatch(name).groups()]
     wrong = [
         f"{what} {number} in the name is out of range; NTU RGB+D 60 has {low} to {high}"
@@ -123,7 +136,7 @@ def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
     return Item(
         name,
         path,
-        split_of(protocol, subject, camera),
+        split=cross_subject_split(subject) if protocol == "xsub" else cross_view_split(camera),
         label=action - 1,
         subject=subject,
         camera=camera,
@@ -134,7 +147,7 @@ def video_item(name: str, path: Path, protocol: str, **extra: Any) -> Item:
 
 @dataclass(frozen=True)
 class NTU60:
-    """Options of the reader; defaults are the published point-cloud preprocessing. ``scale``: mm per unit of length."""
+    """Reads NTU RGB+D 60; defaults are the published point-cloud preprocessing. ``scale``: mm per unit of length."""
 
     inputs: tuple[Path, ...]
     protocol: str = "xsub"
@@ -150,17 +163,21 @@ class NTU60:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return list(CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         return {1.0: "mm", 1000.0: "m"}.get(self.scale, f"{self.scale:g} mm")
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k != "inputs"}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found: dict[str, Item] = {}
         for given in self.inputs:
             for item in self._search(given):
@@ -187,7 +204,9 @@ class NTU60:
             raise DataError(f"{given}: does not exist; expected a folder of nturgb+d_depth_masked, or its ZIPs")
 
     def _folder(self, folder: Path, root: Path) -> Iterator[Item]:
-        """The videos below a folder, without a look into them: 56,880 folders take a second, their frames minutes."""
+        """Yields the videos below a folder, without a look into them: 56,880 folders take a second, their frames
+        minutes.
+        """
         with os.scandir(folder) as entries:
             ordered = sorted(entries, key=lambda entry: entry.name)
         strange = ""
@@ -217,24 +236,25 @@ class NTU60:
 
     def _archive(self, path: Path) -> Iterator[Item]:
         try:
-            folders, shift = zip_index.folders(path)
+            folders = zip_folders.list_folders(path)
         except (DataError, OSError) as error:
             yield Item(str(path), path, problem=str(error))
             return
-        videos = {name: ranges for name, ranges in folders.items() if NAME.fullmatch(name.rpartition("/")[2])}
-        for name, ranges in videos.items():
-            yield video_item(name.rpartition("/")[2], path, self.protocol, ranges=ranges, shift=shift)
+        videos = {name: files for name, files in folders.items() if NAME.fullmatch(name.rpartition("/")[2])}
+        for name, files in videos.items():
+            yield video_item(name.rpartition("/")[2], path, self.protocol, files=files)
         if not videos:
             inside = ", ".join(sorted(folders)[:3])
             yield Item(
                 str(path), path, problem=f"{path}: no folder SsssCcccPpppRrrrAaaa in it; found {inside or 'none'}"
             )
         for name in sorted(folders.keys() - videos.keys()) if videos else ():
-            first = next((n for n in zip_index.file_names(path, folders[name]) if FRAME.fullmatch(n)), "")
+            first = next((n for n in folders[name].names if FRAME.fullmatch(n)), "")
             if first:
                 yield Item(f"{path}/{name}", path, problem=_strange_name(path / name, first))
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         where = item.path if "root" in item.extra else item.path / item.name
         frames = sorted(self._frames(item, where))
         numbers = np.array([number for number, _ in frames])
@@ -256,11 +276,11 @@ class NTU60:
         return Sample(CloudSequence(item.name, points, offsets(counts[kept]), time=time, **describe(item)), notes)
 
     def _frames(self, item: Item, where: Path) -> Iterator[tuple[int, Path | bytes]]:
-        """(number, file or content) of the frames of a video, unsorted."""
+        """Yields (number, file or content) of the frames of a video, unsorted."""
         if "root" in item.extra:
             files: Iterator = folder_files(item.path, item.extra["root"], ".png")
         else:
-            files = zip_index.read_files(item.path, item.extra["ranges"], item.extra["shift"])
+            files = zip_folders.read_files(item.path, item.extra["files"])
         others, empty = "", True
         for name, data in files:
             match = FRAME.fullmatch(name)
@@ -274,6 +294,7 @@ class NTU60:
             raise DataError(f"{where}: no MDepth-00000001.png ...; {found}")
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         good = [item for item in items if not item.problem]
         setups, splits = Counter(item.name[:4] for item in good), Counter(item.split for item in good)
         lines = [f"{len(good)} of the {VIDEOS} published videos found, {len(items) - len(good)} entries unusable"]

@@ -28,7 +28,7 @@ SUBJECT = re.compile(r"subject(\d+)_r\d+")
 
 @dataclass(frozen=True)
 class ListEntry:
-    """One line of a list file: ``stop`` is exclusive, ``label`` counts from 1, ``path`` is relative to the data."""
+    """Holds one line of a list file: ``stop`` is exclusive, ``label`` counts from 1, ``path`` is relative to the data."""
 
     path: str
     stream: str
@@ -38,7 +38,11 @@ class ListEntry:
 
 
 def parse_line(line: str) -> ListEntry:
-    """``path:./Video_data/class_01/subject3_r0 depth:sk_depth:146:226 color:... label:1`` -> its parts; ValueError."""
+    """Returns the parts of a line of a list file. Raises ValueError, which says what is wrong with it.
+
+    >>> parse_line("path:./Video_data/class_01/subject3_r0 depth:sk_depth:146:226 color:sk_color:146:226 label:1")
+    ListEntry(path='./Video_data/class_01/subject3_r0', stream='sk_depth', start=146, stop=226, label=1)
+    """
     match = LINE.fullmatch(line.strip())
     if not match:
         raise ValueError("expected 'path:FOLDER depth:NAME:START:STOP ... label:N'")
@@ -51,7 +55,7 @@ def parse_line(line: str) -> ListEntry:
 
 
 def foreground(frame: np.ndarray, erode: int = 1) -> np.ndarray:
-    """The hand in an 8-bit frame (H,W), nearer = larger -> mask u8 (H,W).
+    """Returns the mask u8 (H,W) of the hand in an 8-bit frame (H,W), nearer = larger.
 
     Otsu's threshold, the largest 4-connected component, ``erode`` passes of a 3x3 erosion (PointLSTM's preprocessing).
     """
@@ -75,7 +79,7 @@ def foreground(frame: np.ndarray, erode: int = 1) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def pixel_places(height: int, width: int) -> np.ndarray:
-    """Row, column and 0 of every pixel in raster order, f32 (H*W, 3)."""
+    """Returns row, column and 0 of every pixel in raster order, f32 (H*W, 3)."""
     places = np.zeros((height, width, 3), np.float32)
     places[..., 0] = np.arange(height)[:, None]
     places[..., 1] = np.arange(width)
@@ -85,7 +89,7 @@ def pixel_places(height: int, width: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NvGesture:
-    """Options of the reader; defaults are the peers' preprocessing without their thinning to 32 frames x 512 points."""
+    """Reads NvGesture; defaults are the peers' preprocessing without their thinning to 32 frames x 512 points."""
 
     raw: Path
     foreground: str = "otsu"  # otsu | none
@@ -100,19 +104,23 @@ class NvGesture:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return [f"gesture {number:02}" for number in range(1, CLASSES + 1)]
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         if self.coordinates == "image":
             return "pixel (row, column), gray level (depth; nearer = larger)"
         return "255 - gray level"
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k != "raw"}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         expected = "nvgesture_train_correct_cvpr2016_v2.lst, nvgesture_test_... and Video_data/"
         folder = require_folder(self.raw, expected)
         lists = {split: sorted(folder.glob(f"nvgesture_{split}_correct*.lst")) for split in PUBLISHED}
@@ -159,6 +167,7 @@ class NvGesture:
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         start, stop = item.extra["start"], item.extra["stop"]
         frames, rate = read_video(item.path, start, stop)
         if not frames:
@@ -188,5 +197,6 @@ class NvGesture:
         return points
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         return [f"{split}: {found[split]} of the {count} published clips found" for split, count in PUBLISHED.items()]

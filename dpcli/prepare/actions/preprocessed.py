@@ -15,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions import msraction3d, ntu60
 from dpcli.prepare.actions.pts_label import FILE as PTS_LABEL
 from dpcli.prepare.actions.pts_label import PtsLabel
-from dpcli.prepare.decode.depth_png import leads_out
+from dpcli.prepare.decode.folder_listing import leads_out
 from dpcli.prepare.decode.npz_frames import member_names, read_frames
 from dpcli.prepare.reader import Item, Reader, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
@@ -34,9 +34,11 @@ def open_preprocessed(
     protocol: str = "xsub",
     scale: float | None = None,
 ) -> Reader:
-    """The reader for what is in a folder. form: which of the forms, or ``auto`` to tell it by the first file found.
+    """Returns the reader for what is in a folder. form: which of the forms, or ``auto`` to tell it by the first file
+    found.
 
-    UsageError when an option is given that the form doesn't have; DataError when the folder holds none of them.
+    Raises UsageError when an option is given that the form doesn't have. Raises DataError when the folder holds none
+    of them.
     """
     if form not in _FORMS:
         raise UsageError(f"--form {form}: expected one of {', '.join(_FORMS)}")
@@ -63,7 +65,7 @@ def _detect(raw: Path) -> str:
 
 @dataclass(frozen=True)
 class PeerClouds:
-    """Reader of one `.npz` per video. The clouds come out as `prepare msraction3d` or `prepare ntu60` would make them.
+    """Reads one `.npz` per video. The clouds come out as `prepare msraction3d` or `prepare ntu60` would make them.
 
     ``scale``: stored units per unit of length in the output. By default 300 for MSR-Action3D, whose files hold raw
     depth units, and 0.01 for NTU, whose files hold 16-bit values / 65535: the factors in the peers' loaders.
@@ -83,10 +85,12 @@ class PeerClouds:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return list(msraction3d.CLASS_NAMES if self.form == "msraction3d" else ntu60.CLASS_NAMES)
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         if self.form == "msraction3d":
             return f"{self._scale:g} raw depth units" if self._scale != 1 else "raw depth unit"
         return f"{self._scale * 65535:g} mm"
@@ -97,10 +101,12 @@ class PeerClouds:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         protocol = {"protocol": self.protocol} if self.form == "ntu60" else {}
         return {"form": self.form, "scale": self._scale, **protocol}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         root = require_folder(self.raw, f"one .npz per video of {self.form}")
         make: Callable[[Path], Item] = self._msr_item if self.form == "msraction3d" else self._ntu_item
         items: dict[str, Item] = {}
@@ -133,6 +139,7 @@ class PeerClouds:
         return ntu60.video_item(match[1], path, self.protocol)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         names = member_names(item.path)
         key = next((k for k in (KEYS[self.form], *KEYS.values()) if k in names), None)
         if key is None:
@@ -145,6 +152,7 @@ class PeerClouds:
         return Sample(CloudSequence(item.name, points, offsets(counts[kept]), **describe(item)), notes)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         published = 567 if self.form == "msraction3d" else ntu60.VIDEOS
         counts = f"{sum(found.values())} of the {published} published videos found"

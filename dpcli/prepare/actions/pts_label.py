@@ -13,7 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.shrec17_lists import FINGERS, GESTURES, Entry, entries, find_lists, gesture_names
-from dpcli.prepare.decode.depth_png import leads_out
+from dpcli.prepare.decode.folder_listing import leads_out
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
 from dpcli.store import CloudSequence
 
@@ -23,7 +23,7 @@ _NVGESTURE = re.compile(r"(?:.*/)?(class_(\d+)/subject(\d+)_r\d+)")
 
 
 def read_array(path: Path) -> np.ndarray:
-    """The array of a pts_label.npy (T,N,C), C >= 3: row, column, depth, then what isn't used; DataError otherwise."""
+    """Reads the array (T,N,C) of a pts_label.npy, C >= 3: row, column, depth, then what isn't used. Raises DataError."""
     try:
         array = np.load(path, allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
@@ -41,7 +41,7 @@ def read_array(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PtsLabel:
-    """Reader of pts_label.npy files in folders gesture_G/finger_F/subject_S/essai_E, or class_C/subjectS_rR.
+    """Reads pts_label.npy files in folders gesture_G/finger_F/subject_S/essai_E, or class_C/subjectS_rR.
 
     ``lists``: the folder of SHREC'17's train_gestures.txt and test_gestures.txt; by default they are looked for in
     ``raw``. Without lists there is no split, and the 28 labels are those of (gesture, finger) in their order.
@@ -58,6 +58,7 @@ class PtsLabel:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         if self._is_nvgesture():
             return [f"gesture {number:02}" for number in range(1, 26)]
         found = self._list_files()
@@ -67,12 +68,14 @@ class PtsLabel:
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         if self._is_nvgesture():
             return "pixel (row, column), gray level (depth; nearer = larger)"
         return "pixel (row, column), mm (depth)"
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {"labels": self.labels}
 
     def _list_files(self) -> list:
@@ -87,6 +90,7 @@ class PtsLabel:
         return any(True for _ in self.raw.rglob("class_*")) and not any(True for _ in self.raw.rglob("gesture_*"))
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         root = require_folder(self.raw, f"{FILE} files in folders such as gesture_1/finger_1/subject_1/essai_1")
         lists = self._list_files()
         listed = {e.folder: (s, e) for s, _, e in entries(lists) if isinstance(e, Entry)}
@@ -104,7 +108,7 @@ class PtsLabel:
         return sorted(items.values(), key=lambda item: natural_key(item.name))
 
     def _absent(self, lists: list, items: dict[str, Item]) -> Iterator[Item]:
-        """What the lists name and the folder lacks, and lines that can't be understood."""
+        """Returns items for what the lists name and the folder lacks, and for lines that can't be understood."""
         for split, where, entry in entries(lists):
             if isinstance(entry, str):
                 yield Item(where, self.raw, split, problem=entry)
@@ -139,6 +143,7 @@ class PtsLabel:
         return Item(match[1], path, label=label, subject=subject)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         array = read_array(item.path)
         # a frame in which nothing was found was filled with points of depth 0
         seen = array[..., 2] > 0
@@ -151,6 +156,7 @@ class PtsLabel:
         return Sample(sequence, notes)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         lines = [f"{sum(found.values())} gestures found (train {found['train']}, test {found['test']})"]
         if found[""]:

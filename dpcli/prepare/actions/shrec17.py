@@ -11,9 +11,10 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.actions.shrec17_lists import PUBLISHED, find_lists, gesture_names, listed_items
-from dpcli.prepare.decode.depth_files import load_cv2
-from dpcli.prepare.decode.depth_png import decode_depth_png, folder_files, leads_out
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
+from dpcli.prepare.decode.png import decode_depth_png
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
 from dpcli.store import CloudSequence
 
@@ -23,7 +24,7 @@ TICKS_PER_SECOND = 1e7  # of the timestamps in general_informations.txt
 
 
 def read_regions(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """general_informations.txt -> timestamps f64 (T) in ticks, hand regions i64 (T,4): x, y, width, height."""
+    """Reads general_informations.txt: timestamps f64 (T) in ticks, hand regions i64 (T,4): x, y, width, height."""
     try:
         lines = path.read_text(errors="replace").splitlines()
     except FileNotFoundError:
@@ -45,15 +46,17 @@ def read_regions(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def largest_component(mask: np.ndarray) -> np.ndarray:
-    """mask u8 (H,W) of 0 and 1 -> the largest 4-connected component, u8; of equal ones the first in raster order."""
+    """Returns the largest 4-connected component of a mask u8 (H,W) of 0 and 1; of equal ones the first in raster
+    order.
+    """
     cv2 = load_cv2()
     _, labels = cv2.connectedComponents(mask, connectivity=4)
     areas = np.bincount(labels.reshape(-1)[np.flatnonzero(mask)], minlength=1)
     return mask if len(areas) < 2 else (labels == areas.argmax()).astype(np.uint8)
 
 
-def hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.ndarray:
-    """A cropped depth frame (H,W) u8 or u16 -> the same with all but the hand set to 0 (PointLSTM's preprocessing).
+def keep_only_hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.ndarray:
+    """Returns a cropped depth frame (H,W) u8 or u16 with all but the hand set to 0 (PointLSTM's preprocessing).
 
     Median blur; depth > 0 closed by a ``close`` x ``close`` square; of that the largest component; of that the pixels
     that had a depth before the closing. 0 leaves a step out.
@@ -69,7 +72,7 @@ def hand(depth: np.ndarray, median: int = 3, close: int = 7) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Shrec17:
-    """Options of the reader; defaults are the peers' preprocessing without their thinning to 32 frames x 256 points."""
+    """Reads SHREC'17; defaults are the peers' preprocessing without their thinning to 32 frames x 256 points."""
 
     raw: Path
     labels: int = 28
@@ -93,20 +96,26 @@ class Shrec17:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return gesture_names(find_lists(self.raw), self.labels)
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         return "pixel (row, column), mm (depth)" if self.coordinates == "image" else "mm"
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k != "raw"}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         lists = find_lists(self.raw)
         root = lists[0].path.parent
-        items = {item.name: item if item.problem else _checked(item) for item in listed_items(lists, self.labels)}
+        items = {
+            item.name: item if item.problem else _with_folder_problem(item) for item in listed_items(lists, self.labels)
+        }
         listed = {item.path for item in items.values()}
         for folder in sorted(root.glob("gesture_*/finger_*/subject_*/essai_*")):
             if folder not in listed:
@@ -115,19 +124,20 @@ class Shrec17:
         return sorted(items.values(), key=lambda item: natural_key(item.name))
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         frames, notes = self._frame_paths(item)
         ticks, regions = self._regions(item, len(frames))
         clouds, cut = [], 0
         for k, path in enumerate(frames):
             depth = decode_depth_png(path.read_bytes(), str(path), (WIDTH, HEIGHT), bits=(8, 16))
-            x, y, right, bottom = _inside(regions[k]) if self.bbox else (0, 0, WIDTH, HEIGHT)
+            x, y, right, bottom = _clip_to_image(regions[k]) if self.bbox else (0, 0, WIDTH, HEIGHT)
             cut += bool(self.bbox and [x, y, right - x, bottom - y] != regions[k].tolist())
             clouds.append(self._points(depth, x, y, right, bottom))
         counts = np.array([len(cloud) for cloud in clouds], np.int64)
         kept, dropped = drop_empty_frames(str(item.path), counts)
         if cut:
             notes["hand regions cut at the edge of the image"] = cut
-        seconds = _seconds(ticks, len(frames))
+        seconds = _frame_seconds(ticks, len(frames))
         if seconds is None:
             seconds = np.arange(len(frames)) / FPS
             notes["sequences without usable timestamps (30 frames/s assumed)"] = 1
@@ -137,7 +147,7 @@ class Shrec17:
         return Sample(sequence, {**notes, **dropped})
 
     def _frame_paths(self, item: Item) -> tuple[list[Path], dict[str, int]]:
-        """The files 0_depth.png ... as many as the list says; more of them are left out and counted."""
+        """Returns the files 0_depth.png ... as many as the list says; more of them are left out and counted."""
         found = dict(folder_files(item.path, item.extra["root"], "_depth.png"))
         wanted = [f"{k}_depth.png" for k in range(item.extra["frames"])]
         missing = [name for name in wanted if name not in found]
@@ -159,12 +169,12 @@ class Shrec17:
         return ticks, regions
 
     def _points(self, depth: np.ndarray, x: int, y: int, right: int, bottom: int) -> np.ndarray:
-        """One frame (480,640) and the region to look at -> points f32 (N,3) in raster order of the pixels."""
+        """Returns the points f32 (N,3), in raster order of the pixels, of a region of one frame (480,640)."""
         if right <= x or bottom <= y:
             return np.zeros((0, 3), np.float32)
         region = np.ascontiguousarray(depth[y:bottom, x:right])
         if self.foreground == "component":
-            region = hand(region, self.median, self.close)
+            region = keep_only_hand(region, self.median, self.close)
         elif self.median:
             region = load_cv2().medianBlur(region, self.median)
         if self.coordinates == "camera":
@@ -175,14 +185,15 @@ class Shrec17:
         return np.stack([row + y, column + x, region[row, column]], axis=1).astype(np.float32)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         return [
             f"{split}: {found[split]} of the {count} published gestures found" for split, count in PUBLISHED.items()
         ]
 
 
-def _checked(item: Item) -> Item:
-    """The item, with a problem when its folder is missing or a link out of the data."""
+def _with_folder_problem(item: Item) -> Item:
+    """Returns the item, with a problem when its folder is missing or a link out of the data."""
     root, problem = item.extra["root"], ""
     if not item.path.is_dir():
         problem = f"{root}: {item.extra['line']} names {item.name}, which does not exist"
@@ -191,14 +202,14 @@ def _checked(item: Item) -> Item:
     return replace(item, problem=problem) if problem else item
 
 
-def _inside(region: np.ndarray) -> tuple[int, int, int, int]:
-    """x, y, width, height -> left, top, right, bottom of what lies in the image; nothing when right <= left."""
+def _clip_to_image(region: np.ndarray) -> tuple[int, int, int, int]:
+    """Returns left, top, right, bottom of what lies in the image of x, y, width, height; nothing when right <= left."""
     x, y, width, height = (int(v) for v in region)
     return max(x, 0), max(y, 0), min(x + width, WIDTH), min(y + height, HEIGHT)
 
 
-def _seconds(ticks: np.ndarray, frames: int) -> np.ndarray | None:
-    """Timestamps of the frames as seconds from the first; None where they are too few or don't rise."""
+def _frame_seconds(ticks: np.ndarray, frames: int) -> np.ndarray | None:
+    """Returns timestamps of the frames as seconds from the first; None where they are too few or don't rise."""
     if len(ticks) < frames or (np.diff(ticks[:frames]) <= 0).any():
         return None
     return (ticks[:frames] - ticks[0]) / TICKS_PER_SECOND

@@ -32,7 +32,7 @@ _COLUMNS = {"gesture": 14, "finger": 2, "subject": 28, "trial": 0, "label14": 14
 
 @dataclass(frozen=True)
 class Entry:
-    """One line: all count from 1; ``frames`` is the length of the sequence."""
+    """Holds one line: all count from 1; ``frames`` is the length of the sequence."""
 
     gesture: int
     finger: int
@@ -44,15 +44,16 @@ class Entry:
 
     @property
     def folder(self) -> str:
+        """Returns the sequence's folder, relative to the lists."""
         return f"gesture_{self.gesture}/finger_{self.finger}/subject_{self.subject}/essai_{self.trial}"
 
     def label(self, labels: int) -> int:
-        """The label among 14 or 28, from 0."""
+        """Returns the label among 14 or 28, from 0."""
         return (self.label14 if labels == 14 else self.label28) - 1
 
 
 def parse_line(line: str) -> Entry:
-    """``1 1 2 1 1 1 67`` -> its parts; ValueError says what is wrong."""
+    """Returns the parts of a line such as ``1 1 2 1 1 1 67``. Raises ValueError, which says what is wrong."""
     words = line.split()
     if len(words) != len(_COLUMNS) or not all(word.isascii() and word.isdigit() for word in words):
         raise ValueError("expected 7 whole numbers: gesture finger subject trial label14 label28 frames")
@@ -64,7 +65,7 @@ def parse_line(line: str) -> Entry:
 
 @dataclass(frozen=True)
 class ListFile:
-    """A list file and its lines (number from 1, text), blank ones left out."""
+    """Holds a list file and its lines (number from 1, text), blank ones left out."""
 
     path: Path
     split: str
@@ -72,7 +73,10 @@ class ListFile:
 
 
 def find_lists(raw: Path) -> list[ListFile]:
-    """train_gestures.txt and test_gestures.txt in ``raw`` or in a folder directly in it; DataError unless both are."""
+    """Finds train_gestures.txt and test_gestures.txt in ``raw`` or a folder directly in it.
+
+    Raises DataError unless both are there.
+    """
     expected = "train_gestures.txt, test_gestures.txt and gesture_1/ ... gesture_14/"
     folder = require_folder(raw, expected)
     homes = [home for home in (folder, *sorted(folder.iterdir())) if (home / "train_gestures.txt").is_file()]
@@ -90,7 +94,7 @@ def find_lists(raw: Path) -> list[ListFile]:
 
 
 def entries(lists: Sequence[ListFile]) -> Iterator[tuple[str, str, Entry | str]]:
-    """(split, FILE:LINE, entry or what is wrong with the line), each sequence once."""
+    """Yields (split, FILE:LINE, entry or what is wrong with the line), each sequence once."""
     seen: dict[str, str] = {}
     meaning: dict[tuple[str, int], tuple[tuple[int, ...], str]] = {}
     for file in lists:
@@ -139,7 +143,7 @@ def gesture_names(lists: Sequence[ListFile], labels: int) -> list[str]:
 
 
 def listed_items(lists: Sequence[ListFile], labels: int) -> list[Item]:
-    """One item per line, in the order of the lists; ``path`` is the sequence's folder beside the lists."""
+    """Returns one item per line, in the order of the lists; ``path`` is the sequence's folder beside the lists."""
     items = []
     for split, where, entry in entries(lists):
         root = lists[0].path.parent

@@ -17,7 +17,7 @@ _CHECKED_STATES = 6  # values of a joint at which the place of the surface is co
 
 @dataclass(frozen=True)
 class Joint:
-    """A hinge (``revolute``, radians) or slide (``prismatic``, the object's unit) from a parent to a child body.
+    """Holds a hinge (``revolute``, radians) or slide (``prismatic``, the object's unit) from a parent to a child body.
 
     origin f64 (4,4): the child's frame in the parent's at value 0; axis f64 (3): unit vector in the child's frame.
     A joint that ``follows`` another has the value multiplier * value + offset of that joint; -1: a joint of its own.
@@ -37,7 +37,7 @@ class Joint:
 
 @dataclass
 class ArticulatedObject:
-    """Rigid bodies in a tree of joints. Body 0 is the root; a joint's parent is reached before its child.
+    """Holds rigid bodies in a tree of joints. Body 0 is the root; a joint's parent is reached before its child.
 
     triangles f64 (T,3,3): corners, each in the frame of its body; body_of_triangle i64 (T). Triangles have an area.
     notes: counts of what was odd in the source, for the log.
@@ -51,34 +51,37 @@ class ArticulatedObject:
 
     @property
     def num_bodies(self) -> int:
+        """Returns the number of bodies."""
         return len(self.joints) + 1
 
     @cached_property
     def areas(self) -> np.ndarray:
-        """Area of every triangle, f64 (T)."""
+        """Returns the area of every triangle, f64 (T)."""
         return triangle_areas(self.triangles)
 
     @cached_property
     def body_areas(self) -> np.ndarray:
-        """Surface area of every body, f64 (bodies)."""
+        """Returns surface area of every body, f64 (bodies)."""
         return np.bincount(self.body_of_triangle, self.areas, minlength=self.num_bodies)
 
     @cached_property
     def vertices(self) -> tuple[np.ndarray, np.ndarray]:
-        """The distinct corners f64 (V,3), each in the frame of its body, and their bodies i64 (V)."""
+        """Returns the distinct corners f64 (V,3), each in the frame of its body, and their bodies i64 (V)."""
         corners = np.concatenate([self.triangles.reshape(-1, 3), np.repeat(self.body_of_triangle, 3)[:, None]], axis=1)
         corners = np.unique(corners, axis=0)
         return corners[:, :3], corners[:, 3].astype(np.int64)
 
     def poses(self, values: np.ndarray) -> np.ndarray:
-        """Forward kinematics. values f64 (F,joints) -> body-to-root f64 (F,bodies,4,4). Followers: see ``follow``."""
+        """Returns body-to-root f64 (F,bodies,4,4) for joint values f64 (F,joints): forward kinematics, after
+        ``follow``.
+        """
         poses = np.tile(np.eye(4), (len(values), self.num_bodies, 1, 1))
         for joint, value in zip(self.joints, values.T, strict=True):
             poses[:, joint.child] = poses[:, joint.parent] @ joint.origin @ joint_motion(joint, value)
         return poses
 
     def follow(self, values: np.ndarray) -> np.ndarray:
-        """Joint values f64 (F,joints) in which every follower has the value its leader gives it."""
+        """Returns joint values f64 (F,joints) in which every follower has the value its leader gives it."""
         values = values.copy()
         for index, joint in enumerate(self.joints):
             if joint.follows >= 0:
@@ -86,7 +89,7 @@ class ArticulatedObject:
         return values
 
     def extent(self, poses: np.ndarray) -> tuple[np.ndarray, float]:
-        """Center (3) of the bounding box and radius of the sphere about it that holds the object. poses (bodies,4,4)."""
+        """Returns the center (3) of the bounding box and the radius of the sphere about it. poses f64 (bodies,4,4)."""
         points, body = self.vertices
         placed = transform(poses[body], points)
         center = (placed.min(0) + placed.max(0)) / 2
@@ -94,7 +97,7 @@ class ArticulatedObject:
 
 
 def joint_motion(joint: Joint, values: np.ndarray) -> np.ndarray:
-    """What a joint does at its values f64 (F): 4x4 matrices f64 (F,4,4). Hinges: Rodrigues' formula."""
+    """Returns the motions f64 (F,4,4) of a joint at its values f64 (F); hinges turn by Rodrigues' formula."""
     motion = np.tile(np.eye(4), (len(values), 1, 1))
     if joint.kind == "prismatic":
         motion[:, :3, 3] = values[:, None] * joint.axis
@@ -104,7 +107,7 @@ def joint_motion(joint: Joint, values: np.ndarray) -> np.ndarray:
 
 
 def axis_rotation(axis: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Rotations by ``angles`` f64 (F), radians, about the unit vector ``axis`` (3) -> f64 (F,3,3)."""
+    """Returns rotations by ``angles`` f64 (F), radians, about the unit vector ``axis`` (3) -> f64 (F,3,3)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
@@ -117,14 +120,14 @@ def transform(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def triangle_areas(triangles: np.ndarray) -> np.ndarray:
-    """Areas f64 (T) of triangles (T,3,3)."""
+    """Returns areas f64 (T) of triangles (T,3,3)."""
     return np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1) / 2
 
 
 def drop_degenerate(
     triangles: np.ndarray, body_of_triangle: np.ndarray, notes: Counter
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Without the triangles that have no area or a corner that is not finite; counts them in ``notes``."""
+    """Removes the triangles that have no area or a corner that is not finite, and counts them in ``notes``."""
     with np.errstate(invalid="ignore", over="ignore"):
         area = triangle_areas(triangles)
         size = np.abs(triangles).max(axis=(1, 2), initial=0.0)
@@ -135,7 +138,7 @@ def drop_degenerate(
 
 
 def sample_values(obj: ArticulatedObject, frames: int, step: float, rng: np.random.Generator) -> np.ndarray:
-    """Joint values f64 (F,joints): a random walk of each joint within its limits.
+    """Draws joint values f64 (F,joints): a random walk of each joint within its limits.
 
     ``step``: the largest change between consecutive frames as a fraction of the joint's range; with 1 they are
     independent. A walk must span at least half a step, or it is drawn again.
@@ -161,7 +164,7 @@ def _walk(lower: float, upper: float, frames: int, step: float, rng: np.random.G
 
 
 def idle_joints(obj: ArticulatedObject, least: float, visible_only: bool, rng: np.random.Generator) -> set[int]:
-    """Joints that hardly move anything over their whole range. When all do, the one that moves most is not among them.
+    """Returns the joints that hardly move anything over their whole range, but never the one that moves most.
 
     ``least``: a fraction of the object's diameter that some point of the surface must move by. With ``visible_only``
     a tenth of the moved surface must come to lie that far from where surface was: a wheel that spins about its own axis
@@ -181,7 +184,9 @@ def idle_joints(obj: ArticulatedObject, least: float, visible_only: bool, rng: n
 def _largest_change(
     obj: ArticulatedObject, joint: Joint, below: np.ndarray, poses: np.ndarray, of_shape: bool, rng: np.random.Generator
 ) -> float:
-    """How far the surface of the bodies ``below`` the joint, bool (bodies), goes from its place at the lower limit."""
+    """Returns how far the surface of the bodies ``below`` the joint, bool (bodies), goes from its place at the lower
+    limit.
+    """
     if not obj.body_areas[below].sum():
         return 0.0
     only = np.where(below[obj.body_of_triangle], obj.areas, 0.0)
@@ -206,7 +211,7 @@ def _range(obj: ArticulatedObject, joint: Joint) -> tuple[float, float]:
 
 
 def _subtrees(obj: ArticulatedObject) -> np.ndarray:
-    """bool (bodies,bodies): row b marks b and everything that hangs on it."""
+    """Returns bool (bodies,bodies): row b marks b and everything that hangs on it."""
     below = np.eye(obj.num_bodies, dtype=bool)
     for joint in reversed(obj.joints):
         below[joint.parent] |= below[joint.child]
@@ -214,7 +219,9 @@ def _subtrees(obj: ArticulatedObject) -> np.ndarray:
 
 
 def groups(obj: ArticulatedObject, locked: set[int]) -> np.ndarray:
-    """For every body the topmost body it is rigidly joined to when the ``locked`` joints stay still, i64 (bodies)."""
+    """Returns for every body the topmost body it is rigidly joined to when the ``locked`` joints stay still, i64
+    (bodies).
+    """
     top = np.arange(obj.num_bodies)
     for index, joint in enumerate(obj.joints):
         if index in locked:
@@ -223,7 +230,8 @@ def groups(obj: ArticulatedObject, locked: set[int]) -> np.ndarray:
 
 
 def lock_small(obj: ArticulatedObject, locked: set[int], least: float) -> set[int]:
-    """``locked`` and the joints above groups of bodies whose share of the surface is below ``least``, smallest first.
+    """Returns ``locked`` and the joints above groups of bodies whose share of the surface is below ``least``, smallest
+    first.
 
     Stops when two parts are left.
     """
@@ -240,7 +248,7 @@ def lock_small(obj: ArticulatedObject, locked: set[int], least: float) -> set[in
 
 
 def lock_some(obj: ArticulatedObject, locked: set[int], most: int, rng: np.random.Generator) -> set[int]:
-    """``locked`` and as many joints drawn at random as leave at most ``most`` parts."""
+    """Returns ``locked`` and as many joints drawn at random as leave at most ``most`` parts."""
     locked = set(locked)
     free = [index for index in range(len(obj.joints)) if index not in locked]
     for index in rng.permutation(free):
@@ -251,7 +259,7 @@ def lock_some(obj: ArticulatedObject, locked: set[int], most: int, rng: np.rando
 
 
 def parts(obj: ArticulatedObject, locked: set[int]) -> np.ndarray:
-    """Part of every body, i64 (bodies); -1 where a rigid group has no surface.
+    """Returns the part of every body, i64 (bodies); -1 where a rigid group has no surface.
 
     Part 0 is the group of the root (the first group with a surface when the root's has none); the others follow in
     the order of their topmost bodies.
@@ -264,7 +272,9 @@ def parts(obj: ArticulatedObject, locked: set[int]) -> np.ndarray:
 
 
 def sampling_weights(obj: ArticulatedObject, part: np.ndarray, least: float) -> np.ndarray:
-    """Areas f64 (T), raised on small parts so that each gets the share ``least`` of the points. part i64 (bodies)."""
+    """Returns the areas f64 (T), raised on small parts so that each gets the share ``least`` of the points. part i64
+    (bodies).
+    """
     part = part[obj.body_of_triangle]
     share = np.bincount(part, obj.areas) / obj.areas.sum()
     least = min(least, 0.5 / len(share))
@@ -276,7 +286,7 @@ def sampling_weights(obj: ArticulatedObject, part: np.ndarray, least: float) -> 
 
 
 def finite_limits(obj: ArticulatedObject) -> ArticulatedObject:
-    """Slides without limits get 0 .. a quarter of the object's diameter at the joints' other middles."""
+    """Gives slides without limits 0 to a quarter of the object's diameter, the other joints at their middles."""
     endless = [i for i, joint in enumerate(obj.joints) if not np.isfinite(joint.lower + joint.upper)]
     if not endless:
         return obj
@@ -289,7 +299,7 @@ def finite_limits(obj: ArticulatedObject) -> ArticulatedObject:
 
 
 def require_surface(obj: ArticulatedObject) -> ArticulatedObject:
-    """The object when it has joints and a surface; else DataError."""
+    """Returns the object when it has joints and a surface. Raises DataError otherwise."""
     if not obj.joints:
         raise DataError(f"{obj.name}: no movable joint (revolute, continuous or prismatic); nothing in it can move")
     if not len(obj.triangles):

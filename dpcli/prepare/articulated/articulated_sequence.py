@@ -34,9 +34,12 @@ _DENSER = 4  # so many times more points are sampled when --sampling fps or voxe
 _GLUED = 0.25  # of min_part: a part with fewer expected points is glued to its parent
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Articulation:
-    """How sequences are drawn from an object; see `dpc prepare sapien --help`. Angles in degrees, lengths in diameters."""
+    """Says how sequences are drawn from an object; see `dpc prepare sapien --help`.
+
+    Angles in degrees, lengths in diameters.
+    """
 
     points_per_frame: int = 512
     frames: int = 4
@@ -66,17 +69,18 @@ class Articulation:
 
     @classmethod
     def of_options(cls, options: dict[str, Any]) -> Articulation:
-        """From the command's options, which share --points with all readers."""
+        """Returns from the command's options, which share --points with all readers."""
         return cls(**{"points_per_frame" if key == "points" else key: value for key, value in options.items()})
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return asdict(self)
 
 
 @dataclass
 class Study:
-    """An object and what the options say about its joints, found out once for all its sequences."""
+    """Holds an object and what the options say about its joints, found out once for all its sequences."""
 
     obj: ArticulatedObject
     locked: set[int]
@@ -84,7 +88,7 @@ class Study:
 
 
 def study(obj: ArticulatedObject, options: Articulation) -> Study:
-    """Decide which joints move. DataError when fewer than two rigid parts remain.
+    """Decides which joints move. Raises DataError when fewer than two rigid parts remain.
 
     A joint stays still, and what hangs on it belongs to its parent's part, when it moves nothing by ``min_motion`` of
     the object's diameter (see ``idle_joints``), or when its part's share of the surface is below a quarter of
@@ -105,7 +109,7 @@ def study(obj: ArticulatedObject, options: Articulation) -> Study:
 def draw_sequence(
     name: str, studied: Study, options: Articulation, pad_parts: int, rng: np.random.Generator, **known: Any
 ) -> Sample:
-    """One sequence of ``options.frames`` frames; ``known``: fields of the CloudSequence that the index holds.
+    """Draws one sequence of ``options.frames`` frames; ``known``: fields of the CloudSequence that the index holds.
 
     The object of frame 0 fits a sphere of diameter 1 about the origin; every frame's points are drawn independently.
     pose f64 (F,pad_parts,4,4) takes a part's own frame to the frame's points; unused parts are the identity.
@@ -137,7 +141,7 @@ def _normalized(obj: ArticulatedObject, poses: np.ndarray) -> tuple[float, np.nd
 
 
 def global_motions(options: Articulation, rng: np.random.Generator) -> np.ndarray:
-    """Motion of the whole object in every frame, f64 (F,4,4): one orientation for all, and a small motion for each."""
+    """Draws the motion of the whole object, f64 (F,4,4): one orientation for all frames, and a small motion for each."""
     upright = options.orientation == "upright"
     motions = np.tile(np.eye(4), (options.frames, 1, 1))
     turn = axis_rotation(np.array([0.0, 0, 1]), rng.uniform(0, 2 * np.pi, 1))[0] if upright else random_rotation(rng)
@@ -151,7 +155,7 @@ def global_motions(options: Articulation, rng: np.random.Generator) -> np.ndarra
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """A rotation f64 (3,3), uniform over SO(3): a unit quaternion from a normal distribution."""
+    """Draws a rotation f64 (3,3), uniform over SO(3): a unit quaternion from a normal distribution."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
     return np.array(
         [
@@ -170,7 +174,7 @@ def _frames(
     options: Articulation,
     rng: np.random.Generator,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points f32 (N,3) and part ids i16 (N) of every frame. poses f64 (F,bodies,4,4), part i64 (bodies)."""
+    """Yields points f32 (N,3) and part ids i16 (N) of every frame. poses f64 (F,bodies,4,4), part i64 (bodies)."""
     count = options.points_per_frame * (1 if options.sampling == "random" else _DENSER)
     camera = _camera(obj, scale, poses, options, rng) if options.view == "single" else None
     weights = sampling_weights(obj, part, options.min_part / options.points_per_frame)
@@ -189,7 +193,7 @@ def _frames(
 def _camera(
     obj: ArticulatedObject, scale: float, poses: np.ndarray, options: Articulation, rng: np.random.Generator
 ) -> Camera:
-    """One camera for all frames, which sees the object whole in each."""
+    """Returns one camera for all frames, which sees the object whole in each."""
     points, body = obj.vertices
     radius = max(np.linalg.norm(transform(placed[body], scale * points), axis=1).max() for placed in poses)
     return Camera.random(float(radius), options.orientation == "upright", rng)

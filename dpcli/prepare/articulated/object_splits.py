@@ -1,19 +1,18 @@
-"""Which objects train, validate and test: by category, or a share of the objects."""
+"""Splits of objects: each trains, validates or tests by its category, or by a draw with given shares."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from dpcli.errors import UsageError
+from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.seeds import PrepareStream, generator
-
-SPLITS = ("train", "validation", "test")
-SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # what people call them
 
 
 @dataclass(frozen=True)
 class SplitRule:
-    """Objects of the named categories validate or test; the others are divided by ``fractions`` (of SPLITS).
+    """Assigns splits: objects of the named categories validate or test; the others are divided by ``fractions`` (of
+    SPLITS).
 
     Without fractions: all others train when categories are named, else 80, 10 and 10 %. One object is in one split.
     """
@@ -32,7 +31,7 @@ class SplitRule:
             raise UsageError(f"--fractions {given}: expected train,validation,test that sum to 1, such as 0.8,0.1,0.1")
 
     def assign(self, categories: list[str], seed: int) -> list[str]:
-        """The split of every object, whose ``categories`` are given in the order of the objects."""
+        """Returns the split of every object, whose ``categories`` are given in the order of the objects."""
         known = set(categories)
         for option, named in (("test", self.test_categories), ("validation", self.validation_categories)):
             unknown = sorted(set(named) - known)

@@ -1,4 +1,4 @@
-"""Where the objects of a generated room stand and how they move: the recipe of OGC-DR (Song and Yang 2022)."""
+"""The layout of a generated room: objects stand on its floor and move, by the recipe of OGC-DR (Song and Yang 2022)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ _SHRINK_AFTER, _SHRINK = 20, 0.99  # objects too bulky for the floor: from this 
 
 @dataclass(frozen=True)
 class RoomMotion:
-    """Per step: ``rotation`` degrees at most, about y in ``upright`` of all cases, else x or z; a shift in x and in z
-    each of ``shift`` (least, most) either way."""
+    """Limits one step: ``rotation`` degrees at most, about y in ``upright`` of all cases, else x or z; a shift in x and
+    in z each of ``shift`` (least, most) either way.
+    """
 
     rotation: float = 10.0
     upright: float = 0.6
@@ -27,7 +28,9 @@ class RoomMotion:
 
 @dataclass
 class Layout:
-    """scale f64 (n) of the shapes; pose f64 (T,n,4,4): scaled shape to room; shrunk: how much smaller than drawn."""
+    """Holds scale f64 (n) of the shapes, pose f64 (T,n,4,4), scaled shape to room, and shrunk: how much smaller than
+    drawn.
+    """
 
     scale: np.ndarray
     pose: np.ndarray
@@ -35,16 +38,18 @@ class Layout:
 
 
 def scale_range(objects: int) -> tuple[float, float]:
-    """Longest side of an object: 0.25 to 0.45 in a room of 4, 0.2 to 0.3 in a room of 8, linear between and beyond."""
+    """Returns the range of an object's longest side: 0.25 to 0.45 in a room of 4, 0.2 to 0.3 in one of 8, linear
+    between.
+    """
     share = (objects - 4) / 4
     return 0.25 - 0.05 * share, 0.45 - 0.15 * share
 
 
 def draw_layout(hulls: list[np.ndarray], frames: int, motion: RoomMotion, rng: np.random.Generator) -> Layout:
-    """Stand objects on the floor and move them so that their axis-parallel boxes never overlap.
+    """Stands objects on the floor and moves them so that their axis-parallel boxes never overlap.
 
     hulls: for each object, points f64 (V,3) that span it, centered, longest side 1, y up. In frame 0 all boxes are on
-    the floor of 1 x U(0.6, 1). An object turns about its own middle. DataError when there is no room for them.
+    the floor of 1 x U(0.6, 1). An object turns about its own middle. Raises DataError when there is no room for them.
     """
     low, high = scale_range(len(hulls))
     for number in range(_ROOMS):
@@ -61,18 +66,18 @@ def draw_layout(hulls: list[np.ndarray], frames: int, motion: RoomMotion, rng: n
 
 
 def box(shape: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Axis-parallel box f64 (2,3) of points (V,3) under a pose (4,4)."""
+    """Returns the axis-parallel box f64 (2,3) of points (V,3) under a pose (4,4)."""
     placed = shape @ pose[:3, :3].T + pose[:3, 3]
     return np.stack([placed.min(0), placed.max(0)])
 
 
 def overlaps(one: np.ndarray, others: list[np.ndarray]) -> bool:
-    """Whether a box (2,3) and any other have a common point."""
+    """Returns whether a box (2,3) and any other have a common point."""
     return any((one[0] <= other[1]).all() and (other[0] <= one[1]).all() for other in others)
 
 
 def _stand(shapes: list[np.ndarray], depth: float, rng: np.random.Generator) -> np.ndarray | None:
-    """Poses f64 (n,4,4) of frame 0, or None when one finds no place. The bulkiest choose first."""
+    """Returns poses f64 (n,4,4) of frame 0, or None when one finds no place. The bulkiest choose first."""
     poses, boxes = np.tile(np.eye(4), (len(shapes), 1, 1)), []
     for index in sorted(range(len(shapes)), key=lambda k: -np.ptp(shapes[k][:, ::2], axis=0).prod()):
         pose = poses[index]
@@ -95,7 +100,9 @@ def _stand(shapes: list[np.ndarray], depth: float, rng: np.random.Generator) -> 
 def _step(
     shapes: list[np.ndarray], before: np.ndarray, motion: RoomMotion, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """The next frame's poses f64 (n,4,4): each object turned and shifted, boxes apart; None when one finds no way."""
+    """Returns the next frame's poses f64 (n,4,4): each object turned and shifted, boxes apart; None when one finds no
+    way.
+    """
     poses, boxes = before.copy(), []
     for index, shape in enumerate(shapes):
         for _ in range(_TRIES):

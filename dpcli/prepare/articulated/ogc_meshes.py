@@ -16,7 +16,9 @@ from dpcli.prepare.reader import natural_key, require_folder
 
 @dataclass(frozen=True)
 class Shape:
-    """triangles f64 (T,3,3), centered at the middle of their box, whose longest side is 1; hull f64 (V,3) spans them."""
+    """Holds triangles f64 (T,3,3), centered at the middle of their box, whose longest side is 1; hull f64 (V,3) spans
+    them.
+    """
 
     triangles: np.ndarray
     hull: np.ndarray
@@ -24,7 +26,7 @@ class Shape:
 
 @lru_cache(maxsize=4)
 def find_meshes(folder: Path) -> tuple[str, ...]:
-    """Mesh files below a folder, relative to it, in natural order; DataError when there are none."""
+    """Returns mesh files below a folder, relative to it, in natural order. Raises DataError when there are none."""
     require_folder(folder, f"meshes in it or below ({' '.join(MESH_FORMATS)})")
     found = [
         Path(root, name).relative_to(folder).as_posix()
@@ -39,7 +41,10 @@ def find_meshes(folder: Path) -> tuple[str, ...]:
 
 @lru_cache(maxsize=24)
 def load_shape(path: Path, up: str) -> Shape:
-    """A mesh file as a Shape; ``up``: the axis (y or z) that points up in it. DataError when it has no surface."""
+    """Reads a mesh file as a Shape; ``up``: the axis (y or z) that points up in it.
+
+    Raises DataError when it has no surface.
+    """
     import trimesh
 
     try:
@@ -62,12 +67,12 @@ def load_shape(path: Path, up: str) -> Shape:
 
 
 def areas(triangles: np.ndarray) -> np.ndarray:
-    """f64 (T) of triangles (T,3,3)."""
+    """Returns the areas f64 (T) of triangles (T,3,3)."""
     return 0.5 * np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
 
 
 def spanning(points: np.ndarray) -> np.ndarray:
-    """The corners of the convex hull of points (N,3); all different points where it is flat."""
+    """Returns the corners of the convex hull of points (N,3); all different points where it is flat."""
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.unique(points, axis=0)

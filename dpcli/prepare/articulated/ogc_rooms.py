@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.ogc_layout import RoomMotion, draw_layout
 from dpcli.prepare.articulated.ogc_meshes import Shape, areas, find_meshes, load_shape
 from dpcli.prepare.decode.open3d_import import load_open3d
 from dpcli.prepare.meshes.raycast import pixel_rays
 from dpcli.prepare.meshes.surface_points import SurfacePoints, choose_on_surface, points_on
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe
 from dpcli.store import CloudSequence
 
 POINTS = 2048
@@ -30,7 +30,9 @@ _ZOOM, _VIEW_ANGLE = 0.7, 60.0  # of Open3D's default camera; degrees, vertical
 
 @dataclass(frozen=True)
 class RoomOptions:
-    """``rooms`` of each number in ``objects``; ``view`` full or single; ``points`` a frame; ``up`` of the meshes."""
+    """Says what rooms are made: ``rooms`` of each number in ``objects``; ``view`` full or single; ``points`` a frame;
+    ``up``.
+    """
 
     objects: tuple[int, ...] = (8, 7, 6, 5, 4)
     rooms: int = 1000
@@ -53,7 +55,7 @@ class RoomOptions:
 
 @dataclass(frozen=True)
 class GeneratedRooms:
-    """Rooms of objects drawn from a folder of meshes, by a seed. One room is in one split, 75, 5 and 20 %."""
+    """Makes rooms of objects drawn from a folder of meshes, by a seed. One room is in one split, 75, 5 and 20 %."""
 
     meshes: Path
     options: RoomOptions = RoomOptions()
@@ -65,11 +67,13 @@ class GeneratedRooms:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         names = "\n".join(find_meshes(self.meshes)).encode("utf-8", "surrogateescape")
         digest = hashlib.sha256(names).hexdigest()[:16]
         return {**asdict(self.options), "fractions": list(self.split.fractions), "meshes_digest": digest}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         find_meshes(self.meshes)
         counts = self.options.objects
         names = [(n, f"{n}_{k:06d}") for n in counts for k in range(self.options.rooms)]
@@ -81,6 +85,7 @@ class GeneratedRooms:
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         notes: Counter = Counter()
         shapes = self._draw_shapes(item.extra["objects"], notes, rng)
         layout = draw_layout([shape.hull for shape in shapes], self.options.frames, self.options.motion, rng)
@@ -96,7 +101,7 @@ class GeneratedRooms:
         return Sample(sequence, {what: count for what, count in notes.items() if count})
 
     def _draw_shapes(self, count: int, notes: Counter, rng: np.random.Generator) -> list[Shape]:
-        """Meshes drawn with equal chances; another is drawn in place of one that cannot be read, and that is counted."""
+        """Draws meshes with equal chances; another is drawn in place of one that cannot be read, and that is counted."""
         names, shapes = find_meshes(self.meshes), []
         for _ in range(count + _BAD_MESHES):
             name = names[rng.integers(len(names))]
@@ -112,7 +117,7 @@ class GeneratedRooms:
     def _frame(
         self, triangles: np.ndarray, owner: np.ndarray, poses: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Points f32 (N,3) and the object i16 (N) of each."""
+        """Returns points f32 (N,3) and the object i16 (N) of each."""
         from dpcli.ops import fps_numpy
 
         placed = triangles @ poses[owner, :3, :3].transpose(0, 2, 1) + poses[owner, None, :3, 3]
@@ -127,6 +132,7 @@ class GeneratedRooms:
         return points, part
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         counts = Counter(item.split for item in items)
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
         kinds = ",".join(map(str, self.options.objects))
@@ -134,7 +140,7 @@ class GeneratedRooms:
 
 
 def seen_by_camera(triangles: np.ndarray) -> SurfacePoints:
-    """What the pixels of one picture show of triangles f64 (T,3,3); DataError when they show nothing.
+    """Returns what the pixels of one picture show of triangles f64 (T,3,3). Raises DataError when they show nothing.
 
     The camera is Open3D's default: it looks along -z at the middle of the scene's box, from a distance that makes 0.7
     of the box's longest side half of the picture's height.
@@ -154,7 +160,7 @@ def seen_by_camera(triangles: np.ndarray) -> SurfacePoints:
 
 def _first_hits(triangles: np.ndarray, rays: np.ndarray) -> SurfacePoints:
     open3d = load_open3d()
-    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelizm
+    scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
     corners = open3d.core.Tensor(triangles.reshape(-1, 3).astype(np.float32))
     scene.add_triangles(corners, open3d.core.Tensor(np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)))
     hits = scene.cast_rays(open3d.core.Tensor(rays))

@@ -1,4 +1,7 @@
-"""Kinds of procedural objects: furniture, appliances, tools. Each takes a Builder and a generator; z is up, -y the front."""
+"""Kinds of procedural objects: furniture, appliances, tools.
+
+Each takes a Builder and a generator; z is up, -y the front.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,9 @@ Rng = np.random.Generator
 def _leaf(
     b: Builder, rng: Rng, size: tuple[float, float], at: tuple[float, float, float], side: str, opening: float
 ) -> int:
-    """A door leaf of (width, height) in front of ``at`` (its center), hinged on ``side``: left, right, bottom or top."""
+    """Builds a door leaf of (width, height) in front of ``at`` (its center), hinged on ``side``: left, right, bottom or
+    top.
+    """
     w, h = size
     x, y, z = at
     t = rng.uniform(0.02, 0.05)
@@ -53,7 +58,7 @@ def _handle(rng: Rng, at: np.ndarray, upright: bool) -> np.ndarray:
 
 
 def _drawer(b: Builder, rng: Rng, size: tuple[float, float, float], at: tuple[float, float, float]) -> int:
-    """A drawer of (width, depth, height) whose front stands at ``at``; it slides toward -y."""
+    """Builds a drawer of (width, depth, height) whose front stands at ``at``; it slides toward -y."""
     w, d, h = size
     front = box((w * 0.98, 0.03, h * 0.95), (0, -0.015, 0))
     tray = open_box((w * 0.9, d * 0.9, h * 0.7), 0.012, (0, d * 0.45, 0))
@@ -70,7 +75,7 @@ def _legs(b: Builder, rng: Rng, size: tuple[float, float], top: float, height: f
 
 
 def cabinet(b: Builder, rng: Rng) -> None:
-    """Columns of doors and drawers."""
+    """Builds columns of doors and drawers."""
     w, d, h = rng.uniform((0.5, 0.3, 0.5), (1.2, 0.6, 1.4))
     b.add(0, open_box((w, d, h), 0.02, without="front"))
     columns = int(rng.integers(1, 4))
@@ -90,7 +95,7 @@ def cabinet(b: Builder, rng: Rng) -> None:
 
 
 def desk(b: Builder, rng: Rng) -> None:
-    """A table top on legs with drawers below."""
+    """Builds a table top on legs with drawers below."""
     w, d, h = rng.uniform((0.8, 0.4, 0.5), (1.6, 0.8, 0.8))
     b.add(0, box((w, d, 0.04), (0, 0, 0)))
     _legs(b, rng, (w, d), -0.02, h)
@@ -101,7 +106,7 @@ def desk(b: Builder, rng: Rng) -> None:
 
 
 def carton(b: Builder, rng: Rng) -> None:
-    """An open box with one to four flaps."""
+    """Builds an open box with one to four flaps."""
     w, d, h = rng.uniform(0.3, 1.0, 3)
     b.add(0, open_box((w, d, h), 0.015))
     flaps = rng.permutation(4)[: rng.integers(1, 5)]
@@ -115,7 +120,7 @@ def carton(b: Builder, rng: Rng) -> None:
 
 
 def chest(b: Builder, rng: Rng) -> None:
-    """A box with a lid hinged at the back, flat or vaulted."""
+    """Builds a box with a lid hinged at the back, flat or vaulted."""
     w, d, h = rng.uniform((0.4, 0.3, 0.2), (1.0, 0.7, 0.6))
     b.add(0, open_box((w, d, h), 0.02))
     lid = box((w, d, 0.03), (0, -d / 2, 0.015))
@@ -127,7 +132,7 @@ def chest(b: Builder, rng: Rng) -> None:
 
 
 def appliance(b: Builder, rng: Rng) -> None:
-    """Oven, microwave, dishwasher, refrigerator: a body with one to three doors and some knobs."""
+    """Builds oven, microwave, dishwasher, refrigerator: a body with one to three doors and some knobs."""
     w, d, h = rng.uniform((0.4, 0.35, 0.3), (0.9, 0.8, 1.7))
     b.add(0, open_box((w, d, h), rng.uniform(0.02, 0.06), without="front"))
     doors = int(rng.integers(1, 4)) if h > 0.9 else 1
@@ -146,7 +151,7 @@ def appliance(b: Builder, rng: Rng) -> None:
 
 
 def laptop(b: Builder, rng: Rng) -> None:
-    """Two plates and a hinge; also a flip phone or a book."""
+    """Builds two plates and a hinge; also a flip phone or a book."""
     w, d = rng.uniform(0.25, 0.5), rng.uniform(0.2, 0.4)
     t = rng.uniform(0.01, 0.04)
     b.add(0, box((w, d, t)))
@@ -161,7 +166,7 @@ def _blade(rng: Rng, length: float, width: float, thick: float, toward: int) -> 
 
 
 def scissors(b: Builder, rng: Rng) -> None:
-    """Two blades with rings that cross at a pivot; pliers with rods instead."""
+    """Builds two blades with rings that cross at a pivot; pliers with rods instead."""
     length, width, grip = rng.uniform(0.3, 0.6), rng.uniform(0.05, 0.12), rng.uniform(0.25, 0.6)
     rings, thick = rng.random() < 0.6, rng.uniform(0.012, 0.05)
     halves = []
@@ -177,7 +182,7 @@ def scissors(b: Builder, rng: Rng) -> None:
 
 
 def knife(b: Builder, rng: Rng) -> None:
-    """A pocket knife with one to four blades, or a cutter whose blade slides."""
+    """Builds a pocket knife with one to four blades, or a cutter whose blade slides."""
     length, width = rng.uniform(0.3, 0.6), rng.uniform(0.04, 0.09)
     thick = rng.uniform(0.03, 0.06)
     if rng.random() < 0.35:
@@ -195,7 +200,7 @@ def knife(b: Builder, rng: Rng) -> None:
 
 
 def lamp(b: Builder, rng: Rng) -> None:
-    """A desk lamp: a foot, one to three arms, a shade."""
+    """Builds a desk lamp: a foot, one to three arms, a shade."""
     radius = rng.uniform(0.1, 0.2)
     b.add(0, cylinder(radius, 0.03))
     on, at = 0, np.array([0, 0, 0.015])
@@ -220,7 +225,7 @@ def lamp(b: Builder, rng: Rng) -> None:
 
 
 def tap(b: Builder, rng: Rng) -> None:
-    """A tap: a column, a spout that swings, one or two levers."""
+    """Builds a tap: a column, a spout that swings, one or two levers."""
     h, reach, tube = rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.45), rng.uniform(0.02, 0.04)
     b.add(0, cylinder(tube * 1.6, h, (0, 0, h / 2)), cylinder(tube * 3, 0.03))
     rise = rng.uniform(0, 0.2)
@@ -237,7 +242,7 @@ def tap(b: Builder, rng: Rng) -> None:
 
 
 def window(b: Builder, rng: Rng) -> None:
-    """A frame with one or two sashes that swing or slide."""
+    """Builds a frame with one or two sashes that swing or slide."""
     w, h, bar = rng.uniform(0.6, 1.4), rng.uniform(0.5, 1.3), rng.uniform(0.03, 0.07)
     for x in (-1, 1):
         b.add(0, box((bar, bar, h + bar), (x * w / 2, 0, 0)), box((w + bar, bar, bar), (0, 0, x * h / 2)))
@@ -256,7 +261,7 @@ def window(b: Builder, rng: Rng) -> None:
 
 
 def cart(b: Builder, rng: Rng) -> None:
-    """A tray on spoked wheels, steered in front, perhaps with a handle or a tipping tray."""
+    """Builds a tray on spoked wheels, steered in front, perhaps with a handle or a tipping tray."""
     w, d, r = rng.uniform(0.3, 0.6), rng.uniform(0.5, 1.0), rng.uniform(0.08, 0.18)
     b.add(0, box((w, d, 0.05)))
     tray = open_box((w, d, rng.uniform(0.15, 0.4)), 0.02, (0, 0, 0.0))
@@ -276,7 +281,7 @@ def cart(b: Builder, rng: Rng) -> None:
 
 
 def bottle(b: Builder, rng: Rng) -> None:
-    """A bottle, jar or pot whose cap or lid lifts off along its axis."""
+    """Builds a bottle, jar or pot whose cap or lid lifts off along its axis."""
     r, h = rng.uniform(0.1, 0.3), rng.uniform(0.2, 0.8)
     neck, rise = r * rng.uniform(0.35, 1.0), rng.uniform(0.02, 0.3) * h
     b.add(
@@ -292,7 +297,7 @@ def bottle(b: Builder, rng: Rng) -> None:
 
 
 def bin_(b: Builder, rng: Rng) -> None:
-    """A bin with a hinged lid, and a pedal that follows it or not."""
+    """Builds a bin with a hinged lid, and a pedal that follows it or not."""
     r, h = rng.uniform(0.15, 0.3), rng.uniform(0.3, 0.8)
     b.add(0, lathe([(0, 0), (r * rng.uniform(0.7, 1), 0), (r, h)]))
     b.hinge((0, r, h), X, -rng.uniform(60, 110), 0, cylinder(r * 1.05, 0.03, (0, -r, 0.015)))
@@ -301,7 +306,7 @@ def bin_(b: Builder, rng: Rng) -> None:
 
 
 def chair(b: Builder, rng: Rng) -> None:
-    """A swivel chair: the seat turns and rises, the back leans."""
+    """Builds a swivel chair: the seat turns and rises, the back leans."""
     for k in range(5):
         foot = turned(0.27 * Y[None], Z, 72 * k)[0]
         b.add(0, rod((0, 0, 0.05), foot, 0.025))
@@ -317,7 +322,7 @@ def chair(b: Builder, rng: Rng) -> None:
 
 
 def fan(b: Builder, rng: Rng) -> None:
-    """A rotor of two to six blades on a stand that swings."""
+    """Builds a rotor of two to six blades on a stand that swings."""
     h, r = rng.uniform(0.3, 0.8), rng.uniform(0.2, 0.4)
     b.add(0, cylinder(rng.uniform(0.12, 0.2), 0.03), cylinder(0.025, h, (0, 0, h / 2)))
     head = b.hinge((0, 0, h), Z, -90, 90, cylinder(0.07, 0.2, (0, 0.05, 0), Y))
@@ -329,7 +334,7 @@ def fan(b: Builder, rng: Rng) -> None:
 
 
 def door(b: Builder, rng: Rng) -> None:
-    """A wall with a door and its latch, or a gate with two leaves."""
+    """Builds a wall with a door and its latch, or a gate with two leaves."""
     w, h, t = rng.uniform(0.5, 0.9), rng.uniform(0.8, 1.6), rng.uniform(0.05, 0.15)
     post = rng.uniform(0.05, 0.4)
     for x in (-1, 1):
@@ -346,7 +351,7 @@ def door(b: Builder, rng: Rng) -> None:
 
 
 def arm(b: Builder, rng: Rng) -> None:
-    """A robot arm or excavator: a turning base, two to four links, a gripper of two fingers or a shovel."""
+    """Builds a robot arm or excavator: a turning base, two to four links, a gripper of two fingers or a shovel."""
     b.add(0, box((*rng.uniform(0.25, 0.5, 2), 0.1)))
     on, at = b.hinge((0, 0, 0.05), Z, -150, 150, cylinder(0.12, 0.12, (0, 0, 0.06))), np.array([0, 0, 0.12])
     for _ in range(int(rng.integers(2, 4))):
@@ -369,7 +374,7 @@ def _beam(to: np.ndarray, thick: float) -> np.ndarray:
 
 
 def glasses(b: Builder, rng: Rng) -> None:
-    """Spectacles whose temples fold."""
+    """Builds spectacles whose temples fold."""
     r, gap, length = rng.uniform((0.1, 0.03, 0.45), (0.16, 0.06, 0.55))
     for x in (-1, 1):
         lens = ring(r, 0.012, (x * (r + gap), 0, 0), Y)
@@ -382,7 +387,7 @@ def glasses(b: Builder, rng: Rng) -> None:
 
 
 def clock(b: Builder, rng: Rng) -> None:
-    """A dial with two or three hands."""
+    """Builds a dial with two or three hands."""
     r = rng.uniform(0.3, 0.5)
     b.add(0, cylinder(r, 0.04, axis=Y) if rng.random() < 0.6 else box((2 * r, 0.04, 2 * r)))
     for k, part in enumerate((0.9, 0.6, 0.75)[: rng.integers(2, 4)]):
@@ -391,7 +396,7 @@ def clock(b: Builder, rng: Rng) -> None:
 
 
 def stapler(b: Builder, rng: Rng) -> None:
-    """Bars that open about a common end: a stapler, tongs, a nutcracker, a seesaw clamp."""
+    """Builds bars that open about a common end: a stapler, tongs, a nutcracker, a seesaw clamp."""
     length, width = rng.uniform(0.3, 0.6), rng.uniform(0.04, 0.12)
     bars, thick = int(rng.integers(2, 4)), rng.uniform(0.02, 0.06)
     b.add(0, box((length, width, thick), (length / 2, 0, 0)))
@@ -401,7 +406,7 @@ def stapler(b: Builder, rng: Rng) -> None:
 
 
 def assembly(b: Builder, rng: Rng) -> None:
-    """Nothing in particular: two to seven random solids joined anyhow in a tree."""
+    """Builds nothing in particular: two to seven random solids joined anyhow in a tree."""
     centers, sizes = [], []
     for k in range(int(rng.integers(2, 8))):
         size = rng.uniform(0.08, 0.6, 3)
@@ -425,7 +430,7 @@ def assembly(b: Builder, rng: Rng) -> None:
 
 
 def _any_solid(rng: Rng, size: np.ndarray) -> np.ndarray:
-    """A solid that fills a box of this size about the origin."""
+    """Builds a solid that fills a box of this size about the origin."""
     unit = [
         lambda: box((1, 1, 1)),
         lambda: cylinder(0.5, 1, axis=np.eye(3)[rng.integers(3)]),

@@ -14,16 +14,16 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
-from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
-from dpcli.prepare.reader import Item, Sample, describe, natural_key
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe, natural_key
 
 _EXPECTED = "a .urdf file, or a folder of objects, each a folder with a mobility.urdf or another .urdf"
 
 
 @dataclass(frozen=True)
 class FoundObject:
-    """One URDF of the raw data; ``category`` is "" when nothing tells it."""
+    """Holds one URDF of the raw data; ``category`` is "" when nothing tells it."""
 
     path: Path
     category: str
@@ -32,7 +32,7 @@ class FoundObject:
 
 @lru_cache(maxsize=4)
 def find_objects(raw: Path) -> tuple[FoundObject, ...]:
-    """Every object below ``raw``, in natural order. A folder's mobility.urdf hides other URDF files beside it.
+    """Returns every object below ``raw``, in natural order. A folder's mobility.urdf hides other URDF files beside it.
 
     The category is the folder that holds the object's folder (Category/ID/mobility.urdf); without such a folder,
     ``model_cat`` of the object's meta.json, as the original distribution has it.
@@ -74,13 +74,13 @@ def _model_category(meta: Path) -> str:
 
 @lru_cache(maxsize=3)
 def _studied(path: Path, options: Articulation) -> Study:
-    """Meshes are read once for all sequences of an object; a process keeps the last few objects."""
+    """Studies an object; its meshes are read once for all its sequences, and a process keeps the last few objects."""
     return study(load_object(read_skeleton(path)), options)
 
 
 @dataclass(frozen=True)
 class Sapien:
-    """Options of the reader. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how."""
+    """Reads URDF objects. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how."""
 
     raw: Path
     pairs_per_object: int = 8
@@ -96,14 +96,17 @@ class Sapien:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return sorted({found.category for found in find_objects(self.raw)} - {""})
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         own = {"pairs_per_object": self.pairs_per_object, "seed": self.seed, "split": asdict(self.split)}
         return {**own, **self.articulation.config}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found = find_objects(self.raw)
         splits = self.split.assign([f.category for f in found], self.seed)
         problems, joints = zip(*(_inspect(f.path) for f in found))
@@ -123,10 +126,12 @@ class Sapien:
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         studied = _studied(item.path, self.articulation)
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         good = {item.path: item.split for item in items if not item.problem}
         counts = Counter(good.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
@@ -135,7 +140,7 @@ class Sapien:
 
 
 def _inspect(path: Path) -> tuple[str, int]:
-    """(problem that shows without the meshes' content, number of joints)."""
+    """Returns (problem that shows without the meshes' content, number of joints)."""
     try:
         skeleton = read_skeleton(path)
     except DataError as error:

@@ -13,7 +13,7 @@ X, Y, Z = np.eye(3)
 
 
 def box(size: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """A box of edges ``size`` (3) centered at ``at`` (3): triangles f64 (12,3,3)."""
+    """Builds a box of edges ``size`` (3) centered at ``at`` (3): triangles f64 (12,3,3)."""
     corners = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5) * size + at
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return corners[[t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]]
@@ -22,7 +22,7 @@ def box(size: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
 def lathe(
     profile: Sequence[tuple[float, float]], at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z, sections: int = 24
 ) -> np.ndarray:
-    """A profile of (radius, height) points turned about ``axis`` through ``at``: triangles f64 (T,3,3)."""
+    """Turns a profile of (radius, height) points about ``axis`` through ``at``: triangles f64 (T,3,3)."""
     angle = np.linspace(0, 2 * np.pi, sections + 1)
     radius, height = np.array(profile, np.float64).T
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -35,31 +35,31 @@ def lathe(
 
 
 def cylinder(radius: float, length: float, at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z) -> np.ndarray:
-    """A closed cylinder centered at ``at``."""
+    """Builds a closed cylinder centered at ``at``."""
     half = length / 2
     return lathe([(0, -half), (radius, -half), (radius, half), (0, half)], at, axis)
 
 
 def rod(start: np.ndarray, end: np.ndarray, radius: float) -> np.ndarray:
-    """A cylinder from ``start`` (3) to ``end`` (3)."""
+    """Builds a cylinder from ``start`` (3) to ``end`` (3)."""
     start, end = np.asarray(start, np.float64), np.asarray(end, np.float64)
     return cylinder(radius, float(np.linalg.norm(end - start)), (start + end) / 2, end - start)
 
 
 def ball(radius: float, at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """A sphere."""
+    """Builds a sphere."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, 13)
     return lathe(list(zip(radius * np.cos(angle), radius * np.sin(angle), strict=True)), at)
 
 
 def ring(radius: float, tube: float, at: Sequence[float] = (0, 0, 0), axis: np.ndarray = Z) -> np.ndarray:
-    """A torus: wheels' tires, finger holes, handles."""
+    """Builds a torus: wheels' tires, finger holes, handles."""
     angle = np.linspace(0, 2 * np.pi, 11)
     return lathe(list(zip(radius + tube * np.cos(angle), tube * np.sin(angle), strict=True)), at, axis)
 
 
 def plate(outline: Sequence[tuple[float, float]], thickness: float, at: Sequence[float] = (0, 0, 0)) -> np.ndarray:
-    """An outline (x,y), star-shaped about its mean, extruded along z by ``thickness``, centered in z."""
+    """Extrudes an outline (x,y), star-shaped about its mean, along z by ``thickness``, centered in z."""
     xy = np.array(outline, np.float64)
     after, middle, half = np.roll(xy, -1, axis=0), xy.mean(0), thickness / 2
 
@@ -78,7 +78,7 @@ def plate(outline: Sequence[tuple[float, float]], thickness: float, at: Sequence
 
 
 def open_box(size: Sequence[float], wall: float, at: Sequence[float] = (0, 0, 0), without: str = "top") -> np.ndarray:
-    """A box of five thin walls; ``without``: the side left open, one of top, front (toward -y)."""
+    """Builds a box of five thin walls; ``without``: the side left open, one of top, front (toward -y)."""
     w, d, h = size
     sides = {
         "top": box((w, d, wall), (0, 0, h / 2)),
@@ -92,7 +92,7 @@ def open_box(size: Sequence[float], wall: float, at: Sequence[float] = (0, 0, 0)
 
 
 def frame(axis: np.ndarray) -> np.ndarray:
-    """A rotation f64 (3,3) that takes z to ``axis`` (3)."""
+    """Returns a rotation f64 (3,3) that takes z to ``axis`` (3)."""
     z = np.asarray(axis, np.float64) / np.linalg.norm(axis)
     x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
     x /= np.linalg.norm(x)
@@ -100,20 +100,21 @@ def frame(axis: np.ndarray) -> np.ndarray:
 
 
 class Builder:
-    """Collects bodies, each a list of solids in its own frame. Body 0 is there from the start."""
+    """Holds collects bodies, each a list of solids in its own frame. Body 0 is there from the start."""
 
     def __init__(self) -> None:
         self._joints: list[Joint] = []
         self._solids: list[tuple[int, np.ndarray]] = []
 
     def add(self, body: int, *solids: np.ndarray) -> None:
-        """Put triangles (T,3,3), in the body's frame, on a body."""
+        """Puts triangles (T,3,3), in the body's frame, on a body."""
         self._solids += [(body, solid) for solid in solids]
 
     def hinge(
         self, at: Sequence[float], axis: np.ndarray, lower: float, upper: float, *solids: np.ndarray, on: int = 0
     ) -> int:
-        """A new body that turns about ``axis`` (3) through ``at`` (3) of body ``on``; degrees. Returns its number.
+        """Adds a body that turns about ``axis`` (3) through ``at`` (3) of body ``on``, in degrees, and returns its
+        number.
 
         Its frame has the parent's axes and its origin at ``at``.
         """
@@ -122,7 +123,7 @@ class Builder:
     def slide(
         self, at: Sequence[float], axis: np.ndarray, lower: float, upper: float, *solids: np.ndarray, on: int = 0
     ) -> int:
-        """A new body that slides along ``axis`` (3), else as ``hinge``."""
+        """Adds a body that slides along ``axis`` (3), else as ``hinge``."""
         return self._join("prismatic", at, axis, lower, upper, solids, on)
 
     def _join(self, kind, at, axis, lower, upper, solids, on) -> int:
@@ -135,12 +136,12 @@ class Builder:
         return body
 
     def build(self, name: str) -> ArticulatedObject:
-        """The finished object."""
+        """Returns the finished object."""
         bodies = np.concatenate([np.full(len(solid), body) for body, solid in self._solids])
         kept = drop_degenerate(np.concatenate([solid for _, solid in self._solids]), bodies, Counter())
         return ArticulatedObject(name, list(self._joints), *kept)
 
 
 def turned(solid: np.ndarray, axis: np.ndarray, degrees: float) -> np.ndarray:
-    """The triangles turned about an axis through the origin."""
+    """Returns the triangles turned about an axis through the origin."""
     return solid @ axis_rotation(np.asarray(axis, np.float64), np.radians([degrees]))[0].T

@@ -13,15 +13,15 @@ import numpy as np
 from dpcli.errors import UsageError
 from dpcli.prepare.articulated.articulated_object import ArticulatedObject
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
-from dpcli.prepare.articulated.object_splits import SPLITS, SplitRule
+from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.procedural_kinds import KINDS
 from dpcli.prepare.articulated.solids import Builder
-from dpcli.prepare.reader import Item, Sample, describe
+from dpcli.prepare.reader import SPLITS, Item, Sample, describe
 from dpcli.runtime.seeds import PrepareStream, generator
 
 
 def build_object(seed: int, number: int, kinds: tuple[str, ...]) -> ArticulatedObject:
-    """Object ``number`` of a seed; its kind is the next in the circle of ``kinds``, its shape is drawn."""
+    """Builds object ``number`` of a seed; its kind is the next in the circle of ``kinds``, its shape is drawn."""
     kind = kinds[number % len(kinds)]
     builder = Builder()
     KINDS[kind](builder, generator(seed, PrepareStream.MADE, number))
@@ -35,7 +35,7 @@ def _studied(seed: int, number: int, kinds: tuple[str, ...], options: Articulati
 
 @dataclass(frozen=True)
 class SyntheticArticulated:
-    """Options of the generator. ``kinds``: those to make; empty for all."""
+    """Makes procedural objects. ``kinds``: those to make; empty for all."""
 
     objects: int = 220
     sequences_per_object: int = 4
@@ -56,15 +56,18 @@ class SyntheticArticulated:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return sorted(self.kinds or KINDS)
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         own = asdict(self)
         own.pop("articulation")
         return {**own, **self.articulation.config}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         names = tuple(self.class_names)
         kinds = [names[number % len(names)] for number in range(self.objects)]
         splits = self.split.assign(kinds, self.seed)
@@ -83,10 +86,12 @@ class SyntheticArticulated:
         ]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         studied = _studied(self.seed, item.extra["object"], tuple(self.class_names), self.articulation)
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         counts = Counter({item.extra["object"]: item.split for item in items}.values())
         shares = ", ".join(f"{counts[split]} {split}" for split in SPLITS if counts[split])
         return [f"{self.objects} objects of {len(self.class_names)} kinds ({shares}), {len(items)} sequences"]

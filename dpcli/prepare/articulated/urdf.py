@@ -21,7 +21,7 @@ _UNSUPPORTED = ("floating", "planar")
 
 @dataclass
 class Skeleton:
-    """A URDF without its meshes. shapes: (body, 4x4 shape-to-body, geometry of yourdfpy) of every visual."""
+    """Holds a URDF without its meshes. shapes: (body, 4x4 shape-to-body, geometry of yourdfpy) of every visual."""
 
     path: Path
     joints: list[Joint]
@@ -30,7 +30,7 @@ class Skeleton:
 
 
 def read_skeleton(path: Path) -> Skeleton:
-    """Parse a URDF and merge links joined by fixed joints. DataError when it isn't a tree of links.
+    """Parse a URDF and merge links joined by fixed joints. Raises DataError when it isn't a tree of links.
 
     Limits: a continuous joint gets +-180 degrees, so does a revolute joint without limits; inverted ones are swapped;
     a slide without limits has infinite ones here. Floating and planar joints are taken as fixed. All are noted.
@@ -43,7 +43,10 @@ def read_skeleton(path: Path) -> Skeleton:
 
 
 def load_object(skeleton: Skeleton) -> ArticulatedObject:
-    """The skeleton with the triangles of its visual geometry. DataError names a mesh that is missing or unreadable."""
+    """Returns the skeleton with the triangles of its visual geometry.
+
+    DataError names a mesh that is missing or unreadable.
+    """
     notes = Counter(skeleton.notes)
     triangles, bodies = [np.zeros((0, 3, 3))], [np.zeros(0, np.int64)]
     for body, placement, geometry in skeleton.shapes:
@@ -57,7 +60,7 @@ def load_object(skeleton: Skeleton) -> ArticulatedObject:
 
 
 def missing_meshes(skeleton: Skeleton) -> list[str]:
-    """File names of visual meshes that don't exist, as the URDF spells them."""
+    """Returns file names of visual meshes that don't exist, as the URDF spells them."""
     names = [geometry.mesh.filename for _, _, geometry in skeleton.shapes if geometry.mesh is not None]
     return [name for name in dict.fromkeys(names) if not resolve(skeleton.path, name).is_file()]
 
@@ -80,7 +83,7 @@ def _parse(path: Path) -> Any:
 
 
 def _walk_tree(path: Path, robot: Any) -> tuple[list[Any], dict[str, tuple[int, np.ndarray]]]:
-    """Joints from the root outwards, and of every link its body and its 4x4 placement in that body."""
+    """Returns the joints from the root outwards, and of every link its body and its 4x4 placement in that body."""
     links = {link.name for link in robot.links}
     children: dict[str, list[Any]] = {}
     parent_of: dict[str, Any] = {}
@@ -126,7 +129,7 @@ def _check_numbers(path: Path, joint: Any) -> None:
 
 
 def _limits(joint: Any) -> tuple[float, float, str]:
-    """(lower, upper, what was odd)."""
+    """Returns (lower, upper, what was odd)."""
     low, high = (joint.limit.lower, joint.limit.upper) if joint.limit is not None else (None, None)
     given = low is not None and high is not None and np.isfinite(low + high)
     if joint.type == "continuous":
@@ -145,7 +148,7 @@ def _moves(joint: Any) -> bool:
 
 
 def _fixed_motion(joint: Any) -> np.ndarray:
-    """What a joint that doesn't move does: its origin, and its one value when its limits are equal."""
+    """Returns what a joint that doesn't move does: its origin, and its one value when its limits are equal."""
     origin = np.eye(4) if joint.origin is None else joint.origin
     if joint.type not in MOVABLE:
         return origin
@@ -181,7 +184,7 @@ def _movable(
 
 
 def _followers(path: Path, robot: Any, joints: list[Joint], sources: list[Any]) -> list[Joint]:
-    """Mimic joints follow the joint of their own that their chain of leaders ends at."""
+    """Returns the mimic joints; each follows the joint of its own that its chain of leaders ends at."""
     index = {source.name: i for i, source in enumerate(sources)}
     mimics = {joint.name: joint.mimic for joint in robot.joints if joint.mimic is not None}
     values = {joint.name: _limits(joint)[0] for joint in robot.joints if joint.type in MOVABLE and not _moves(joint)}
@@ -204,7 +207,7 @@ def _followers(path: Path, robot: Any, joints: list[Joint], sources: list[Any]) 
 
 
 def _shapes(robot: Any, place: dict[str, tuple[int, np.ndarray]], notes: Counter) -> list[tuple[int, np.ndarray, Any]]:
-    """Visual geometry; that of the collisions when the file has no visual at all."""
+    """Returns the visual geometry, or that of the collisions when the file has no visual at all."""
     for kind in ("visuals", "collisions"):
         shapes = []
         for link in robot.links:

@@ -13,7 +13,7 @@ MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
 
 
 def geometry_triangles(path: Path, geometry: Any) -> np.ndarray:
-    """Corners f64 (T,3,3) of a geometry element, in its own frame."""
+    """Returns the corners f64 (T,3,3) of a geometry element, in its own frame."""
     import trimesh
 
     scale = 1.0
@@ -32,7 +32,7 @@ def geometry_triangles(path: Path, geometry: Any) -> np.ndarray:
 
 
 def resolve(path: Path, name: str) -> Path:
-    """Where a mesh is: beside the URDF, or in one of the folders above it as ``package://`` names need it."""
+    """Returns where a mesh is: beside the URDF, or in one of the folders above it as ``package://`` names need it."""
     plain = name.split("://", 1)[1] if "://" in name else name
     tails = [plain, plain.split("/", 1)[1]] if name.startswith("package://") and "/" in plain else [plain]
     folders = [path.parent, *list(path.resolve().parents)[1:4]] if "://" in name else [path.parent]

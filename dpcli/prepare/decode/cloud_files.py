@@ -18,14 +18,17 @@ _RGB = (("red", "green", "blue"), ("r", "g", "b"))
 
 @dataclass
 class Cloud:
-    """points f64 (N,3) as stored, NaN where the file has it; color u8 (N,3) or None."""
+    """Holds points f64 (N,3) as stored, NaN where the file has it, and color u8 (N,3) or None."""
 
     points: np.ndarray
     color: np.ndarray | None = None
 
 
 def read_cloud(path: Path, bin_columns: int = 4) -> Cloud:
-    """One cloud; DataError says what is wrong. ``bin_columns``: float32 values per point of a ``.bin``."""
+    """Reads one cloud. Raises DataError, which says what is wrong.
+
+    ``bin_columns``: float32 values per point of a ``.bin``.
+    """
     readers = {
         ".ply": _read_open3d,
         ".pcd": _read_open3d,
@@ -58,7 +61,7 @@ def _read_open3d(path: Path) -> Cloud:
 
 
 def _declared_points(path: Path) -> int:
-    """The number of points in the header of a ``.ply`` (``element vertex N``) or ``.pcd`` (``POINTS N``)."""
+    """Returns the number of points in the header of a ``.ply`` (``element vertex N``) or ``.pcd`` (``POINTS N``)."""
     with path.open("rb") as file:
         header = file.read(4096).decode("latin-1").splitlines()
     for line in header:
@@ -90,7 +93,7 @@ _PLY_BYTES = {
 
 
 def _check_ply_is_whole(path: Path, declared: int) -> None:
-    """DataError when the vertices stop early: Open3D fills the rest with points that nobody measured."""
+    """Raises DataError when the vertices stop early: Open3D fills the rest with points that nobody measured."""
     with path.open("rb") as file:
         head, end, body = file.read(1 << 16).partition(b"end_header")
         lines = [line.split() for line in head.decode("latin-1").splitlines()]
@@ -158,7 +161,7 @@ def _read_las(path: Path) -> Cloud:
 
 
 def _read_text(path: Path) -> Cloud:
-    """Numbers in columns split by comma, semicolon or blanks; a header names the columns, else x y z come first."""
+    """Reads columns split by comma, semicolon or blanks; a header names the columns, else x y z come first."""
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         first = file.readline().strip()
     delimiter = next((d for d in ",;" if d in first), None)

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.depth_files import load_cv2, open_video
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.depth_files import open_video
 from dpcli.prepare.reader import natural_key
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -23,7 +24,7 @@ FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampl
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of a clip. `names` are for messages; `numbers` the integers in the names (or 0, 1, ...).
+    """Holds the frames of a clip. `names` are for messages; `numbers` the integers in the names (or 0, 1, ...).
 
     times: f64 (T) seconds as the file declares them, None when it doesn't.
     """
@@ -38,7 +39,7 @@ class Frames:
         return len(self.names)
 
     def read(self, wanted: Sequence[int]) -> Iterator[np.ndarray]:
-        """Frames by rising index, each u8 (H,W,4) straight alpha, opaque where the file has no alpha."""
+        """Yields frames by rising index, each u8 (H,W,4) straight alpha, opaque where the file has no alpha."""
         if self.path.is_dir():
             return (read_rgba(self.files[index]) for index in wanted)
         if self.path.suffix.lower() in ANIMATION_SUFFIXES:
@@ -47,7 +48,7 @@ class Frames:
 
 
 def open_frames(path: Path) -> Frames:
-    """The frames of a folder, video or GIF; DataError when there are none or they cannot be decoded."""
+    """Opens the frames of a folder, video or GIF. Raises DataError when there are none or they cannot be decoded."""
     if path.is_dir():
         return _open_folder(path)
     if not path.is_file():
@@ -64,7 +65,9 @@ def open_frames(path: Path) -> Frames:
 
 
 def image_paths(folder: Path) -> list[Path]:
-    """Images directly in a folder, by the integers in their names that aren't the same in all, from left to right."""
+    """Returns images directly in a folder, by the integers in their names that aren't the same in all, from left to
+    right.
+    """
     found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     found.sort(key=natural_key)
     columns = _telling_columns([path.stem for path in found])
@@ -75,10 +78,12 @@ def image_paths(folder: Path) -> list[Path]:
 
 
 def frame_numbers(stems: Sequence[str]) -> list[int]:
-    """The integer of each name that tells frames apart: the last one that differs between them and counts as they follow.
+    """Returns the integer of each name that tells frames apart: the last that differs between them and counts as they
+    follow.
 
     `frame_0001`, `1_rgba`, `cam2_000_v1` all work; 0, 1, 2, ... where no integer alone does: names without any, or not
-    equally many, or such as `1305031102.675304` (seconds, microseconds) and `12-59-58`, where the last one starts again.
+    equally many, or such as `1305031102.675304` (seconds, microseconds) and `12-59-58`, where the last one starts
+    again.
     """
     columns = _telling_columns(stems)
     if len(columns) == 1:
@@ -92,8 +97,9 @@ def frame_numbers(stems: Sequence[str]) -> list[int]:
 
 
 def _telling_columns(stems: Sequence[str]) -> list[list[int]]:
-    """The columns of integers in the names that aren't the same everywhere, or the last one if all are; [] where names
-    hold none, or not equally many."""
+    """Returns the columns of integers in the names that aren't the same everywhere, or the last one if all are; []
+    where names hold none, or not equally many.
+    """
     rows = [[int(word) for word in re.findall(r"\d+", stem)] for stem in stems]
     if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
         return []
@@ -115,7 +121,7 @@ def _open_folder(folder: Path) -> Frames:
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """One image as u8 (H,W,4), straight alpha; DataError when unreadable."""
+    """Reads one image as u8 (H,W,4), straight alpha. Raises DataError when unreadable."""
     from PIL import Image
 
     try:
@@ -185,7 +191,8 @@ def _open_video(path: Path) -> Frames:
 
 
 def _frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
-    """Seconds of a video's frames from its first: by its rate where that is what their time stamps say, else the stamps.
+    """Returns seconds of a video's frames from its first: by its rate where that is what their time stamps say, else
+    the stamps.
 
     Recordings of screens and phones have frames when something happens; their rate is a mean. Stamps are rounded to
     milliseconds in some containers and missing (0) in others.
@@ -199,7 +206,9 @@ def _frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
 
 
 def _lasts(times: np.ndarray, duration: float) -> bool:
-    """Whether frames at these times fill a clip that is said to last so long: the last one may stay for a while."""
+    """Returns whether frames at these times fill a clip that is said to last so long: the last one may stay for a
+    while.
+    """
     steps = np.diff(times)
     return len(steps) > 0 and duration - times[-1] <= max(2 * float(steps.max()), 0.1 * duration)
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
-from dpcli.prepare.decode.gray_png import decode_gray_png
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.png import decode_gray_png
 from dpcli.prepare.reader import natural_key
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
@@ -25,24 +26,14 @@ _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 
 @dataclass
 class DepthVideo:
-    """Raw frames (T,H,W) u8, u16, or float, and the frame rate its file declares (None = says nothing)."""
+    """Holds raw frames (T,H,W) u8, u16, or float, and the frame rate its file declares (None = says nothing)."""
 
     frames: np.ndarray
     fps: float | None = None
 
 
-def load_cv2():  # -> module
-    """OpenCV without its own lines on stderr about damaged files: ours name the file and what to do."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    import cv2
-
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    cv2.setNumThreads(1)  # one process per core is the parallelizm
-    return cv2
-
-
 def open_video(path: Path):  # -> cv2.VideoCapture
-    """An OpenCV capture that yields 16-bit gray frames unharmed and 8-bit ones expanded to the full range."""
+    """Opens an OpenCV capture that yields 16-bit gray frames unharmed and 8-bit ones expanded to the full range."""
     if not path.is_file():
         raise DataError(f"{path}: no such video")
     cv2, name = load_cv2(), utf8_path(path, "OpenCV")
@@ -59,7 +50,7 @@ def open_video(path: Path):  # -> cv2.VideoCapture
 
 
 def video_frames(path: Path, start: int = 0, stop: int | None = None, stride: int = 1) -> Iterator[np.ndarray]:
-    """Frames start, start + stride, ... before ``stop``, each (H,W) u8 or u16; ends early where the file ends.
+    """Yields frames start, start + stride, ... before ``stop``, each (H,W) u8 or u16; ends early where the file ends.
 
     Decodes from the beginning: jumping to a frame of an inter-coded video isn't exact in every container.
     """
@@ -73,7 +64,7 @@ def video_frames(path: Path, start: int = 0, stop: int | None = None, stride: in
 def read_video(
     path: Path, start: int = 0, stop: int | None = None, stride: int = 1
 ) -> tuple[list[np.ndarray], float | None]:
-    """What `video_frames` yields, and the frames per second that the file declares (None = says nothing)."""
+    """Returns what `video_frames` yields, and the frames per second that the file declares (None = says nothing)."""
     import cv2
 
     capture = open_video(path)
@@ -101,13 +92,15 @@ def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> 
 
 
 def _colored(frame: np.ndarray) -> bool:
-    """Whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of its pixels."""
+    """Returns whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of
+    its pixels.
+    """
     some = frame[::8, ::8].astype(np.int16)
     return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLORED_SHARE)
 
 
 def read_image(path: Path) -> np.ndarray:
-    """One gray depth image (H,W) u8, u16 or f32; DataError when unreadable or colored."""
+    """Reads one gray depth image (H,W) u8, u16 or f32. Raises DataError when unreadable or colored."""
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is not None:
@@ -129,7 +122,7 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_image_folder(folder: Path, stride: int = 1) -> np.ndarray:
-    """The images of a folder in natural order -> (T,H,W); DataError when sizes or types differ."""
+    """Reads the images of a folder in natural order as (T,H,W). Raises DataError when sizes or types differ."""
     paths = image_paths(folder)[::stride]
     if not paths:
         raise DataError(f"{folder}: no depth images ({', '.join(IMAGE_SUFFIXES)})")
@@ -146,18 +139,18 @@ def read_image_folder(folder: Path, stride: int = 1) -> np.ndarray:
 
 
 def has_images(folder: Path) -> bool:
-    """Whether `image_paths` finds any, without asking for all."""
+    """Returns whether `image_paths` finds any, without asking for all."""
     with os.scandir(folder) as entries:
         return any(entry.name.lower().endswith(IMAGE_SUFFIXES) for entry in entries)
 
 
 def image_paths(folder: Path) -> list[Path]:
-    """Image files directly in a folder, in natural order."""
+    """Returns image files directly in a folder, in natural order."""
     return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
 
 
 def read_array(path: Path, stride: int = 1) -> np.ndarray:
-    """A ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
+    """Reads a ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except (ValueError, OSError, EOFError) as error:
@@ -172,7 +165,7 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
 
 
 def read_depth_video(path: Path, stride: int = 1) -> DepthVideo:
-    """Any depth video: a video file, an ``.npy``, or a folder of images. ``stride`` keeps every n-th frame."""
+    """Reads any depth video: a video file, an ``.npy``, or a folder of images. ``stride`` keeps every n-th frame."""
     suffix = path.suffix.lower()
     if path.is_dir():
         video = DepthVideo(read_image_folder(path, stride))

@@ -16,7 +16,7 @@ _MOST_BYTES = 1 << 31  # of a member unpacked; 300 frames of 40,000 points in fl
 
 
 def member_names(path: Path) -> list[str]:
-    """The arrays in an .npz, without reading them; DataError when it is none."""
+    """Returns the arrays in an .npz, without reading them. Raises DataError when it is none."""
     try:
         with zipfile.ZipFile(path) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
@@ -25,9 +25,10 @@ def member_names(path: Path) -> list[str]:
 
 
 def read_frames(path: Path, key: str) -> list[np.ndarray]:
-    """Frames (N,3 or more) of numbers, N their own each, from array ``key`` of an .npz; columns 0 to 2 are returned.
+    """Reads frames (N,3 or more) of numbers, N their own each, from array ``key`` of an .npz; columns 0 to 2 are
+    returned.
 
-    An object array is a pickle: it is read through an allow list of plain arrays. DataError on anything else.
+    An object array is a pickle: it is read through an allow list of plain arrays. Raises DataError on anything else.
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -11,7 +11,7 @@ from dpcli.errors import DpcError
 
 @lru_cache(maxsize=1)
 def load_open3d() -> ModuleType:
-    """The ``open3d`` module; DpcError when it can't be imported.
+    """Imports Open3D and returns it. Raises DpcError when it can't be imported.
 
     Its wheel links against libusb-1.0. The PyPI package ``libusb-package`` carries that library; loaded first and
     globally, it satisfies the link without root rights.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +15,7 @@ from dpcli.errors import DataError, UsageError
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Focal lengths and principal point, in pixels; pixel (0, 0) is the center of the top-left one."""
+    """Holds focal lengths and principal point, in pixels; pixel (0, 0) is the center of the top-left one."""
 
     fx: float
     fy: float
@@ -29,7 +28,11 @@ class Intrinsics:
 
     @classmethod
     def from_field_of_view(cls, degrees: float, width: int, height: int) -> Intrinsics:
-        """Square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view."""
+        """Returns a camera of square pixels, center in the middle; ``degrees`` is the HORIZONTAL field of view.
+
+        >>> round(Intrinsics.from_field_of_view(90, 640, 480).fx, 6)
+        320.0
+        """
         if not 0 < degrees < 180:
             raise UsageError(f"a field of view lies between 0 and 180 degrees, found {degrees:g}")
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
@@ -37,7 +40,9 @@ class Intrinsics:
 
     @classmethod
     def from_json(cls, path: Path) -> Intrinsics:
-        """``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-major]}``."""
+        """Reads ``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-
+        major]}``.
+        """
         try:
             data = json.loads(path.read_text())
         except OSError as error:
@@ -55,7 +60,7 @@ class Intrinsics:
 
 @lru_cache(maxsize=8)
 def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
-    """Rays through every pixel at unit depth, f32 (H*W, 3) in raster order; z is 1. Camera axes OpenCV."""
+    """Returns rays through every pixel at unit depth, f32 (H*W, 3) in raster order; z is 1. Camera axes OpenCV."""
     x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(height) - intrinsics.cy) / intrinsics.fy
     rays = np.ones((height, width, 3), np.float32)
@@ -67,30 +72,29 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _complex_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
-    """x + iy of `pixel_rays`, complex64 (H*W): one number is taken three times as fast as a row."""
+    """Returns x + iy of `pixel_rays`, complex64 (H*W): one number is taken three times as fast as a row."""
     rays = np.ascontiguousarray(pixel_rays(height, width, intrinsics)[:, :2])
     return rays.view(np.complex64).reshape(-1)
 
 
 def back_project(
-    depth: np.ndarray,
-    intrinsics: Intrinsics,
-    *,
-    unit: float = 1.0,
-    near: float = 0.0,
-    far: float = np.inf,
-    choose: Callable[[int], np.ndarray | slice] | None = None,
+    depth: np.ndarray, intrinsics: Intrinsics, *, unit: float = 1.0, near: float = 0.0, far: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth frames to points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in near..far.
+    """Turns depth frames into points: x = (u - cx) / fx * z, y = (v - cy) / fy * z, for every pixel with z > 0 in
+    near..far.
 
     depth: (T,H,W), any real dtype, 0 or less = nothing seen; z is depth * unit in float32 -> points f32 (P,3) in raster
-    order within each frame, frames one after the other; counts i64 (T) of points per frame. `choose` says which of so
-    many points of a frame are made (`Thinning.blind`).
+    order within each frame, frames one after the other; counts i64 (T) of points per frame.
+
+    >>> depth = np.array([[[0, 0, 0], [0, 0, 2000]]], np.uint16)  # one pixel of a 3 x 2 picture sees something, in mm
+    >>> points, counts = back_project(depth, Intrinsics(8, 8, 1, 0.5), unit=0.001)
+    >>> points.tolist(), counts.tolist()
+    ([[0.25, 0.125, 2.0]], [1])
     """
     frames, height, width = depth.shape
     rays = _complex_rays(height, width, intrinsics)
     # what is not seen is dropped before anything is computed: most pixels of a cut-out person or hand
-    seen = [_seen(frame, np.float32(unit), near, far, choose) for frame in depth.reshape(frames, height * width)]
+    seen = [_seen(frame, np.float32(unit), near, far) for frame in depth.reshape(frames, height * width)]
     counts = np.array([len(pixels) for pixels, _ in seen], np.int64)
     points = np.empty((int(counts.sum()), 3), np.float32)
     start = 0
@@ -104,16 +108,12 @@ def back_project(
     return points, counts
 
 
-def _seen(
-    frame: np.ndarray, unit: np.float32, near: float, far: float, choose: Callable[[int], np.ndarray | slice] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels i64 (P) of a flat frame in which something was seen in near..far and chosen, and its depth f32 (P)."""
+def _seen(frame: np.ndarray, unit: np.float32, near: float, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns pixels i64 (P) of a flat frame in which something was seen in near..far, and its depth f32 (P)."""
     pixels = np.flatnonzero(frame > 0)
     if near > 0 or far < np.inf:
         z = _lengths(frame, pixels, unit)
         pixels = pixels[(z >= near) & (z <= far)]
-    if choose is not None:
-        pixels = pixels[choose(len(pixels))]
     return pixels, _lengths(frame, pixels, unit)
 
 

@@ -25,7 +25,10 @@ _MOST_BYTES = 1 << 28
 
 
 class ArrayUnpickler(pickle.Unpickler):
+    """Loads pickles that name nothing but NumPy's array constructors."""
+
     def find_class(self, module: str, name: str) -> Any:
+        """Returns a constructor of the allow list. Raises UnpicklingError for any other name."""
         if (module, name) in _ALLOWED:
             home = "numpy._core" if np.lib.NumpyVersion(np.__version__) >= "2.0.0" else "numpy.core"
             return super().find_class(re.sub(r"^numpy\._?core", home, module), name)
@@ -33,9 +36,9 @@ class ArrayUnpickler(pickle.Unpickler):
 
 
 def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: bool = False) -> Any:
-    """One array of an open .npz; with ``pickled`` an object array may be in it, and its only element is returned.
+    """Reads one array of an open .npz; with ``pickled`` an object array may be in it, and its only element is returned.
 
-    DataError when the member is absent, damaged, or a pickle that needs more than plain arrays and containers.
+    Raises DataError when the member is absent, damaged, or a pickle that needs more than plain arrays and containers.
     """
     try:
         info = archive.getinfo(f"{key}.npy")

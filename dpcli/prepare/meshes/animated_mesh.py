@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Texture:
-    """A picture on a surface: sRGB u8 (H,W,4), alpha in the last channel; wrap: repeat | mirror | clamp.
+    """Holds a picture on a surface: sRGB u8 (H,W,4), alpha in the last channel; wrap: repeat | mirror | clamp.
 
     change: f64 (2,3) affine map of the coordinates before they are looked up, or None.
     """
@@ -21,7 +21,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Material:
-    """color: linear RGBA factor. blend: opaque | mask | blend, with `cutoff` for mask. unlit: no shading."""
+    """Holds color, a linear RGBA factor; blend: opaque | mask | blend, with `cutoff` for mask; unlit: no shading."""
 
     color: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     texture: Texture | None = None
@@ -32,7 +32,7 @@ class Material:
 
 @dataclass(frozen=True)
 class AnimatedMesh:
-    """T frames of V vertices and F triangles, baked; B bones.
+    """Holds T frames of V vertices and F triangles, baked; B bones.
 
     time: f64 (T) seconds. positions, normals: f32 (T,V,3). triangles: i64 (F,3). material: i64 (F) into `materials`.
     color: linear RGBA f32 (V,4). uv: f32 (V,2), v downwards. bones i64 and weights f32 (V,J): skinning, sums 1.
@@ -56,16 +56,17 @@ class AnimatedMesh:
 
     @property
     def num_frames(self) -> int:
+        """Returns the number of frames."""
         return len(self.time)
 
     def frames(self, start: int, stop: int) -> AnimatedMesh:
-        """Frames start to stop - 1 alone; small enough to send to another process."""
+        """Returns frames start to stop - 1 alone; small enough to send to another process."""
         cut = slice(start, stop)
         kept = {key: getattr(self, key)[cut] for key in ("time", "positions", "normals", "bone_pose")}
         return replace(self, **kept)
 
     def moved(self, rotation: np.ndarray, shift: np.ndarray, scale: float) -> AnimatedMesh:
-        """x -> scale R x + shift; shift (3), or (T,3): one per frame."""
+        """Applies x -> scale R x + shift; shift (3), or (T,3): one per frame."""
         shift = np.broadcast_to(np.asarray(shift, np.float64), (self.num_frames, 3))
         change = np.tile(np.eye(4), (self.num_frames, 1, 1))
         change[:, :3, :3], change[:, :3, 3] = scale * rotation, shift
@@ -76,7 +77,7 @@ class AnimatedMesh:
 
 
 def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, float]:
-    """A small ball that holds points (N,3): center f64 (3) and radius.
+    """Returns center f64 (3) and radius of a small ball that holds points (N,3).
 
     Badoiu and Clarkson (2003): step i moves the center by 1/(i+1) toward the farthest point; within 1/sqrt(steps)
     of the smallest ball. Started at the middle of the box, it ends far closer than that.
@@ -91,7 +92,7 @@ def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, f
 
 
 def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool = True) -> AnimatedMesh:
-    """The mesh in a ball of this radius around the origin, over all frames together.
+    """Returns the mesh in a ball of this radius around the origin, over all frames together.
 
     yaw: radians about the upright, y. travel=False: takes out the level (x, z) motion of the middle, as on a treadmill.
     """
@@ -107,7 +108,9 @@ def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool
 
 
 def _extreme(points: np.ndarray, directions: int = 512) -> np.ndarray:
-    """The points that can touch a bounding ball, nearly: the farthest in each of many directions; millions are slow."""
+    """Returns the points that can touch a bounding ball, nearly: the farthest in each of many directions; millions are
+    slow.
+    """
     if len(points) < 2_000:
         return points
     k = np.arange(directions) + 0.5

@@ -20,7 +20,7 @@ from dpcli.runtime.provenance import file_digest
 
 @contextmanager
 def _well_formed(path: Path) -> Iterator[None]:
-    """What a damaged file makes of our assumptions (a text for a number, a missing key) becomes a DataError."""
+    """Turns what a damaged file makes of our assumptions (a text for a number, a missing key) into a DataError."""
     try:
         yield
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
@@ -30,7 +30,7 @@ def _well_formed(path: Path) -> Iterator[None]:
 
 
 def list_clips(path: Path) -> list[tuple[str, float]]:
-    """(name, seconds) of every clip of a file; DataError when one is broken or there is none."""
+    """Returns (name, seconds) of every clip of a file. Raises DataError when one is broken or there is none."""
     with _well_formed(path):
         file = read_gltf(path)
         choose_clip(file, None)
@@ -39,7 +39,9 @@ def list_clips(path: Path) -> list[tuple[str, float]]:
 
 
 def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
-    """A clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own units."""
+    """Reads a clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own
+    units.
+    """
     with _well_formed(path):
         file = read_gltf(path)
         chosen, names = choose_clip(file, clip), clip_names(file)
@@ -49,12 +51,12 @@ def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
 
 
 def animation_clip(path: Path, clip: str | None, frames: int, filming: Filming, jobs: int = 1) -> Clip:
-    """The Clip that `film` makes of `load_animation`."""
+    """Returns the Clip that `film` makes of `load_animation`."""
     return film(load_animation(path, clip, frames), filming, jobs)
 
 
 def animation_config(path: Path, clip: str | None, frames: int, filming: Filming) -> dict[str, Any]:
-    """What decides the content, for the file's provenance."""
+    """Returns what decides the content, for the file's provenance."""
     with _well_formed(path):
         name = clip_names(file := read_gltf(path))[choose_clip(file, clip)]
     return {"input": path.name, "digest": file_digest(path)[:16], "clip": name, "frames": frames, **filming.config}

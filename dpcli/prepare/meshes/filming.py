@@ -12,13 +12,12 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
-from dpcli.prepare.meshes.bone_parts import carry, choose_points, heaviest_bones, rigid_parts
+from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, rigid_parts, track_points
 from dpcli.prepare.meshes.raycast import FrameCaster
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
-from dpcli.runtime.worker_server import start_early
 from dpcli.store.views import ViewsHeader
 
 OBJECT_RADIUS = 0.75  # of the ball around the object; the default camera sees 0.83 whole
@@ -26,12 +25,12 @@ _CHUNK = 4  # frames that a worker gets at a time: the mesh travels with them
 _STILL = 1e-3  # of the object's radius: what moves less than this is no motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Filming:
-    """How an animated mesh is filmed. Angles in degrees; the reference camera stands at azimuth 0.
+    """Says how an animated mesh is filmed. Angles in degrees; the reference camera stands at azimuth 0.
 
-    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points of
-    ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
+    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points
+    of ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
     """
 
     size: int = 512
@@ -60,23 +59,25 @@ class Filming:
 
     @property
     def config(self) -> dict[str, Any]:
-        """Everything that decides the pictures, except the seed."""
+        """Returns everything that decides the pictures, except the seed."""
         return {key: value for key, value in asdict(self).items() if key != "seed"}
 
     @property
     def roles(self) -> list[str]:
+        """Returns the role of every view: reference, then train, then test."""
         return ["reference", *["train"] * len(self.train_azimuths), *["test"] * len(self.test_azimuths)]
 
     def cameras(self) -> np.ndarray:
-        """world_to_camera f64 (V,4,4): the reference, the train and the test views."""
+        """Returns world_to_camera f64 (V,4,4): the reference, the train and the test views."""
         azimuths = np.radians([0.0, *self.train_azimuths, *self.test_azimuths])
         return np.stack([orbit_pose(azimuth, np.radians(self.elevation), DEFAULT_RADIUS) for azimuth in azimuths])
 
 
 def film(mesh: AnimatedMesh, filming: Filming, jobs: int = 1) -> Clip:
-    """A Clip of the mesh, normalized to a ball of radius 0.75 at the origin; its pictures are drawn as they are asked for.
+    """Returns a Clip of the mesh, normalized to a ball of radius 0.75 at the origin; its pictures are drawn when asked
+    for.
 
-    The pictures don't depend on jobs. DataError when the mesh has no extent; a warning when it doesn't move.
+    The pictures don't depend on jobs. Raises DataError when the mesh has no extent; a warning when it doesn't move.
     """
     if not np.isfinite(mesh.positions).all():
         frame = int(np.argmax(~np.isfinite(mesh.positions).all((1, 2))))
@@ -97,11 +98,11 @@ def film(mesh: AnimatedMesh, filming: Filming, jobs: int = 1) -> Clip:
 
 
 def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """track f32 (T,M,3) and part i16 (M) of `tracks` points; None, None when 0 are asked for."""
+    """Returns track f32 (T,M,3) and part i16 (M) of `tracks` points; None, None when 0 are asked for."""
     if not filming.tracks:
         return None, None
     points = choose_points(mesh, filming.tracks, generator(filming.seed))
-    track, bone = carry(mesh, points), heaviest_bones(mesh, points)
+    track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
     smallest = int(np.ceil(filming.min_part * filming.tracks))
     tolerance = filming.part_tolerance * OBJECT_RADIUS
     part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(np.float64), tolerance, smallest)
@@ -115,8 +116,6 @@ def _pictures(
     starts = range(0, mesh.num_frames, _CHUNK)
     pieces = ((start, mesh.frames(start, start + _CHUNK)) for start in starts)
     jobs = min(jobs, len(starts))
-    if jobs > 1:
-        start_early([__name__])
     work = partial(draw_frames, header.intrinsics, header.world_to_camera, header.size, filming)
     for (start, _), result in ordered_map(work, pieces, jobs):
         if isinstance(result, Exception):
@@ -133,7 +132,7 @@ def draw_frames(
     filming: Filming,
     piece: tuple[int, AnimatedMesh],
 ) -> list[list[np.ndarray]]:
-    """Pictures u8 (H,W,4) of all views of some frames: [frame][view]. Runs in a worker process."""
+    """Draws the pictures u8 (H,W,4) of all views of some frames: [frame][view]. Runs in a worker process."""
     casters = (FrameCaster(piece[1], frame, filming.shading) for frame in range(piece[1].num_frames))
     cameras = list(zip(intrinsics, world_to_camera, strict=True))
     return [[caster.picture(*camera, size, filming.samples) for camera in cameras] for caster in casters]

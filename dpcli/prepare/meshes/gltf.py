@@ -1,6 +1,8 @@
-"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and 4).
+"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and
+4).
 
-The container is JSON beside a block of bytes, so the standard library reads it; see `gltf_scene` for what it means.
+The container is JSON beside a block of bytes, so the standard library reads it; `gltf_nodes` and
+`gltf_mesh` say what it means.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ _UNDERSTOOD = (
 
 @dataclass
 class Gltf:
-    """A glTF file: its JSON and, read when asked for, its buffers.
+    """Holds a glTF file: its JSON and, read when asked for, its buffers.
 
     `accessor` decodes numbers, `image` gives a texture's encoded bytes. All errors are DataErrors that name the file.
     """
@@ -45,17 +47,18 @@ class Gltf:
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
     def fail(self, problem: str) -> DataError:
+        """Returns the DataError that names the file and this fault."""
         return DataError(f"{self.path}: {problem}")
 
     def items(self, kind: str) -> list[dict[str, Any]]:
-        """The top-level list of this name, such as nodes; [] when absent."""
+        """Returns the top-level list of this name, such as nodes; [] when absent."""
         value = self.tree.get(kind, [])
         if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
             raise self.fail(f"{kind} is not a list of objects; the file is damaged, export it again")
         return value
 
     def item(self, kind: str, index: Any) -> dict[str, Any]:
-        """One entry of a top-level list; DataError when the index points at nothing."""
+        """Returns one entry of a top-level list. Raises DataError when the index points at nothing."""
         entries = self.items(kind)
         if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < len(entries):
             raise self.fail(
@@ -64,7 +67,7 @@ class Gltf:
         return entries[index]
 
     def accessor(self, index: Any, what: str, width: int | None = None, finite: bool = True) -> np.ndarray:
-        """Numbers of an accessor: (count,) or (count, components), normalized integers as float32 in -1..1.
+        """Returns numbers of an accessor: (count,) or (count, components), normalized integers as float32 in -1..1.
 
         what: named in errors. width: components expected, such as 3. finite: refuse NaN and infinite floats.
         """
@@ -140,7 +143,9 @@ class Gltf:
         return self._buffers[index]
 
     def _resource(self, uri: str) -> bytes:
-        """Bytes of a data: URI or of a file below the folder; anything else is refused, a file may be hostile."""
+        """Returns the bytes of a data: URI or of a file below the folder; anything else is refused, a file may be
+        hostile.
+        """
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             try:
@@ -159,7 +164,7 @@ class Gltf:
             ) from None
 
     def image(self, index: Any) -> np.ndarray:
-        """Pixels of images[index], u8 (H,W,4), decoded by Pillow."""
+        """Returns pixels of images[index], u8 (H,W,4), decoded by Pillow."""
         from PIL import Image, UnidentifiedImageError
 
         entry = self.item("images", index)
@@ -174,7 +179,9 @@ class Gltf:
 
 
 def read_gltf(path: Path) -> Gltf:
-    """Open a .glb or .gltf file; DataError unless it is whole, version 2 and free of extensions we can't follow."""
+    """Open a .glb or .gltf file. Raises DataError unless it is whole, version 2 and free of extensions we can't
+    follow.
+    """
     try:
         data = Path(path).read_bytes()
     except IsADirectoryError:
@@ -198,7 +205,7 @@ def read_gltf(path: Path) -> Gltf:
 
 
 def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    """JSON and binary chunk of a .glb (section 4)."""
+    """Returns JSON and binary chunk of a .glb (section 4)."""
     version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
     if version != 2 or length > len(data):
         raise DataError(

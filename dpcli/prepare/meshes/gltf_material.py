@@ -14,17 +14,23 @@ _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
 def to_linear(color: np.ndarray) -> np.ndarray:
-    """sRGB in 0..1 -> linear light (IEC 61966-2-1)."""
+    """Converts sRGB in 0..1 to linear light (IEC 61966-2-1).
+
+    >>> to_linear(np.array([0.0, 0.5, 1.0])).round(4).tolist()
+    [0.0, 0.214, 1.0]
+    """
     return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
 
 
 def to_srgb(color: np.ndarray) -> np.ndarray:
-    """Linear light in 0..1 -> sRGB; the inverse of `to_linear`."""
+    """Converts linear light in 0..1 to sRGB; the inverse of `to_linear`."""
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * np.maximum(color, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def read_material(file: Gltf, index: int, header_only: bool = False) -> Any:
-    """The Material of this index (-1: white); with header_only the number of the texture coordinates it uses."""
+    """Reads the Material of this index (-1: white); with header_only returns the number of the texture coordinates it
+    uses.
+    """
     entry = file.item("materials", index) if index != -1 else {}
     extensions = entry.get("extensions", {})
     metal = entry.get("pbrMetallicRoughness", {})
@@ -57,7 +63,7 @@ def _texture(file: Gltf, index: Any, change: dict[str, Any]) -> Texture:
 
 
 def _uv_matrix(change: dict[str, Any]) -> np.ndarray | None:
-    """KHR_texture_transform: f64 (2,3), uv' = A uv + b with A = rotation x scale."""
+    """Returns the f64 (2,3) of KHR_texture_transform: uv' = A uv + b with A = rotation x scale."""
     if not change:
         return None
     angle, scale, offset = change.get("rotation", 0.0), change.get("scale", (1, 1)), change.get("offset", (0, 0))

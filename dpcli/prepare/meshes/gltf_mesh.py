@@ -20,7 +20,7 @@ _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
 
 @dataclass
 class _Piece:
-    """One primitive of one node, at rest; targets: position deltas f32 (M,V,3) and normal deltas, or None."""
+    """Holds one primitive of one node, at rest; targets: position deltas f32 (M,V,3) and normal deltas, or None."""
 
     node: int
     positions: np.ndarray
@@ -37,9 +37,9 @@ class _Piece:
 
 
 def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
-    """The scene's triangles at `frames` times of a clip; time counts from 0. Bones are the file's nodes.
+    """Bakes the scene's triangles at `frames` times of a clip; time counts from 0. Bones are the file's nodes.
 
-    What has no skin hangs on its node. Points and lines are passed over. DataError when the file is broken.
+    What has no skin hangs on its node. Points and lines are passed over. Raises DataError when the file is broken.
     """
     parent, curves = node_parents(file), read_clip(file, clip)
     time = curves.sample_times(frames)
@@ -78,7 +78,7 @@ def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
 
 
 def _scene_nodes(file: Gltf) -> list[int]:
-    """Nodes of the default scene, parents first; all nodes when the file names no scene."""
+    """Returns nodes of the default scene, parents first; all nodes when the file names no scene."""
     if not file.items("scenes"):
         return list(range(len(file.items("nodes"))))
     order = list(file.item("scenes", file.tree.get("scene", 0)).get("nodes", []))
@@ -100,7 +100,7 @@ def _read_node(file: Gltf, index: int) -> list[_Piece]:
 
 
 def _read_skin(file: Gltf, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Joints (nodes) i64 (K) and inverse bind matrices f64 (K,4,4)."""
+    """Returns joints (nodes) i64 (K) and inverse bind matrices f64 (K,4,4)."""
     entry = file.item("skins", index)
     joints = np.array(entry.get("joints", []), np.int64)
     for joint in joints:
@@ -184,7 +184,7 @@ def _triangles(file: Gltf, entry: dict[str, Any], count: int, where: str) -> np.
 def _binding(
     file: Gltf, node: int, attributes: dict, positions: np.ndarray, skins: Any, where: str
 ) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
-    """Bones (nodes) i64 (V,J), weights f32 (V,J) that sum to 1, inverse bind matrix of every bone used."""
+    """Returns bones (nodes) i64 (V,J), weights f32 (V,J) that sum to 1, inverse bind matrix of every bone used."""
     count = len(positions)
     if skins is None or "JOINTS_0" not in attributes:
         return np.full((count, 1), node), np.ones((count, 1), np.float32), {node: np.eye(4)}
@@ -209,7 +209,7 @@ def _binding(
 def _repaired(
     file: Gltf, local: np.ndarray, weights: np.ndarray, positions: np.ndarray, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joints and weights (V,J), weights normalized, joints of no weight 0.
+    """Returns joints and weights (V,J), weights normalized, joints of no weight 0.
 
     Exporters leave a few vertices without weights, or with 0/0 = NaN: they follow the nearest vertex that has some.
     """
@@ -229,7 +229,7 @@ def _repaired(
 
 
 def _move(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and normals f32 (T,V,3) of a piece."""
+    """Returns positions and normals f32 (T,V,3) of a piece."""
     positions, normals = piece.positions, piece.normals
     if piece.targets is not None:
         amount = _morph_weights(file, piece, clip, time)
@@ -242,7 +242,7 @@ def _move(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray, poses: np.nda
 
 
 def _morph_weights(file: Gltf, piece: _Piece, clip: Clip, time: np.ndarray) -> np.ndarray:
-    """f64 (T,M): the clip's, or else the node's or mesh's own."""
+    """Returns the weights f64 (T,M) of the clip, or else the node's or mesh's own."""
     count = len(piece.targets)
     if (piece.node, "weights") in clip.curves:
         amount = clip.curves[piece.node, "weights"].at(time)

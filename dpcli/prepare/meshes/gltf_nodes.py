@@ -15,7 +15,7 @@ _REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scal
 
 @dataclass(frozen=True)
 class Clip:
-    """One animation. curves: (node, translation | rotation | scale | weights) -> Curve. Seconds."""
+    """Holds one animation. curves: (node, translation | rotation | scale | weights) -> Curve. Seconds."""
 
     name: str
     start: float
@@ -23,7 +23,9 @@ class Clip:
     curves: dict[tuple[int, str], Curve]
 
     def sample_times(self, frames: int) -> np.ndarray:
-        """`frames` times f64 (T) from the start on; the end is left out, in a loop it would repeat the first frame."""
+        """Returns `frames` times f64 (T) from the start on; the end is left out, in a loop it would repeat the first
+        frame.
+        """
         return self.start + (self.end - self.start) * np.arange(frames) / frames
 
 
@@ -33,7 +35,7 @@ def clip_names(file: Gltf) -> list[str]:
 
 
 def choose_clip(file: Gltf, wanted: str | None) -> int:
-    """Index of a clip by name, or by what follows the last | of it, in any case; None: the first."""
+    """Returns the index of a clip by name, or by what follows the last | of it, in any case; None: the first."""
     names = clip_names(file)
     if not names:
         raise file.fail("has no animation: nothing moves in it. Export the model with its clips (see --list)")
@@ -48,7 +50,7 @@ def choose_clip(file: Gltf, wanted: str | None) -> int:
 
 
 def read_clip(file: Gltf, index: int) -> Clip:
-    """The clip's curves; DataError that names clip, node and key when one is broken."""
+    """Reads the clip's curves. Raises DataError that names clip, node and key when one is broken."""
     entry, name = file.item("animations", index), clip_names(file)[index]
     curves = {}
     for channel in entry.get("channels", []):
@@ -88,11 +90,12 @@ def _read_curve(file: Gltf, what: str, path: str, times: int, values: int, inter
 
 
 def node_name(file: Gltf, index: int) -> str:
+    """Returns a node's name for messages."""
     return str(file.item("nodes", index).get("name") or f"node {index}")
 
 
 def node_parents(file: Gltf) -> np.ndarray:
-    """Parent i64 (N) of every node, -1 for roots; DataError when one has two, or is below itself."""
+    """Returns parent i64 (N) of every node, -1 for roots. Raises DataError when one has two, or is below itself."""
     nodes = file.items("nodes")
     parent = np.full(len(nodes), -1)
     for index, node in enumerate(nodes):
@@ -107,7 +110,7 @@ def node_parents(file: Gltf) -> np.ndarray:
 
 
 def parents_first(parent: np.ndarray) -> list[int]:
-    """Indices such that a parent comes before its children; those on a circle are left out."""
+    """Returns indices such that a parent comes before its children; those on a circle are left out."""
     children: dict[int, list[int]] = {}
     for index, above in enumerate(parent):
         children.setdefault(int(above), []).append(index)
@@ -118,7 +121,7 @@ def parents_first(parent: np.ndarray) -> list[int]:
 
 
 def node_poses(file: Gltf, parent: np.ndarray, clip: Clip, time: np.ndarray) -> np.ndarray:
-    """Node to world f64 (T,N,4,4) at `time` (T)."""
+    """Returns node to world f64 (T,N,4,4) at `time` (T)."""
     local = np.stack([_local(file, index, clip, time) for index in range(len(parent))], axis=1)
     world = local.copy()
     for index in parents_first(parent):

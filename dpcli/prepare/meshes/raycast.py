@@ -17,7 +17,7 @@ _NUDGE = 1e-4  # a ray goes on this far behind a transparent surface
 
 
 class FrameCaster:
-    """One frame of an AnimatedMesh, ready to be looked at from any camera.
+    """Draws one frame of an AnimatedMesh from any camera.
 
     shading: 0 shows plain colors, 1 full light and shade. All surfaces are seen from both sides.
     """
@@ -27,7 +27,7 @@ class FrameCaster:
         self.positions, self.normals = mesh.positions[frame], mesh.normals[frame]
         open3d = load_open3d()
         self._tensor = open3d.core.Tensor
-        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelizm
+        self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
         self._scene.add_triangles(
             self._tensor(np.ascontiguousarray(self.positions, np.float32)),
             self._tensor(np.ascontiguousarray(mesh.triangles, np.uint32)),
@@ -40,8 +40,9 @@ class FrameCaster:
         size: tuple[int, int],  # width, height
         samples: int = 2,
     ) -> np.ndarray:
-        """RGBA u8 (H,W,4), straight alpha, sRGB; samples x samples rays per pixel, colors averaged as they are shown
-        (splats are blended in sRGB, too). What is empty is 0 0 0 0."""
+        """Draws RGBA u8 (H,W,4), straight alpha, sRGB; samples x samples rays per pixel, colors averaged as they are
+        shown (splats are blended in sRGB, too). What is empty is 0 0 0 0.
+        """
         width, height = size
         image = np.zeros((height, width, 4), np.uint8)
         rows, columns = self._window(intrinsics, world_to_camera, size)
@@ -59,7 +60,7 @@ class FrameCaster:
         return image
 
     def _window(self, intrinsics: np.ndarray, pose: np.ndarray, size: tuple[int, int]) -> tuple[slice, slice]:
-        """Rows and columns that the object can touch; the whole picture when some of it is behind the camera."""
+        """Returns rows and columns that the object can touch; the whole picture when some of it is behind the camera."""
         points = self.positions.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
         if points[:, 2].min() < 1e-3:
             return slice(0, size[1]), slice(0, size[0])
@@ -69,7 +70,7 @@ class FrameCaster:
         return slice(low[1], high[1]), slice(low[0], high[0])
 
     def _look(self, rays: np.ndarray) -> np.ndarray:
-        """Premultiplied sRGB and alpha f32 (N,4) of rays f32 (N,6), front to back."""
+        """Returns premultiplied sRGB and alpha f32 (N,4) of rays f32 (N,6), front to back."""
         result = np.zeros((len(rays), 4), np.float32)
         left = np.arange(len(rays))  # rays that still see something
         through = np.ones(len(rays), np.float32)
@@ -94,7 +95,7 @@ class FrameCaster:
         return result
 
     def _surface(self, triangle: np.ndarray, weights: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """sRGB and alpha f32 (N,4) of points on triangles, lit; direction: where the rays go."""
+        """Returns sRGB and alpha f32 (N,4) of points on triangles, lit; direction: where the rays go."""
         mesh, corners = self.mesh, self.mesh.triangles[triangle]
         color = surface_color(mesh, mesh.material[triangle], corners, weights)
         if self.shading and not all(m.unlit for m in mesh.materials):
@@ -105,7 +106,7 @@ class FrameCaster:
     def _light(
         self, triangle: np.ndarray, corners: np.ndarray, weights: np.ndarray, direction: np.ndarray
     ) -> np.ndarray:
-        """How much light (N) comes from each point, 1 on a plain or unlit surface."""
+        """Returns how much light (N) comes from each point, 1 on a plain or unlit surface."""
         normal = np.einsum("nk,nka->na", weights, self.normals[corners])
         length = np.sqrt(np.einsum("na,na->n", normal, normal))
         facing = np.where(np.einsum("na,na->n", normal, direction) > 0, -1, 1)
@@ -116,7 +117,7 @@ class FrameCaster:
 
 
 def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: slice, samples: int) -> np.ndarray:
-    """Rays f32 (rows, samples, columns, samples, 6): origin and unit direction, pixel centers at +0.5."""
+    """Returns rays f32 (rows, samples, columns, samples, 6): origin and unit direction, pixel centers at +0.5."""
     y = np.arange(rows.start * samples, rows.stop * samples).reshape(-1, samples)
     x = np.arange(columns.start * samples, columns.stop * samples).reshape(-1, samples)
     y, x = (y + 0.5) / samples, (x + 0.5) / samples
@@ -129,7 +130,7 @@ def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: s
 
 
 def surface_color(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Linear RGBA f32 (N,4), unlit, of points by the vertices i64 (N,3) around them and their weights (N,3).
+    """Returns linear RGBA f32 (N,4), unlit, of points by the vertices i64 (N,3) around them and their weights (N,3).
 
     Base color factor x vertex color x texture; alpha is 1 where the material is opaque, 0 or 1 where it is masked.
     """
@@ -154,7 +155,7 @@ def _alpha(material: Material, alpha: np.ndarray) -> np.ndarray:
 
 
 def sample_texture(texture: Texture, uv: np.ndarray) -> np.ndarray:
-    """Bilinear look-up, linear RGBA f32 (N,4); uv (N,2) with v downwards, (0, 0) the upper left corner."""
+    """Looks up linear RGBA f32 (N,4) bilinearly; uv (N,2) with v downwards, (0, 0) the upper left corner."""
     if texture.change is not None:
         uv = uv @ texture.change[:, :2].T + texture.change[:, 2]
     height, width = texture.pixels.shape[:2]
@@ -168,7 +169,7 @@ def sample_texture(texture: Texture, uv: np.ndarray) -> np.ndarray:
 
 
 def _linear(texture: Texture, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Linear RGBA f32 (N,4) of pixels; a table is decoded, not the picture, which also travels to workers."""
+    """Returns linear RGBA f32 (N,4) of pixels; a table is decoded, not the picture, which also travels to workers."""
     encoded = texture.pixels[row, column]
     decoded = _DECODED[encoded]
     decoded[:, 3] = encoded[:, 3] / np.float32(255)

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.ops.rotations import motion_matrix, quaternion_to_matrix
+
 
 @dataclass(frozen=True)
 class Curve:
-    """A property over time. times: f64 (K) seconds, rising. values: f64 (K,D), CUBICSPLINE (K,3,D): in-tangent, value,
-    out-tangent. interpolation: LINEAR | STEP | CUBICSPLINE. rotation: values are quaternions x y z w."""
+    """Holds a property over time. times: f64 (K) seconds, rising. values: f64 (K,D), CUBICSPLINE (K,3,D): in-tangent,
+    value, out-tangent. interpolation: LINEAR | STEP | CUBICSPLINE. rotation: values are quaternions x y z w.
+    """
 
     times: np.ndarray
     values: np.ndarray
@@ -18,7 +21,7 @@ class Curve:
     rotation: bool = False
 
     def at(self, time: np.ndarray) -> np.ndarray:
-        """Values f64 (T,D) at `time` (T); before the first and after the last key they stay."""
+        """Returns values f64 (T,D) at `time` (T); before the first and after the last key they stay."""
         cubic = self.interpolation == "CUBICSPLINE"
         time = np.clip(np.asarray(time, np.float64), self.times[0], self.times[-1])
         if len(self.times) == 1:
@@ -38,7 +41,7 @@ class Curve:
 
 
 def _hermite(first: np.ndarray, last: np.ndarray, step: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Cubic Hermite spline between keys (T,3,D), tangents per second."""
+    """Interpolates between keys (T,3,D) by a cubic Hermite spline, tangents per second."""
     s2, s3 = s * s, s * s * s
     leaving, arriving = step * first[:, 2], step * last[:, 0]
     return (
@@ -50,13 +53,13 @@ def _hermite(first: np.ndarray, last: np.ndarray, step: np.ndarray, s: np.ndarra
 
 
 def normalize(quaternions: np.ndarray) -> np.ndarray:
-    """Unit quaternions; a zero one becomes zero rotation (x y z w)."""
+    """Returns unit quaternions (x y z w); a zero one becomes zero rotation."""
     length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
     return np.where(length > 1e-12, quaternions / np.maximum(length, 1e-12), [0.0, 0.0, 0.0, 1.0])
 
 
 def slerp(first: np.ndarray, last: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Spherical interpolation of quaternions (...,4) the short way round, at s (...,1) in 0..1."""
+    """Interpolates quaternions (...,4) spherically the short way round, at s (...,1) in 0..1."""
     first, last = normalize(first), normalize(last)
     cosine = (first * last).sum(-1, keepdims=True)
     last, cosine = np.where(cosine < 0, -last, last), np.abs(cosine)
@@ -70,25 +73,9 @@ def slerp(first: np.ndarray, last: np.ndarray, s: np.ndarray) -> np.ndarray:
 
 
 def matrices(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Transforms f64 (T,4,4) = translation (T,3) x rotation (T,4, x y z w) x scale (T,3)."""
-    x, y, z, w = np.moveaxis(normalize(rotation), -1, 0)
-    turned = np.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - z * w),
-            2 * (x * z + y * w),
-            2 * (x * y + z * w),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - x * w),
-            2 * (x * z - y * w),
-            2 * (y * z + x * w),
-            1 - 2 * (x * x + y * y),
-        ],
-        axis=-1,
-    ).reshape(-1, 3, 3)
-    result = np.tile(np.eye(4), (len(turned), 1, 1))
-    result[:, :3, :3], result[:, :3, 3] = turned * scale[:, None, :], translation
-    return result
+    """Returns transforms f64 (T,4,4) = translation (T,3) x rotation (T,4, x y z w) x scale (T,3)."""
+    turned = quaternion_to_matrix(normalize(rotation)[..., [3, 0, 1, 2]])
+    return motion_matrix(turned * scale[:, None, :], translation)
 
 
 def skin(
@@ -98,7 +85,7 @@ def skin(
     weights: np.ndarray,  # (V,J), sums 1
     motion: np.ndarray,  # (T,B,4,4) rest pose -> frame
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Linear blend skinning: positions and unit normals f32 (T,V,3). Normals follow the inverse transpose's direction.
+    """Computes positions and unit normals f32 (T,V,3) by linear blend skinning; normals follow the inverse transpose.
 
     The cofactor matrix is used for it: that is det times the inverse transpose, and exists when a bone is scaled to 0.
     """
@@ -118,7 +105,7 @@ def skin(
 
 
 def vertex_normals(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Area-weighted unit normals f32 (V,3) of one frame (V,3)."""
+    """Returns area-weighted unit normals f32 (V,3) of one frame (V,3)."""
     a, b, c = (positions[triangles[:, k]].astype(np.float64) for k in range(3))
     across = np.cross(b - a, c - a)
     total = np.stack(

@@ -13,14 +13,14 @@ _IMAGE_SIDES = (96, 192, 384, 768)  # pixels: the first that sees enough points 
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points by where they lie: triangle i64 (N) and the weights f64 (N,3) of its corners."""
+    """Holds points by where they lie: triangle i64 (N) and the weights f64 (N,3) of its corners."""
 
     triangle: np.ndarray
     weights: np.ndarray
 
 
 def choose_on_surface(areas: np.ndarray, count: int, rng: np.random.Generator) -> SurfacePoints:
-    """``count`` points, uniform over the surface, in random order. areas f64 (T), at least one positive.
+    """Draws ``count`` points, uniform over the surface, in random order. areas f64 (T), at least one positive.
 
     Systematic sampling over the triangles in their order, so a part's number of points differs by less than one from
     its share of the area (a plain draw would leave small parts without any).
@@ -34,20 +34,20 @@ def choose_on_surface(areas: np.ndarray, count: int, rng: np.random.Generator) -
 
 
 def points_on(triangles: np.ndarray, chosen: SurfacePoints) -> np.ndarray:
-    """Where the chosen points are, f64 (N,3), in the frame the triangles (T,3,3) are given in."""
+    """Returns where the chosen points are, f64 (N,3), in the frame the triangles (T,3,3) are given in."""
     return (triangles[chosen.triangle] * chosen.weights[..., None]).sum(1)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera at ``eye`` (3) that looks at the origin and sees a square of ``half`` x distance each way."""
+    """Looks from ``eye`` (3) at the origin and sees a square of ``half`` x distance each way; a pinhole camera."""
 
     eye: np.ndarray
     half: float
 
     @classmethod
     def random(cls, radius: float, upright: bool, rng: np.random.Generator) -> Camera:
-        """On a sphere about the origin, far enough to see a ball of this radius whole.
+        """Draws a camera on a sphere about the origin, far enough to see a ball of this radius whole.
 
         Any direction; when the object stands upright (z up), 15 degrees below to 60 degrees above its horizon.
         """
@@ -58,7 +58,7 @@ class Camera:
         return cls(distance * direction, float(np.tan(np.arcsin(radius / distance))))
 
     def rays(self, side: int, rng: np.random.Generator) -> np.ndarray:
-        """One ray through a random place of each of side x side pixels: origin and direction, f32 (side^2,6)."""
+        """Returns one ray through a random place of each of side x side pixels: origin and direction, f32 (side^2,6)."""
         ahead = -self.eye / np.linalg.norm(self.eye)
         right = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
         right /= np.linalg.norm(right)
@@ -72,7 +72,7 @@ class Camera:
 def choose_visible(
     triangles: np.ndarray, poses: np.ndarray, camera: Camera, count: int, rng: np.random.Generator
 ) -> SurfacePoints:
-    """At most ``count`` points that the camera sees, drawn at random from its pixels.
+    """Draws at most ``count`` points that the camera sees, at random from its pixels.
 
     triangles f64 (T,3,3), poses f64 (T,4,4): where each triangle stands.
     """

@@ -22,7 +22,7 @@ _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coo
 
 @dataclass(frozen=True)
 class CloudFolders:
-    """Options of the reader. ``scale``: input units per unit of length in the output."""
+    """Reads point cloud files. ``scale``: input units per unit of length in the output."""
 
     raw: Path
     bin_columns: int = 4
@@ -43,19 +43,22 @@ class CloudFolders:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return self._table.class_names if self._table else []
 
     @property
     def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
         return self.unit
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """``color`` when the very first frame has colors; then every frame must."""
+        """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
         return (("time",) if self.fps else ()) + (("color",) if self._has_color else ())
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
 
     @cached_property
@@ -91,6 +94,7 @@ class CloudFolders:
         return False
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
         for relative in self._relative:
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
@@ -98,6 +102,7 @@ class CloudFolders:
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         paths = frame_paths(item.path)[:: self.stride]
         clouds = [read_cloud(path, self.bin_columns) for path in paths]
         notes = {"points with NaN or infinity dropped": sum(drop_invalid(cloud) for cloud in clouds)}
@@ -128,22 +133,25 @@ class CloudFolders:
         return np.concatenate([cloud.color for cloud in clouds if cloud.color is not None])
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         frames = sum(len(frame_paths(item.path)) for item in items)
         return [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
 
 
 def is_cloud(name: str) -> bool:
-    """Whether a file name looks like a point cloud."""
+    """Returns whether a file name looks like a point cloud."""
     return name.lower().endswith(SUFFIXES) and not name.startswith(".")
 
 
 def frame_paths(folder: Path) -> list[Path]:
-    """The point clouds directly in a folder, in natural order."""
+    """Returns the point clouds directly in a folder, in natural order."""
     return sorted((p for p in folder.iterdir() if is_cloud(p.name) and p.is_file()), key=natural_key)
 
 
 def drop_invalid(cloud: Cloud) -> int:
-    """Remove points with NaN or infinity (organized clouds mark "no return" so) in place; how many there were."""
+    """Removes points with NaN or infinity (organized clouds mark "no return" so) in place, and returns how many there
+    were.
+    """
     valid = np.isfinite(cloud.points).all(1)
     if not valid.all():
         cloud.points = cloud.points[valid]

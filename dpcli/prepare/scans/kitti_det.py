@@ -9,17 +9,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     IMAGE_SIZE,
     View,
     calibration_matrix,
     check_coordinates,
-    oriented,
-    png_size,
+    missing_files_problem,
+    orient_points,
     read_calibration,
     read_velodyne,
-    require_files,
     training_folder,
 )
 from dpcli.store import CloudSequence
@@ -32,7 +32,9 @@ _SPLITS = {"train": "train", "val": "validation"}
 
 @dataclass(frozen=True)
 class Box:
-    """A labeled box in camera axes: ``foot`` f64 (3), the middle of its lower face; size in meters; turned about y."""
+    """Holds a labeled box in camera axes: ``foot`` f64 (3), the middle of its lower face; size in meters; turned about
+    y.
+    """
 
     kind: str
     foot: np.ndarray
@@ -42,7 +44,9 @@ class Box:
     rotation_y: float
 
     def contains(self, points: np.ndarray, margin: float = MARGIN) -> np.ndarray:
-        """bool (N) of points f64 (N,3); y points down, so the box reaches from -height to 0 above its foot."""
+        """Returns bool (N), which points f64 (N,3) it holds; y points down: the box reaches from -height to 0 above its
+        foot.
+        """
         x, y, z = (points - self.foot).T
         cosine, sine = np.cos(self.rotation_y), np.sin(self.rotation_y)
         along, across = cosine * x - sine * z, sine * x + cosine * z
@@ -51,7 +55,10 @@ class Box:
 
 
 def read_boxes(path: Path) -> list[Box]:
-    """The boxes of a label file, in its order, without DontCare regions. DataError names the line that is not one."""
+    """Reads the boxes of a label file, in its order, without DontCare regions.
+
+    DataError names the line that is not one.
+    """
     boxes = []
     for number, line in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
         words = line.split()
@@ -73,7 +80,9 @@ def read_boxes(path: Path) -> list[Box]:
 
 
 def parts_of_boxes(points: np.ndarray, boxes: list[Box]) -> np.ndarray:
-    """i16 (N): the number of the box, from 1, that holds a camera point f64 (N,3), 0 for none; of several, the last."""
+    """Returns i16 (N): the number of the box, from 1, that holds a camera point f64 (N,3), 0 for none; of several, the
+    last.
+    """
     part = np.zeros(len(points), np.int16)
     for number, box in enumerate(boxes, 1):
         part[box.contains(points)] = number
@@ -96,7 +105,7 @@ def read_lists(folder: Path) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class KittiDetection:
-    """Reader of training/{velodyne,label_2,calib,image_2}; ``objects``: the types whose boxes are parts 1, 2, ...
+    """Reads training/{velodyne,label_2,calib,image_2}; ``objects``: the types whose boxes are parts 1, 2, ...
 
     ``lists``: folder of train.txt and val.txt (the split of Chen et al. 2015, 3,712 and 3,769 scans); by default
     RAW/ImageSets. Without lists no scan has a split.
@@ -119,10 +128,12 @@ class KittiDetection:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         view = {"near": self.view.near, "far": self.view.far}
         return {"objects": list(self.objects), **view, "coordinates": self.coordinates}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder, split = training_folder(self.raw, "velodyne"), self._split()
         names = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
         if not names:
@@ -133,7 +144,7 @@ class KittiDetection:
                 name,
                 folder,
                 split=split.get(name, ""),
-                problem=require_files([folder / key / f"{name}{end}" for key, end in _FILES.items()])
+                problem=missing_files_problem([folder / key / f"{name}{end}" for key, end in _FILES.items()])
                 if name in present
                 else f"{folder / 'velodyne' / name}.bin: listed ({split[name]}), but not there",
             )
@@ -149,6 +160,7 @@ class KittiDetection:
         return found
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         scan = read_velodyne(item.path / "velodyne" / f"{item.name}.bin")
         path = item.path / "calib" / f"{item.name}.txt"
         found = read_calibration(path)
@@ -170,11 +182,12 @@ class KittiDetection:
             "scans without an object": int(not part.any()),
             "boxes without a point": len(boxes) - len(np.unique(part[part > 0])),
         }
-        cloud = oriented(points, self.coordinates)
+        cloud = orient_points(points, self.coordinates)
         sequence = CloudSequence.from_frames(item.name, [cloud], part=[part], **describe(item))
         return Sample(sequence, {what: count for what, count in notes.items() if count})
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         counts = {split: sum(item.split == split for item in items) for split in (*_SPLITS.values(), "")}
         lines = [
             f"{len(items)} scans ({counts['train']} train, {counts['validation']} validation, {counts['']} in no list)"

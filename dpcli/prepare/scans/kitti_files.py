@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode.depth_files import load_cv2
-from dpcli.prepare.decode.gray_png import decode_gray_png
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.png import decode_gray_png
 from dpcli.prepare.reader import require_folder
 
 COORDINATES = ("published", "camera")
@@ -18,18 +17,23 @@ IMAGE_SIZE = (1242, 375)  # pixels, width and height of most of KITTI's pictures
 
 
 def check_coordinates(name: str) -> None:
-    """UsageError unless it is one of COORDINATES."""
+    """Raises UsageError unless it is one of COORDINATES."""
     if name not in COORDINATES:
         raise UsageError(f"--coordinates {name}: expected {' or '.join(COORDINATES)}")
 
 
-def oriented(points: np.ndarray, coordinates: str) -> np.ndarray:
-    """Camera points (N,3) (x right, y down, z forward) as f32; ``published``: x left, y up, z forward, a half turn."""
+def orient_points(points: np.ndarray, coordinates: str) -> np.ndarray:
+    """Returns camera points (N,3) (x right, y down, z forward) as f32; ``published``: x left, y up, z forward, a half
+    turn.
+    """
     return (points * ([-1, -1, 1] if coordinates == "published" else [1, 1, 1])).astype(np.float32)
 
 
 def training_folder(raw: Path, holds: str) -> Path:
-    """``raw``/training, or ``raw`` where it is that folder itself; DataError when neither has the folder ``holds``."""
+    """Returns ``raw``/training, or ``raw`` where it is that folder.
+
+    Raises DataError when neither has the folder ``holds``.
+    """
     require_folder(raw, f"training/{holds}/ in it, as KITTI distributes it")
     for folder in (raw / "training", raw):
         if (folder / holds).is_dir():
@@ -37,15 +41,15 @@ def training_folder(raw: Path, holds: str) -> Path:
     raise DataError(f"{raw}: no training/{holds}/ in it; expected the folders of KITTI's archives, unpacked together")
 
 
-def require_files(paths: list[Path]) -> str:
-    """The problem of an item whose files are not all there; "" when they are."""
+def missing_files_problem(paths: list[Path]) -> str:
+    """Returns the problem of an item whose files are not all there; "" when they are."""
     missing = [path for path in paths if not path.is_file()]
     more = f" and {len(missing) - 1} more files of this scene" if len(missing) > 1 else ""
     return f"{missing[0]}: missing{more}" if missing else ""
 
 
 def read_calibration(path: Path) -> dict[str, np.ndarray]:
-    """``KEY: numbers`` lines -> f64 arrays; lines that hold no numbers, such as calib_time, are passed over."""
+    """Reads ``KEY: numbers`` lines as f64 arrays; lines that hold no numbers, such as calib_time, are passed over."""
     try:
         text = path.read_text("utf-8")
     except UnicodeDecodeError:
@@ -63,7 +67,9 @@ def read_calibration(path: Path) -> dict[str, np.ndarray]:
 
 
 def calibration_matrix(found: dict[str, np.ndarray], path: Path, key: str) -> np.ndarray:
-    """A 3x4 (12 numbers) or 3x3 (9 numbers) matrix of a calibration file, as f64 (4,4) filled up with the identity."""
+    """Returns a 3x4 (12 numbers) or 3x3 (9 numbers) matrix of a calibration file, as f64 (4,4) filled up with the
+    identity.
+    """
     if key not in found:
         raise DataError(f"{path}: no line '{key}:'; found {', '.join(sorted(found)) or 'no calibration at all'}")
     values = found[key]
@@ -75,7 +81,7 @@ def calibration_matrix(found: dict[str, np.ndarray], path: Path, key: str) -> np
 
 
 def read_velodyne(path: Path) -> np.ndarray:
-    """A scan f32 (N,3): x forward, y left, z up, meters. The file: float32 x y z reflectance, little-endian."""
+    """Reads a scan f32 (N,3): x forward, y left, z up, meters. The file: float32 x y z reflectance, little-endian."""
     data = path.read_bytes()
     if not data or len(data) % 16:
         raise DataError(
@@ -90,7 +96,10 @@ def read_velodyne(path: Path) -> np.ndarray:
 def read_png(
     path: Path, channels: int, size: tuple[int, int] | None = None, bits: tuple[int, ...] = (16,)
 ) -> np.ndarray:
-    """An image (H,W) or (H,W,channels) in the file's channel order. DataError unless type and ``size`` (H,W) agree."""
+    """Reads an image (H,W) or (H,W,channels) in the file's channel order.
+
+    Raises DataError unless type and ``size`` (H,W) agree.
+    """
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is None and data:
@@ -106,19 +115,11 @@ def read_png(
     return image[..., ::-1] if image.ndim == 3 else image  # OpenCV turns the channels round
 
 
-def png_size(path: Path) -> tuple[int, int]:
-    """Width and height of a PNG from its first 24 bytes; nothing is decoded."""
-    with open(path, "rb") as file:
-        head = file.read(24)
-    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n" or head[12:16] != b"IHDR":
-        raise DataError(f"{path}: not a PNG (empty, truncated, or of another kind); its size is needed for the crop")
-    return struct.unpack(">II", head[16:24])
-
-
 @dataclass(frozen=True)
 class View:
-    """What of a scan is kept: in the left color camera's picture, farther than ``near`` ahead of the scanner, nearer
-    than ``far`` from the camera (meters; x of the scanner, z of the camera)."""
+    """Says what of a scan is kept: in the left color camera's picture, farther than ``near`` ahead of the scanner,
+    nearer than ``far`` from the camera (meters; x of the scanner, z of the camera).
+    """
 
     near: float = 2.0
     far: float = 35.0
@@ -134,7 +135,9 @@ class View:
         projection: np.ndarray,  # f64 (4,4), camera to pixels
         size: tuple[int, int],  # width, height
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Points in camera axes f64 (M,3) and the indices i64 (M) of those kept: 0 <= u < width, 0 <= v < height."""
+        """Returns points in camera axes f64 (M,3) and the indices i64 (M) of those kept: 0 <= u < width, 0 <= v <
+        height.
+        """
         ahead = np.flatnonzero(scan[:, 0] > self.near)
         points = scan[ahead].astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3]
         u, v, w = (points @ projection[:3, :3].T + projection[:3, 3]).T
@@ -143,7 +146,11 @@ class View:
         return points[inside], ahead[inside]
 
 
-def compressed(ids: np.ndarray) -> np.ndarray:
-    """Object ids (N), 0 = background -> i16 (N): 0 stays, the others become 1, 2, ... in rising order."""
+def renumber_objects(ids: np.ndarray) -> np.ndarray:
+    """Renumbers object ids (N), 0 = background, as i16 (N): 0 stays, the others become 1, 2, ... in rising order.
+
+    >>> renumber_objects(np.array([0, 7, 3, 7])).tolist()
+    [0, 2, 1, 2]
+    """
     known = np.unique(ids[ids > 0])
     return np.where(ids > 0, np.searchsorted(known, ids) + 1, 0).astype(np.int16)

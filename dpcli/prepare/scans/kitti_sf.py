@@ -13,11 +13,11 @@ from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     calibration_matrix,
     check_coordinates,
-    compressed,
-    oriented,
+    missing_files_problem,
+    orient_points,
     read_calibration,
     read_png,
-    require_files,
+    renumber_objects,
     training_folder,
 )
 from dpcli.store import CloudSequence
@@ -42,7 +42,7 @@ SCENES, TRAIN_SCENES = 200, 100
 
 @dataclass
 class FlowPair:
-    """The same points in two frames, camera axes: first, second f64 (N,3) meters; pixel i64 (N,2) row, column."""
+    """Holds the same points in two frames, camera axes: first, second f64 (N,3) meters; pixel i64 (N,2) row, column."""
 
     first: np.ndarray
     second: np.ndarray
@@ -50,7 +50,8 @@ class FlowPair:
 
 
 def unproject(u: np.ndarray, v: np.ndarray, depth: np.ndarray, projection: np.ndarray) -> np.ndarray:
-    """Points f64 (N,3), x right, y down, z forward, of pixels (u, v) and depths (N) under a projection f64 (3+,4).
+    """Returns points f64 (N,3), x right, y down, z forward, of pixels (u, v) and depths (N) under a projection f64
+    (3+,4).
 
     With P = projection: u (z + P[2,3]) = P[0,0] x + P[0,2] z + P[0,3], and so for v; the same focal length both ways.
     """
@@ -66,7 +67,7 @@ def flow_pair(
     projection: np.ndarray,  # f64 (3+,4)
     far: float,
 ) -> FlowPair:
-    """Points whose disparity in both frames and flow are known and that are nearer than ``far`` in both."""
+    """Returns points whose disparity in both frames and flow are known and that are nearer than ``far`` in both."""
     depth = [projection[0, 0] * BASELINE / (one + 1e-5) for one in disparity]
     good = (disparity[0] > 0) & (disparity[1] > 0) & (flow[..., 2] == 1) & (depth[0] < far) & (depth[1] < far)
     v, u = np.nonzero(good)
@@ -77,7 +78,7 @@ def flow_pair(
 
 
 def class_numbers(names: tuple[str, ...]) -> tuple[int, ...]:
-    """Cityscapes numbers of class names; UsageError names one that is unknown."""
+    """Returns cityscapes numbers of class names; UsageError names one that is unknown."""
     unknown = [name for name in names if name not in CLASSES]
     if unknown or not names:
         raise UsageError(
@@ -89,7 +90,7 @@ def class_numbers(names: tuple[str, ...]) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class KittiSceneFlow:
-    """Reader of training/{disp_occ_0,disp_occ_1,flow_occ,instance,calib_cam_to_cam}.
+    """Reads training/{disp_occ_0,disp_occ_1,flow_occ,instance,calib_cam_to_cam}.
 
     ``objects``: the classes whose instances are parts 1, 2, ...; all else is part 0. ``labels``: which images say so.
     """
@@ -113,10 +114,12 @@ class KittiSceneFlow:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         objects = {"objects": list(self.objects)} if self.labels == "instance" else {}
         return {"labels": self.labels, **objects, "far": self.far, "coordinates": self.coordinates}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder = training_folder(self.raw, "flow_occ")
         names = sorted(path.name[:-7] for path in (folder / "flow_occ").glob("*_10.png"))
         if not names:
@@ -131,7 +134,7 @@ class KittiSceneFlow:
                 name,
                 folder,
                 split="train" if int(name) < TRAIN_SCENES else "test",
-                problem=require_files(list(self._files(folder, name).values())),
+                problem=missing_files_problem(list(self._files(folder, name).values())),
             )
             for name in names
         ]
@@ -144,6 +147,7 @@ class KittiSceneFlow:
         return {**{key: folder / key / f"{name}_10.png" for key in images}, "calibration": chosen}
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         files = self._files(item.path, item.name)
         flow = read_png(files["flow_occ"], 3)
         size = flow.shape[:2]
@@ -158,7 +162,7 @@ class KittiSceneFlow:
         if not len(pair.pixel):
             raise DataError(f"{files['flow_occ']}: no pixel has flow and both disparities nearer than {self.far} m")
         part = self._parts(files[self.labels], size, pair.pixel)
-        first, second = (oriented(points, self.coordinates) for points in (pair.first, pair.second))
+        first, second = (orient_points(points, self.coordinates) for points in (pair.first, pair.second))
         flows = [second - first, first - second]
         sequence = CloudSequence.from_frames(
             item.name, [first, second], part=[part, part], scene_flow=flows, **describe(item)
@@ -166,13 +170,14 @@ class KittiSceneFlow:
         return Sample(sequence, {} if part.any() else {"scenes without an object": 1})
 
     def _parts(self, path: Path, size: tuple[int, int], pixel: np.ndarray) -> np.ndarray:
-        """i16 (N): 0 background, then one number for each object that has points."""
+        """Returns i16 (N): 0 background, then one number for each object that has points."""
         ids = read_png(path, 1, size, bits=(8, 16))[pixel[:, 0], pixel[:, 1]].astype(np.int64)
         if self.labels == "instance":
             ids[~np.isin(ids // 256, class_numbers(self.objects))] = 0
-        return compressed(ids)
+        return renumber_objects(ids)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         good = sum(not item.problem for item in items)
         lines = [f"{good} of {len(items)} scenes have all their files ({sum(i.split == 'train' for i in items)} train)"]
         if len(items) != SCENES:

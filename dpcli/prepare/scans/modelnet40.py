@@ -64,7 +64,7 @@ _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and 
 
 
 def read_file(path: Path, *names: str) -> list[np.ndarray]:
-    """Data sets of an HDF5 file as arrays; DataError when absent, damaged, or kept in another file."""
+    """Reads data sets of an HDF5 file as arrays. Raises DataError when absent, damaged, or kept in another file."""
     try:
         with h5py.File(path, "r") as file:
             for name in names:
@@ -87,7 +87,7 @@ def _clouds(path: Path) -> np.ndarray:
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """Labels i64 (N) of a file, from 0."""
+    """Returns labels i64 (N) of a file, from 0."""
     (label,) = read_file(path, "label")
     if label.dtype.kind not in "iu" or label.size != len(label):
         raise DataError(f"{path}: label is {label.dtype} {label.shape}; expected whole numbers (shapes, 1)")
@@ -96,7 +96,7 @@ def read_labels(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ModelNet40:
-    """Reader of the folder; a sample is a sequence of one frame."""
+    """Reads the folder; a sample is a sequence of one frame."""
 
     raw: Path
     length_unit: ClassVar[str] = "unit sphere"
@@ -104,6 +104,7 @@ class ModelNet40:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         path = self.raw / "shape_names.txt"
         if not path.is_file():
             return list(CLASS_NAMES)
@@ -114,9 +115,11 @@ class ModelNet40:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return {}
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         folder = require_folder(self.raw, _EXPECTED)
         there = {path.name: path for path in folder.iterdir() if _FILE.fullmatch(path.name)}
         splits = {name: _FILE.fullmatch(name)[1] for name in there}  # type: ignore[index]
@@ -149,6 +152,7 @@ class ModelNet40:
         return [_item(f"{stem}/{row:04d}", path, homes[0], row, int(label)) for row, label in enumerate(labels)]
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         data, row = _clouds(item.path), item.extra["row"]
         if row >= len(data):
             raise DataError(f"{item.path}: data has {len(data)} shapes, label has more; expected as many")
@@ -157,6 +161,7 @@ class ModelNet40:
         return Sample(CloudSequence.from_frames(item.name, [data[row].astype(np.float32)], **describe(item)))
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         found = Counter(item.split for item in items if not item.problem)
         return [f"{split}: {found[split]} of the {count} published shapes found" for split, count in PUBLISHED.items()]
 
@@ -169,7 +174,9 @@ def _item(name: str, path: Path, split: str, row: int, label: int) -> Item:
 
 
 def _listed(path: Path) -> set[str] | None:
-    """File names of a list such as ``data/modelnet40_ply_hdf5_2048/ply_data_train0.h5``; None without the list."""
+    """Returns file names of a list such as ``data/modelnet40_ply_hdf5_2048/ply_data_train0.h5``; None without the
+    list.
+    """
     if not path.is_file():
         return None
     lines = path.read_text(errors="replace").split("\n")

@@ -16,10 +16,10 @@ from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
     check_coordinates,
-    compressed,
-    oriented,
+    orient_points,
     read_calibration,
     read_velodyne,
+    renumber_objects,
 )
 from dpcli.store import CloudSequence
 
@@ -42,7 +42,9 @@ VALIDATION = "08"
 
 
 def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Semantic class and full label, i64 (count) each; the file: uint32, class in the lower 16 bits, instance above."""
+    """Reads semantic class and full label, i64 (count) each; the file: uint32, class in the lower 16 bits, instance
+    above.
+    """
     data = path.read_bytes()
     if len(data) != 4 * count:
         raise DataError(f"{path}: {len(data)} bytes; expected {4 * count}, 4 for each of the scan's {count} points")
@@ -52,7 +54,7 @@ def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=4)
 def read_poses(path: Path) -> np.ndarray:
-    """poses.txt -> f64 (scans,4,4): camera of each scan to the camera of scan 0."""
+    """Reads poses.txt as f64 (scans,4,4): camera of each scan to the camera of scan 0."""
     try:
         rows = [[float(word) for word in line.split()] for line in path.read_text("utf-8").splitlines() if line.strip()]
     except OSError:
@@ -68,7 +70,7 @@ def read_poses(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SemanticKitti:
-    """Reader of sequences/SS/{velodyne,labels,calib.txt,poses.txt}.
+    """Reads sequences/SS/{velodyne,labels,calib.txt,poses.txt}.
 
     ``group``: which of GROUPS; ``frames`` successive scans are one sample, windows don't overlap; ``align`` moves them
     to the camera of the sample's first scan; ``objects``: the classes whose instances are parts 1, 2, ..., else 0.
@@ -97,6 +99,7 @@ class SemanticKitti:
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         own = {"group": self.group, "frames": self.frames, "align": self.align, "objects": list(self.objects)}
         return {**own, "near": self.view.near, "far": self.view.far, "coordinates": self.coordinates}
 
@@ -112,6 +115,7 @@ class SemanticKitti:
         )
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         items = []
         for sequence, folder in self._folders():
             scans = sorted(path.stem for path in (folder / "velodyne").glob("*.bin"))
@@ -136,6 +140,7 @@ class SemanticKitti:
         return ""
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         path = item.path / "calib.txt"
         if not path.is_file():
             raise DataError(f"{path}: missing; the crop to the camera's view needs it")
@@ -144,11 +149,11 @@ class SemanticKitti:
         kept = [self._scan(item.path, name, to_camera, projection) for name in item.extra["scans"]]
         motions = self._alignment(item)
         clouds = [
-            oriented(points @ m[:3, :3].T + m[:3, 3], self.coordinates)
+            orient_points(points @ m[:3, :3].T + m[:3, 3], self.coordinates)
             for (points, _), m in zip(kept, motions, strict=True)
         ]
         sizes = np.cumsum([len(ids) for _, ids in kept])[:-1]
-        part = compressed(np.concatenate([ids for _, ids in kept]))  # over all frames: an object keeps its number
+        part = renumber_objects(np.concatenate([ids for _, ids in kept]))  # over all frames: an object keeps its number
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))
@@ -157,7 +162,7 @@ class SemanticKitti:
     def _scan(
         self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Points in camera axes f64 (M,3) and object ids i64 (M), 0 = background."""
+        """Returns points in camera axes f64 (M,3) and object ids i64 (M), 0 = background."""
         scan = read_velodyne(folder / "velodyne" / f"{name}.bin")
         semantic, label = read_labels(folder / "labels" / f"{name}.label", len(scan))
         label[~np.isin(semantic, [number for kind in self.objects for number in CLASSES[kind]])] = 0
@@ -165,7 +170,9 @@ class SemanticKitti:
         return points, label[index]
 
     def _alignment(self, item: Item) -> np.ndarray:
-        """f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities without."""
+        """Returns f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities
+        without.
+        """
         numbers = [int(name) for name in item.extra["scans"]]
         if not self.align:
             return np.tile(np.eye(4), (len(numbers), 1, 1))
@@ -175,6 +182,7 @@ class SemanticKitti:
         return np.linalg.inv(poses[numbers[0]]) @ poses[numbers]
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         held = sum(len(list((folder / "velodyne").glob("*.bin"))) for _, folder in self._folders())
         found = [name for name, _ in self._folders()]
         lines = [f"{len(items)} samples of {self.frames} scans, sequences {', '.join(found)}"]

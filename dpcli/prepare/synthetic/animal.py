@@ -20,9 +20,9 @@ _CELLS = 120  # along the longest side of the grid that the skin is cut from
 
 
 def make_animal(motion: str, frames: int, cycles: float = 0.0, seed: int = 0, cells: int = _CELLS) -> AnimatedMesh:
-    """The animal of this seed over `frames` frames; cycles 0: as many as the motion has as a rule.
+    """Makes the animal of this seed over `frames` frames; cycles 0: as many as the motion has as a rule.
 
-    Unit: about the length of the body. UsageError on an unknown motion.
+    Unit: about the length of the body. Raises UsageError on an unknown motion.
     """
     if motion not in MOTIONS:
         raise UsageError(f"--motion {motion}: expected one of {', '.join(MOTIONS)}")
@@ -54,10 +54,10 @@ def make_animal(motion: str, frames: int, cycles: float = 0.0, seed: int = 0, ce
 
 
 def animal_clip(motion: str, frames: int, cycles: float, filming: Filming, jobs: int = 1) -> Clip:
-    """A Clip of the animal of `filming.seed`, as `film` makes it."""
+    """Returns a Clip of the animal of `filming.seed`, as `film` makes it."""
     return film(make_animal(motion, frames, cycles, filming.seed), filming, jobs)
 
 
 def animal_config(motion: str, frames: int, cycles: float, filming: Filming) -> dict[str, Any]:
-    """What decides the content, for the file's provenance."""
+    """Returns what decides the content, for the file's provenance."""
     return {"motion": motion, "frames": frames, "cycles": cycles, **filming.config}

@@ -1,4 +1,7 @@
-"""Made-up animals at rest: bones, the round shapes around them, and how big everything is. They look along +z, y is up."""
+"""Made-up animals at rest: bones, the round shapes around them, and how big everything is.
+
+They look along +z, y is up.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,8 @@ class Bone:
 
 @dataclass(frozen=True)
 class Shape:
-    """A cone with round ends on a bone, from a (radius ra) to b (radius rb); flat < 1 squeezes it along ``normal``.
+    """Holds a cone with round ends on a bone, from a (radius ra) to b (radius rb); flat < 1 squeezes it along
+    ``normal``.
 
     paint: which of the animal's colors it has: coat, dark, fin, horn.
     """
@@ -35,7 +39,9 @@ class Shape:
 
 @dataclass
 class Creature:
-    """bones: parents before children. eyes: (bone, center of the head, direction, radius): they sit on the surface."""
+    """Holds bones, parents before children; shapes; eyes: (bone, center of the head, direction, radius), on the
+    surface.
+    """
 
     kind: str
     bones: list[Bone] = field(default_factory=list)
@@ -44,30 +50,34 @@ class Creature:
     leg: float = 0.5  # length, hip to ground
 
     def bone(self, name: str, parent: str, pivot: object) -> int:
+        """Adds a bone and returns its index."""
         self.bones.append(Bone(name, self.index(parent) if parent else -1, np.asarray(pivot, float)))
         return len(self.bones) - 1
 
     def shape(self, bone: int, a: object, b: object, ra: float, rb: float, paint: str = "coat", **more: object) -> None:
+        """Adds a shape to a bone."""
         self.shapes.append(Shape(bone, np.asarray(a, float), np.asarray(b, float), ra, rb, paint, **more))  # type: ignore[arg-type]
 
     def index(self, name: str) -> int:
+        """Returns the index of the bone of this name."""
         return [bone.name for bone in self.bones].index(name)
 
     def limb(
         self, name: str, parent: str, points: list, radii: list[float], paint: str = "coat", **more: object
     ) -> None:
-        """A chain of bones name_0, name_1, ... through the points, radii at each."""
+        """Adds a chain of bones name_0, name_1, ... through the points, radii at each."""
         for k in range(len(points) - 1):
             index = self.bone(f"{name}_{k}", parent if k == 0 else f"{name}_{k - 1}", points[k])
             self.shape(index, points[k], points[k + 1], radii[k], radii[k + 1], paint, **more)
 
     def add_eyes(self, bone: str, center: np.ndarray, direction: tuple[float, float, float], radius: float) -> None:
+        """Adds two eyes, mirrored at the middle of the head."""
         for side in (-1, 1):
             self.eyes.append((self.index(bone), center, np.array(direction) * [side, 1, 1], radius))
 
 
 def quadruped(rng: np.random.Generator) -> Creature:
-    """A dog- to horse-like animal, about 1 from rump to chest; head, ears, tail, four legs with knees and feet."""
+    """Draws a dog- to horse-like animal, about 1 from rump to chest; head, ears, tail, four legs with knees and feet."""
     u = rng.uniform
     leg, girth, neck, rise = u(0.42, 0.62), u(0.13, 0.18), u(0.14, 0.3), u(0.5, 1.1)
     animal = Creature("quadruped", leg=leg)
@@ -111,7 +121,7 @@ def _head(animal: Creature, crown: np.ndarray, girth: float, rng: np.random.Gene
 
 
 def _leg(animal: Creature, name: str, parent: str, top: np.ndarray, girth: float, end: str) -> None:
-    """Thigh, shin and foot, down to the ground at y = 0."""
+    """Adds thigh, shin and foot, down to the ground at y = 0."""
     thick, bend = girth * (0.42 if end == "hind" else 0.36), 0.05 if end == "hind" else -0.02
     knee = np.array([top[0], 0.52 * top[1], top[2] + bend])
     ankle = np.array([top[0], 0.13 * top[1], top[2] - 0.6 * bend])
@@ -121,7 +131,7 @@ def _leg(animal: Creature, name: str, parent: str, top: np.ndarray, girth: float
 
 
 def bird(rng: np.random.Generator) -> Creature:
-    """A bird in flight, span about 1.6; wings of an inner and an outer part."""
+    """Draws a bird in flight, span about 1.6; wings of an inner and an outer part."""
     u = rng.uniform
     animal, girth, span, chord = Creature("bird"), u(0.1, 0.15), u(0.62, 0.85), u(0.13, 0.2)
     animal.bone("body", "", (0, 0, 0))
@@ -145,7 +155,7 @@ def bird(rng: np.random.Generator) -> Creature:
 
 
 def fish(rng: np.random.Generator) -> Creature:
-    """A fish about 1 long: a head, three body segments, tail, back and breast fins."""
+    """Draws a fish about 1 long: a head, three body segments, tail, back and breast fins."""
     u = rng.uniform
     animal, deep, slim = Creature("fish"), u(0.14, 0.24), u(0.5, 0.75)
     z = [0.36, 0.18, -0.02, -0.2, -0.38]

@@ -18,7 +18,7 @@ _REACH = 8 * _SMOOTH  # beyond this a shape adds nothing to the field that could
 
 @dataclass(frozen=True)
 class Skin:
-    """vertices f64 (V,3), triangles i64 (F,3), color linear RGBA f32 (V,4), bones i64 (V,4), weights f32 (V,4)."""
+    """Holds vertices f64 (V,3), triangles i64 (F,3), color linear RGBA f32 (V,4), bones i64 (V,4), weights f32 (V,4)."""
 
     vertices: np.ndarray
     triangles: np.ndarray
@@ -28,7 +28,7 @@ class Skin:
 
 
 def make_skin(animal: Creature, rng: np.random.Generator, cells: int = 120) -> Skin:
-    """The painted skin; ``cells`` along the longest side of the grid it is cut from."""
+    """Makes the painted skin; ``cells`` along the longest side of the grid it is cut from."""
     vertices, triangles = _mesh(animal, cells)
     distance = np.stack([shape_distance(vertices, shape) for shape in animal.shapes], axis=1)
     bones, weights = _bind(animal, distance / [shape.flat for shape in animal.shapes])
@@ -42,7 +42,7 @@ def make_skin(animal: Creature, rng: np.random.Generator, cells: int = 120) -> S
 
 
 def shape_distance(points: np.ndarray, shape: Shape) -> np.ndarray:
-    """About how far points (N,3) are outside a shape, negative inside; exact in sign."""
+    """Returns about how far points (N,3) are outside a shape, negative inside; exact in sign."""
     offset, axis = points - shape.a, shape.b - shape.a
     if shape.flat < 1:
         normal = np.array(shape.normal) / np.linalg.norm(shape.normal)
@@ -53,8 +53,8 @@ def shape_distance(points: np.ndarray, shape: Shape) -> np.ndarray:
     return gap * shape.flat
 
 
-def field(points: np.ndarray, shapes: list[Shape]) -> np.ndarray:
-    """The smooth union of shapes, -k log sum exp(-d / k); negative inside."""
+def smooth_union(points: np.ndarray, shapes: list[Shape]) -> np.ndarray:
+    """Returns the smooth union of shapes, -k log sum exp(-d / k); negative inside."""
     total = sum(np.exp(-np.maximum(shape_distance(points, shape), -0.3) / _SMOOTH) for shape in shapes)
     return -_SMOOTH * np.log(np.maximum(total, 1e-300))
 
@@ -78,7 +78,7 @@ def _mesh(animal: Creature, cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bind(animal: Creature, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Each vertex hangs on the bone of the nearest shape, near a joint also on that bone's parent and children."""
+    """Hangs each vertex on the bone of the nearest shape, near a joint also on that bone's parent and children."""
     owner = np.array([shape.bone for shape in animal.shapes])
     per_bone = np.stack(
         [distance[:, owner == index].min(1, initial=np.inf) for index in range(len(animal.bones))], axis=1
@@ -96,7 +96,9 @@ def _bind(animal: Creature, distance: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _paint(animal: Creature, vertices: np.ndarray, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Linear RGBA f32 (V,4): a coat with a pale belly and spots, stripes or patches; dark feet, colored fins, horn."""
+    """Paints linear RGBA f32 (V,4): a coat with a pale belly and spots, stripes or patches; dark feet, colored fins,
+    horn.
+    """
     hue = rng.uniform(0.03, 0.12) if animal.kind == "quadruped" else rng.uniform(0, 1)
     coat = np.array(colorsys.hsv_to_rgb(hue, rng.uniform(0.45, 0.75), rng.uniform(0.6, 0.85)))
     mark = coat * rng.uniform(0.25, 0.45) if rng.random() < 0.6 else 0.3 * coat + 0.68
@@ -115,7 +117,7 @@ def _paint(animal: Creature, vertices: np.ndarray, distance: np.ndarray, rng: np
 
 
 def _pattern(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """How much of the marking's color each vertex has, 0..1."""
+    """Returns how much of the marking's color each vertex has, 0..1."""
     kind, scale = rng.choice(["spots", "stripes", "patches"]), rng.uniform(0.8, 1.25)
     waves, phases = rng.normal(size=(24, 3)), rng.uniform(0, 2 * np.pi, 24)
     noise = np.sin((22 if kind == "spots" else 8) * scale * vertices @ waves.T + phases).sum(1) / np.sqrt(12)
@@ -125,10 +127,10 @@ def _pattern(vertices: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _eye(animal: Creature, bone: int, center: np.ndarray, direction: np.ndarray, radius: float) -> Skin:
-    """A dark ball with a glint, half sunk into the head where the direction leaves it."""
+    """Returns a dark ball with a glint, half sunk into the head where the direction leaves it."""
     direction = direction / np.linalg.norm(direction)
     along = np.linspace(0, 0.3, 301)
-    inside = field(center + along[:, None] * direction, animal.shapes) < 0
+    inside = smooth_union(center + along[:, None] * direction, animal.shapes) < 0
     place = center + (along[int(np.argmin(inside))] - 0.3 * radius) * direction
     side = np.stack(np.meshgrid(*[np.linspace(-1.3, 1.3, 14)] * 3, indexing="ij"), axis=-1)
     unit, triangles = surface_nets(np.linalg.norm(side, axis=-1) - 1)

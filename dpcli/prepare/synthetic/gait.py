@@ -1,4 +1,4 @@
-"""How made-up animals move: every bone's turn over time, as sums of few sines, so that a clip loops."""
+"""The gaits of made-up animals: every bone turns over time by a sum of few sines, so that a clip loops."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ X, Y, Z = np.eye(3)
 
 @dataclass(frozen=True)
 class Motion:
-    """kind: of the animal. cycles: as a rule in one clip. period: seconds of a cycle."""
+    """Describes a motion. kind: of the animal. cycles: as a rule in one clip. period: seconds of a cycle."""
 
     kind: str
     cycles: float
@@ -64,7 +64,7 @@ def _step(animal: Creature, w: np.ndarray, gait: str) -> tuple[Turns, np.ndarray
 
 
 def _even(w: np.ndarray, edge: float = 0.96) -> np.ndarray:
-    """A rounded zigzag of height 1: a leg on the ground swings back evenly, as the body passes over it."""
+    """Returns a rounded zigzag of height 1: a leg on the ground swings back evenly, as the body passes over it."""
     return np.arcsin(edge * np.sin(w)) / np.arcsin(edge)
 
 
@@ -104,7 +104,7 @@ def _swim(w: np.ndarray) -> tuple[Turns, np.ndarray]:
 
 
 def bone_motion(animal: Creature, turns: Turns, travel: np.ndarray) -> np.ndarray:
-    """Rest pose to frame f64 (T,B,4,4): each bone turns about its pivot, then moves with its parent."""
+    """Returns rest pose to frame f64 (T,B,4,4): each bone turns about its pivot, then moves with its parent."""
     frames = len(travel)
     motion = np.tile(np.eye(4), (frames, len(animal.bones), 1, 1))
     for index, bone in enumerate(animal.bones):
@@ -121,7 +121,7 @@ def bone_motion(animal: Creature, turns: Turns, travel: np.ndarray) -> np.ndarra
 
 
 def rotations(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Rotation matrices f64 (T,3,3) about a unit axis by angles (T), radians (Rodrigues)."""
+    """Returns rotation matrices f64 (T,3,3) about a unit axis by angles (T), radians (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]

@@ -37,7 +37,7 @@ _FIELD_OF_VIEW = 57.0  # degrees, horizontal: Kinect v1
 
 
 def wrist_path(movement: int, s: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
-    """Where the wrists are at phase s (T) of 0..1 -> right, left f64 (T,3) from their shoulders, in arm lengths.
+    """Returns where the wrists are at phase s (T) of 0..1: right, left f64 (T,3) from their shoulders, in arm lengths.
 
     movement: index of a pair of classes. None for a left wrist that rests. Size, height and direction vary with rng.
     """
@@ -60,7 +60,7 @@ def wrist_path(movement: int, s: np.ndarray, rng: np.random.Generator) -> tuple[
 
 
 def _direction(azimuth: np.ndarray | float, elevation: np.ndarray | float) -> np.ndarray:
-    """Unit vectors (T,3); azimuth from straight ahead toward the right, elevation from the horizon, radians."""
+    """Returns unit vectors (T,3); azimuth from straight ahead toward the right, elevation from the horizon, radians."""
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     return np.stack(
         [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)], axis=-1
@@ -69,7 +69,7 @@ def _direction(azimuth: np.ndarray | float, elevation: np.ndarray | float) -> np
 
 @dataclass(frozen=True)
 class _Subject:
-    """What stays the same in all videos of a person."""
+    """Holds what stays the same in all videos of a person."""
 
     figure: Figure
     pause: float  # longest rest before and after the movement, as a fraction of the video
@@ -79,7 +79,7 @@ class _Subject:
 
 
 def draw_subject(seed: int, subject: int) -> _Subject:
-    """The person of this number; the same in every video and every run with the seed."""
+    """Draws the person of this number; the same in every video and every run with the seed."""
     rng = generator(seed, PrepareStream.MADE, subject)
     figure = Figure(rng.uniform(1.5, 1.95), rng.uniform(0.85, 1.2), rng.uniform(0.31, 0.35), rng.uniform(0.095, 0.115))
     return _Subject(
@@ -88,7 +88,7 @@ def draw_subject(seed: int, subject: int) -> _Subject:
 
 
 def time_warp(frames: int, pause: float, rng: np.random.Generator) -> np.ndarray:
-    """Phase f64 (T) from 0 to 1: a rest, a smooth movement, a rest. Its law is the same when played backwards."""
+    """Returns phase f64 (T) from 0 to 1: a rest, a smooth movement, a rest. Its law is the same when played backwards."""
     before, after = rng.uniform(0, pause, 2)
     t = (np.linspace(0, 1, frames) - before) / (1 - before - after)
     t = np.clip(t, 0, 1)
@@ -97,7 +97,7 @@ def time_warp(frames: int, pause: float, rng: np.random.Generator) -> np.ndarray
 
 @dataclass(frozen=True)
 class SyntheticGestures:
-    """Options of the generator. ``size``: image width in pixels (the height is 3/4 of it)."""
+    """Makes gestures. ``size``: image width in pixels (the height is 3/4 of it)."""
 
     videos_per_class: int = 20
     frames: int = 24
@@ -116,18 +116,21 @@ class SyntheticGestures:
 
     @property
     def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
         return list(CLASS_NAMES)
 
     @property
     def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
         return asdict(self)
 
     @property
     def train_subjects(self) -> int:
-        """Subjects 1 to this train, the others test: six of ten."""
+        """Returns how many subjects, from 1 on, train; the others test: six of ten."""
         return max(1, min(self.subjects - 1, round(0.6 * self.subjects)))
 
     def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         return [
             self._item(label, 1 + number % self.subjects, number)
             for number in range(self.videos_per_class)
@@ -140,6 +143,7 @@ class SyntheticGestures:
         return Item(name, Path(name), split=split, label=label, subject=subject)
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
         subject = draw_subject(self.seed, item.subject)
         starts, ends = self._animate(subject, item.label, rng)
         height, width = self.size * 3 // 4, self.size
@@ -166,7 +170,7 @@ class SyntheticGestures:
         return Sample(sequence, notes)
 
     def _animate(self, subject: _Subject, label: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Axes of all capsules in camera axes, f64 (T,parts,3) each."""
+        """Returns axes of all capsules in camera axes, f64 (T,parts,3) each."""
         figure, phase = subject.figure, time_warp(self.frames, subject.pause, rng)
         right, left = wrist_path(label // 2, 1 - phase if label % 2 else phase, rng)
         if left is None:
@@ -179,12 +183,14 @@ class SyntheticGestures:
         return to_camera(starts, yaw, place), to_camera(ends, yaw, place)
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         split = f"subjects 1-{self.train_subjects} train, the others test"
         return [f"{len(items)} videos of {len(CLASS_NAMES)} gestures; {split}"]
 
 
 def to_camera(points: np.ndarray, yaw: float, place: np.ndarray) -> np.ndarray:
-    """Body axes (...,3) -> camera axes (OpenCV): the figure faces the camera, turned by ``yaw`` about the upright.
+    """Turns body axes (...,3) into camera axes (OpenCV): the figure faces the camera, turned by ``yaw`` about the
+    upright.
 
     place: (sideways shift, height of the camera above the floor, distance), meters.
     """

@@ -28,7 +28,7 @@ PARTS = (
 
 @dataclass(frozen=True)
 class Figure:
-    """Lengths in meters; ``girth`` scales all radii."""
+    """Holds lengths in meters; ``girth`` scales all radii."""
 
     height: float = 1.75
     girth: float = 1.0
@@ -37,17 +37,17 @@ class Figure:
 
     @property
     def reach(self) -> float:
-        """Shoulder to wrist, meters."""
+        """Returns the distance from shoulder to wrist, meters."""
         return self.arm * self.height
 
     def shoulders(self) -> tuple[np.ndarray, np.ndarray]:
-        """Right and left shoulder (3), meters."""
+        """Returns right and left shoulder (3), meters."""
         x, y = self.shoulder * self.height, 0.81 * self.height
         return np.array([x, y, 0.0]), np.array([-x, y, 0.0])
 
     @property
     def radii(self) -> np.ndarray:
-        """Capsule radius of every part, f64 (parts), meters."""
+        """Returns the capsule radius of every part, f64 (parts), meters."""
         relative = [0.075, 0.07, 0.055, 0.028, 0.024, 0.026, 0.028, 0.024, 0.026, 0.045, 0.034, 0.045, 0.034]
         return self.girth * self.height * np.array(relative)
 
@@ -55,7 +55,8 @@ class Figure:
 def bend_elbow(
     shoulder: np.ndarray, wrist: np.ndarray, upper: float, fore: float, pole: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Two-bone inverse kinematics: shoulder (3), wanted wrist (T,3), bone lengths, pole (3) -> elbow, wrist (T,3).
+    """Solves two-bone inverse kinematics: shoulder (3), wanted wrist (T,3), bone lengths, pole (3) -> elbow, wrist
+    (T,3).
 
     The elbow bends toward ``pole``. A wrist out of reach is moved onto the nearest reachable sphere.
     """
@@ -71,7 +72,7 @@ def bend_elbow(
 
 
 def capsules(figure: Figure, right_wrist: np.ndarray, left_wrist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both ends of every part's axis, in body axes: wrists (T,3) -> starts, ends f64 (T,parts,3)."""
+    """Returns both ends of every part's axis, in body axes: wrists (T,3) -> starts, ends f64 (T,parts,3)."""
     h, still = figure.height, np.zeros_like(right_wrist)
     fixed = {name: still + np.array(at) * h for name, at in _TRUNK.items()}
     starts, ends = np.zeros((2, len(right_wrist), len(PARTS), 3))

@@ -9,7 +9,8 @@ _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(_CORNERS[a
 
 
 def surface_nets(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The zero surface of a field (X,Y,Z), negative inside: vertices f64 (V,3) in grid units, triangles i64 (F,3).
+    """Returns the zero surface of a field (X,Y,Z), negative inside: vertices f64 (V,3) in grid units, triangles i64
+    (F,3).
 
     One vertex in each cell that the surface crosses, at the mean of its crossings; corners run anticlockwise seen from
     outside. The surface is closed when the field is positive on all sides of the grid.
@@ -25,7 +26,7 @@ def surface_nets(field: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _offsets(field: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """Mean of the crossings of a cell's twelve edges, (V,3) in 0..1."""
+    """Returns the mean of the crossings of a cell's twelve edges, (V,3) in 0..1."""
     values = np.stack([field[tuple((where + c).T)] for c in _CORNERS], axis=1).astype(np.float64)
     total, crossings = np.zeros((len(where), 3)), np.zeros((len(where), 1))
     for a, b in _EDGES:
@@ -38,7 +39,7 @@ def _offsets(field: np.ndarray, where: np.ndarray) -> np.ndarray:
 
 
 def _faces(inside: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Every grid edge that crosses the surface makes a quad of the four cells around it."""
+    """Makes of every grid edge that crosses the surface a quad of the four cells around it."""
     triangles = []
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3

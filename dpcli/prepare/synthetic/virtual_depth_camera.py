@@ -10,7 +10,7 @@ from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
 def render(
     starts: np.ndarray, ends: np.ndarray, radii: np.ndarray, intrinsics: Intrinsics, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """One frame: capsules with axes starts-ends f64 (K,3) and radii (K), in camera axes, meters.
+    """Renders one frame: capsules with axes starts-ends f64 (K,3) and radii (K), in camera axes, meters.
 
     -> depth f32 (H,W), inf where nothing is seen; part i16 (H,W), -1 there.
     """
@@ -28,7 +28,8 @@ def render(
 
 
 def intersect(rays: np.ndarray, a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
-    """Depth of the first hit of rays (...,3) of unit z from the origin with a capsule; f32 (...), inf = no hit.
+    """Returns the depth of the first hit of rays (...,3) of unit z from the origin with a capsule; f32 (...), inf = no
+    hit.
 
     A ray meets the capsule where it enters the cylinder around a-b between both ends, or else the sphere at the
     nearer end. With unit z the ray parameter is the depth. The origin must lie outside the capsule.
@@ -60,7 +61,9 @@ def intersect(rays: np.ndarray, a: np.ndarray, b: np.ndarray, radius: float) -> 
 def bounding_box(
     a: np.ndarray, b: np.ndarray, radius: float, k: Intrinsics, height: int, width: int
 ) -> tuple[slice, slice]:
-    """Rows and columns of the image that a capsule can touch (conservative); the whole image when it is very near."""
+    """Returns rows and columns of the image that a capsule can touch (conservative); the whole image when it is very
+    near.
+    """
     low, high = np.minimum(a, b) - radius, np.maximum(a, b) + radius
     if low[2] <= 1e-3:
         return slice(0, height), slice(0, width)
@@ -73,7 +76,7 @@ def bounding_box(
 
 
 def add_noise(depth: np.ndarray, rng: np.random.Generator, strength: float, missing: float) -> np.ndarray:
-    """Sensor noise on depth f32 (P) in meters; non-positive values mean a lost pixel.
+    """Adds sensor noise to depth f32 (P) in meters; non-positive values mean a lost pixel.
 
     Axial noise grows with distance as measured on a Kinect (Nguyen et al. 2012: 1.2 mm + 1.9 mm (z - 0.4 m)^2),
     times ``strength``; a fraction ``missing`` of the pixels is lost.

@@ -23,10 +23,10 @@ from dpcli.prepare.views.artemis_files import (
     read_poses,
     read_skin,
 )
-from dpcli.prepare.views.matting import clean, read_mask
+from dpcli.prepare.views.matting import clear_invisible, read_mask
 from dpcli.prepare.views.orbit_world import bounding_sphere, into_orbit, sphere_of_silhouettes, up_direction
 from dpcli.prepare.views.square_crop import Box, crop_around, touches_border, union, visible_box
-from dpcli.prepare.views.video import spread
+from dpcli.prepare.views.video import spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import PrepareStream, generator
@@ -36,9 +36,12 @@ TEST_AZIMUTHS = (15.0, -75.0, 105.0, 195.0)  # of the usual video-to-4D benchmar
 _INSIDE = 0.7  # of the true tracks have to fall on the object; else cameras and bones disagree
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ArtemisOptions:
-    """What is taken of an animal. Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number."""
+    """Says what is taken of an animal.
+
+    Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number.
+    """
 
     motion: str
     frames: int = 32
@@ -53,7 +56,7 @@ class ArtemisOptions:
     seed: int = 0
 
     def check(self) -> None:
-        """UsageError on values that make no sense."""
+        """Raises UsageError on values that make no sense."""
         if not 0 <= self.border <= 0.9:
             raise UsageError(f"--border {self.border:g}: expected 0 to 0.9")
         if not 0 < self.fps < 10_000:
@@ -64,14 +67,14 @@ class ArtemisOptions:
 
 @dataclass(frozen=True)
 class _Rig:
-    """All cameras of the folder in its own world: intrinsics f64 (V,3,3), poses world_to_camera f64 (V,4,4)."""
+    """Holds all cameras of the folder in its own world: intrinsics f64 (V,3,3), poses world_to_camera f64 (V,4,4)."""
 
     intrinsics: np.ndarray
     poses: np.ndarray
 
 
 def artemis_config(animal: Path, options: ArtemisOptions) -> dict[str, Any]:
-    """Options and a digest of the cameras and bones, for provenance (the pictures are too many to read twice)."""
+    """Returns options and a digest of cameras and bones, for provenance (the pictures are too many to read twice)."""
     options.check()
     motion = find_motion(animal, options.motion)
     small = [animal / "CamPose.inf", animal / "Intrinsic.inf"]
@@ -85,7 +88,7 @@ def artemis_config(animal: Path, options: ArtemisOptions) -> dict[str, Any]:
 
 
 def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
-    """One motion as views: the reference camera first, then test cameras, then further training cameras.
+    """Reads one motion as views: the reference camera first, then test cameras, then further training cameras.
 
     The world is turned (the ring's axis becomes y, the reference camera azimuth 0), shifted and scaled so that the
     object's bounding sphere over all frames has radius 0.75 around the origin: from the skinned voxels where the
@@ -98,7 +101,7 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
         log.warn(
             f"{animal}: {len(motion.folders)} of the {declared} frames of {motion.name} are there; is the copy whole?"
         )
-    frames = [list(motion.folders)[row] for row in spread(len(motion.folders), options.frames)]
+    frames = [list(motion.folders)[row] for row in spread_frames(len(motion.folders), options.frames)]
     reference = _pick_reference(motion, frames[0], rig, options.reference)
     skin = _sampled_skin(animal, options) if options.tracks and has_skin(animal) else None
     track = None if skin is None else _tracks(animal, motion, frames, skin)
@@ -110,7 +113,7 @@ def artemis_clip(animal: Path, options: ArtemisOptions) -> Clip:
     test = _choose(motion, frames[0], poses, reference, options)
     roles = ["reference", *["test"] * len(test), *["train"] * len(options.train_cameras)]
     views = [reference, *test, *options.train_cameras]
-    frames, boxes = _survey(motion, frames, views, options.on_error)
+    frames, boxes = _plan_clip(motion, frames, views, options.on_error)
     crops = [crop_around(box, options.border) for box in boxes]
     if track is not None:
         track = _tracks(animal, motion, frames, skin)
@@ -144,7 +147,7 @@ def _read_rig(animal: Path) -> _Rig:
 
 
 def _present(motion: Motion, frame: int, count: int) -> list[int]:
-    """Cameras that have a picture of this frame."""
+    """Returns cameras that have a picture of this frame."""
     found = []
     for camera in range(count):
         try:
@@ -169,7 +172,10 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 
 def _choose(motion: Motion, frame: int, poses: np.ndarray, reference: int, options: ArtemisOptions) -> list[int]:
-    """The test cameras; the log says which and where they stand. UsageError on cameras that aren't there."""
+    """Returns the test cameras; the log says which and where they stand.
+
+    Raises UsageError on cameras that aren't there.
+    """
     present = [camera for camera in _present(motion, frame, len(poses)) if camera != reference]
     azimuth = {camera: np.rad2deg(orbit_of(poses[camera])[0]) for camera in (*present, reference)}
     for option, wanted in (("--cameras", options.cameras), ("--train-cameras", options.train_cameras)):
@@ -188,7 +194,9 @@ def _choose(motion: Motion, frame: int, poses: np.ndarray, reference: int, optio
 
 
 def nearest_azimuths(azimuth: dict[int, float], wanted: Sequence[float] = TEST_AZIMUTHS) -> list[int]:
-    """For each wanted azimuth (degrees) in turn the nearest camera that is still free; the lower number of equals."""
+    """Returns for each wanted azimuth (degrees) in turn the nearest camera that is still free; the lower number of
+    equals.
+    """
     free = dict(sorted(azimuth.items()))
     chosen = []
     for angle in wanted:
@@ -200,7 +208,7 @@ def nearest_azimuths(azimuth: dict[int, float], wanted: Sequence[float] = TEST_A
 
 
 def _sampled_skin(animal: Path, options: ArtemisOptions) -> Skin:
-    """At most --tracks voxels of the outer shell, drawn without repeats, in the file's order."""
+    """Draws at most --tracks voxels of the outer shell, without repeats, in the file's order."""
     bones = len(read_poses(animal / "bones" / "Bones_0000.inf"))
     skin = read_skin(animal, bones)
     shell = outer_shell(skin.points)
@@ -210,7 +218,7 @@ def _sampled_skin(animal: Path, options: ArtemisOptions) -> Skin:
 
 
 def _tracks(animal: Path, motion: Motion, frames: list[int], skin: Skin) -> np.ndarray:
-    """f64 (T,M,3) in the folder's own world."""
+    """Returns the tracks f64 (T,M,3) in the folder's own world."""
     rest = read_poses(animal / "bones" / "Bones_0000.inf")
     places = []
     for frame in frames:
@@ -223,7 +231,7 @@ def _tracks(animal: Path, motion: Motion, frames: list[int], skin: Skin) -> np.n
 
 
 def _sphere(motion: Motion, frame: int, rig: _Rig) -> tuple[np.ndarray, float]:
-    """Center and radius of the object from the silhouettes of all cameras at one frame."""
+    """Returns center and radius of the object from the silhouettes of all cameras at one frame."""
     cameras, boxes = [], []
     for camera in _present(motion, frame, len(rig.poses)):
         box = visible_box(_alpha(motion, frame, camera))
@@ -236,7 +244,7 @@ def _sphere(motion: Motion, frame: int, rig: _Rig) -> tuple[np.ndarray, float]:
 
 
 def _alpha(motion: Motion, frame: int, camera: int) -> np.ndarray:
-    """u8 (H,W,4) with alpha only, for boxes."""
+    """Returns u8 (H,W,4) with alpha only, for boxes."""
     alpha = read_mask(motion.alpha(frame, camera))
     return np.dstack([np.zeros((*alpha.shape, 3), np.uint8), alpha])
 
@@ -246,11 +254,11 @@ def _picture(motion: Motion, frame: int, camera: int) -> np.ndarray:
     if color.shape[:2] != alpha.shape:
         here, there = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, color.shape))
         raise DataError(f"{motion.alpha(frame, camera)}: {here}, its picture is {there}; expected the same size")
-    return clean(np.dstack([color[..., :3], alpha]))
+    return clear_invisible(np.dstack([color[..., :3], alpha]))
 
 
-def _survey(motion: Motion, frames: list[int], views: list[int], on_error: str) -> tuple[list[int], list[Box]]:
-    """Frames that are whole in all chosen cameras, and the object's box over them in each."""
+def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: str) -> tuple[list[int], list[Box]]:
+    """Returns frames that are whole in all chosen cameras, and the object's box over them in each."""
     good, boxes, cut_off = [], [], []
     for frame in frames:
         try:
@@ -280,7 +288,9 @@ def _survey(motion: Motion, frames: list[int], views: list[int], on_error: str) 
 
 
 def _check_tracks(motion: Motion, frame: int, view: int, rig: _Rig, points: np.ndarray) -> None:
-    """Warn when the skinned voxels do not project into the silhouette: then cameras or bones are of another convention."""
+    """Warn when the skinned voxels do not project into the silhouette: then cameras or bones are of another
+    convention.
+    """
     alpha = _alpha(motion, frame, view)[..., 3]
     seen = points @ rig.poses[view][:3, :3].T + rig.poses[view][:3, 3]
     pixel = seen @ rig.intrinsics[view].T

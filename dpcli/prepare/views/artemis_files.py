@@ -17,13 +17,13 @@ _ALPHA = "img_{:04d}_alpha.png"
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the pictures of one motion lie: `folders` by the number of the frame, rising."""
+    """Holds where the pictures of one motion lie: `folders` by the number of the frame, rising."""
 
     name: str
     folders: dict[int, Path]
 
     def image(self, frame: int, camera: int) -> Path:
-        """The color picture; DataError when it is missing."""
+        """Returns the path of the color picture. Raises DataError when it is missing."""
         for pattern in _IMAGE:
             path = self.folders[frame] / pattern.format(camera)
             if path.is_file():
@@ -33,7 +33,7 @@ class Motion:
         )
 
     def alpha(self, frame: int, camera: int) -> Path:
-        """The mask beside it; DataError when it is missing."""
+        """Returns the path of the mask beside it. Raises DataError when it is missing."""
         path = self.folders[frame] / _ALPHA.format(camera)
         if not path.is_file():
             raise DataError(f"{path}: missing; frame {frame} lacks the alpha of camera {camera}")
@@ -41,7 +41,7 @@ class Motion:
 
 
 def find_motion(animal: Path, name: str) -> Motion:
-    """The frames of a motion. UsageError that lists the motions when `name` is none of them."""
+    """Finds the frames of a motion. Raises UsageError that lists the motions when `name` is none of them."""
     images = require_folder(require_folder(animal, "img/, bones/, CamPose.inf, Intrinsic.inf") / "img", "MOTION/FRAME/")
     folder = images / name
     if not name or not folder.is_dir():
@@ -56,7 +56,7 @@ def find_motion(animal: Path, name: str) -> Motion:
 
 
 def declared_frames(animal: Path) -> dict[str, int]:
-    """Frames of each motion as the file `sequences` says; empty without one."""
+    """Returns frames of each motion as the file `sequences` says; empty without one."""
     for name in ("sequences", "sequences.txt"):
         if (animal / name).is_file():
             words = (line.split() for line in (animal / name).read_text(encoding="utf-8").splitlines())
@@ -65,9 +65,9 @@ def declared_frames(animal: Path) -> dict[str, int]:
 
 
 def read_poses(path: Path) -> np.ndarray:
-    """Rigid poses f64 (N,4,4), camera-to-world or bone-to-world, of a file with 12 numbers a row.
+    """Reads rigid poses f64 (N,4,4), camera-to-world or bone-to-world, of a file with 12 numbers a row.
 
-    A row holds the 3rd, 1st, 2nd and 4th column of [R T], in this order. DataError when a row is no rotation.
+    A row holds the 3rd, 1st, 2nd and 4th column of [R T], in this order. Raises DataError when a row is no rotation.
     """
     rows = _numbers(path)
     if rows.ndim != 2 or rows.shape[1] != 12 or not np.isfinite(rows).all():
@@ -87,7 +87,7 @@ def read_poses(path: Path) -> np.ndarray:
 
 
 def read_intrinsics(path: Path) -> np.ndarray:
-    """f64 (V,3,3) of a file that holds, per camera, a line with its number and three rows of K."""
+    """Reads f64 (V,3,3) of a file that holds, per camera, a line with its number and three rows of K."""
     words = _text(path).split()
     if len(words) == 0 or len(words) % 10:
         raise DataError(f"{path}: {len(words)} numbers; expected 10 per camera: its number and K, row by row")
@@ -124,14 +124,18 @@ def _text(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Skin:
-    """Voxels of the rest pose and how bones carry them: points f64 (N,3), bone i64 (N,W), weight f64 (N,W), rows sum to 1."""
+    """Holds voxels of the rest pose and how bones carry them: points f64 (N,3), bone i64 (N,W), weight f64 (N,W), rows
+    sum to 1.
+    """
 
     points: np.ndarray
     bone: np.ndarray
     weight: np.ndarray
 
     def at(self, bones: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        """x_t = sum_w weight (Bones_t Bones_rest^-1) x, linear blend skinning; bones, rest f64 (B,4,4) -> f64 (N,3)."""
+        """Computes x_t = sum_w weight (Bones_t Bones_rest^-1) x, linear blend skinning; bones, rest f64 (B,4,4) -> f64
+        (N,3).
+        """
         moves = bones @ np.linalg.inv(rest)
         whole = np.concatenate([self.points, np.ones((len(self.points), 1))], axis=1)
         moved = np.einsum("nwij,nj->nwi", moves[self.bone][:, :, :3], whole)
@@ -139,19 +143,21 @@ class Skin:
 
     @property
     def heaviest(self) -> np.ndarray:
-        """The bone with the largest weight i64 (N); the first of equals."""
+        """Returns the bone with the largest weight i64 (N); the first of equals."""
         return self.bone[np.arange(len(self.bone)), self.weight.argmax(axis=1)]
 
     def choose(self, rows: np.ndarray) -> Skin:
+        """Returns the voxels of these indices alone."""
         return Skin(self.points[rows], self.bone[rows], self.weight[rows])
 
 
 def has_skin(animal: Path) -> bool:
+    """Tells whether the folder holds skinned voxels."""
     return (animal / "volumes" / "coords_init.pth").is_file() and (animal / "bones").is_dir()
 
 
 def read_skin(animal: Path, bones: int) -> Skin:
-    """The voxels under volumes/; tensors only, nothing is unpickled. DataError when shapes disagree."""
+    """Reads the voxels under volumes/; tensors only, nothing is unpickled. Raises DataError when shapes disagree."""
     folder = animal / "volumes"
     names = {"points": "coords_init.pth", "bone": "volume_indices.pth", "weight": "volume_weights.pth"}
     points, bone, weight = (_tensor(folder / name) for name in names.values())
@@ -189,7 +195,9 @@ def _tensor(path: Path) -> np.ndarray:
 
 
 def outer_shell(points: np.ndarray) -> np.ndarray:
-    """Rows i64 of the voxels (N,3) that lack one of their six neighbors; all when they are on no regular grid."""
+    """Returns the rows i64 of the voxels (N,3) that lack one of their six neighbors; all when they are on no regular
+    grid.
+    """
     step = np.inf
     for axis in range(3):
         gaps = np.diff(np.unique(np.round(points[:, axis], 6)))

@@ -21,7 +21,7 @@ _EXAMPLE = '[{"azimuth": 30, "elevation": 20}, ...] in degrees (also radius, fov
 
 @dataclass(frozen=True)
 class OrbitCamera:
-    """A camera that looks at the object: angles in radians, radius in world units; role train or test."""
+    """Looks at the object from angles in radians and a radius in world units; role train or test."""
 
     azimuth: float
     elevation: float
@@ -31,13 +31,15 @@ class OrbitCamera:
 
 
 def six_views(radius: float = DEFAULT_RADIUS, fovy: float = DEFAULT_FOVY) -> list[OrbitCamera]:
-    """What Zero123++ (v1.1) draws and STAG4D stores: azimuths 30, 90, ..., 330; elevations +30 and -20 in turn."""
+    """Returns the cameras of what Zero123++ (v1.1) draws: azimuths 30, 90, ..., 330; elevations +30 and -20 in turn."""
     angles = np.deg2rad([(30 + 60 * view, -20 if view % 2 else 30) for view in range(6)])
     return [OrbitCamera(float(azimuth), float(elevation), radius, fovy) for azimuth, elevation in angles]
 
 
 def read_cameras(path: Path, radius: float = DEFAULT_RADIUS, fovy: float = DEFAULT_FOVY) -> list[OrbitCamera]:
-    """Cameras of a JSON list of objects, angles in degrees; radius and fovy (radians) fill in what an entry lacks."""
+    """Reads cameras of a JSON list of objects, angles in degrees; radius and fovy (radians) fill in what an entry
+    lacks.
+    """
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -65,7 +67,7 @@ def _camera(path: Path, number: int, entry: Any, radius: float, fovy: float) -> 
 
 
 def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequence[int], total: int) -> list[list[Path]]:
-    """Paths [view][frame] of the pictures that belong to the frames `numbers` (out of `total` of the clip).
+    """Finds the paths [view][frame] of the pictures of the frames `numbers` (out of `total` of the clip).
 
     Layouts: FOLDER/FRAME/VIEW.png (STAG4D) or FOLDER/VIEW/FRAME.png. cameras None: six views of STAG4D.
     """
@@ -96,7 +98,9 @@ def find_views(folder: Path, cameras: list[OrbitCamera] | None, numbers: Sequenc
 
 
 def _matching(where: Path, have: list[int], numbers: Sequence[int], total: int) -> list[int]:
-    """Positions of the frames `numbers` among `have`: by number, or in order where both sides count all `total` frames."""
+    """Returns positions of the frames `numbers` among `have`: by number, or in order where both sides count all `total`
+    frames.
+    """
     place = {number: row for row, number in enumerate(have)}
     missing = [number for number in numbers if number not in place]
     if not missing:

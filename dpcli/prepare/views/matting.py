@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.decode.depth_files import load_cv2
+from dpcli.prepare.decode.cv2_import import load_cv2
 
 TOLERANCE = 0.06  # of the value range: compression noise of a video stays below
 FAINT = 8  # alpha below is a leftover of compression or of a network, not the object
@@ -22,7 +22,7 @@ _SPECK = 1e-4  # of the picture: smaller islands are noise
 
 
 def border_pixels(rgb: np.ndarray) -> np.ndarray:
-    """u8 (H,W,3) -> u8 (B,3): the outermost 2 % of rows and columns, at least one, thinned to about 4,000."""
+    """Returns the outermost 2 % of rows and columns of u8 (H,W,3), at least one, thinned to about 4,000: u8 (B,3)."""
     ring = max(1, min(rgb.shape[:2]) // 50)
     sides = (rgb[:ring], rgb[-ring:], rgb[ring:-ring, :ring], rgb[ring:-ring, -ring:])
     pixels = np.concatenate([side.reshape(-1, 3) for side in sides])
@@ -30,13 +30,21 @@ def border_pixels(rgb: np.ndarray) -> np.ndarray:
 
 
 def plain_share(pixels: np.ndarray, color: np.ndarray, tolerance: float) -> float:
-    """Share of pixels u8 (B,3) that are `color` (3), 0..255, within `tolerance` of the value range in every channel."""
+    """Returns the share of pixels u8 (B,3) that are `color` (3), 0..255, within `tolerance` of the range in every
+    channel.
+
+    >>> pixels = np.array([[255, 255, 255], [250, 255, 255], [0, 0, 0], [9, 9, 9]], np.uint8)
+    >>> plain_share(pixels, np.array([255, 255, 255]), 0.06)
+    0.5
+    """
     off = np.abs(pixels.astype(np.float32) - color).max(axis=1)
     return float((off <= 255 * tolerance).mean())
 
 
 def plain_background(borders: list[np.ndarray], names: list[str], tolerance: float) -> np.ndarray:
-    """The one color f32 (3) around the object in all frames; DataError that says what to do when there is none.
+    """Finds the one color f32 (3) around the object in all frames.
+
+    Raises DataError that says what to do when there is none.
 
     borders: `border_pixels` of each frame. The color is the mean around the fullest cell of the color cube, which an
     object that covers part of the border doesn't move.
@@ -55,7 +63,10 @@ def plain_background(borders: list[np.ndarray], names: list[str], tolerance: flo
 
 
 def named_background(text: str) -> np.ndarray | None:
-    """The color f32 (3), 0..255, of white, black or r,g,b; None for auto and keep. UsageError on anything else."""
+    """Returns the color f32 (3), 0..255, of white, black or r,g,b; None for auto and keep.
+
+    Raises UsageError on anything else.
+    """
     if text in ("auto", "keep"):
         return None
     try:
@@ -68,7 +79,10 @@ def named_background(text: str) -> np.ndarray | None:
 
 
 def background_color(borders: list[np.ndarray], names: list[str], background: str, tolerance: float) -> np.ndarray:
-    """The color f32 (3) that --background names, or the plain one that auto finds; DataError when it isn't there."""
+    """Returns the color f32 (3) that --background names, or the plain one that auto finds.
+
+    Raises DataError when it isn't there.
+    """
     named = named_background(background)
     if named is None:
         return plain_background(borders, names, tolerance)
@@ -98,8 +112,8 @@ def _hex(color: np.ndarray) -> str:
 def key_out(
     rgb: np.ndarray, background: np.ndarray, tolerance: float = TOLERANCE, holes: str = "auto"
 ) -> tuple[np.ndarray, int]:
-    """u8 (H,W,3) on a plain background (3) -> u8 (H,W,4), straight alpha that is soft along the outline, and how many
-    pixels were taken for holes.
+    """Cuts u8 (H,W,3) out of a plain background (3): u8 (H,W,4), straight alpha that is soft along the outline, and how
+    many pixels were taken for holes.
 
     Background is what has its color and is connected to the border. Enclosed regions of that color are eyes, teeth,
     a shirt, or gaps between arms and legs. holes: keep (part of the object), cut (see-through), auto (see-through when
@@ -119,17 +133,19 @@ def key_out(
     alpha, color = inside.astype(np.float32), rgb.copy()
     if core.any() and rim.any():
         _soften(alpha, color, core, rim, np.asarray(background, np.float32), 255 * tolerance)
-    return clean(np.dstack([color, np.round(255 * alpha).astype(np.uint8)])), int(gaps.sum())
+    return clear_invisible(np.dstack([color, np.round(255 * alpha).astype(np.uint8)])), int(gaps.sum())
 
 
 def _difference(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """f32 (H,W): the largest difference of a channel from the background's, channel by channel, which is faster."""
+    """Returns f32 (H,W): the largest difference of a channel from the background's, channel by channel, which is
+    faster.
+    """
     channels = (np.abs(rgb[..., k].astype(np.float32) - np.float32(background[k])) for k in range(3))
     return reduce(np.maximum, channels)
 
 
 def _gaps(enclosed: np.ndarray, off: np.ndarray, outside: np.ndarray, holes: str) -> np.ndarray:
-    """bool (H,W): those of the enclosed regions of the background's color that are taken for see-through."""
+    """Returns bool (H,W): those of the enclosed regions of the background's color that are taken for see-through."""
     if holes == "keep" or not enclosed.any():
         return np.zeros_like(enclosed)
     cv2 = load_cv2()
@@ -147,7 +163,7 @@ def _gaps(enclosed: np.ndarray, off: np.ndarray, outside: np.ndarray, holes: str
 def _soften(
     alpha: np.ndarray, color: np.ndarray, core: np.ndarray, rim: np.ndarray, background: np.ndarray, noise: float
 ) -> None:
-    """Share f32 (H,W) and color u8 (H,W,3) of the object in the pixels of the rim, in place."""
+    """Writes share f32 (H,W) and color u8 (H,W,3) of the object in the pixels of the rim, in place."""
     cv2 = load_cv2()
     distance, label = cv2.distanceTransformWithLabels(1 - core, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     rows, columns = np.nonzero(core)
@@ -166,7 +182,7 @@ def _soften(
 
 
 def _reaches_border(empty: np.ndarray) -> np.ndarray:
-    """bool (H,W): pixels of `empty` u8 connected to the border of the picture (4 neighbors)."""
+    """Returns bool (H,W): pixels of `empty` u8 connected to the border of the picture (4 neighbors)."""
     cv2 = load_cv2()
     framed = np.pad(empty, 1, constant_values=1)
     _, label = cv2.connectedComponents(framed, connectivity=4)
@@ -182,27 +198,30 @@ def _without_specks(inside: np.ndarray) -> np.ndarray:
 
 
 def opaque(rgba: np.ndarray) -> np.ndarray:
-    """The frame u8 (H,W,4) as a whole, alpha 255."""
+    """Returns the frame u8 (H,W,4) as a whole, alpha 255."""
     return np.dstack([rgba[..., :3], np.full(rgba.shape[:2], 255, np.uint8)])
 
 
 def cut_alone(rgba: np.ndarray, name: str, background: str, tolerance: float, holes: str) -> np.ndarray:
-    """One picture u8 (H,W,4) by its own alpha, else by its own plain background; whole for `keep`."""
+    """Cuts one picture u8 (H,W,4) by its own alpha, else by its own plain background; whole for `keep`."""
     if background == "keep":
         return opaque(rgba)
     if (rgba[..., 3] < 255).any():
-        return clean(rgba)
+        return clear_invisible(rgba)
     color = background_color([border_pixels(rgba[..., :3])], [name], background, tolerance)
     return key_out(rgba[..., :3], color, tolerance, holes)[0]
 
 
-def clean(rgba: np.ndarray) -> np.ndarray:
-    """Faint alpha becomes 0, and the color nobody sees becomes black: equal objects give equal bytes."""
+def clear_invisible(rgba: np.ndarray) -> np.ndarray:
+    """Clears faint alpha to 0, and the color nobody sees to black: equal objects give equal bytes."""
     return rgba * (rgba[..., 3:] >= FAINT)
 
 
 def with_mask(rgba: np.ndarray, mask: Path, name: str) -> np.ndarray:
-    """The frame u8 (H,W,4) with the alpha of a mask file; DataError when sizes differ or it looks inverted."""
+    """Returns the frame u8 (H,W,4) with the alpha of a mask file.
+
+    Raises DataError when sizes differ or it looks inverted.
+    """
     alpha = read_mask(mask)
     if alpha.shape != rgba.shape[:2]:
         found, expected = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, rgba.shape))
@@ -210,11 +229,13 @@ def with_mask(rgba: np.ndarray, mask: Path, name: str) -> np.ndarray:
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     if (border > 127).mean() > 0.9 and (alpha <= 127).any():
         raise DataError(f"{mask}: the mask covers the whole border: inverted? White (255) has to be the object")
-    return clean(np.dstack([rgba[..., :3], alpha]))
+    return clear_invisible(np.dstack([rgba[..., :3], alpha]))
 
 
 def read_mask(path: Path) -> np.ndarray:
-    """u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of ids (palette, 0/1/2...) isn't 0."""
+    """Reads u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of ids (palette, 0/1/2...)
+    isn't 0.
+    """
     from PIL import Image
 
     try:

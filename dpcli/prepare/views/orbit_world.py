@@ -1,4 +1,6 @@
-"""From a capture's own world into ours: y up, the object at the origin in a sphere of known radius, azimuth 0 in front."""
+"""From a capture's own world into ours: y up, the object at the origin in a sphere of known radius, azimuth 0 in
+front.
+"""
 
 from __future__ import annotations
 
@@ -11,18 +13,18 @@ OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: it fits
 
 @dataclass(frozen=True)
 class Similarity:
-    """x' = scale * rotation (x - center); rotation f64 (3,3), center f64 (3)."""
+    """Maps x' = scale * rotation (x - center); rotation f64 (3,3), center f64 (3)."""
 
     scale: float
     rotation: np.ndarray
     center: np.ndarray
 
     def points(self, points: np.ndarray) -> np.ndarray:
-        """(...,3) -> f64 (...,3)."""
+        """Maps points (...,3) to f64 (...,3)."""
         return self.scale * (np.asarray(points, np.float64) - self.center) @ self.rotation.T
 
     def pose(self, world_to_camera: np.ndarray) -> np.ndarray:
-        """f64 (4,4) of the same camera in the new world: every point keeps its pixel, depths are scaled."""
+        """Returns f64 (4,4) of the same camera in the new world: every point keeps its pixel, depths are scaled."""
         pose = np.eye(4)
         pose[:3, :3] = world_to_camera[:3, :3] @ self.rotation.T
         pose[:3, 3] = self.scale * (world_to_camera[:3, :3] @ self.center + world_to_camera[:3, 3])
@@ -30,12 +32,12 @@ class Similarity:
 
 
 def camera_centers(poses: np.ndarray) -> np.ndarray:
-    """world_to_camera (V,4,4) -> positions f64 (V,3)."""
+    """Returns the positions f64 (V,3) of world_to_camera (V,4,4)."""
     return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
 
 
 def up_direction(poses: np.ndarray) -> np.ndarray:
-    """Unit vector (3) that points up in a world of upright cameras, world_to_camera (V,4,4).
+    """Returns the unit vector (3) that points up in a world of upright cameras, world_to_camera (V,4,4).
 
     The normal of the plane that the cameras stand in, where they stand in one (a ring); else the mean of their
     pictures' up directions.
@@ -51,7 +53,7 @@ def up_direction(poses: np.ndarray) -> np.ndarray:
 
 
 def into_orbit(up: np.ndarray, reference: np.ndarray, center: np.ndarray, radius: float) -> Similarity:
-    """The similarity that puts `center` at the origin, `up` on +y, the camera `reference` (4,4) at azimuth 0.
+    """Returns the similarity that puts `center` at the origin, `up` on +y, the camera `reference` (4,4) at azimuth 0.
 
     radius: of the object in its own world; becomes OBJECT_RADIUS. A camera straight above keeps its picture's up as
     the direction away from azimuth 0.
@@ -68,7 +70,7 @@ def into_orbit(up: np.ndarray, reference: np.ndarray, center: np.ndarray, radius
 
 
 def bounding_sphere(points: np.ndarray, steps: int = 200) -> tuple[np.ndarray, float]:
-    """Center f64 (3) and radius of a sphere that holds all points (...,3), nearly the smallest one.
+    """Returns center f64 (3) and radius of a sphere that holds all points (...,3), nearly the smallest one.
 
     Steps of 1/(i+1) toward the farthest point (Badoiu and Clarkson 2003): within a percent of the smallest radius,
     and turned points give the turned sphere. The radius is exact for the center.
@@ -84,7 +86,7 @@ def bounding_sphere(points: np.ndarray, steps: int = 200) -> tuple[np.ndarray, f
 def sphere_of_silhouettes(
     intrinsics: np.ndarray, poses: np.ndarray, boxes: list[tuple[int, int, int, int]]
 ) -> tuple[np.ndarray, float]:
-    """Center f64 (3) and radius of an object known by its boxes (left, top, right, bottom) in V pictures.
+    """Returns center f64 (3) and radius of an object known by its boxes (left, top, right, bottom) in V pictures.
 
     The center is the point nearest to the rays through the boxes' middles (for parallel rays: nearest to the world's
     origin besides); the radius is the largest extent of a box around it, at its depth.

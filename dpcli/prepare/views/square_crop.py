@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.prepare.decode.depth_files import load_cv2
+from dpcli.prepare.decode.cv2_import import load_cv2
 
 VISIBLE = 26  # alpha from which a pixel counts as the object: a tenth
 Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom are the first pixel outside
@@ -14,14 +14,14 @@ Box = tuple[int, int, int, int]  # left, top, right, bottom; right and bottom ar
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of the source picture: left, top (may be negative) and side, in whole pixels."""
+    """Holds a square of the source picture: left, top (may be negative) and side, in whole pixels."""
 
     left: int
     top: int
     side: int
 
     def apply(self, rgba: np.ndarray, size: int) -> np.ndarray:
-        """u8 (H,W,4) -> u8 (size,size,4); transparent where the square reaches over the picture."""
+        """Cuts u8 (H,W,4) to u8 (size,size,4); transparent where the square reaches over the picture."""
         height, width = rgba.shape[:2]
         square = np.zeros((self.side, self.side, 4), np.uint8)
         x0, y0 = max(self.left, 0), max(self.top, 0)
@@ -31,14 +31,14 @@ class Crop:
         return resize(square, size)
 
     def intrinsics(self, camera: np.ndarray, size: int) -> np.ndarray:
-        """f64 (3,3) of the cropped and resized picture: u' = (u - left) size / side; pixel centers at +0.5."""
+        """Returns f64 (3,3) of the cropped and resized picture: u' = (u - left) size / side; pixel centers at +0.5."""
         scale = size / self.side
         move = np.array([[scale, 0, -scale * self.left], [0, scale, -scale * self.top], [0, 0, 1]])
         return move @ camera
 
 
 def resize(rgba: np.ndarray, size: int) -> np.ndarray:
-    """u8 (S,S,4) -> u8 (size,size,4), on premultiplied colors: transparent pixels don't bleed into the outline."""
+    """Resizes u8 (S,S,4) to (size,size,4) on premultiplied colors: transparent pixels don't bleed into the outline."""
     if rgba.shape[:2] == (size, size):
         return rgba
     cv2 = load_cv2()
@@ -54,7 +54,7 @@ def resize(rgba: np.ndarray, size: int) -> np.ndarray:
 
 
 def visible_box(rgba: np.ndarray, island: float = 0.0) -> Box | None:
-    """The smallest box around the object, None when the picture is empty.
+    """Returns the smallest box around the object, None when the picture is empty.
 
     island: pieces apart that are smaller than this share of the object don't count (leftovers of a segmentation).
     """
@@ -72,25 +72,26 @@ def visible_box(rgba: np.ndarray, island: float = 0.0) -> Box | None:
 
 
 def touches_border(rgba: np.ndarray) -> bool:
-    """Whether the object runs into the picture's border, along at least a hundredth of a side."""
+    """Returns whether the object runs into the picture's border, along at least a hundredth of a side."""
     solid = rgba[..., 3] > 127
     runs = [solid[0].sum(), solid[-1].sum(), solid[:, 0].sum(), solid[:, -1].sum()]
     return max(runs) >= max(2, min(solid.shape) // 100)
 
 
 def union(boxes: list[Box]) -> Box:
+    """Returns the smallest box that holds all of these, None when all are None."""
     left, top, right, bottom = np.array(boxes).T
     return int(left.min()), int(top.min()), int(right.max()), int(bottom.max())
 
 
 def crop_around(box: Box, border: float) -> Crop:
-    """The square around a box that leaves the share `border` of the picture empty along the box's longer side."""
+    """Returns the square around a box that leaves the share `border` of the picture empty along the box's longer side."""
     left, top, right, bottom = box
     side = max(int(round(max(right - left, bottom - top) / (1 - border))), 2)
     return Crop(round((left + right - side) / 2), round((top + bottom - side) / 2), side)
 
 
 def whole_picture(width: int, height: int) -> Crop:
-    """The square that holds the whole picture, centered."""
+    """Returns the square that holds the whole picture, centered."""
     side = max(width, height)
     return Crop(-((side - width) // 2), -((side - height) // 2), side)

@@ -17,7 +17,7 @@ from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes
 from dpcli.prepare.views.square_crop import Box, union, visible_box, whole_picture
-from dpcli.prepare.views.video import VideoOptions, spread
+from dpcli.prepare.views.video import VideoOptions, spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
@@ -41,12 +41,12 @@ class _View:
 
 
 def is_transforms(path: Path) -> bool:
-    """Whether a folder is one of this kind."""
+    """Returns whether a folder is one of this kind."""
     return path.is_dir() and any((path / name).is_file() for name in FILES)
 
 
 def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
-    """Options and digests of everything read, for provenance."""
+    """Returns options and digests of everything read, for provenance."""
     _check(options)
     views, times = _grid(path)
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
@@ -60,14 +60,14 @@ def _check(options: VideoOptions) -> None:
 
 
 def transforms_clip(path: Path, options: VideoOptions) -> Clip:
-    """All still cameras of the folder over the times they share; the first training camera is the reference.
+    """Reads all still cameras of the folder over the times they share; the first training camera is the reference.
 
     The world is turned (z up becomes y up, the reference to azimuth 0) and scaled so that the object's silhouettes fit
     a sphere of radius 0.75 around the origin; cameras follow exactly. No crop: only padded to a square and resized.
     """
     _check(options)
     views, times = _grid(path)
-    seconds, chosen = _seconds(times, options.fps), spread(len(times), options.frames)
+    seconds, chosen = _seconds(times, options.fps), spread_frames(len(times), options.frames)
     times = [times[index] for index in chosen]
     boxes, sizes = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([_intrinsics(view, *size) for view, size in zip(views, sizes, strict=True)])
@@ -96,7 +96,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
 
 
 def _grid(folder: Path) -> tuple[list[_View], list[float]]:
-    """Still cameras that have a picture at every time, training ones first, and the times, rising."""
+    """Returns still cameras that have a picture at every time, training ones first, and the times, rising."""
     views: dict[bytes, _View] = {}
     times: set[float] = set()
     for name, role in FILES.items():
@@ -171,7 +171,7 @@ def _image(folder: Path, name: str) -> Path:
 
 
 def _intrinsics(view: _View, width: int, height: int) -> np.ndarray:
-    """f64 (3,3) of the picture as stored, also where it was resized after `w`, `h` were noted."""
+    """Returns f64 (3,3) of the picture as stored, also where it was resized after `w`, `h` were noted."""
     known = view.focal
     if "fl_x" in known:
         across, down = width / float(known.get("w", width)), height / float(known.get("h", height))
@@ -193,7 +193,7 @@ def _cut(path: Path, options: VideoOptions) -> np.ndarray:
 
 
 def _look(view: _View, times: list[float], options: VideoOptions) -> tuple[Box, tuple[int, int]]:
-    """The box of the object over all times, and the (width, height) of a view."""
+    """Returns the box of the object over all times, and the (width, height) of a view."""
     boxes: list[Box] = []
     sizes: dict[tuple[int, int], Path] = defaultdict()
     for time in times:
@@ -211,6 +211,6 @@ def _look(view: _View, times: list[float], options: VideoOptions) -> tuple[Box, 
 
 
 def _seconds(times: list[float], fps: float | None) -> np.ndarray:
-    """The files' times, all of them, which run from 0 to 1, stretched to as many frames per second as --fps says."""
+    """Returns the files' times, which run from 0 to 1, stretched to as many frames per second as --fps says."""
     values = np.array(times) - times[0]
     return values / values[-1] * (len(values) - 1) / (fps or FOLDER_FPS) if len(values) > 1 else values

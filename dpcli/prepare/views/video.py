@@ -25,9 +25,9 @@ _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen th
 _NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class VideoOptions:
-    """How a clip is read. Angles in degrees here, as typed; `frames` 0 keeps all; `views` is a multi-view folder."""
+    """Says how a clip is read. Angles in degrees here, as typed; `frames` 0 keeps all; `views` is a multi-view folder."""
 
     frames: int = 32
     size: int = 512
@@ -47,7 +47,7 @@ class VideoOptions:
     views_cameras: Path | None = None
 
     def check(self) -> None:
-        """UsageError on values that make no sense, before any file is opened."""
+        """Raises UsageError on values that make no sense, before any file is opened."""
         for option, value, low, high in (
             ("--border", self.border, 0.0, 0.9),
             ("--tolerance", self.tolerance, 0.0, 0.5),
@@ -69,15 +69,18 @@ class VideoOptions:
         matting.named_background(self.background)
 
     def camera(self) -> OrbitCamera:
-        """The reference camera: azimuth 0."""
+        """Returns the reference camera: azimuth 0."""
         return OrbitCamera(0.0, float(np.deg2rad(self.elevation)), self.radius, float(np.deg2rad(self.fovy)))
 
 
 def video_clip(path: Path, options: VideoOptions) -> Clip:
-    """The clip of a folder, video or GIF. DataError on frames that can't be used; the log says what was chosen."""
+    """Reads the clip of a folder, video or GIF.
+
+    Raises DataError on frames that can't be used; the log says what was chosen.
+    """
     options.check()
     frames = open_frames(path)
-    cutter, wanted, crop, size = _survey(frames, options)
+    cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
     header = ViewsHeader(
@@ -101,13 +104,13 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
 
 
 def clip_name(path: Path) -> str:
-    """The file's or folder's name, or that of the folder above when it says nothing (`minions/rgba`)."""
+    """Returns the file's or folder's name, or that of the folder above when it says nothing (`minions/rgba`)."""
     path = path.resolve()
     return path.parent.name if path.is_dir() and path.name.lower() in _NO_NAMES else path.stem
 
 
 def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
-    """Options and digests of everything read, for provenance: equal configurations give equal files."""
+    """Returns options and digests of everything read, for provenance: equal configurations give equal files."""
     options.check()
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
     config["input_digest"] = digest_of(open_frames(path).files)
@@ -126,7 +129,7 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
 
 @dataclass
 class Cutter:
-    """Frames with the object cut out: by its own alpha, a mask, a plain background's color, or not at all (keep)."""
+    """Cuts the object out of frames: by its own alpha, a mask, a plain background's color, or not at all (keep)."""
 
     frames: Frames
     options: VideoOptions
@@ -136,7 +139,7 @@ class Cutter:
     gaps: dict[int, int] = field(default_factory=dict)  # pixels taken for holes, by frame
 
     def cut(self, wanted: list[int]) -> Iterator[np.ndarray]:
-        """u8 (H,W,4), straight alpha, of the frames `wanted`, rising."""
+        """Yields u8 (H,W,4), straight alpha, of the frames `wanted`, rising."""
         for index, frame in zip(wanted, self.frames.read(wanted)):
             if self.mode == "mask":
                 yield matting.with_mask(frame, self.masks[index], self.frames.names[index])
@@ -147,12 +150,12 @@ class Cutter:
             elif self.mode == "keep":
                 yield matting.opaque(frame)
             else:
-                yield matting.clean(frame)
+                yield matting.clear_invisible(frame)
 
 
-def _survey(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
-    """How to cut, which frames, the one crop of them all, and the (width, height) of the source."""
-    wanted = _readable(frames, spread(len(frames), options.frames), options.on_error)
+def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
+    """Returns how to cut, which frames, the one crop of them all, and the (width, height) of the source."""
+    wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
     warn_gaps(frames, wanted)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
     boxes, cut_off, good, empty = [], [], [], []
@@ -189,15 +192,19 @@ def _how(cutter: Cutter) -> str:
     return {"alpha": "the frames' alpha", "mask": "masks", "keep": "nothing: the background is kept"}[cutter.mode]
 
 
-def spread(total: int, count: int) -> list[int]:
-    """At most `count` of `total` indices, evenly spread from the first to the last; all for 0."""
+def spread_frames(total: int, count: int) -> list[int]:
+    """Returns at most `count` of `total` indices, evenly spread from the first to the last; all for 0.
+
+    >>> spread_frames(10, 4)
+    [0, 3, 6, 9]
+    """
     if count == 0 or count >= total:
         return list(range(total))
     return np.linspace(0, total - 1, count).round().astype(int).tolist()
 
 
 def _readable(frames: Frames, wanted: list[int], on_error: str) -> list[int]:
-    """Without the images that cannot be read when --on-error is skip."""
+    """Returns the frames without the images that cannot be read when --on-error is skip."""
     if on_error == "stop" or not frames.path.is_dir():
         return wanted
     good = []
@@ -213,7 +220,7 @@ def _readable(frames: Frames, wanted: list[int], on_error: str) -> list[int]:
 
 
 def warn_gaps(frames: Frames, wanted: list[int]) -> None:
-    """Say in the log where the numbers of frames jump."""
+    """Says in the log where the numbers of frames jump."""
     steps = np.diff(frames.numbers)
     if len(steps) > 1 and (steps != np.median(steps)).any():
         at = int(np.argmax(steps != np.median(steps)))
@@ -224,7 +231,7 @@ def warn_gaps(frames: Frames, wanted: list[int]) -> None:
 
 
 def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tuple[Cutter, tuple[int, int]]:
-    """Look at every frame once: one size, alpha or none, what is around the object."""
+    """Looks at every frame once: one size, alpha or none, what is around the object."""
     shape, borders, clear = None, [], []
     for index, frame in zip(wanted, frames.read(wanted)):
         shape = shape or frame.shape
@@ -255,7 +262,7 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
 
 
 def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
-    """A mask for every frame of the clip: by number where all numbers agree, else in order."""
+    """Finds a mask for every frame of the clip: by number where all numbers agree, else in order."""
     masks = open_frames(require_folder(folder, "a mask per frame, as images"))
     if set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
         place = dict(zip(masks.numbers, masks.files))
@@ -284,7 +291,7 @@ def _named(frames: Frames, indices: list[int]) -> str:
 
 
 def _times(frames: Frames, wanted: list[int], fps: float | None) -> np.ndarray:
-    """Seconds f64 (T) from the first frame that is used."""
+    """Returns seconds f64 (T) from the first frame that is used."""
     if fps is None and frames.times is None:
         log.info(f"{frames.path}: no frame rate; {FOLDER_FPS:g} per second assumed (--fps)")
     rate = fps or FOLDER_FPS
@@ -296,7 +303,10 @@ def _times(frames: Frames, wanted: list[int], fps: float | None) -> np.ndarray:
 def find_given_views(
     frames: Frames, wanted: list[int], options: VideoOptions
 ) -> tuple[list[list[Path]], list[OrbitCamera]]:
-    """Pictures [view][frame] of --views for the frames `wanted`, and their cameras; DataError when some are missing."""
+    """Finds pictures [view][frame] of --views for the frames `wanted`, and their cameras.
+
+    Raises DataError when some are missing.
+    """
     if not options.views:
         return [], []
     reference = options.camera()
@@ -308,7 +318,7 @@ def find_given_views(
 
 
 def _given_pictures(paths: list[Path], options: VideoOptions) -> Iterator[np.ndarray]:
-    """Square as they come, so only resized; their own alpha, else their plain background cut away."""
+    """Yields them square as they come, so only resized; their own alpha, else their plain background cut away."""
     shape = None
     for path in paths:
         rgba = read_rgba(path)

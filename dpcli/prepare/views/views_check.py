@@ -1,4 +1,6 @@
-"""What `--check` looks for in a clip or an ARTEMIS animal beyond its recipe: an index that opens no picture wholly."""
+"""Indices of a clip or an ARTEMIS animal for `--check`: they find beyond the recipe what lacks, and open no picture
+wholly.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +15,23 @@ from dpcli.prepare.decode.color_frames import Frames, open_frames
 from dpcli.prepare.reader import Item, require_folder
 from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_intrinsics, read_poses
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_config
-from dpcli.prepare.views.video import VideoOptions, clip_name, find_given_views, find_masks, spread, warn_gaps
+from dpcli.prepare.views.video import VideoOptions, clip_name, find_given_views, find_masks, spread_frames, warn_gaps
 
 _PICTURE = re.compile(r"img_(\d{4})(_alpha)?\.(jpg|png)")
 
 
 @dataclass(frozen=True)
 class ArtemisIndex:
-    """The motions of an animal, or only `motion`, each with what it lacks."""
+    """Lists the motions of an animal, or only `motion`, each with what it lacks."""
 
     animal: Path
     motion: str = ""
 
     def items(self) -> list[Item]:
-        """One item a motion that is there or that the file `sequences` tells of. DataError when cameras are unknown."""
+        """Returns one item a motion that is there or in the file `sequences`.
+
+        Raises DataError when cameras are unknown.
+        """
         poses, cameras = read_poses(self.animal / "CamPose.inf"), read_intrinsics(self.animal / "Intrinsic.inf")
         if len(poses) != len(cameras):
             raise DataError(f"{self.animal}: CamPose.inf has {len(poses)} cameras, Intrinsic.inf {len(cameras)}")
@@ -38,6 +43,7 @@ class ArtemisIndex:
         ]
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         return []
 
     def _problem(self, name: str, declared: int, cameras: int) -> str:
@@ -55,7 +61,9 @@ class ArtemisIndex:
         return "; ".join(faults)
 
     def _lacking_bones(self, motion: Motion) -> Iterator[str]:
-        """Without bones/ an animal has no true tracks, which is allowed; some of them is not."""
+        """Returns which bones lack: without bones/ an animal has no true tracks, which is allowed; some of them is
+        not.
+        """
         if (self.animal / "bones").is_dir():
             for frame in motion.folders:
                 name = f"bones/{motion.name}/Bones_{frame:04d}.inf"
@@ -64,7 +72,7 @@ class ArtemisIndex:
 
 
 def _lacking_pictures(motion: Motion, cameras: int) -> Iterator[str]:
-    """Pictures and masks that a frame lacks of the cameras that any frame shows."""
+    """Returns pictures and masks that a frame lacks of the cameras that any frame shows."""
     found = {frame: _pictures(folder) for frame, folder in motion.folders.items()}
     used = sorted({camera for own in found.values() for camera, _ in own if camera < cameras}) or range(cameras)
     for frame, own in found.items():
@@ -75,33 +83,37 @@ def _lacking_pictures(motion: Motion, cameras: int) -> Iterator[str]:
 
 
 def _pictures(folder: Path) -> set[tuple[int, bool]]:
-    """(camera, is it the mask) of each file; a folder listing instead of 72 questions."""
+    """Returns (camera, is it the mask) of each file; a folder listing instead of 72 questions."""
     matches = (_PICTURE.fullmatch(name) for name in os.listdir(folder))
     return {(int(one[1]), bool(one[2])) for one in matches if one and (one[2] is None or one[3] == "png")}
 
 
 @dataclass(frozen=True)
 class ClipIndex:
-    """The frames of a clip, and whether its masks and further views are there for them."""
+    """Lists the frames of a clip, and whether its masks and further views are there for them."""
 
     clip: Path
     options: VideoOptions
 
     def items(self) -> list[Item]:
-        """One item a frame; of pictures only the head is read. DataError when masks or views lack frames."""
+        """Returns one item a frame; of pictures only the head is read.
+
+        Raises DataError when masks or views lack frames.
+        """
         if is_transforms(self.clip):
             transforms_config(self.clip, self.options)  # finds every picture that the lists name
             return [Item(clip_name(self.clip), self.clip)]
         frames = open_frames(self.clip)
         if self.options.mask:
             find_masks(frames, self.options.mask)
-        find_given_views(frames, spread(len(frames), self.options.frames), self.options)
+        find_given_views(frames, spread_frames(len(frames), self.options.frames), self.options)
         warn_gaps(frames, list(range(len(frames))))
         if not self.clip.is_dir():
             return [Item(name, self.clip) for name in frames.names]
         return list(_frame_items(frames))
 
     def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
         return []
 
 
@@ -116,7 +128,7 @@ def _frame_items(frames: Frames) -> Iterator[Item]:
 
 
 def _picture_size(path: Path) -> tuple[tuple[int, int] | None, str]:
-    """((width, height), "") of a picture, or (None, what is wrong)."""
+    """Returns ((width, height), "") of a picture, or (None, what is wrong)."""
     from PIL import Image
 
     try:

@@ -20,7 +20,7 @@ from dpcli.store.writing.already_made import already_made
 
 @dataclass
 class Clip:
-    """What a reader makes of its raw data: the header, and a function that yields (view, frame, rgba) of every picture.
+    """Holds the header of a clip, and a function that yields (view, frame, rgba) of every picture.
 
     rgba: u8 (H,W,4), straight alpha. track, part: ground truth as ViewsWriter takes it.
     """
@@ -41,10 +41,10 @@ def convert_clip(
     seed: int = 0,
     force: bool = False,
 ) -> ViewsHeader:
-    """Write a clip to `output` and return its header; a finished file of the same configuration is left as it is.
+    """Writes a clip to `output` and return its header; a finished file of the same configuration is left as it is.
 
-    config: everything that decides the content, digests of the inputs among them. UsageError when `output` was made
-    another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
+    config: everything that decides the content, digests of the inputs among them. Raises UsageError when `output` was
+    made another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
     """
     provenance = record(json.loads(json.dumps({"reader": source, **config})), seed)
     if not force and already_made(output, provenance, ViewsReader):
@@ -75,7 +75,7 @@ def convert_clip(
 
 
 def digest_of(paths: Iterable[Path]) -> str:
-    """One short digest of many files' bytes, in their order."""
+    """Returns one short digest of many files' bytes, in their order."""
     digest = hashlib.sha256()
     for path in paths:
         digest.update(file_digest(path).encode())

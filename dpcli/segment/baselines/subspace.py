@@ -1,4 +1,4 @@
-"""Parts from trajectories: who moves with whom, as an affinity, and its spectral clustering."""
+"""The clustering of trajectories: an affinity that says which points move together, and its spectral clustering."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ def sparse_affinity(
     alpha: float = 800.0,
     steps: int = _STEPS,
 ) -> np.ndarray:  # [N, N]
-    """Affinity f32 (N,N), symmetric, >= 0, of sparse subspace clustering: |C| + |C|^T, columns scaled to maximum 1.
+    """Returns the affinity f32 (N,N) of sparse subspace clustering: symmetric, >= 0, columns scaled to maximum 1.
 
     Each trajectory is written as an affine combination of few others, min |C|_1 + lambda/2 |Y - Y C|^2 with diag C = 0
     and columns that sum to 1, because trajectories of one rigid body lie in an affine subspace of 3 dimensions (so
-    motions that all points share change nothing). lambda is alpha over the smallest, among the points, of their
-    largest inner product; the solver is ADMM. Elhamifar & Vidal, Sparse Subspace Clustering, TPAMI 2013.
+    motions that all points share change nothing); the affinity is |C| + |C|^T. lambda is alpha over the smallest, among
+    the points, of their largest inner product; the solver is ADMM. Elhamifar & Vidal, Sparse Subspace Clustering, TPAMI
+    2013.
     """
     data = trajectories.reshape(len(trajectories), -1).T.astype(np.float64)  # [3T, N]
     data -= data.mean(1, keepdims=True)
@@ -32,7 +33,7 @@ def sparse_affinity(
 
 
 def _affine_lasso(data: np.ndarray, fit: float, rho: float, steps: int) -> np.ndarray:
-    """Codes C f32 (N,N) of the problem above; rho is ADMM's penalty, everything is divided by it.
+    """Returns the codes C f32 (N,N) of `sparse_affinity`'s problem; rho is ADMM's penalty, everything is divided by it.
 
     The dense step's system I + low^T low has rank 3T + 1 beside the identity: solved through that (Woodbury).
     """
@@ -62,7 +63,7 @@ def trajectory_affinity(
     sigma: float = 0.1,
     reach: float = 0.1,
 ) -> np.ndarray:  # [N, N]
-    """Affinity f64 (N,N) in 0..1 of pairs, by their most different motion: exp(-max_t d |m_i - m_j|^2).
+    """Returns the affinity f64 (N,N) in 0..1 of pairs, by their most different motion: exp(-max_t d |m_i - m_j|^2).
 
     d is the mean distance of two trajectories in units of `reach`, motions count in units of `sigma` (both lengths).
     Brox & Malik, ECCV 2010; Ochs, Malik & Brox, TPAMI 2014, with one sigma in place of the image's local variation.
@@ -75,7 +76,7 @@ def trajectory_affinity(
 
 
 def _squared_distances(points: np.ndarray) -> np.ndarray:
-    """All pairs of points (N,3), f64 (N,N)."""
+    """Returns the squared distances f64 (N,N) of all pairs of points (N,3)."""
     from scipy.spatial.distance import cdist
 
     return cdist(points, points, "sqeuclidean")
@@ -88,7 +89,7 @@ def spectral_parts(
     most: int,
     rng: np.random.Generator,
 ) -> np.ndarray:  # [N]
-    """Clusters i64 (N) of a graph, by its normalized Laplacian's lowest eigenvectors (Ng, Jordan & Weiss 2001).
+    """Returns clusters i64 (N) of a graph, by its normalized Laplacian's lowest eigenvectors (Ng, Jordan & Weiss 2001).
 
     num_parts None: estimated by the eigengap, between fewest and most.
     """
@@ -107,16 +108,19 @@ def spectral_parts(
 
 
 def eigengap(values: np.ndarray, fewest: int = 1) -> int:
-    """How many of the ascending eigenvalues (M) lie below the widest gap, fewest..M-1; of equal gaps the first.
+    """Returns how many of the ascending eigenvalues (M) lie below the widest gap, fewest..M-1; of equal gaps the first.
 
     fewest, or M where that is less, when no gap is left. von Luxburg, A Tutorial on Spectral Clustering, 2007.
+
+    >>> eigengap(np.array([0.0, 0.0, 0.0, 0.8, 0.9]))
+    3
     """
     gaps = np.diff(values)[fewest - 1 :]
     return fewest + int(np.argmax(gaps > gaps.max() - 1e-9)) if len(gaps) else min(fewest, len(values))
 
 
 def _k_means(rows: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Clusters i64 (N) of rows (N,D); no more clusters than there are different rows."""
+    """Returns the clusters i64 (N) of rows (N,D); there are no more clusters than different rows."""
     from sklearn.cluster import KMeans
 
     count = min(count, len(np.unique(rows.round(6), axis=0)))

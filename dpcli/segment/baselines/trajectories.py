@@ -1,4 +1,4 @@
-"""Points followed through the frames by flow: their motion, less the dominant one, and labels that stay with them."""
+"""Points followed through the frames by flow: their motion, that less the dominant one, and labels that stay with them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ _ROUNDS = 10  # of the robust fit of the dominant motion
 
 
 def follow(frames: Sequence[np.ndarray], flows: Flows, t: int) -> np.ndarray:
-    """Displacement f64 (N_t,U,3) of frame t's points to the U other frames that flows lead to, in their order.
+    """Returns the displacement f64 (N_t,U,3) of frame t's points to the U other frames that flows lead to.
 
-    Direct flow where there is one; else the flow of the frame last reached, interpolated from its three nearest points.
+    The frames are in their order. Direct flow is taken where there is one; else the flow of the frame last reached,
+    interpolated from its three nearest points.
     """
     reached = {t: np.asarray(frames[t], np.float64)}
     while True:
@@ -29,6 +30,7 @@ def follow(frames: Sequence[np.ndarray], flows: Flows, t: int) -> np.ndarray:
 
 
 def _interpolated(query: np.ndarray, points: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Returns the values of points (N,3) at the query (M,3), from the three nearest."""
     import torch
 
     from dpcli.ops import three_nn_interpolate
@@ -38,7 +40,7 @@ def _interpolated(query: np.ndarray, points: np.ndarray, values: np.ndarray) -> 
 
 
 def residual_motion(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """Motion (N,U,3) less the dominant rigid motion to each frame, f64.
+    """Returns the motion f64 (N,U,3) less the dominant rigid motion to each frame.
 
     The fit reweights its points by their distance from it (Geman & McClure), so the larger part decides.
     """
@@ -62,7 +64,7 @@ def residual_motion(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
 def consistent_labels(
     frames: Sequence[np.ndarray], flows: Flows, labels: Sequence[np.ndarray], max_parts: int
 ) -> list[np.ndarray]:
-    """The same labels (T of (N_t)) with ids renamed: a part keeps the id of the frame before.
+    """Returns the labels (T of (N_t)) with ids renamed so that a part keeps the id of the frame before.
 
     The frame before is carried along by the flow (either direction; without one, left in place) and parts are paired
     such that the sum of IoU is largest (Hungarian). A part without partner gets an id not used so far, while there are
@@ -86,17 +88,17 @@ def consistent_labels(
 
 
 def _carried_labels(frames: Sequence[np.ndarray], flows: Flows, before: int, t: int, labels: np.ndarray) -> np.ndarray:
-    """For each point of frame t, the label of the nearest point of the frame before."""
+    """Returns, for each point of frame t, the label of the nearest point of the frame before."""
     source, query = frames[before], frames[t]
     if (before, t) in flows:
         source = source + flows[before, t]
     elif (t, before) in flows:
         query = query + flows[t, before]
-    return labels[nearest(source, query)]
+    return labels[find_nearest(source, query)]
 
 
 def _matched(own: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """For each id of own (0..K-1), the id of other that it is paired with, -1 for none."""
+    """Returns, for each id of own (0..K-1), the id of other that it is paired with, -1 for none."""
     from scipy.optimize import linear_sum_assignment
 
     shared = np.zeros((own.max() + 1, other.max() + 1))
@@ -109,8 +111,8 @@ def _matched(own: np.ndarray, other: np.ndarray) -> np.ndarray:
     return ids
 
 
-def nearest(points: np.ndarray, query: np.ndarray, with_distance: bool = False) -> Any:
-    """Index of the nearest of points for every query; with its distance, if wanted."""
+def find_nearest(points: np.ndarray, query: np.ndarray, with_distance: bool = False) -> Any:
+    """Returns the index of the nearest of points (N,D) for every query (M,D); with its distance, if asked for."""
     from scipy.spatial import cKDTree
 
     distance, index = cKDTree(points).query(query)

@@ -1,4 +1,4 @@
-"""`dpc segment estimate-flow`: scene flow of every frame, as a field of a clouds file or as its points (thesis A.1.5)."""
+"""`dpc segment estimate-flow`: the scene flow of every frame, as a field of a clouds file or as its points (thesis A.1.5)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, DpcError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
 from dpcli.runtime.pool import ordered_map
@@ -18,7 +19,8 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.segment.flow.estimate import METHODS, estimate_flow
+from dpcli.segment.flow.estimators import METHODS, estimate_flow, find_estimator
+from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.sequence import POINT_FIELDS
 from dpcli.store.writing.already_made import WORK, already_made
@@ -30,7 +32,11 @@ _WORTH_WORKERS = 200  # frames; fewer are done by one process before a second ha
 
 @dataclass(frozen=True)
 class FlowOfSequence:
-    """What to do with each sequence; picklable, for worker processes. points: drawn from each frame, 0 = all."""
+    """Estimates the flow of one sequence; picklable, for worker processes.
+
+    flow: icp, nearest, or a trained estimator. points: drawn from each frame, 0 = all. as_points: whether the flow vectors
+    take the place of the points.
+    """
 
     flow: str
     points: int = 512
@@ -39,13 +45,13 @@ class FlowOfSequence:
     device: str = "cpu"
 
     def fields(self, given: Sequence[str]) -> list[str]:
-        """Of the result: those given beside the flow; where flow vectors are the points, only the time."""
+        """Returns the fields of the result: those of the input beside the flow; only the time where flow is the points."""
         if self.as_points:
             return [name for name in given if name == "time"]
         return [*(name for name in given if name != "scene_flow"), "scene_flow"]
 
     def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
-        """The sequence of that number in its file: some points of each frame, and their flow."""
+        """Returns some points of each frame of a sequence, and their flow; its number in the file chooses the points."""
         index, sequence = numbered
         drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS, index))
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
@@ -56,7 +62,7 @@ class FlowOfSequence:
 
 
 def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) -> CloudSequence:
-    """At most `points` random points of each frame in their own order, with their fields; 0 keeps all."""
+    """Returns at most `points` random points of each frame in their own order, with their fields; 0 keeps all."""
     starts, counts = sequence.frame_offsets[:-1], np.diff(sequence.frame_offsets)
     keep = [
         start + (np.sort(rng.choice(count, points, replace=False)) if 0 < points < count else np.arange(count))
@@ -80,7 +86,7 @@ def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) 
 
 
 def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, device: str = "cpu") -> np.ndarray:
-    """Flow f32 (P,3) of the points drawn from the frames `whole`: to the next frame, in the last frame to the one before.
+    """Returns the flow f32 (P,3) of the points drawn from the frames `whole`: to the next frame, of the last frame back.
 
     icp and nearest look for the points in the whole next frame (icp in 1,024 of its points at most), a trained
     estimator in the points drawn from it, as it was trained. Zero in a single frame and toward a frame without points.
@@ -88,11 +94,14 @@ def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, devi
     frames = [drawn.frame(t) for t in range(drawn.num_frames)]
     targets = whole if flow in METHODS else frames
     last = len(frames) - 1
-    found = [_flow(frames[t], targets[t + 1 if t < last else t - 1], flow, device) for t in range(last + 1) if last]
-    return np.concatenate(found).astype(np.float32, copy=False) if last else np.zeros_like(drawn.points)
+    flows = [
+        _frame_flow(frames[t], targets[t + 1 if t < last else t - 1], flow, device) for t in range(last + 1) if last
+    ]
+    return np.concatenate(flows).astype(np.float32, copy=False) if last else np.zeros_like(drawn.points)
 
 
-def _flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) -> np.ndarray:
+def _frame_flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) -> np.ndarray:
+    """Returns the flow f32 (N,3) of points (N,3) toward a frame (M,3); zero where either has no points."""
     if min(len(points), len(target)) == 0:
         return np.zeros_like(points)
     pair = (torch.from_numpy(np.ascontiguousarray(cloud))[None] for cloud in (points, target))
@@ -100,7 +109,7 @@ def _flow(points: np.ndarray, target: np.ndarray, flow: str, device: str) -> np.
 
 
 def flow_as_points(sequence: CloudSequence) -> np.ndarray:
-    """Flow f32 (P,3) scaled to the range of the coordinates (thesis A.1.5.2), forward in time in the last frame as well.
+    """Returns flow f32 (P,3) scaled to the range of the coordinates (thesis A.1.5.2), forward in time in all frames.
 
     One factor a sequence: the 99th percentile of the flow's norms becomes that of the distances of all points from
     their mean. The largest norm counts where that percentile is 0; flow below 1e-9 of the distances becomes 0.
@@ -117,7 +126,14 @@ def flow_as_points(sequence: CloudSequence) -> np.ndarray:
     return np.float32(flow * factor)
 
 
-def run_flow_estimate(
+class EstimatedFlow(NamedTuple):
+    """Holds how much flow was estimated."""
+
+    sequences: int
+    frames: int
+
+
+def estimate_flow_of_file(
     data: str,
     output: str,
     *,
@@ -129,19 +145,21 @@ def run_flow_estimate(
     device: str,
     jobs: int | None,
     force: bool,
-) -> None:
-    """`dpc segment estimate-flow`; running again continues where a stopped or killed run ended."""
-    weights = flow_weights(flow)
+) -> EstimatedFlow:
+    """Writes the flow of a clouds file; running again continues where a stopped or killed run ended.
+
+    flow, points, as_points: see `FlowOfSequence`. jobs: processes, None for as many as pay.
+    """
+    weights = find_estimator(flow)
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
-        chosen = [i for i, name in enumerate(reader.splits) if split == "all" or name == split]
-        if not chosen:
-            raise DataError(f"{data}: no sequence of split {split!r}; it has {sorted(set(reader.splits))}")
+        chosen = sequences_of_split(reader, split, data)
+        size = EstimatedFlow(len(chosen), int(reader.frame_counts[chosen].sum()))
         config = {"flow": "estimator" if weights else flow, "points": points, "as_points": as_points, "split": split}
         inputs = {"clouds": path} | ({"flow": weights} if weights else {})
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
         device = str(choose_device(device)) if weights else "cpu"
-        work = FlowOfSequence(str(weights or flow), points, as_points, seed, device)
+        work = FlowOfSequence(flow, points, as_points, seed, device)
         if force or not _already_there(target, history[-1]):
             keep_freed_memory()
             with CloudsWriter(
@@ -155,27 +173,12 @@ def run_flow_estimate(
                 force=force,
                 resume=output != "-",
             ) as writer:
-                frames = int(reader.frame_counts[chosen].sum())
-                _estimate_all(reader, chosen, work, writer, _processes(jobs, work, frames))
-    if output != "-":
-        print(f"{output}: flow of {len(chosen)} sequences, {int(reader.frame_counts[chosen].sum())} frames")
+                _estimate_sequences(reader, chosen, work, writer, _choose_processes(jobs, work, size.frames))
+    return size
 
 
-def flow_weights(flow: str) -> Path | None:
-    """Returns the file of a trained estimator, checked before any work; None for a method that needs none."""
-    if flow in METHODS:
-        return None
-    if not Path(flow).exists():
-        raise UsageError(f"--flow {flow}: expected {', '.join(METHODS)}, or a trained estimator's file or folder")
-    from dpcli.segment.flow.model_file import find_flow_model, load_flow_model
-
-    path = find_flow_model(flow)
-    load_flow_model(path)
-    return path
-
-
-def _processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
-    """Rigid bodies are found on one core: if that takes long, by a process for each. The other methods use all anyway."""
+def _choose_processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
+    """Returns how many processes work: one for each core where rigid bodies are found, which takes one core, else one."""
     if work.device != "cpu":
         return 1  # one process on an accelerator
     return jobs or (cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1)
@@ -190,9 +193,10 @@ def _already_there(target: Path, entry: dict) -> bool:
     return made
 
 
-def _estimate_all(
+def _estimate_sequences(
     reader: CloudsReader, chosen: list[int], work: FlowOfSequence, writer: CloudsWriter, jobs: int
 ) -> None:
+    """Writes the flow of the sequences that an earlier run has not written."""
     done = len(writer.written_names)
     read = [name for name in work.fields(reader.fields) if name in reader.fields and name != "scene_flow"]
     todo = ((index, reader.read(index, fields=read)) for index in chosen[done:])

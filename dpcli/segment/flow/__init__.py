@@ -1,7 +1,4 @@
-"""Scene flow between two frames: nearest points, rigid bodies found by ICP, or a network trained without labels."""
+"""This folder holds all that estimates scene flow: nearest points, rigid bodies by ICP, a network and its training.
 
-from __future__ import annotations
-
-from dpcli.segment.flow.estimate import METHODS, estimate_flow
-
-__all__ = ["METHODS", "estimate_flow"]
+Nothing here knows of part networks but their slot matching.
+"""

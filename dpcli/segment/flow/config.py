@@ -1,49 +1,75 @@
-"""Sizes of the flow network; two named configurations."""
+"""The sizes of the flow network, the settings of its training, and their two presets; nothing here needs torch."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from dataclasses import dataclass
+from typing import Literal
 
-from dpcli.errors import UsageError
+from dpcli.runtime.settings.catalog import Catalog
+from dpcli.runtime.settings.fields import check, setting
 
 
 @dataclass(frozen=True)
 class FlowConfig:
-    """Widths and neighborhoods. Defaults are `compact`, ours, for training on a CPU. Lengths: diameters of the object."""
+    """Holds the widths and neighborhoods of a flow network; defaults are `compact`, ours, for training on a CPU.
 
-    local: tuple[int, int] = (24, 48)  # channels at N/2 and N/4 points
-    deep: tuple[int, int] = (64, 96)  # at N/8 and N/16: what the global correlation compares
-    hidden: int = 64  # of the gated recurrent unit
-    head: int = 48  # of the flow regressor
-    neighbors: int = 16
-    correlated: int = 8  # nearest points of the other frame, compared with each warped point
-    radius: float = 0.1  # farther ones are replaced by the nearest
-    iterations: int = 4
-    norm: str = "layer"  # or batch
-    support: float = 10.0  # global correlation looks no farther
+    Lengths are in diameters of the object.
+    """
+
+    local: tuple[int, int] = setting((24, 48), "Channels of the levels of N/2 and N/4 points.", least=1)
+    deep: tuple[int, int] = setting(
+        (64, 96), "Channels of the levels of N/8 and N/16 points, which the global match compares.", least=1
+    )
+    hidden: int = setting(64, "Width of the gated recurrent unit.", least=1)
+    head: int = setting(48, "Width of the layers that regress the flow.", least=1)
+    neighbors: int = setting(16, "Neighbors that a set convolution looks at.", least=1)
+    correlated: int = setting(8, "Nearest points of the other frame that a warped point is compared with.", least=1)
+    radius: float = setting(
+        0.1, "Distance beyond which such a point is replaced by the nearest, in diameters.", above=0
+    )
+    iterations: int = setting(4, "Estimates of the flow: the global match, then corrections.", least=1)
+    norm: Literal["layer", "batch"] = setting("layer", "Normalization of the layers.")
+    support: float = setting(10.0, "Distance beyond which the global match looks for nothing, in diameters.", above=0)
+
+    def __post_init__(self) -> None:
+        check(self)
 
     def to_json(self) -> str:
+        """Returns the text that a weights file keeps."""
         return json.dumps(dataclasses.asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> FlowConfig:
+        """Returns the sizes that `to_json` wrote."""
         values = json.loads(text)
         return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
 
 
+@dataclass(frozen=True)
+class FlowSchedule:
+    """Holds how long a flow network learns."""
+
+    steps: int = setting(2000, "Steps of the optimizer.", least=1)
+    batch: int = setting(8, "Pairs per step.", least=1)
+    points: int = setting(512, "Points of each frame that the network sees in training.", least=32)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
 def release() -> FlowConfig:
-    """The widths stated for FlowStep3D on SAPIEN. What is known of it leaves joints open, so the count differs from its
-    629,207 parameters, and its checkpoints don't load."""
+    """Returns the widths stated for FlowStep3D on SAPIEN.
+
+    What is known of it leaves joints open, so the count differs from its 629,207 parameters, and its checkpoints don't
+    load.
+    """
     return FlowConfig(local=(32, 64), deep=(128, 256), hidden=128, head=128, norm="batch")
 
 
-FLOW_CONFIGS = {"compact": FlowConfig, "release": release}
-
-
-def find_flow_config(name: str) -> FlowConfig:
-    """A named configuration. UsageError lists the names."""
-    if name not in FLOW_CONFIGS:
-        raise UsageError(f"--config {name}: expected one of {', '.join(FLOW_CONFIGS)}")
-    return FLOW_CONFIGS[name]()
+CATALOG = Catalog(network=FlowConfig, schedule=FlowSchedule)
+PRESETS = {
+    "compact": {"network": FlowConfig(), "schedule": FlowSchedule()},
+    "release": {"network": release(), "schedule": FlowSchedule()},
+}

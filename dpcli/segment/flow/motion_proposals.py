@@ -1,18 +1,21 @@
-"""Where to look: regions of a cloud, and motions that parts of articulated things are likely to make."""
+"""Proposals for the search of rigid bodies: regions of a cloud, and motions that articulated things often make."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from dpcli.ops import fps_numpy
-from dpcli.segment.flow.kernels_icp import distinct_kernel, lloyd_kernel
+from dpcli.segment.flow.icp_kernels import distinct_kernel, lloyd_kernel
 
 ANGLES = (-0.6, -0.3, 0.3, 0.6)  # radians
 SHIFTS = (-0.18, -0.08, 0.08, 0.18)  # diameters
 
 
-def turn(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """Motions (H,3,4): by angles (H) radians about unit axes (H,3) through centers (H,3) or (3) (Rodrigues)."""
+def turn_about(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Returns motions (H,3,4) that turn by angles (H), radians, about unit axes (H,3) through centers (H,3) or (3).
+
+    By Rodrigues' formula.
+    """
     x, y, z = axes.T
     zero = np.zeros_like(x)
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
@@ -24,20 +27,22 @@ def turn(axes: np.ndarray, angles: np.ndarray, centers: np.ndarray) -> np.ndarra
     return np.concatenate([rotation, offset[:, :, None]], 2)
 
 
-def shift(offsets: np.ndarray) -> np.ndarray:
-    """Motions (H,3,4) without a turn, by offsets (H,3)."""
+def shift_by(offsets: np.ndarray) -> np.ndarray:
+    """Returns motions (H,3,4) that shift by offsets (H,3) and don't turn."""
     return np.concatenate([np.broadcast_to(np.eye(3), (len(offsets), 3, 3)), offsets[:, :, None]], 2)
 
 
-def compose(after: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Motions (H,3,4) after one (3,4)."""
+def compose_motions(after: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Returns motions (H,3,4) that follow one other motion (3,4)."""
     rotation = after[:, :, :3] @ before[:, :3]
     return np.concatenate([rotation, after[:, :, :3] @ before[:, 3:] + after[:, :, 3:]], 2)
 
 
-def articulated(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
-    """Motions (H,3,4) for a part (n,3): none; about its edges (doors, lids), about its normal (blades); along its axes
-    (drawers); and onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
+def propose_motions(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
+    """Returns motions (H,3,4) that a part (n,3) is likely to make; the first is the identity.
+
+    The others turn about its edges (doors, lids), about its normal (blades), shift along its axes (drawers), and shift
+    it onto each of the places `lonely` (Q,3) of the other frame that nothing has reached yet.
     """
     center = points.mean(0)
     axes = np.linalg.eigh(np.cov(points.T))[1].T[::-1]  # longest first, the normal last
@@ -45,18 +50,21 @@ def articulated(points: np.ndarray, lonely: np.ndarray) -> np.ndarray:
     hinge, across = np.array([0, 1, 0, 1]), np.array([1, 0, 2, 2])
     edges = center + np.array([-1, 1])[:, None, None] * (extent[across, None] * axes[across])  # [side, hinge, 3]
     angles = len(ANGLES)
-    turns = turn(
+    turns = turn_about(
         np.tile(np.repeat(axes[hinge], angles, 0), (2, 1)),
         np.tile(ANGLES, 8),
         np.repeat(edges.reshape(-1, 3), angles, 0),
     )
-    spins = turn(axes[[2, 2]], np.array([-0.4, 0.4]), center)
+    spins = turn_about(axes[[2, 2]], np.array([-0.4, 0.4]), center)
     offsets = np.concatenate([np.zeros((1, 3)), *(axes * by for by in SHIFTS), lonely - center])
-    return np.concatenate([turns, spins, shift(offsets)])
+    return np.concatenate([turns, spins, shift_by(offsets)])
 
 
-def distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: float, most: int) -> list[int]:
-    """Indices of the best (lowest) scored motions, no two of which move every point to within `apart` of each other."""
+def choose_distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: float, most: int) -> list[int]:
+    """Returns indices of the best (lowest) scored motions, at most `most`.
+
+    No two of them move every point to within `apart` of each other.
+    """
     chosen = np.empty(most, np.int64)
     corners = points[:: max(1, len(points) // 12)]
     moved = np.einsum("hij,nj->hni", motions[:, :, :3], corners) + motions[:, None, :, 3]
@@ -64,24 +72,24 @@ def distinct(motions: np.ndarray, score: np.ndarray, points: np.ndarray, apart: 
     return chosen[:found].tolist()
 
 
-def voronoi(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
-    """Patch i64 (N) of each point (N,3 or more): k-means (Lloyd) from farthest points; the same every time."""
+def cluster_patches(points: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
+    """Returns the patch i64 (N) of each point (N,3 or more): k-means (Lloyd) from farthest points; the same every time."""
     center = points[fps_numpy(points[:, :3], min(count, len(points)))].astype(np.float64)
     patch = np.zeros(len(points), np.int64)
     lloyd_kernel(np.ascontiguousarray(points, np.float32), center, rounds, patch)
     return patch
 
 
-def centers(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
-    """Up to `most` centers (Q,3) of patches of about `each` points; none for fewer than 6 points."""
+def find_patch_centers(points: np.ndarray, each: int = 12, most: int = 4) -> np.ndarray:
+    """Returns up to `most` centers (Q,3) of patches of about `each` points; none for fewer than 6 points."""
     if len(points) < 6:
         return np.zeros((0, 3))
-    patch = voronoi(points, min(most, max(1, len(points) // each)))
+    patch = cluster_patches(points, min(most, max(1, len(points) // each)))
     return np.stack([points[patch == k].mean(0) for k in np.unique(patch)]).astype(np.float64)
 
 
-def components(chosen: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
-    """Connected sets of the chosen points (mask (N)) in the graph of neighbors (N,k), as index arrays."""
+def find_components(chosen: np.ndarray, neighbors: np.ndarray) -> list[np.ndarray]:
+    """Returns connected sets of the chosen points (mask (N)) in the graph of neighbors (N,k), as index arrays."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -1,7 +1,7 @@
-"""Which points move as one body, judged from a flow alone: several rigid motions fitted to it, greedily.
+"""The points that move as one body, judged from a flow alone: several rigid motions are fitted to it, greedily.
 
-The start of unsupervised training. A network that knows nothing puts all points into one part and stays there, since parts
-that are alike get the same motion; labels from the flow, wrong as some are, show it what a part is.
+This is the start of unsupervised training. A network that knows nothing puts all points into one part and stays there,
+since parts that are alike get the same motion; labels from the flow, wrong as some are, show it what a part is.
 """
 
 from __future__ import annotations
@@ -23,12 +23,20 @@ def rigid_groups(
     gain: float = 0.03,
     smallest: float = 0.02,
 ) -> Tensor:  # [B, N]
-    """Labels i64 (B,N), 0 = the largest body; -1 = no motion found explains the point.
+    """Returns labels i64 (B,N), 0 = the largest body; -1 = no motion found explains the point.
 
-    Hypotheses are the motions of neighborhoods of `seeds` far-apart points, of two sizes, and of the whole. The one that
-    explains most is taken and fitted again to what it explains, then the one that explains most of the rest, until a
-    motion would gain less than the share `gain` of the points or there are `most`. A point counts as explained within a
-    tolerance: three times the median residual of the small neighborhoods' own fits, kept within the bounds (diameters).
+    Hypotheses are the motions of neighborhoods of `seeds` far-apart points, of two sizes, and of the whole. The one
+    that explains most is taken and fitted again to what it explains, then the one that explains most of the rest, until
+    a motion would gain less than the share `gain` of the points or there are `most`. A point counts as explained within
+    a tolerance: three times the median residual of the small neighborhoods' own fits, kept within the bounds
+    (diameters).
+
+    The left 60 points of a line stand still, the right 40 rise:
+
+    >>> points = torch.linspace(0, 1, 100)[None, :, None] * torch.tensor([1.0, 0.0, 0.0])
+    >>> flow = (points[..., :1] > 0.6) * torch.tensor([0.0, 0.0, 0.3])
+    >>> rigid_groups(points, flow)[0].bincount().tolist()
+    [60, 40]
     """
     moved = points + flow
     hypotheses, noise = _hypotheses(points, moved, min(seeds, points.shape[1]))
@@ -55,7 +63,7 @@ def rigid_groups(
 
 
 def _hypotheses(points: Tensor, moved: Tensor, seeds: int) -> tuple[tuple[Tensor, Tensor], Tensor]:
-    """Motions (B,H,3,3), (B,H,3) and the flow's noise (B)."""
+    """Returns motions (B,H,3,3), (B,H,3) and the flow's noise (B)."""
     centers = gather_points(points, fps(points, seeds))
     rotations, shifts, noise = [], [], None
     for count in (16, 48):
@@ -73,12 +81,12 @@ def _hypotheses(points: Tensor, moved: Tensor, seeds: int) -> tuple[tuple[Tensor
 
 
 def _residuals(points: Tensor, moved: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
-    """(B,H,N): how far each motion takes each point from where the flow does."""
+    """Returns how far (B,H,N) each motion takes each point from where the flow does."""
     return (apply_motions(points, rotation, shift) - moved[:, None]).square().sum(-1).sqrt()
 
 
 def _refined(points: Tensor, moved: Tensor, cost: Tensor, residual: Tensor, bound: Tensor) -> Tensor:
-    """Residuals (B,N) of a motion fitted again, twice, to the points it explains better than what is there."""
+    """Returns residuals (B,N) of a motion fitted again, twice, to the points it explains better than what is there."""
     for _ in range(2):
         inside = (residual < torch.minimum(cost, bound)).to(points.dtype)
         enough = inside.sum(1, keepdim=True) >= 4
@@ -88,7 +96,10 @@ def _refined(points: Tensor, moved: Tensor, cost: Tensor, residual: Tensor, boun
 
 
 def _labels(points: Tensor, residual: Tensor, bound: Tensor, smallest: float) -> Tensor:
-    """The motion with the least residual over each point's neighbors; crumbs and unexplained points are -1."""
+    """Returns the motion (B,N) with the least residual over each point's neighbors.
+
+    Points of bodies with a smaller share than `smallest`, and unexplained ones, are -1.
+    """
     _, index = knn(points, points, min(8, points.shape[1]))
     capped = residual.clamp(max=2 * float(bound.max())).transpose(1, 2)  # [B, N, M]
     smooth = gather_points(capped, index).mean(2)

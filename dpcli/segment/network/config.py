@@ -1,17 +1,60 @@
-"""What a part network is made of; two named configurations and their switches."""
+"""The sizes of a part network, the two sets of sizes there are, and the settings that choose among them."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from dpcli.errors import UsageError
+from dpcli.runtime.settings.fields import check, setting
+
+Group = Literal["icosahedral", "trivial"]
+Pooling = Literal["point", "global"]
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Holds what a user chooses of the network; `config` makes the sizes of it."""
+
+    sizes: Literal["compact", "release"] = setting(
+        "compact",
+        "Widths, neighborhoods and kernels: compact (under 0.25 M parameters) or release (1.43 M, as published).",
+    )
+    group: Group = setting("icosahedral", "Rotation group; trivial turns equivariance off (an ablation).")
+    pooling: Pooling = setting(
+        "point", "Who chooses the rotations of eq. 4.2: each point, or the whole cloud at once (global, an ablation)."
+    )
+    motion_head: bool = setting(True, "Have a motion head, which says each part's rotation between two frames.")
+    slots: int = setting(8, "Most parts that a frame can be divided into.", least=2)
+    points: int = setting(512, "Points of each frame that the network sees.", least=32)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def config(self) -> PartConfig:
+        """Returns the sizes of the network that these settings describe."""
+        chosen = {"group": self.group, "pooling": self.pooling, "slots": self.slots, "points": self.points}
+        without_motion = {} if self.motion_head else {"motion_width": 0}
+        return dataclasses.replace(SIZES[self.sizes](), **chosen, **without_motion)
+
+
+@dataclass(frozen=True)
+class Precision:
+    """Holds whether the network works in mixed precision."""
+
+    amp: bool | None = setting(
+        None, "Matrix products in bfloat16, geometry in float32; none: on GPUs that have it (Ampere and later)."
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One separable SE(3) convolution. Lengths in the input's unit (an object of diameter 1)."""
+    """Holds the sizes of one separable SE(3) convolution; lengths are in diameters of the object."""
 
     channels: int
     stride: int
@@ -23,15 +66,13 @@ class Layer:
 
 @dataclass(frozen=True)
 class PartConfig:
-    """Sizes and switches of the network. Defaults are `compact`."""
+    """Holds the sizes and switches of a part network as its weights file records them; defaults are `compact`."""
 
     layers: tuple[tuple[Layer, ...], ...]  # blocks of layers; every block ends in an invariant pooling
-    group: str = "icosahedral"  # trivial: no equivariance (ablation)
+    group: Group = "icosahedral"
     kernel: str = "vertices"  # uniform: 23 points that no rotation permutes (release)
     rule: str = "nearest"  # first: in index order (release)
-    pooling: str = (
-        "point"  # point: every point its own rotation weights (eq. 4.2); global: one for the cloud (ablation)
-    )
+    pooling: Pooling = "point"
     pool_heads: int = 4
     canonical_heads: int = 4  # learned frames that give exactly invariant coordinates; 0: raw xyz (release)
     decoder: tuple[tuple[int, ...], ...] = ((96, 64), (96, 64))
@@ -46,21 +87,18 @@ class PartConfig:
     points: int = 512  # per frame in training
 
     def __post_init__(self) -> None:
-        for option, value, known in (
-            ("--group", self.group, ("icosahedral", "trivial")),
-            ("--pooling", self.pooling, ("point", "global")),
-        ):
-            if value not in known:
-                raise UsageError(f"{option} {value}: expected {' or '.join(known)}")
-
-    def changed(self, **changes: object) -> PartConfig:
-        return dataclasses.replace(self, **{key: value for key, value in changes.items() if value is not None})
+        """Raises UsageError for a rotation group or pooling that does not exist."""
+        for name, legal in (("group", get_args(Group)), ("pooling", get_args(Pooling))):
+            if getattr(self, name) not in legal:
+                raise UsageError(f"{name} = {getattr(self, name)}: expected one of {', '.join(legal)}")
 
     def to_json(self) -> str:
+        """Returns the text that a weights file keeps."""
         return json.dumps(dataclasses.asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> PartConfig:
+        """Returns the sizes that `to_json` wrote."""
         values = json.loads(text)
         values["layers"] = tuple(tuple(Layer(**layer) for layer in block) for block in values["layers"])
         for key in ("decoder", "motion_layers"):
@@ -69,7 +107,7 @@ class PartConfig:
 
 
 def compact() -> PartConfig:
-    """Ours: less than 0.25 M parameters and 0.92 GMAC per 512-point frame, all of them counted."""
+    """Returns our sizes: less than 0.25 M parameters and 0.92 G multiply-adds per 512-point frame, all of them counted."""
 
     def layer(channels: int, stride: int, radius: float) -> Layer:
         return Layer(channels, stride, radius, (0.6 * radius) ** 2, 32, 0.65 * radius)
@@ -79,7 +117,7 @@ def compact() -> PartConfig:
 
 
 def release() -> PartConfig:
-    """The released SAPIEN network: 1,432,365 parameters."""
+    """Returns the sizes of the network released for SAPIEN: 1,432,365 parameters."""
     rows = (
         (32, 2, 0.2, 0.02, 96),
         (32, 1, 0.08**0.5, 0.04, 48),
@@ -103,11 +141,5 @@ def release() -> PartConfig:
     )
 
 
-CONFIGS = {"compact": compact, "release": release}
-
-
-def find_config(name: str) -> PartConfig:
-    """A named configuration. UsageError lists the names."""
-    if name not in CONFIGS:
-        raise UsageError(f"--config {name}: expected one of {', '.join(CONFIGS)}")
-    return CONFIGS[name]()
+SIZES = {"compact": compact, "release": release}
+NETWORK_PRESETS = {name: NetworkSettings(sizes=name) for name in SIZES}

@@ -1,4 +1,4 @@
-"""From a frame's points to equivariant features, and from these to invariant ones (thesis 4.4.3, B.1.1, B.1.2)."""
+"""The encoder: from a frame's points to equivariant features, and from these to invariant ones (thesis 4.4.3, B.1)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from dpcli.ops import fps
-from dpcli.ops.gather import gather_points
+from dpcli.ops import fps, gather_points
 from dpcli.runtime.mixed_precision import full_precision
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS
@@ -18,7 +17,7 @@ from dpcli.segment.network.se3_conv import SeparableConv
 
 @dataclass
 class Level:
-    """One block's result: points (B,P,3), equivariant features (B,P,G,C), invariant features (B,P,H*C)."""
+    """Holds one block's result: points (B,P,3), equivariant features (B,P,G,C), invariant features (B,P,H*C)."""
 
     points: Tensor
     equivariant: Tensor
@@ -26,10 +25,11 @@ class Level:
 
 
 class InvariantPooling(nn.Module):
-    """u(p) = sum_a softmax_a(logit(p,a)) f(p,a), the weighted sum over the group (eq. 4.2), with one or several weightings.
+    """Pools over the group: u(p) = sum_a softmax_a(logit(p,a)) f(p,a) (eq. 4.2), with one or several weightings.
 
-    logit = 1x1 convolution of [f(p,a), R_a^T (x_p - m)]. m is the cloud's mean in the release, which lets a part's weights
-    depend on the other parts' poses; else the mean of the point's own neighbors. ``global``: one weighting for all points.
+    logit = 1x1 convolution of [f(p,a), R_a^T (x_p - m)]. m is the cloud's mean in the release, which lets a part's
+    weights depend on the other parts' poses; else the mean of the point's own neighbors. `global`: one weighting for
+    all points.
     """
 
     def __init__(self, channels: int, config: PartConfig) -> None:
@@ -38,7 +38,7 @@ class InvariantPooling(nn.Module):
         self.logit = nn.Linear(channels + 3, config.pool_heads)
 
     def forward(self, features: Tensor, points: Tensor, near: Neighborhood) -> Tensor:
-        """features (B,P,G,C), points (B,P,3) -> (B,P,H*C)."""
+        """Returns invariant features (B,P,H*C) from features (B,P,G,C) at points (B,P,3)."""
         rotations = GROUPS[self.config.group]().rotations_like(points)
         if self.config.canonical_heads:  # scaled by the radius, each cloud's own: of order 1, like the features
             radius = near.offsets.square().sum(-1).mean((1, 2)).sqrt().clamp(min=1e-6)
@@ -55,12 +55,15 @@ class InvariantPooling(nn.Module):
 
 @full_precision
 def _turned_back(rotations: Tensor, offsets: Tensor) -> Tensor:
-    """R_a^T x of offsets (B,P,3) for every rotation (G,3,3): (B,P,G,3)."""
+    """Returns R_a^T x of offsets (B,P,3) for every rotation (G,3,3): (B,P,G,3)."""
     return torch.einsum("gij,bpi->bpgj", rotations, offsets)
 
 
 class Encoder(nn.Module):
-    """Blocks of separable SE(3) convolutions; centers are farthest points of the first layer, later strides keep the first ones."""
+    """Stacks blocks of separable SE(3) convolutions.
+
+    The first layer's centers are farthest points; later strides keep the first of them.
+    """
 
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
@@ -76,7 +79,7 @@ class Encoder(nn.Module):
             self.pools.append(InvariantPooling(channels, config))
 
     def forward(self, points: Tensor) -> list[Level]:
-        """points (B,N,3) -> a level per block."""
+        """Returns a level per block from points (B,N,3)."""
         features, levels = None, []
         for block, pool in zip(self.blocks, self.pools):
             near, used = None, None
@@ -97,10 +100,10 @@ class Encoder(nn.Module):
 
 
 class CanonicalFrames(nn.Module):
-    """Coordinates no rotation of the group and no shift changes: x - mean, read in frames that the features choose.
+    """Computes coordinates that no rotation of the group and no shift changes: x - mean, read in learned frames.
 
-    w(a) = softmax over the group of a 1x1 convolution of the features' mean over points; the coordinates are
-    sum_a w(a) R_a^T (x - mean), one triple per head. Turning the cloud by g moves w(a) to w(g a), and nothing else.
+    w(a) = softmax over the group of a 1x1 convolution of the features' mean over points; the coordinates are sum_a w(a)
+    R_a^T (x - mean), one triple per head. Turning the cloud by g moves w(a) to w(g a), and nothing else.
     """
 
     def __init__(self, channels: int, config: PartConfig) -> None:
@@ -110,7 +113,7 @@ class CanonicalFrames(nn.Module):
         nn.init.normal_(self.logit.weight, std=4 / channels**0.5)  # an even weighting of all rotations would give zero
 
     def forward(self, level: Level) -> Tensor:
-        """Maps (B,H,3,3) that take centered coordinates into the canonical frames."""
+        """Returns maps (B,H,3,3) that take centered coordinates into the canonical frames."""
         return self._maps(level.equivariant)
 
     @full_precision

@@ -18,10 +18,10 @@ _CLOSE = 1e-6  # rotations of the group differ by 0.6 and more in some entry, ro
 
 @dataclass(frozen=True)
 class RotationGroup:
-    """A finite group of rotations with the tables of its products.
+    """Holds a finite group of rotations with the tables of its products.
 
-    rotations f64 (G,3,3), the identity first; product i64 (G,G): index of R_a R_b; inverse i64 (G);
-    nearby i64 (Q): the elements a group convolution reaches from each a, as a Q, closed under inversion.
+    rotations f64 (G,3,3), the identity first; product i64 (G,G): index of R_a R_b; inverse i64 (G); nearby i64 (Q): the
+    elements a group convolution reaches from each a, as a Q, closed under inversion.
     """
 
     rotations: np.ndarray
@@ -33,12 +33,15 @@ class RotationGroup:
         return len(self.rotations)
 
     def rotations_like(self, tensor: torch.Tensor) -> torch.Tensor:
-        """The rotations (G,3,3) on a tensor's device, in its precision."""
+        """Returns the rotations (G,3,3) on a tensor's device, in its precision."""
         return torch.as_tensor(self.rotations, dtype=tensor.dtype, device=tensor.device)
 
 
 def find_rotation(rotations: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Index i64 (...) of every wanted (...,3,3) among rotations (G,3,3). ValueError when one is not there."""
+    """Returns the index i64 (...) of every wanted (...,3,3) among rotations (G,3,3).
+
+    Raises ValueError when one is not there.
+    """
     distance = np.abs(wanted[..., None, :, :] - rotations).max((-1, -2))
     if distance.size and distance.min(-1).max() > _CLOSE:
         raise ValueError("a rotation is no element of the group")
@@ -46,13 +49,13 @@ def find_rotation(rotations: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def vertices() -> np.ndarray:
-    """The icosahedron's 12 vertices, unit vectors f64 (12,3)."""
+    """Returns the icosahedron's 12 vertices, unit vectors f64 (12,3)."""
     cyclic = [np.roll([0.0, a, b * _GOLDEN], shift) for shift in range(3) for a in (1, -1) for b in (1, -1)]
     return np.array(cyclic) / np.hypot(1, _GOLDEN)
 
 
 def rotation_about(axis: np.ndarray, degrees: float) -> np.ndarray:
-    """Rotation matrix f64 (3,3) about an axis, anticlockwise seen from its tip (Rodrigues)."""
+    """Returns the rotation matrix f64 (3,3) about an axis, anticlockwise seen from its tip (Rodrigues)."""
     x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle = np.radians(degrees)
@@ -60,7 +63,7 @@ def rotation_about(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def _faces() -> np.ndarray:
-    """Centers of the 20 faces, unit vectors: every three vertices that touch one another."""
+    """Returns the centers of the 20 faces, unit vectors: every three vertices that touch one another."""
     points = vertices()
     touch = np.isclose(points @ points.T, 1 / 5**0.5)
     found = [
@@ -75,10 +78,17 @@ def _faces() -> np.ndarray:
 
 @lru_cache
 def icosahedral_group() -> RotationGroup:
-    """The 60 rotations that map an icosahedron to itself: 1 identity, 24 fifth-turns, 20 third-turns, 15 half-turns.
+    """Returns the 60 rotations that map an icosahedron to itself.
 
-    Closes the turns by 72 degrees about a vertex and by 120 degrees about one of its faces under products. ``nearby``
-    are the 12 elements that map a face to itself or to one of its three neighbors (EPN, Chen et al. 2021).
+    They are 1 identity, 24 fifth-turns, 20 third-turns and 15 half-turns. Closes the turns by 72 degrees about a vertex
+    and by 120 degrees about one of its faces under products. `nearby` are the 12 elements that map a face to itself or
+    to one of its three neighbors (EPN, Chen et al. 2021).
+
+    >>> group = icosahedral_group()
+    >>> len(group), len(np.unique(group.product)), len(group.nearby)  # products of elements are elements
+    (60, 60, 12)
+    >>> bool((group.product[np.arange(60), group.inverse] == 0).all())
+    True
     """
     faces, points = _faces(), vertices()
     face = faces[np.argmax(faces @ points[0])]
@@ -96,11 +106,12 @@ def icosahedral_group() -> RotationGroup:
 
 @lru_cache
 def trivial_group() -> RotationGroup:
-    """The identity alone: turns every layer into its ordinary, not equivariant counterpart (an ablation)."""
+    """Returns the identity alone: every layer becomes its ordinary, not equivariant counterpart (an ablation)."""
     return _with_tables(np.eye(3)[None], np.array([0]))
 
 
 def _with_tables(rotations: np.ndarray, nearby: np.ndarray) -> RotationGroup:
+    """Returns the group with its tables; nearby: indices of the elements that a convolution reaches."""
     product = find_rotation(rotations, rotations[:, None] @ rotations[None])
     return RotationGroup(rotations, product, np.argmin(product, axis=1), nearby)
 

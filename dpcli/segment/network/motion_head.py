@@ -10,45 +10,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from dpcli.ops.rotations import mean_rotation, normalize_quaternion, quaternion_to_matrix
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.icosahedron import GROUPS, RotationGroup
 
 
 def relative_labels(rotation: Tensor, group: RotationGroup) -> tuple[Tensor, Tensor]:
-    """For T (...,3,3): label i64 (...,G), l(a) = argmax_l trace(R_a^T T R_l), and residual R_a^T T R_l (...,G,3,3)."""
+    """Returns, for T (...,3,3), label i64 (...,G) and residual (...,G,3,3) of every rotation a of the group.
+
+    l(a) = argmax_l trace(R_a^T T R_l); the residual is R_a^T T R_l.
+    """
     anchors = group.rotations_like(rotation)
     turned = torch.einsum("gij,...ik->...gjk", anchors, rotation)  # R_a^T T
     label = torch.einsum("...gjk,lkj->...gl", turned, anchors).argmax(-1)
     return label, turned @ anchors[label]
 
 
-def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """(w,x,y,z) of any length (...,4) -> rotation (...,3,3)."""
-    w, x, y, z = nn.functional.normalize(quaternion, dim=-1, eps=1e-8).unbind(-1)
-    rows = (
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    )
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-
-def mean_rotation(rotations: Tensor, weights: Tensor) -> Tensor:
-    """Weighted chordal mean: (...,M,3,3), (...,M) -> (...,3,3), the rotation nearest to the weighted sum."""
-    left, _, right = torch.linalg.svd((weights[..., None, None] * rotations).sum(-3))
-    sign = torch.linalg.det(left @ right)
-    scale = torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1)
-    return (left * scale[..., None, :]) @ right
-
-
 class MotionHead(nn.Module):
-    """Confidence (B,S,a,l) of every pair of rotations, softmax over l, and residual quaternions (B,S,a,l,4)."""
+    """Computes confidence (B,S,a,l) of every pair of rotations, softmax over l, and residual quaternions (B,S,a,l,4)."""
 
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
@@ -66,9 +45,10 @@ class MotionHead(nn.Module):
             self.residual.bias.copy_(torch.tensor([1.0, 0, 0, 0]))  # start from no residual
 
     def part_features(self, features: Tensor, points: Tensor, mask: Tensor) -> Tensor:
-        """Eq. 4.3 and max over points: features (B,P,G,C), points (B,P,3), mask (B,P,S) -> (B,S,G,D).
+        """Returns the features (B,S,G,D) of each part by eq. 4.3, the maximum over its points.
 
-        Coordinates are centered on the part, weighted by the mask, so that they depend on nothing but the part.
+        features (B,P,G,C), points (B,P,3), mask (B,P,S). Coordinates are centered on the part, weighted by the mask, so
+        that they depend on nothing but the part.
         """
         anchors = self.group.rotations_like(points)
         share = mask / mask.sum(1, keepdim=True).clamp(min=1e-6)
@@ -80,7 +60,7 @@ class MotionHead(nn.Module):
         return torch.stack(slots, 1)
 
     def forward(self, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-        """part_features of frame 1 and, slots matched to it, of frame 2."""
+        """Returns confidence and residuals from `part_features` of frame 1 and, slots matched to it, of frame 2."""
         half = self.pair.weight.chunk(2, 1)
         target, source = second @ half[0].T, first @ half[1].T + self.pair.bias
         hidden = torch.relu(source[:, :, :, None] + target[:, :, None])  # [B, S, a, l, D]
@@ -89,12 +69,15 @@ class MotionHead(nn.Module):
         return torch.softmax(3 * self.confidence(hidden).squeeze(-1), -1), self.residual(hidden)
 
     def candidates(self, confidence: Tensor, residual: Tensor, best: int = 4) -> Tensor:
-        """Rotations (B,S,best+1,3,3) from frame 1 to 2: for the k-th most confident target of every source, averaged over
-        sources by confidence, and the overall most confident pair's own."""
+        """Returns rotations (B,S,best+1,3,3) from frame 1 to 2.
+
+        They are, for the k-th most confident target of every source, the average over sources by confidence, and the
+        overall most confident pair's own.
+        """
         anchors = self.group.rotations_like(confidence)
         weight, target = confidence.topk(min(best, confidence.shape[-1]), -1)  # [B, S, a, k]
         picked = residual.gather(3, target[..., None].expand(*target.shape, 4))
-        turned = quaternion_to_matrix(picked)  # r ~ R_a^T T^T R_l
+        turned = quaternion_to_matrix(normalize_quaternion(picked))  # r ~ R_a^T T^T R_l
         rotation = anchors[target] @ turned.mT @ anchors[:, None].mT  # T = R_l r^T R_a^T
         means = mean_rotation(rotation.transpose(2, 3), weight.transpose(2, 3))
         top = weight[..., 0].argmax(-1)[..., None, None, None, None].expand(-1, -1, 1, 1, 3, 3)
@@ -104,13 +87,14 @@ class MotionHead(nn.Module):
 def rotation_loss(
     confidence: Tensor, residual: Tensor, rotation: Tensor, weight: Tensor, group: RotationGroup
 ) -> Tensor:
-    """Squared error of the residual at the labeled pair (as the release has it) plus 0.1 of the confidences' cross-entropy.
+    """Returns the squared error of the residual at the labeled pair plus 0.1 of the confidences' cross-entropy.
 
     rotation (B,S,3,3): each part's from frame 1 to 2. weight (B,S): how much each counts, e.g. its share of the points.
+    The error is taken at the labeled pair only, as the release has it.
     """
     label, wanted = relative_labels(rotation.mT, group)
     at = residual.gather(3, label[..., None, None].expand(*label.shape, 1, 4)).squeeze(3)
-    error = (quaternion_to_matrix(at) - wanted).square().mean((-1, -2))
+    error = (quaternion_to_matrix(normalize_quaternion(at)) - wanted).square().mean((-1, -2))
     chosen = confidence.gather(3, label[..., None]).squeeze(-1).clamp(min=1e-8).log()
     return (weight[..., None] * (error - 0.1 * chosen)).sum() / (weight.sum() * label.shape[-1]).clamp(min=1e-6)
 
@@ -118,10 +102,10 @@ def rotation_loss(
 def choose_motion(
     rotations: Tensor, first: Tensor, mask1: Tensor, second: Tensor, mask2: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Of candidate rotations (B,S,M,3,3) the one with the least mask-weighted two-way Chamfer distance (B.6, B.7).
+    """Returns, of candidate rotations (B,S,M,3,3), the one with the least two-way Chamfer distance (B.6, B.7).
 
-    first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S) matched to mask1. The translation joins the parts'
-    weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
+    The distance is weighted by the masks. first (B,P,3), mask1 (B,P,S), second (B,Q,3), mask2 (B,Q,S) matched to mask1.
+    The translation joins the parts' weighted centers. -> rotation (B,S,3,3), translation (B,S,3).
     """
     share1, share2 = (m / m.sum(1, keepdim=True).clamp(min=1e-6) for m in (mask1, mask2))
     center1, center2 = torch.einsum("bps,bpi->bsi", share1, first), torch.einsum("bps,bpi->bsi", share2, second)

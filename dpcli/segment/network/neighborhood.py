@@ -1,6 +1,6 @@
-"""Which points a spherical convolution looks at: centers, neighbors, and how much each counts at each kernel point.
+"""The points a spherical convolution looks at: centers, neighbors, and how much each counts at each kernel point.
 
-Depends on coordinates alone, so one pass serves all layers of a frame and nothing here carries a gradient.
+All of it depends on coordinates alone, so one pass serves all layers of a frame and nothing here carries a gradient.
 """
 
 from __future__ import annotations
@@ -10,15 +10,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dpcli.ops import knn
-from dpcli.ops.gather import gather_points
+from dpcli.ops import gather_points, knn
 from dpcli.runtime.mixed_precision import full_precision
 
 
 @dataclass
 class Neighborhood:
-    """centers (B,P,3), the neighbors' index (B,P,n) into the layer's input points, offsets (B,P,n,3) = x_n - x_p, and
-    window (B,P,n): how much a neighbor counts at all."""
+    """Holds centers (B,P,3) and their neighbors.
+
+    index (B,P,n): into the layer's input points; offsets (B,P,n,3) = x_n - x_p; window (B,P,n): how much a neighbor
+    counts at all.
+    """
 
     centers: Tensor
     index: Tensor
@@ -27,7 +29,7 @@ class Neighborhood:
 
 
 def nearest_neighborhood(points: Tensor, centers: Tensor, radius: float, count: int) -> Neighborhood:
-    """At most `count` nearest points within `radius`, with a window that falls to zero where the ball or the count ends.
+    """Returns at most `count` nearest points within `radius`, with a window that falls to zero at the end.
 
     window = 1 - d^2 / min(radius, distance to the next point)^2: nothing jumps when rounding lets a point in or out, so
     features move as little as the coordinates do. points (B,N,3), centers (B,P,3).
@@ -43,9 +45,9 @@ def nearest_neighborhood(points: Tensor, centers: Tensor, radius: float, count: 
 
 
 def first_neighborhood(points: Tensor, centers: Tensor, radius: float, count: int) -> Neighborhood:
-    """The release's rule: the first `count` points in index order with d < radius, repeated in turn when there are fewer.
+    """Returns the first `count` points in index order with d < radius, repeated in turn when there are fewer.
 
-    Its quirk is kept: with exactly count - 1 hits, the last slot is point 0. window is 1.
+    This is the release's rule, whose quirk is kept: with exactly count - 1 hits, the last slot is point 0. window is 1.
     """
     squared = (centers[:, :, None] - points[:, None]).square().sum(-1)
     hit = squared < radius**2
@@ -64,6 +66,6 @@ RULES = {"nearest": nearest_neighborhood, "first": first_neighborhood}
 
 @full_precision
 def kernel_weights(offsets: Tensor, positions: Tensor, sigma: float) -> Tensor:
-    """max(0, 1 - ||x_n - x_p - k||^2 / sigma) for positions k (D,3): (B,P,n,3) -> (B,P,n,D)."""
+    """Returns max(0, 1 - ||x_n - x_p - k||^2 / sigma) for positions k (D,3): (B,P,n,3) -> (B,P,n,D)."""
     apart = offsets.square().sum(-1, keepdim=True) + positions.square().sum(-1) - 2 * offsets @ positions.T
     return (1 - apart / sigma).clamp(min=0)

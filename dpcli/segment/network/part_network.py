@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor, nn
 
-from dpcli.ops.gather import gather_points
+from dpcli.ops import gather_points
 from dpcli.ops.nearest_neighbors import knn
 from dpcli.runtime.mixed_precision import reduced_products
 from dpcli.segment.network.config import PartConfig
@@ -17,14 +17,14 @@ from dpcli.segment.network.segmentation_head import SegmentationHead
 
 @dataclass
 class FrameParts:
-    """What the network says of single frames: mask (B,N,S) and the coarsest level, which the motion head reads."""
+    """Holds masks (B,N,S) of single frames and the coarsest level, which the motion head reads."""
 
     mask: Tensor
     level: Level
 
 
 class PartNetwork(nn.Module):
-    """Masks of single frames; rotations between two frames from both frames' masks and equivariant features."""
+    """Computes masks of single frames, and the parts' rotations between two frames."""
 
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
@@ -35,7 +35,10 @@ class PartNetwork(nn.Module):
         self.motion = MotionHead(config) if config.motion_width else None
 
     def forward(self, points: Tensor) -> FrameParts:
-        """points (B,N,3) f32, N >= 2 -> mask (B,N,S) and features. The cloud's place doesn't matter: it is centered first."""
+        """Returns masks (B,N,S) and features of points (B,N,3) f32, N >= 2.
+
+        The cloud's place doesn't matter: it is centered first.
+        """
         if self.config.canonical_heads:  # far from the origin, float32 would blur the neighbors' distances
             points = points - points.mean(1, keepdim=True)
         with reduced_products(points.device, self.mixed):
@@ -44,15 +47,18 @@ class PartNetwork(nn.Module):
         return FrameParts(mask.float(), levels[-1])
 
     def pair(self, points: Tensor, frames: FrameParts, matched: Tensor) -> tuple[Tensor, Tensor]:
-        """Confidence and residuals of the motion head. points (2B,N,3): frames 1, then frames 2; matched (2B,N,S): masks
-        with the slots of frames 2 in the order of frames 1."""
+        """Returns confidence and residuals of the motion head.
+
+        points (2B,N,3): frames 1, then frames 2; matched (2B,N,S): masks with the slots of frames 2 in the order of
+        frames 1.
+        """
         assert self.motion is not None
         coarse = self._coarse_mask(points, frames, matched)
         features = self.motion.part_features(frames.level.equivariant, frames.level.points, coarse)
         return self.motion(*features.chunk(2))
 
     def motions(self, points: Tensor, frames: FrameParts, matched: Tensor) -> tuple[Tensor, Tensor]:
-        """Every part's rotation (B,S,3,3) and translation (B,S,3) from frames 1 to frames 2; arguments as `pair`."""
+        """Returns every part's rotation (B,S,3,3) and translation (B,S,3) from frames 1 to 2; arguments as `pair`."""
         candidates = self.motion.candidates(*self.pair(points, frames, matched))
         coarse = self._coarse_mask(points, frames, matched)
         shift = (points.mean(1) if self.config.canonical_heads else points.new_zeros(len(points), 3))[:, None]
@@ -61,7 +67,7 @@ class PartNetwork(nn.Module):
         return choose_motion(candidates, first, mask1, second, mask2)
 
     def _coarse_mask(self, points: Tensor, frames: FrameParts, mask: Tensor) -> Tensor:
-        """The masks at the coarsest level's points, which are some of the frame's own."""
+        """Returns the masks at the coarsest level's points, which are some of the frame's own."""
         centered = points - points.mean(1, keepdim=True) if self.config.canonical_heads else points
         _, own = knn(frames.level.points, centered, 1)
         return gather_points(mask, own[..., 0])

@@ -18,9 +18,10 @@ from dpcli.segment.network.neighborhood import Neighborhood, kernel_weights
 
 
 class SpatialConv(nn.Module):
-    """out[p,a,c'] = sum_{c,k} W[c,k,c'] sum_n w(x_n - x_p - R_a k) f[n,a,c]   (as EPN has it), no bias.
+    """Convolves over space with rotated kernels (as EPN has it), without bias.
 
-    features (B,N,G,C) or None for the constant 1 of a first layer -> (B,P,G,C').
+    out[p,a,c'] = sum_{c,k} W[c,k,c'] sum_n w(x_n - x_p - R_a k) f[n,a,c]. features (B,N,G,C) or None for the constant 1
+    of a first layer -> (B,P,G,C').
     """
 
     def __init__(self, channels: int, layer: Layer, config: PartConfig) -> None:
@@ -35,6 +36,7 @@ class SpatialConv(nn.Module):
         nn.init.normal_(self.weight, std=(2 / ((channels + layer.channels) * count)) ** 0.5 * 2**0.5)
 
     def forward(self, features: Tensor | None, near: Neighborhood) -> Tensor:
+        """Returns features (B,P,G,C') at the centers of the neighborhood."""
         if features is None:
             return self._of_constant(near) @ self.weight
         if self.closed:
@@ -47,17 +49,20 @@ class SpatialConv(nn.Module):
         return torch.stack(grouped, 2)
 
     def _weights(self, near: Neighborhood, positions: Tensor) -> Tensor:
-        """(B,P,n,D): what every neighbor counts at every kernel position (D,3) of radius 1."""
+        """Returns what every neighbor counts at every kernel position (D,3) of radius 1: (B,P,n,D)."""
         weight = kernel_weights(near.offsets, positions * self.layer.kernel_radius, self.layer.sigma)
         return weight * near.window[..., None]
 
     def _of_constant(self, near: Neighborhood) -> Tensor:
-        """(B,P,G,K): the sums of the constant 1, in pieces of the orbit."""
+        """Returns the sums (B,P,G,K) of the constant 1, in pieces of the orbit."""
         total = torch.cat([self._weights(near, part).sum(2) for part in self.orbit.split(128)], -1)
         return total[..., self.slot]
 
     def _one_rotation(self, features: Tensor, near: Neighborhood, rotation: int) -> Tensor:
-        """One a: the correlations of (P,K,n) live only here and are made again for the gradient."""
+        """Returns the result of one rotation a.
+
+        The correlations of (P,K,n) live only here and are made again for the gradient.
+        """
         weight = self._weights(near, self.orbit[self.slot[rotation]])
         rows = torch.arange(len(features), device=features.device)[:, None, None]
         grouped = weight.transpose(2, 3) @ features[rows, near.index]  # [B, P, K, C]
@@ -65,7 +70,10 @@ class SpatialConv(nn.Module):
 
 
 class GroupConv(nn.Module):
-    """out[p,a,c'] = sum_{c,q} W[q,c,c'] f[p, a q, c] over the nearby elements q (as EPN has it), no bias. (B,P,G,C) -> (B,P,G,C')."""
+    """Convolves over the rotation group (as EPN has it), without bias.
+
+    out[p,a,c'] = sum_{c,q} W[q,c,c'] f[p, a q, c] over the nearby elements q. (B,P,G,C) -> (B,P,G,C').
+    """
 
     def __init__(self, channels: int, out_channels: int, config: PartConfig) -> None:
         super().__init__()
@@ -78,6 +86,7 @@ class GroupConv(nn.Module):
         nn.init.normal_(self.weight, std=(2 / ((channels + out_channels) * len(group.nearby))) ** 0.5 * 2**0.5)
 
     def forward(self, features: Tensor) -> Tensor:
+        """Returns features (B,P,G,C') of features (B,P,G,C)."""
         features = features.to(REDUCED) if is_reduced(features) else features
         return _GroupConv.apply(features, self.weight, self.table, self.back)
 
@@ -88,16 +97,21 @@ _POINTS = (
 
 
 class _GroupConv(torch.autograd.Function):
-    """In pieces, gathered again for the gradient instead of keeping twelve copies of the features; gathers, never scatters."""
+    """Computes the group convolution in pieces, which are gathered again for the gradient and never scattered.
+
+    So the twelve copies of the features needn't be kept.
+    """
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, table: Tensor, back: Tensor) -> Tensor:
+        """Returns the product of the turned features and the weights."""
         ctx.save_for_backward(features, weight, table, back)
         return _multiply_turned(features, table, weight.flatten(0, 1).to(features.dtype))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None, None]:
+        """Returns the gradients of features and weights."""
         features, weight, table, back = ctx.saved_tensors
         grad = grad.contiguous()
         given = to_weight = None
@@ -116,6 +130,7 @@ class _GroupConv(torch.autograd.Function):
 
 
 def _multiply_turned(features: Tensor, table: Tensor, matrix: Tensor) -> Tensor:
+    """Returns the turned features (B,P,G,Q*C) times a matrix (Q*C,C'), piece by piece."""
     out = features.new_empty(*features.shape[:3], matrix.shape[1])
     rows = out.flatten(0, 1)
     for piece, turned in _turned(features, table):
@@ -124,7 +139,10 @@ def _multiply_turned(features: Tensor, table: Tensor, matrix: Tensor) -> Tensor:
 
 
 def _turned(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Pieces of (B*P): each element's features at the Q elements of its row, (points*G, Q*C) in a buffer used again."""
+    """Yields pieces of (B*P), each with every element's features at the Q elements of its row, (points*G, Q*C).
+
+    They lie in a buffer that is used again.
+    """
     rows = features.flatten(0, 1)
     size = _POINTS if features.device.type == "cpu" else len(rows)
     buffer = features.new_empty(size, table.numel(), features.shape[-1])
@@ -136,7 +154,10 @@ def _turned(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 
 def instance_norm(features: Tensor) -> Tensor:
-    """Zero mean and unit variance of every channel over points and rotations, which only permute under the group."""
+    """Returns features (B,P,G,C) with zero mean and unit variance of every channel over points and rotations.
+
+    These only permute under the group, so the norm is equivariant (Ulyanov et al. 2016).
+    """
     features = features.to(torch.promote_types(features.dtype, torch.float32))  # sums of thousands: not in bfloat16
     mean = features.mean((1, 2), keepdim=True)
     variance = (features - mean).square().mean((1, 2), keepdim=True)
@@ -148,7 +169,10 @@ _NORM_NS = 0.3  # measured: the kernel's, per number
 
 
 class SeparableConv(nn.Module):
-    """Spatial then group convolution, each with norm and leaky ReLU, plus a 1x1 shortcut (as the release has it)."""
+    """Convolves over space, then over the group, each with norm and leaky ReLU, plus a 1x1 shortcut.
+
+    This is the release's layer.
+    """
 
     def __init__(self, channels: int, layer: Layer, config: PartConfig) -> None:
         super().__init__()
@@ -157,7 +181,10 @@ class SeparableConv(nn.Module):
         self.shortcut = nn.Linear(channels, layer.channels)
 
     def forward(self, features: Tensor | None, near: Neighborhood) -> Tensor:
-        """features (B,N,G,C), or None for the constant 1, at points whose first P are the centers -> (B,P,G,C')."""
+        """Returns features (B,P,G,C').
+
+        features (B,N,G,C), or None for the constant 1, lie at points whose first P are the centers.
+        """
         out = _activate(self.across(_activate(self.spatial(features, near))))
         if features is None:  # the norm of a constant is zero: so is the shortcut
             return out
@@ -165,14 +192,14 @@ class SeparableConv(nn.Module):
 
 
 def _activate(features: Tensor) -> Tensor:
-    """Instance norm and leaky ReLU of features (B,P,G,C) that nobody needs afterwards: without gradient, they are overwritten.
+    """Returns instance norm and leaky ReLU of features (B,P,G,C) that nobody needs afterwards.
 
-    Backends: a numba kernel on CPU in float32 for channels in sixteens where no gradient is wanted, else torch; equal
-    up to rounding.
+    Without gradient, they are overwritten. Backends: a numba kernel on CPU in float32 for channels in sixteens where no
+    gradient is wanted, else torch; equal up to rounding.
     """
     if not _by_kernel(features):
         return nn.functional.leaky_relu(instance_norm(features), _LEAK)
-    from dpcli.segment.network.norm_kernels import norm_kernel
+    from dpcli.segment.network.instance_norm_kernel import norm_kernel
 
     batch, channels = len(features), features.shape[-1]
     rows = features[0].numel() // channels
@@ -182,6 +209,7 @@ def _activate(features: Tensor) -> Tensor:
 
 
 def _by_kernel(features: Tensor) -> bool:
+    """Returns whether the numba kernel can take these features."""
     wanted = torch.is_grad_enabled() and features.requires_grad
     fits = features.dtype == torch.float32 and features.numel() and features.shape[-1] % 16 == 0
     return bool(fits and not wanted and features.is_contiguous() and chosen_backend(features.device) == "numba")

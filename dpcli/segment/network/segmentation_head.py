@@ -12,7 +12,7 @@ from dpcli.segment.network.encoder import CanonicalFrames, Level
 
 
 class PointMLP(nn.Module):
-    """1x1 convolutions without bias, each with group norm (4 groups) and ReLU. (B,N,C) -> (B,N,C')."""
+    """Applies 1x1 convolutions without bias, each with group norm (4 groups) and ReLU: (B,N,C) -> (B,N,C')."""
 
     def __init__(self, channels: int, widths: tuple[int, ...]) -> None:
         super().__init__()
@@ -25,13 +25,14 @@ class PointMLP(nn.Module):
             channels = width
 
     def forward(self, features: Tensor) -> Tensor:
+        """Returns features (B,N,C')."""
         for linear, norm in zip(self.layers, self.norms):
             features = torch.relu(norm(linear(features).transpose(1, 2))).transpose(1, 2)
         return features
 
 
 class SlotLayer(nn.Module):
-    """Queries look at the memory, then at one another, then each at itself; norms before, as in the release."""
+    """Lets queries look at the memory, then at one another, then each at itself; norms come before, as in the release."""
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -41,6 +42,7 @@ class SlotLayer(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, width))
 
     def forward(self, slots: Tensor, memory: Tensor) -> Tensor:
+        """Returns slots (B,S,W) after they have looked at the memory (B,P,W)."""
         slots = slots + self.cross(self.norms[0](slots), memory, memory, need_weights=False)[0]
         normed = self.norms[1](slots)
         slots = slots + self.own(normed, normed, normed, need_weights=False)[0]
@@ -48,7 +50,7 @@ class SlotLayer(nn.Module):
 
 
 class SegmentationHead(nn.Module):
-    """Invariant features of all levels -> soft part masks (B,N,S), rows sum to 1."""
+    """Computes soft part masks (B,N,S), whose rows sum to 1, from the invariant features of all levels."""
 
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
@@ -71,7 +73,7 @@ class SegmentationHead(nn.Module):
             self.point_out = nn.Linear(config.decoder[1][-1], config.embedding)
 
     def forward(self, points: Tensor, levels: list[Level]) -> Tensor:
-        """points (B,N,3) of the frame -> mask (B,N,S)."""
+        """Returns the mask (B,N,S) of a frame's points (B,N,3)."""
         fine, coarse = levels
         here = self._coordinates(points, coarse)
         up = three_nn_interpolate(fine.points, coarse.points, coarse.invariant)
@@ -89,7 +91,10 @@ class SegmentationHead(nn.Module):
         return torch.softmax(_cosine(hidden, slots) / self.config.temperature, -1)
 
     def _coordinates(self, points: Tensor, coarse: Level):
-        """A function from positions (B,P,3) to what the decoder may know of them: raw, or in invariant frames (B,P,3H)."""
+        """Returns a function from positions (B,P,3) to what the decoder may know of them.
+
+        That is the positions themselves, or their coordinates in invariant frames (B,P,3H).
+        """
         if self.frames is None:
             return lambda positions: positions
         maps = self.frames(coarse)
@@ -97,6 +102,7 @@ class SegmentationHead(nn.Module):
         return lambda positions: _read_in(maps, positions - center)
 
     def _slots(self, memory: Tensor) -> Tensor:
+        """Returns the vectors (B,S,E) of the slots, which have looked at the memory (B,P,C)."""
         memory = self.memory(memory)
         slots = self.queries.expand(len(memory), -1, -1)
         for layer in self.layers:
@@ -106,11 +112,14 @@ class SegmentationHead(nn.Module):
 
 @full_precision
 def _cosine(hidden: Tensor, slots: Tensor) -> Tensor:
-    """Cosine (B,N,S) between points' and slots' vectors; divided by a small temperature, so not in bfloat16."""
+    """Returns the cosine (B,N,S) between points' and slots' vectors.
+
+    It is divided by a small temperature, so it is not computed in bfloat16.
+    """
     return nn.functional.normalize(hidden, dim=-1) @ nn.functional.normalize(slots, dim=-1).transpose(1, 2)
 
 
 @full_precision
 def _read_in(maps: Tensor, offsets: Tensor) -> Tensor:
-    """Offsets (B,P,3) in every one of the frames (B,H,3,3): (B,P,3H)."""
+    """Returns offsets (B,P,3) in every one of the frames (B,H,3,3): (B,P,3H)."""
     return torch.einsum("bhij,bpj->bphi", maps, offsets).flatten(2)

@@ -1,4 +1,4 @@
-"""The flow of every training pair, kept in files of the run folder and corrected while the network learns (eq. 4.6)."""
+"""The flows of all training pairs, kept in files of the run folder and corrected while the network learns (eq. 4.6)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from dpcli.errors import UsageError
 from dpcli.runtime.whole_file import disk_full, reserve
 
 _FIRST, _NOW, _KNOWN = "flows_first.npy", "flows.npy", "flows_known.npy"
-_THERE, _TELLING, _CORRECTED = 1, 2, 4  # bits of `flows_known.npy`
+_THERE, _BODIES, _CORRECTED = 1, 2, 4  # bits of `flows_known.npy`
 
 
 class FlowStore:
-    """Flows f32 (pairs,2,N,3), forth and back: `flows_first.npy` as estimated, `flows.npy` as corrected since; u8 (pairs)
-    beside tells what is there. ``take_from``: another run's folder whose first flows a fresh run begins with.
+    """Keeps flows f32 (pairs,2,N,3), forth and back: `flows_first.npy` as estimated, `flows.npy` as corrected since.
+
+    `flows_known.npy` u8 (pairs) tells what is there. take_from: another run's folder whose first flows a fresh run begins
+    with.
 
     Changes wait in memory until `flush`, which the trainer calls after it has saved them with its own state: a run that
     is killed finds either both or neither, and changes nothing twice. Memory: the changes since the last checkpoint.
@@ -30,16 +32,17 @@ class FlowStore:
         self.estimated: dict[int, tuple[torch.Tensor, bool]] = {}
         self.corrected: dict[int, torch.Tensor] = {}
         if fresh and take_from is not None:
-            self._take(take_from)
+            self._take_first_flows(take_from)
 
-    def _take(self, folder: Path) -> None:
+    def _take_first_flows(self, folder: Path) -> None:
+        """Copies the first flows of another run, which nothing has corrected yet."""
         first, known = first_flows(folder, len(self._known), self._first.shape[2])
         for pair in np.flatnonzero(known):
             self._first[pair] = first[pair]
-        self._known[:] = known & (_THERE | _TELLING)
+        self._known[:] = known & (_THERE | _BODIES)
 
     def get(self, pair: int) -> torch.Tensor | None:
-        """(2,N,3), or None when it has not been estimated yet."""
+        """Returns the flow (2,N,3) of a pair, or None when it has not been estimated yet."""
         if pair in self.corrected:
             return self.corrected[pair]
         if pair in self.estimated:
@@ -47,39 +50,39 @@ class FlowStore:
         known = self._known[pair]
         return torch.from_numpy(np.array((self._now if known & _CORRECTED else self._first)[pair])) if known else None
 
-    def telling(self, pair: int) -> bool | None:
-        """Whether the pair's first flow showed more than one body; None when it has not been estimated yet."""
+    def shows_bodies(self, pair: int) -> bool | None:
+        """Returns whether the pair's first flow showed more than one body; None when it has not been estimated yet."""
         if pair in self.estimated:
             return self.estimated[pair][1]
-        return bool(self._known[pair] & _TELLING) if self._known[pair] else None
+        return bool(self._known[pair] & _BODIES) if self._known[pair] else None
 
-    def put_first(self, pair: int, flow: torch.Tensor, telling: bool) -> None:
-        """Keep an estimate (2,N,3)."""
-        self.estimated[pair] = (flow.detach().clone(), telling)
+    def put_first(self, pair: int, flow: torch.Tensor, shows_bodies: bool) -> None:
+        """Keeps an estimate (2,N,3), and whether it shows more than one body."""
+        self.estimated[pair] = (flow.detach().clone(), shows_bodies)
 
     def put(self, pair: int, flow: torch.Tensor) -> None:
-        """Keep a corrected flow (2,N,3)."""
+        """Keeps a corrected flow (2,N,3)."""
         self.corrected[pair] = flow.detach().clone()
 
     def pending(self) -> dict[str, dict[str, torch.Tensor]]:
-        """What `flush` will write, for the trainer's own state; `restore` takes it back."""
+        """Returns what `flush` will write, for the trainer's own state; `restore` takes it back."""
         return {
             "first": {str(pair): flow for pair, (flow, _) in self.estimated.items()},
-            "telling": {str(pair): torch.tensor(telling) for pair, (_, telling) in self.estimated.items()},
+            "telling": {str(pair): torch.tensor(shows_bodies) for pair, (_, shows_bodies) in self.estimated.items()},
             "corrected": {str(pair): flow for pair, flow in self.corrected.items()},
         }
 
     def restore(self, pending: dict[str, dict[str, torch.Tensor]]) -> None:
-        """Write what a run that was killed may not have written."""
+        """Writes what a run that was killed may not have written."""
         self.estimated = {int(p): (flow, bool(pending["telling"][p])) for p, flow in pending["first"].items()}
         self.corrected = {int(p): flow for p, flow in pending["corrected"].items()}
         self.flush()
 
     def flush(self) -> None:
-        """Write what is pending."""
-        for pair, (flow, telling) in self.estimated.items():
+        """Writes what is pending."""
+        for pair, (flow, shows_bodies) in self.estimated.items():
             self._first[pair] = flow.numpy()
-            self._known[pair] |= _THERE + _TELLING * telling
+            self._known[pair] |= _THERE + _BODIES * shows_bodies
         for pair, flow in self.corrected.items():
             self._now[pair] = flow.numpy()
             self._known[pair] |= _CORRECTED
@@ -89,21 +92,24 @@ class FlowStore:
 
 
 def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.ndarray]:
-    """What is already estimated in another run's folder: `flows_first.npy` and `flows_known.npy`. UsageError when it is of
-    other pairs."""
+    """Returns what another run's folder has estimated already: `flows_first.npy` and `flows_known.npy`.
+
+    Raises UsageError where there is nothing, or flows of other pairs.
+    """
     try:
         first, known = (np.load(folder / name, mmap_mode="r") for name in (_FIRST, _KNOWN))
     except (OSError, ValueError) as error:
-        raise UsageError(f"--flows-of {folder}: no flows of a `dpc segment train` run there ({error})") from None
+        raise UsageError(f"flows_of = {folder}: no flows of a `dpc segment train` run there ({error})") from None
     shape = (pairs, 2, points, 3)
     if first.shape != shape:
-        raise UsageError(f"--flows-of {folder}: flows of {first.shape} pairs, frames, points; here {shape}")
+        raise UsageError(f"flows_of = {folder}: flows of {first.shape} pairs, frames, points; here {shape}")
     return first, known
 
 
 def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+    """Opens an array file, and reserves its room on the disk at once."""
     try:
-        array = _mapped(path, shape, dtype, fresh)
+        array = _map_file(path, shape, dtype, fresh)
         with path.open("r+b") as file:
             reserve(file.fileno(), path.stat().st_size)
     except OSError as error:
@@ -111,7 +117,8 @@ def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.nd
     return array
 
 
-def _mapped(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+def _map_file(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
+    """Returns the array of a file, mapped into memory; a new one where it is `fresh` or has another shape."""
     if not fresh and path.exists():
         array = np.lib.format.open_memmap(path, "r+")
         if array.shape == shape:

@@ -1,4 +1,4 @@
-"""The picture of a training run."""
+"""The learning curves of a part network's training."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _TRUTHS = (
 
 
 def draw_curves(rows: list[dict], path: Path) -> None:
-    """Write loss and its terms (left), validation and flow error where there is a truth (right), over epochs, as a PNG."""
+    """Draws the loss and its terms (left), validation and flow error where there is a truth (right), over epochs, as a PNG."""
     panels = [
         Panel("training loss and terms", [Curve(name, name) for name in _LOSSES]),
         Panel("agreement with the truth", _TRUTHS, range=(0, 1.02)),

@@ -1,20 +1,19 @@
-"""What a segmentation is trained with: rigidity of the flow, smoothness, invariance, consensus; and labels, if there are."""
+"""The losses of a part network: rigidity of the flow, invariance, consensus; and cross-entropy with labels."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from dpcli.ops import apply_motions, gather_points, knn, space_time_ball_query
-from dpcli.segment.network.slot_matching import assign, one_hot, permute_slots, soft_iou
+from dpcli.ops import apply_motions
+from dpcli.segment.network.slot_matching import hungarian_assignment, one_hot, permute_slots, soft_iou
 
 
 def dynamic_loss(points: Tensor, flow: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """Release form: mean_i |sum_s m_is (R_s p_i + t_s) - (p_i + f_i)|_2, a scalar; (B,N,3), (B,N,3), (B,N,S), motions.
+    """Returns the rigidity loss as released: mean_i |sum_s m_is (R_s p_i + t_s) - (p_i + f_i)|_2, a scalar.
 
-    OGC's "dynamic rigid consistency". The moved points are detached: the gradient reaches the mask only. At a residual
+    points (B,N,3), flow (B,N,3), mask (B,N,S), rotation (B,S,3,3), translation (B,S,3). OGC's "dynamic rigid
+    consistency" (Song and Yang 2022). The moved points are detached: the gradient reaches the mask only. At a residual
     of exactly zero it is zero.
     """
     moved = apply_motions(points, rotation, translation).detach()
@@ -30,16 +29,20 @@ def rigid_loss(
     translation: Tensor,  # [B, S, 3]
     beta: Tensor | None = None,  # [B, N, S]
 ) -> Tensor:
-    """Thesis equation 4.8: mean over points and slots of beta_is m_is |p_i + f_i - (R_s p_i + t_s)|_2, a scalar.
+    """Returns the rigidity loss of thesis equation 4.8, a scalar.
 
-    beta: `consensus_weights`, detached here; None counts as 1. The gradient reaches the mask only.
+    It is the mean over points and slots of beta_is m_is |p_i + f_i - (R_s p_i + t_s)|_2. beta: `consensus_weights`,
+    detached here; None counts as 1. The gradient reaches the mask only.
     """
     weighted = mask * residuals(points, flow, rotation, translation).detach()
     return (weighted if beta is None else weighted * beta.detach()).mean()
 
 
 def residuals(points: Tensor, flow: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """How far each slot's motion takes a point from where the flow does: |R_s p_i + t_s - p_i - f_i|_2, (B,N,S)."""
+    """Returns how far (B,N,S) each slot's motion takes a point from where the flow does.
+
+    That is |R_s p_i + t_s - p_i - f_i|_2; points (B,N,3), flow (B,N,3), rotation (B,S,3,3), translation (B,S,3).
+    """
     gap = apply_motions(points, rotation, translation) - (points + flow)[:, None]
     return _length(gap).mT
 
@@ -55,11 +58,18 @@ def consensus_weights(
     mask: Tensor | None = None,  # [B, N, S]
     gate: float = 1e-5,
 ) -> Tensor:  # [B, N, S]
-    """beta of thesis equation 4.7: how well the motion head's motion of slot s agrees with the flow at point i.
+    """Returns beta of thesis equation 4.7: how well the motion head's motion of slot s agrees with the flow at point i.
 
-    form "thesis": exp(-tau r_is), r the residual's norm. "release": exp(-tau r_is^2), and only for slots with
-    sum_i m_is r_is^2 < gate (needs mask), 1 for the others. The thesis states no tau; the release has 2, or 0.5 with
-    gate 5 for OGC-DR. Carries no gradient. Raises ValueError for another form, or the release's without a mask.
+    form "thesis": exp(-tau r_is), r the residual's norm. "release": exp(-tau r_is^2), and only for slots with sum_i
+    m_is r_is^2 < gate (needs mask), 1 for the others. The thesis states no tau; the release has 2, or 0.5 with gate 5
+    for OGC-DR. Carries no gradient. Raises ValueError for another form, or the release's without a mask.
+
+    A point that stands still agrees with the identity, and less with a shift by 1:
+
+    >>> points, shift = torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+    >>> beta = consensus_weights(points, torch.zeros(1, 1, 3), torch.eye(3).expand(1, 2, 3, 3), shift, tau=2.0)
+    >>> [round(weight, 4) for weight in beta[0, 0].tolist()]
+    [1.0, 0.1353]
     """
     gap = residuals(points, flow, rotation, translation).detach()
     if form == "thesis":
@@ -71,41 +81,13 @@ def consensus_weights(
     return torch.where(trusted, torch.exp(-tau * square), 1.0)
 
 
-class Neighbors(NamedTuple):
-    """Indices (B,N,k) i64 into the cloud: the nearest within a radius, and any within a larger one."""
-
-    nearest: Tensor
-    ball: Tensor
-
-
-def smoothness_neighbors(
-    points: Tensor, *, k: int = 8, radius: float = 0.1, ball_k: int = 16, ball_radius: float = 0.2
-) -> Neighbors:
-    """Neighbors of every point of (B,N,3) for `smoothness_loss`; the defaults are SAPIEN's.
-
-    The k nearest, those farther than `radius` replaced by the point itself; and the first ball_k in index order with
-    distance below ball_radius, unused places repeating the first. Other data sets: OGC-DR 8, 0.02, 16, 0.04; KITTI 32,
-    1.0, 64, 2.0. The flow's own loss has 4, 0.05, 8, 0.1.
-    """
-    squared, nearest = knn(points, points, k)
-    nearest = torch.where(squared > radius**2, nearest[..., :1], nearest)
-    still = torch.zeros(points.shape[:2], device=points.device)
-    ball, _ = space_time_ball_query(points, still, points, still, [ball_radius], ball_k)
-    return Neighbors(nearest, ball)
-
-
-def smoothness_loss(values: Tensor, neighbors: Neighbors, weights: tuple[float, float] = (3.0, 1.0)) -> Tensor:
-    """Mean over points and neighbors of |v_i - v_j|_1 summed over the channels of (B,N,S): 3 nearest + 1 ball."""
-    near, far = ((values[:, :, None] - gather_points(values, index)).abs().sum(-1).mean() for index in neighbors)
-    return weights[0] * near + weights[1] * far
-
-
 def invariance_loss(mask1: Tensor, mask2: Tensor) -> Tensor:
-    """Two masks (B,N,S) of the same points, seen differently, should agree: mean |m1 - m2|_2 both ways, summed.
+    """Returns how much two masks (B,N,S) of the same points, seen differently, disagree: mean |m1 - m2|_2, both ways.
 
-    Slots are matched by hard IoU first; in each direction the other mask is detached (OGC's last round).
+    Slots are matched by hard IoU first; in each direction the other mask is detached (OGC's last round), and the two
+    are summed.
     """
-    order = assign(soft_iou(one_hot(mask1.detach()), one_hot(mask2.detach())))
+    order = hungarian_assignment(soft_iou(one_hot(mask1.detach()), one_hot(mask2.detach())))
     forth = _length(mask1 - permute_slots(mask2, order).detach()).mean()
     back = _length(mask2 - permute_slots(mask1, order.argsort(1)).detach()).mean()
     return forth + back
@@ -118,18 +100,18 @@ def supervised_loss(
     bce_weight: float = 2.0,
     dice_weight: float = 0.0,
 ) -> Tensor:
-    """Binary cross-entropy of each slot with the part it is matched to (Hungarian on that cost), plus Dice; a scalar.
+    """Returns the binary cross-entropy of each slot with the part it is matched to, plus Dice; a scalar.
 
-    labels: part ids i64 from 0, -1 = unknown: such points count nothing, but stay in the denominator, as in the
-    release. Parts beyond the number of slots find no slot; slots beyond the parts should stay empty. Dice is
-    1 - (2 sum m g + 1) / (sum m + sum g + 1), the mean over slots.
+    The Hungarian match is made on that cost. labels: part ids i64 from 0, -1 = unknown: such points count nothing, but
+    stay in the denominator, as in the release. Parts beyond the number of slots find no slot; slots beyond the parts
+    should stay empty. Dice is 1 - (2 sum m g + 1) / (sum m + sum g + 1), the mean over slots.
     """
     known = (labels >= 0).to(mask.dtype)[..., None]
     parts = max(int(labels.max()) + 1, mask.shape[2])
     truth = torch.nn.functional.one_hot(labels.clamp(min=0), parts).to(mask.dtype) * known
     inside, outside = _log(mask) * known, _log(1 - mask) * known
     gain = (inside.mT @ truth + outside.mT @ (1 - truth)) / mask.shape[1]  # [B, S, parts]
-    order = assign(gain)
+    order = hungarian_assignment(gain)
     bce = -gain.gather(2, order[..., None]).mean()
     if not dice_weight:
         return bce_weight * bce
@@ -139,12 +121,12 @@ def supervised_loss(
 
 
 def _log(share: Tensor) -> Tensor:
-    """Logarithm, not below that of 1e-30; without a gradient there."""
+    """Returns the logarithm, not below that of 1e-30; without a gradient there."""
     return share.clamp(min=1e-30).log()
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """Euclidean norm of the last axis; its gradient at zero is zero, not NaN."""
+    """Returns the Euclidean norm of the last axis; its gradient at zero is zero, not NaN."""
     square = vectors.square().sum(-1)
     zero = square == 0
     return torch.where(zero, 0.0, torch.where(zero, 1.0, square).sqrt())

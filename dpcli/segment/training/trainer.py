@@ -1,4 +1,4 @@
-"""Training a part network on pairs of frames, without labels or with them.
+"""The training of a part network on pairs of frames, without labels or with them.
 
 A run can be stopped or killed at any step and continued to the same result: what a step does depends on (seed, epoch,
 step) and on the saved state alone, and the flows it corrects are saved with that state.
@@ -9,14 +9,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from itertools import chain, cycle, islice
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from dpcli.errors import UsageError
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.seeds import SegmentStream, torch_seed
@@ -27,91 +25,69 @@ from dpcli.segment.network.model_file import save_model
 from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.training.flow_store import FlowStore
 from dpcli.segment.training.losses import supervised_loss
-from dpcli.segment.training.objective import Batch, Objective, pair_loss, turn_randomly
+from dpcli.segment.training.pair_loss import Batch, pair_loss, turn_randomly
+from dpcli.segment.training.settings import TrainSettings
 
 _SAVE_EVERY = 100  # steps between checkpoints: their flows are what memory holds
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How long and how fast. A pair gives two frames to each step."""
-
-    epochs: int = 10
-    pairs_per_epoch: int | None = 1000  # None: all
-    batch: int = 8
-    learning_rate: float = 1e-3  # Adam's; cosine to zero after a short warm-up
-    weight_decay: float = 1e-4
-    augment: bool = True  # every pair turned at random
-    validation_pairs: int = 48
-
-    def __post_init__(self) -> None:
-        for option, value, least in (("--epochs", self.epochs, 1), ("--batch", self.batch, 1)):
-            if value < least:
-                raise UsageError(f"{option} {value}: expected {least} or more")
-        if not self.learning_rate > 0:
-            raise UsageError(f"--lr {self.learning_rate}: expected a number above 0")
-
-    def rate(self, step: int, steps: int) -> float:
-        """Learning rate of one step of `steps`."""
-        warm = max(1, min(100, steps // 10))
-        if step < warm:
-            return self.learning_rate * (step + 1) / warm
-        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - warm) / max(steps - warm, 1)))
 
 
 Estimate = Callable[[torch.Tensor, torch.Tensor], tuple[torch.Tensor, torch.Tensor]]
 
 
 class Trainer:
-    """Trains one network. `estimate` gives the first flow, forth and back, of two frames (N,3)."""
+    """Trains one network on the device it is on.
+
+    estimate: gives the first flow, forth and back, of two frames (N,3); None for supervised training. notes: what the
+    weights file says of the training.
+    """
 
     def __init__(
         self,
         model: PartNetwork,
         folder: RunFolder,
-        schedule: Schedule,
-        objective: Objective,
+        settings: TrainSettings,
         training: PairSource,
         validation: PairSource | None,
         estimate: Estimate | None,
         notes: dict,
-        device: torch.device,
         stop: StopRequest,
         seed: int,
-        flows_of: Path | None = None,
     ) -> None:
-        self.model, self.folder, self.schedule, self.objective = model.to(device), folder, schedule, objective
+        self.model, self.folder, self.settings = model, folder, settings
+        self.schedule, self.objective = settings.schedule, settings.objective
         self.training, self.validation, self.estimate = training, validation, estimate
-        self.notes, self.device, self.stop, self.seed, self.flows_of = notes, device, stop, seed, flows_of
+        self.notes, self.stop, self.seed, self.device = notes, stop, seed, next(model.parameters()).device
         self.epoch, self.step, self.best = 0, 0, math.inf
         self.sums: dict[str, list[float]] = {}
         self.spent = 0.0
         self.optimizer = torch.optim.AdamW(
-            model.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay
+            model.parameters(), lr=self.schedule.learning_rate, weight_decay=self.schedule.weight_decay
         )
         self.checking: list[Batch] | None = None
 
     def run(self) -> None:
-        """From wherever the folder's state says to the last epoch."""
+        """Trains from wherever the folder's state says to the last epoch."""
         state = self.folder.load_state()
         shape = (len(self.training.pairs), self.training.points)
-        self.flows = FlowStore(self.folder.path, *shape, state is None, self.flows_of)
+        first = self.settings.run.flows_of
+        self.flows = FlowStore(self.folder.path, *shape, state is None, Path(first) if first else None)
         if state is not None:
             self._restore(state)
-        over = self.epoch >= self.schedule.epochs  # run again: what is there has been finished
+        finished = self.epoch >= self.schedule.epochs  # by an earlier run
         total = self.schedule.epochs * self._steps() * self.schedule.batch
         with Progress("train parts", total, "pair") as bar:
             bar.skip((self.epoch * self._steps() + self.step) * self.schedule.batch)
             while self.epoch < self.schedule.epochs:
                 self._run_epoch(bar)
-        if self.validation is None and not (over and self.folder.file("best.safetensors").exists()):
+        if self.validation is None and not (finished and self.folder.file("best.safetensors").exists()):
             save_model(self.folder.file("best.safetensors"), self.model, self.notes)
 
     def _steps(self) -> int:
-        """Steps of an epoch: whole batches, the few pairs left over come in another epoch's order."""
-        return max(len(epoch_order(self.training, 0, self.schedule.pairs_per_epoch)) // self.schedule.batch, 1)
+        """Returns the steps of an epoch: whole batches; the few pairs left over come in another epoch's order."""
+        return max(len(epoch_order(self.training, 0, self.schedule.pairs_per_epoch or None)) // self.schedule.batch, 1)
 
     def _run_epoch(self, bar: Progress) -> None:
+        """Learns from the pairs that are left of the epoch, and saves now and then."""
         self.model.train()
         started = time.monotonic()
         steps, rate = self._steps(), 0.0
@@ -131,25 +107,29 @@ class Trainer:
         self._end_epoch(rate, started)
 
     def _epoch_pairs(self, steps: int) -> Iterator[Pair]:
-        """The epoch's pairs from `self.step` on. While the cold start lasts, only those whose flow shows several bodies:
-        the others, half of them or more in slow scenes, have nothing to say to it."""
+        """Yields the epoch's pairs from `self.step` on; while the cold start lasts, only those whose flow shows bodies.
+
+        The others, half of them or more in slow scenes, show one body, from which the cold start learns nothing.
+        """
         cold = self.objective.cold_start > 0 and not self.objective.supervised
         cold = cold and self.epoch < self.objective.cold_until * self.schedule.epochs
         skip = self.step * self.schedule.batch
         order = epoch_order(self.training, self.epoch, None)
-        picked = (pair for pair in order if not cold or self._telling(pair))
-        for count, pair in enumerate(chain(picked, cycle(order))):  # too few telling pairs: any, once more
+        picked = (pair for pair in order if not cold or self._shows_bodies(pair))
+        for count, pair in enumerate(chain(picked, cycle(order))):  # too few of these pairs: any, once more
             if count >= skip:
                 yield pair
 
-    def _telling(self, pair: Pair) -> bool:
-        if self.flows.telling(pair.number) is None:
-            self._flow(pair, torch.from_numpy(self.training.load(pair).points))
-        return bool(self.flows.telling(pair.number))
+    def _shows_bodies(self, pair: Pair) -> bool:
+        """Returns whether the pair's first flow shows more than one body; it is estimated now if the pair is new."""
+        if self.flows.shows_bodies(pair.number) is None:
+            self._find_flow(pair, torch.from_numpy(self.training.load(pair).points))
+        return bool(self.flows.shows_bodies(pair.number))
 
     def _step(self, pairs: list[Pair], step: int, steps: int) -> float:
+        """Learns from one batch of pairs and keeps their corrected flows; returns the learning rate."""
         loaded = [self.training.load(pair) for pair in pairs]
-        batch = self._batch(pairs, loaded)
+        batch = self._load_batch(pairs, loaded)
         rotation = None
         if self.schedule.augment:
             rng = torch.Generator().manual_seed(torch_seed(self.seed, SegmentStream.TURN, step))
@@ -164,6 +144,7 @@ class Trainer:
         return rate
 
     def _optimize(self, loss: torch.Tensor, rate: float) -> None:
+        """Takes a step along the gradient, whose norm is clipped at 5; none where it is not finite."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
@@ -172,16 +153,16 @@ class Trainer:
         if torch.isfinite(norm):
             self.optimizer.step()
 
-    def _batch(self, pairs: list[Pair], loaded: list[LoadedPair]) -> Batch:
-        """Points, labels and the flows as they stand, estimated now where a pair is new."""
-        batch, flow = self._assemble(loaded, lambda i, frames: self._flow(pairs[i], frames))
-        self._compare(flow, loaded)
+    def _load_batch(self, pairs: list[Pair], loaded: list[LoadedPair]) -> Batch:
+        """Returns points, labels and the flows as they stand, estimated now where a pair is new."""
+        batch, flow = self._assemble(loaded, lambda i, frames: self._find_flow(pairs[i], frames))
+        self._measure_flow_error(flow, loaded)
         return batch
 
     def _assemble(
         self, loaded: list[LoadedPair], estimate: Callable[[int, torch.Tensor], torch.Tensor]
     ) -> tuple[Batch, torch.Tensor]:
-        """A batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames of pair i)."""
+        """Returns a batch on the device, and its flow (B,2,N,3): the true one when supervised, else estimate(i, frames)."""
         points = torch.from_numpy(np.stack([pair.points for pair in loaded]))  # [B, 2, N, 3]
         if self.objective.supervised:
             flow = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
@@ -190,7 +171,8 @@ class Trainer:
         part = torch.from_numpy(np.stack([pair.part for pair in loaded]))
         return Batch(*(v.transpose(0, 1).flatten(0, 1).to(self.device) for v in (points, flow, part))), flow
 
-    def _flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
+    def _find_flow(self, pair: Pair, frames: torch.Tensor) -> torch.Tensor:
+        """Returns the flow (2,N,3) that is kept for a pair; a new pair's is estimated."""
         known = self.flows.get(pair.number)
         if known is None:
             known = torch.stack(self.estimate(*frames))
@@ -198,25 +180,29 @@ class Trainer:
         return known
 
     def _keep_flow(self, pairs: list[Pair], flow: torch.Tensor) -> None:
+        """Keeps the corrected flows (2B,N,3) of the pairs."""
         for pair, both in zip(pairs, flow.cpu().unflatten(0, (2, -1)).transpose(0, 1)):
             self.flows.put(pair.number, both)
 
-    def _compare(self, flow: torch.Tensor, loaded: list[LoadedPair]) -> None:
-        """For the log only, and only where the data know the truth: how far the flow in use is from it."""
+    def _measure_flow_error(self, flow: torch.Tensor, loaded: list[LoadedPair]) -> None:
+        """Notes for the log how far the flow in use is from the true one, where the data know that."""
         if all(pair.flow is not None for pair in loaded):
             truth = torch.from_numpy(np.stack([pair.flow for pair in loaded]))
             self._count({"flow_error": float((flow - truth).norm(dim=-1).mean())})
 
     def _count(self, values: dict[str, float]) -> None:
+        """Adds values to the epoch's means."""
         for key, value in values.items():
             entry = self.sums.setdefault(key, [0.0, 0.0])
             entry[0], entry[1] = entry[0] + value, entry[1] + 1
 
     def _mean(self, key: str) -> float | None:
+        """Returns the epoch's mean of a value so far, None where there is none."""
         total, count = self.sums.get(key, (0.0, 0.0))
         return total / count if count else None
 
     def _end_epoch(self, rate: float, started: float) -> None:
+        """Validates, writes a row of the log and the weights, and saves."""
         row = {key: self._mean(key) for key in self.sums}
         if self.validation is not None:
             row |= self.validate()
@@ -236,8 +222,11 @@ class Trainer:
 
     @torch.no_grad()
     def validate(self) -> dict[str, float | None]:
-        """How well masks agree with the bodies that held-out pairs' first flow shows (with labels: the loss), and, where
-        labels are known, the mean Rand index, for people to watch; nothing is chosen by it."""
+        """Returns the loss on held-out pairs, which chooses the best weights, and the mean Rand index, None without labels.
+
+        The loss compares masks with the bodies that the pairs' first flow shows, or with the labels when supervised. The
+        Rand index is for people to watch: nothing is chosen by it.
+        """
         self.model.eval()
         if self.checking is None:
             self.checking = self._validation_batches()
@@ -247,9 +236,9 @@ class Trainer:
             bodies = (
                 batch.part if self.objective.supervised else rigid_groups(batch.points, batch.flow, most=mask.shape[-1])
             )
-            telling = bodies.amax(1) > 0
-            if telling.any():
-                losses += [float(supervised_loss(mask[telling], bodies[telling]))] * int(telling.sum())
+            several = bodies.amax(1) > 0
+            if several.any():
+                losses += [float(supervised_loss(mask[several], bodies[several]))] * int(several.sum())
             if (batch.part >= 0).all():
                 labels = mask.argmax(-1)
                 scores += [rand_index(a, b) for a, b in zip(labels, batch.part)]
@@ -257,6 +246,7 @@ class Trainer:
         return {"validation_loss": loss, "validation_rand_index": float(np.mean(scores)) if scores else None}
 
     def _validation_batches(self) -> list[Batch]:
+        """Returns the held-out pairs with their first flows, which are estimated once."""
         assert self.validation is not None
         pairs = epoch_order(self.validation, 0, self.schedule.validation_pairs)
         batches = []
@@ -291,6 +281,10 @@ class Trainer:
 
 
 def rand_index(labels: torch.Tensor, truth: torch.Tensor) -> float:
-    """Share of ordered point pairs (itself included) on which two labelings (N) agree about same or different."""
+    """Returns the share of ordered point pairs (itself included) on which two labelings (N) agree about same or different.
+
+    >>> rand_index(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 1, 1, 1]))
+    0.625
+    """
     same = labels[:, None] == labels
     return float((same == (truth[:, None] == truth)).float().mean())

@@ -10,15 +10,10 @@ import pytest
 from scipy.special import softmax
 from typer.testing import CliRunner
 
-from dpcli.classify.commands.fuse import (
-    geometric_weights,
-    likelihood_weights,
-    parse_weights,
-    pooled,
-    run_fusion,
-    stream_names,
-)
+from dpcli.classify.commands.fuse import stream_names
+from dpcli.classify.fusion import geometric_weights, likelihood_weights, mean_scores, parse_weights
 from dpcli.cli.app import app
+from dpcli.cli.classify.fuse import fuse as fuse_files
 from dpcli.errors import DataError, UsageError
 from dpcli.store import ScoresReader, ScoresWriter
 
@@ -42,7 +37,7 @@ def two(tmp_path) -> list[Path]:
 
 
 def fuse(inputs: list, output: Path, weights: str | None = None, force: bool = False) -> ScoresReader:
-    run_fusion([str(path) for path in inputs], str(output), weights=weights, force=force)
+    fuse_files([str(path) for path in inputs], str(output), weights=weights, force=force)
     return ScoresReader(output)
 
 
@@ -218,7 +213,7 @@ def test_likelihood_weights_are_the_best_there_are(models):
 
 
 def test_the_geometric_mean_is_that_of_logits(two, tmp_path, capsys):
-    run_fusion([str(path) for path in two], str(tmp_path / "g.h5"), weights="3,1", force=False, mean="geometric")
+    fuse_files([str(path) for path in two], str(tmp_path / "g.h5"), weights="3,1", force=False, mean="geometric")
     assert "geometric mean of 2 scores of 3 videos" in capsys.readouterr().out
     found = ScoresReader(tmp_path / "g.h5")
     for row, name in enumerate(found.names):
@@ -230,12 +225,12 @@ def test_the_geometric_mean_is_that_of_logits(two, tmp_path, capsys):
     draws[0, 0] = [1, 0, 0, 0]  # a score of 0 is finite for the others
     weights = np.array([0.5, 0.3, 0.2])
     for mean in ("arithmetic", "geometric"):
-        there, back = pooled(draws, weights, mean), pooled(draws[::-1], weights[::-1], mean)
+        there, back = mean_scores(draws, weights, mean), mean_scores(draws[::-1], weights[::-1], mean)
         np.testing.assert_array_equal(there, back)
         assert np.isfinite(there).all()
         np.testing.assert_allclose(there.sum(-1), 1)
     with pytest.raises(UsageError, match="--mean harmonic: expected arithmetic or geometric"):
-        run_fusion([str(path) for path in two], str(tmp_path / "x.h5"), weights=None, force=False, mean="harmonic")
+        fuse_files([str(path) for path in two], str(tmp_path / "x.h5"), weights=None, force=False, mean="harmonic")
 
 
 @pytest.mark.parametrize("models", [2, 3])
@@ -276,7 +271,7 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
     judge = with_streams(tmp_path / "held.h5", held, "validation")
 
     def chosen(inputs, by, output="out.h5"):
-        run_fusion([str(path) for path in inputs], str(tmp_path / output), weights=None, force=True, weights_from=by)
+        fuse_files([str(path) for path in inputs], str(tmp_path / output), weights=None, force=True, weights_from=by)
         return ScoresReader(tmp_path / output)
 
     found = chosen([one], str(judge))
@@ -289,7 +284,7 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
     )
 
     two = [write(tmp_path / "points.h5", POINTS), write(tmp_path / "flow.h5", FLOW)]
-    run_fusion([str(one)], str(tmp_path / "g.h5"), weights=None, force=False, weights_from=str(judge), mean="geometric")
+    fuse_files([str(one)], str(tmp_path / "g.h5"), weights=None, force=False, weights_from=str(judge), mean="geometric")
     static, dynamic = np.array([held[name][1:] for name in ("w0", "w1")]).swapaxes(0, 1)
     np.testing.assert_allclose(
         ScoresReader(tmp_path / "g.h5").provenance[-1]["config"]["weights"],
@@ -319,7 +314,7 @@ def test_weights_are_chosen_on_other_videos(tmp_path):
         chosen([one], str(judge), "held.h5")  # the output would have taken its place
     assert judge.read_bytes() == kept
     with pytest.raises(UsageError, match="one of the two"):
-        run_fusion(
+        fuse_files(
             [str(one)], str(tmp_path / "x.h5"), weights="static=1,dynamic=1", force=False, weights_from=str(judge)
         )
 

@@ -50,7 +50,7 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def run_folder(data, dpc) -> Path:
     folder = data.parent / "run"
-    done = dpc("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2)
+    done = dpc("classify", "train", data, "-o", folder, *TRAIN, "--epochs", 2, "--set", "epochs_dynamic=2")
     assert done.returncode == 0, done.stderr.decode()
     return folder
 
@@ -114,7 +114,7 @@ def test_predicting_again_is_done_at_once_and_other_work_is_refused(data, run_fo
 
 ENDS_EARLY = """
 import os, signal, sys
-from dpcli.classify import commands
+from dpcli.classify.commands import predict as commands
 from dpcli.cli.app import main
 number, after, whole = int(sys.argv.pop(1)), int(sys.argv.pop(1)), commands.predict_videos
 def ending(*words):
@@ -238,7 +238,17 @@ def test_a_stopped_step_drops_what_it_would_have_dropped(data, tmp_path, monkeyp
 
             with monkeypatch.context() as patch:
                 patch.setattr(Trainer, "_take", stopping)
-                words = (*TRAIN, "--epochs", "2", "--epochs-dynamic", "2", "--dropout", "0.5", "--validation", "none")
+                words = (
+                    *TRAIN,
+                    "--epochs",
+                    "2",
+                    "--set",
+                    "epochs_dynamic=2",
+                    "--set",
+                    "dropout=0.5",
+                    "--validation",
+                    "none",
+                )
                 assert exit_code("classify", "train", data, "-o", tmp_path / name, *words) == (
                     0 if stop is None else 75
                 )
@@ -252,7 +262,7 @@ def test_a_stopped_step_drops_what_it_would_have_dropped(data, tmp_path, monkeyp
 
 def test_weights_of_another_model_are_told(data, run_folder, dpc_here, tmp_path):
     other = tmp_path / "other"
-    words = (*TRAIN, "--epochs", 1, "--epochs-dynamic", 1, "--seed", 4, "--validation", "none")
+    words = (*TRAIN, "--epochs", 1, "--set", "epochs_dynamic=1", "--seed", 4, "--validation", "none")
     assert dpc_here("classify", "train", data, "-o", other, *words).returncode == 0
     for name, model, split in (("s", run_folder, "test"), ("own", run_folder, "train"), ("theirs", other, "train")):
         assert (
@@ -289,8 +299,8 @@ def test_a_stopped_and_a_killed_run_continue_to_the_same_weights(data, run_folde
         *TRAIN,
         "--epochs",
         "2",
-        "--epochs-dynamic",
-        "2",
+        "--set",
+        "epochs_dynamic=2",
     ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     first = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, env=environment)
@@ -324,18 +334,37 @@ def wait_for(path: Path, process: subprocess.Popen) -> None:
 
 def test_another_configuration_on_the_same_folder_is_refused(data, run_folder, dpc_here):
     other = dpc_here(
-        "classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--epochs-dynamic", 2, "--lr", 0.5
+        "classify", "train", data, "-o", run_folder, *TRAIN, "--epochs", 2, "--set", "epochs_dynamic=2", "--lr", 0.5
     )
     assert other.returncode == 2 and b"another configuration" in other.stderr and b"--force" in other.stderr
     assert b"(schedule.learning_rate 0.002, now 0.5)" in other.stderr
 
 
+def test_the_settings_are_kept_read_back_and_shown(data, run_folder, dpc_here):
+    """Read back over another preset they are the same run, which is finished; with one changed they are another."""
+    saved = run_folder / "settings.toml"
+    words = ("classify", "train", data, "-o", run_folder, "--preset", "thesis", "--config", saved, "--seed", 3)
+    before = saved.read_bytes()
+    again = dpc_here(*words)
+    assert again.returncode == 0 and b"is finished already" in again.stderr and saved.read_bytes() == before
+    other = dpc_here(*words, "--set", "dropout=0.5")
+    assert other.returncode == 2 and b"(network.dropout 0.0, now 0.5)" in other.stderr and saved.read_bytes() == before
+    shown = json.loads(dpc_here("info", run_folder, "--json").stdout)["settings"]
+    assert (shown["network"]["points"], shown["schedule"]["epochs_dynamic"], shown["run"]["validation"]) == (
+        64,
+        2,
+        "0.34",
+    )
+    text = dpc_here("info", run_folder / "last.safetensors").stdout.decode()
+    assert "schedule epochs dynamic" in text and "run validation" in text
+
+
 def test_a_random_speed_is_for_random_clips_of_consecutive_frames(data, tmp_path, dpc_here):
-    words = ("classify", "train", data, "-o", tmp_path / "run", *TRAIN, "--augment", "ours,speed=0.3")
-    for more in (("--timing", "uniform"), ("--clips-per-video", "0")):
+    words = ("classify", "train", data, "-o", tmp_path / "run", *TRAIN, "--set", "augment_speed=0.3")
+    for more in (("--timing", "uniform"), ("--set", "clips_per_video=0")):
         refused = dpc_here(*words, *more)
         assert refused.returncode == 2 and b"random clips" in refused.stderr and not (tmp_path / "run").exists()
-    assert dpc_here(*words, "--epochs", 1, "--epochs-dynamic", 0).returncode == 0
+    assert dpc_here(*words, "--epochs", 1, "--set", "epochs_dynamic=0").returncode == 0
     assert json.loads((tmp_path / "run" / "config.json").read_text())["augmentation"]["speed"] == 0.3
 
 
@@ -346,7 +375,7 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
 
     for wrong in (
         {"batch": 0},
-        {"epochs": (-1, 1)},
+        {"epochs": -1},
         {"learning_rate": -1.0},
         {"decay": "foo"},
         {"workers": -1},
@@ -355,10 +384,10 @@ def test_mistakes_in_the_settings_end_with_a_sentence(tmp_path):
         with pytest.raises(UsageError, match="expected"):
             Schedule(**wrong)
     for option, wrong in (
-        ("--lr -1.0:", {"learning_rate": -1.0}),
-        ("--lr-dynamic 0:", {"learning_rate_dynamic": 0}),
-        ("--epochs -1:", {"epochs": (-1, 1)}),
-        ("--epochs-dynamic -2:", {"epochs": (1, -2)}),
+        ("lr = -1.0:", {"learning_rate": -1.0}),
+        ("lr_dynamic = 0:", {"learning_rate_dynamic": 0}),
+        ("epochs = -1:", {"epochs": -1}),
+        ("epochs_dynamic = -2:", {"epochs_dynamic": -2}),
     ):
         with pytest.raises(UsageError, match=option):
             Schedule(**wrong)
@@ -413,10 +442,10 @@ def test_static_weights_of_another_run_are_a_start(data, run_folder, dpc_here, t
         *TRAIN,
         "--epochs",
         0,
-        "--epochs-dynamic",
-        1,
-        "--static-from",
-        run_folder,
+        "--set",
+        "epochs_dynamic=1",
+        "--set",
+        f"static_from={run_folder}",
     )
     assert run.returncode == 0, run.stderr.decode()
     ours, theirs = last_weights(tmp_path / "r"), last_weights(run_folder)

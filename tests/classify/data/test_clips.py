@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.data.augment import NONE, PEERS, Augmentation, find_augmentation
+from dpcli.classify.data.augment import NONE, PEERS, Augmentation
 from dpcli.classify.data.clips import (
     Clip,
     ClipSource,
@@ -19,8 +21,10 @@ from dpcli.classify.data.clips import (
 )
 from dpcli.classify.data.validation_split import carve_validation, default_rule, folds
 from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.settings import training_settings
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.seeds import generator
+from dpcli.runtime.settings.catalog import Given
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 CONFIG = KinetConfig(
@@ -160,7 +164,7 @@ def test_augmentation_is_one_rigid_draw_a_clip():
         np.linalg.norm(p.reshape(-1, 3)[:, None] - p.reshape(-1, 3)[None], axis=-1) for p in (points, turned)
     )
     assert np.allclose(before, after, atol=1e-4) and not np.allclose(points, turned, atol=1e-2)
-    for where, axes in ((0, PEERS), (points.mean((0, 1)), find_augmentation("peers,origin=0"))):
+    for where, axes in ((0, PEERS), (points.mean((0, 1)), replace(PEERS, origin=False))):
         scaled = axes(points, rng)
         ratio = (scaled - where) / (points - where)
         assert np.allclose(ratio, ratio[0, 0], rtol=1e-2) and len(np.unique(ratio[0, 0].round(4))) == 3
@@ -294,11 +298,16 @@ def test_without_a_speed_clips_are_drawn_as_ever(reader):
     assert all((np.diff(clip.frames) == 1).all() for clip in still.epoch(3, 2) if clip.sequence == 3)
 
 
-def test_an_augmentation_is_a_preset_and_changes():
-    assert find_augmentation("ours") == Augmentation() and find_augmentation("none") == NONE
-    changed = find_augmentation("peers,turn=0.4,speed=0.3,per_axis=0")
+def test_an_augmentation_is_one_by_name_and_changes():
+    """The name sets all ranges, and each may then be changed; the preset's holds where nothing is said."""
+
+    def said(preset: str, **values) -> Augmentation:
+        return training_settings(Given(preset, sets=values)).augmentation
+
+    assert said("quick", augment="none") == NONE and said("quick") == said("thesis", augment="ours") == Augmentation()
+    changed = said("quick", augment="peers", augment_turn=0.4, augment_speed=0.3, augment_per_axis=False)
     assert changed == Augmentation(0.1, False, 0.4, 0, 0, 0, 0, 0, 0.3, True)
-    wrong = ("sped=1", "turn", "turn=x", "turn=-1", "turn=nan", "dropout=1", "")
-    for bad in ("", "mine", "turn=1", *(f"ours,{change}" for change in wrong)):
-        with pytest.raises(UsageError, match="--augment"):
-            find_augmentation(bad)
+    assert said("thesis", augment_turn=0.2) == Augmentation(0.1, True, 0.2, 0, 0, 0, 0, 0, 0, True)
+    for field, bad in (("turn", -1), ("turn", float("nan")), ("dropout", 1.0), ("speed", 10.0)):
+        with pytest.raises(UsageError, match=f"augment_{field} = "):
+            Augmentation(**{field: bad})

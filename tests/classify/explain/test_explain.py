@@ -15,8 +15,7 @@ import pytest
 import torch
 from torch import nn
 
-from dpcli.classify.commands.explain import chosen_samples
-from dpcli.classify.cost import body_like_clip
+from dpcli.classify.commands.explain_pac import chosen_samples
 from dpcli.classify.data.clips import ClipSource, normalize
 from dpcli.classify.explain.features import ClipVectors, Layer, stage_layer
 from dpcli.classify.explain.point_activation_cloud import (
@@ -34,6 +33,7 @@ from dpcli.classify.explain.tsne import chosen_perplexity, neighbor_accuracy, pl
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, save_model
+from dpcli.classify.network_speed import body_like_clip
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.embedding import EmbeddingReader
@@ -524,12 +524,12 @@ def test_pac_writes_clouds_pictures_and_animations(data, weights, tmp_path, monk
         weights,
         "--samples",
         "2",
-        "--rule",
-        "gradient",
-        "--class",
-        "bend",
+        "--set",
+        "rule=gradient",
+        "--set",
+        "class=bend",
     )
-    assert dpc(*words, "-o", out, "--picture", png, "--animation", gif, "--frames", 3) == 0
+    assert dpc(*words, "-o", out, "--picture", png, "--animation", gif, "--set", "frames=3") == 0
     with CloudsReader(out) as reader, h5py.File(out) as file:
         assert reader.names == ["v0", "v2"] and reader.fields == ("part",) and reader.frame_counts.tolist() == [4, 4]
         assert file["frame"][:].tolist() == [0, 1, 2, 3] * 2 and file["explained"][:].tolist() == [2, 2]
@@ -592,7 +592,7 @@ def test_unlabeled_videos_get_a_map_and_a_sentence(weights, tmp_path, capsys):
     assert dpc("classify", "explain", "tsne", *words, "--picture", tmp_path / "t.png") == 0
     said = capsys.readouterr()
     assert "no labels" in said.err and "nearest neighbors -" in said.out
-    words = (data, "--model", weights, "-o", tmp_path / "p.h5", "--rule", "gradient", "--class", "label")
+    words = (data, "--model", weights, "-o", tmp_path / "p.h5", "--set", "rule=gradient", "--set", "class=label")
     assert dpc("classify", "explain", "pac", *words) == 3 and not (tmp_path / "p.h5").exists()
     assert "has no label" in capsys.readouterr().err
 
@@ -600,12 +600,12 @@ def test_unlabeled_videos_get_a_map_and_a_sentence(weights, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
-        (("pac", "--class", "kick"), 2, "--rule gradient"),
-        (("pac", "--rule", "gradient", "--class", "swim"), 2, "wave, kick, bend"),
+        (("pac", "--set", "class=kick"), 2, "rule=gradient"),
+        (("pac", "--set", "rule=gradient", "--set", "class=swim"), 2, "wave, kick, bend"),
         (("pac", "--samples", "v1,nobody"), 3, "'nobody'"),
         (("pac", "--stream", "both"), 2, "static, dynamic, fused"),
         (("tsne", "--stream", "fused,what"), 2, "static, dynamic, fused"),
-        (("pac", "--stage", "3"), 2, "expected 1..2"),
+        (("pac", "--set", "stage=3"), 2, "expected 1..2"),
         (("pac", "--animation", "a.avi"), 2, ".gif, .mp4"),
         (("pac", "--picture", "nowhere/a.png"), 3, "does not exist"),
         (("tsne", "--perplexity", "6"), 2, "less than the 6 videos"),

@@ -8,14 +8,16 @@ import json
 import pytest
 import torch
 
-from dpcli.classify.cost import body_like_clip, count_parameters, macs, measure, paper_parameters, render
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinematic import KinematicUnit
 from dpcli.classify.network.kinet import Kinet, fuse
 from dpcli.classify.network.layers import GlobalHead, he_init
+from dpcli.classify.network_cost import count_parameters, macs, measure, paper_parameters, render
+from dpcli.classify.network_speed import body_like_clip
 from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
 from dpcli.ops import fps
+from dpcli.runtime.settings.catalog import Given
 
 TINY = {
     "num_classes": 5,
@@ -205,27 +207,27 @@ def test_config_survives_json_and_refuses_nonsense():
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        ({"points_per_frame": -1}, "--points -1: expected at least 1"),
-        ({"num_frames": 0}, "--frames 0: expected at least 1"),
-        ({"group_size": 0}, "--group-size 0: expected at least 1"),
-        ({"temporal_radius": -1}, "--temporal-radius -1: expected at least 0"),
-        ({"static_temporal_radius": -1}, "--static-temporal-radius -1: expected at least 0"),
+        ({"points_per_frame": -1}, "points = -1: expected at least 1"),
+        ({"num_frames": 0}, "frames = 0: expected at least 1"),
+        ({"group_size": 0}, "group_size = 0: expected at least 1"),
+        ({"temporal_radius": -1}, "temporal_radius = -1: expected at least 0"),
+        ({"static_temporal_radius": -1}, "static_temporal_radius = -1: expected at least 0"),
         (
             {"static_temporal_radius": 0, "points_per_frame": 63, "num_frames": 32},
-            "--static-temporal-radius 0 hold 63 points",
+            "static_temporal_radius = 0 hold 63 points",
         ),
         (
             {"static_temporal_radius": 0, "backbone": "dgcnn"},
-            "--static-temporal-radius 0: dgcnn's one graph serves both",
+            "static_temporal_radius = 0: dgcnn's one graph serves both",
         ),
-        ({"temporal_radius": 32}, "--temporal-radius 32: balanced grouping shares 64 neighbors among 65 frames"),
-        ({"dropout": 1.0}, "--dropout 1.0: expected a probability"),
-        ({"dropout": float("nan")}, "--dropout nan: expected a probability"),
-        ({"radii": (-0.5, -1.0)}, "--radius -0.5: expected a number above 0"),
-        ({"radii": (float("inf"), float("inf"))}, "--radius inf: expected a number above 0"),
-        ({"centroids": (256, 512)}, "--centroids 256 512: expected two counts, the second not above the first"),
-        ({"neighbors": 0}, "--neighbors 0: expected at least 1"),
-        ({"neighbors": 6145}, "--neighbors 6145: the frames within --temporal-radius 1 hold 6144 points"),
+        ({"temporal_radius": 32}, "temporal_radius = 32: balanced grouping shares 64 neighbors among 65 frames"),
+        ({"dropout": 1.0}, "dropout = 1.0: expected at least 0 and below 1"),
+        ({"dropout": float("nan")}, "dropout = nan: expected at least 0 and below 1"),
+        ({"radii": (-0.5, -1.0)}, "radius = -0.5,-1.0: expected numbers, each above 0"),
+        ({"radii": (float("inf"), float("inf"))}, "radius = inf,inf: expected a finite number"),
+        ({"centroids": (256, 512)}, "centroids = 256,512: expected two counts, the second not above the first"),
+        ({"neighbors": 0}, "neighbors = 0: expected at least 1"),
+        ({"neighbors": 6145}, "neighbors = 6145: the frames within temporal_radius = 1 hold 6144 points"),
         ({"num_classes": 0}, "number of classes 0: expected at least 1"),
     ],
 )
@@ -377,5 +379,6 @@ def test_the_preset_thesis_keeps_its_static_stream_within_a_frame_where_it_can()
         ("tests.support.tiny_backbone:TinyBackbone", None, 1),
         (None, "release", 1),
     ):
-        assert network_config("thesis", variant, {}, 20, backbone).static_radius == radius
-    assert network_config("quick", None, {}, 20).static_radius == 1
+        said = {key: value for key, value in (("backbone", backbone), ("variant", variant)) if value is not None}
+        assert network_config(Given("thesis", sets=said), 20).static_radius == radius
+    assert network_config(Given("quick"), 20).static_radius == 1

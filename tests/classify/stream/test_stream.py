@@ -21,19 +21,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.commands.stream import Lines
 from dpcli.classify.data.clips import Clip, ClipSource, uniform_frames
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, save_model
 from dpcli.classify.stream import frame_source as stream_input
 from dpcli.classify.stream.frame_source import open_frames, read_arrays
-from dpcli.classify.stream.read_ahead import Feed
+from dpcli.classify.stream.read_ahead import ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, Window
 from dpcli.classify.video_scores import batches, predict_videos
 from dpcli.cli.app import main
-from dpcli.cli.classify.app import predict
-from dpcli.cli.classify.stream import cloud_files
+from dpcli.cli.classify.predict import predict
+from dpcli.cli.classify.predict_stream import cloud_files
+from dpcli.cli.classify.stream_lines import Lines
 from dpcli.errors import DataError, Stopped, UsageError
 from dpcli.runtime.signals import StopRequest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
@@ -325,7 +325,7 @@ def test_frames_wait_in_bounded_room_and_none_is_lost():
             yield np.full((1, 3), number, np.float32)
         raise DataError("frame 40 is bad")
 
-    feed = Feed(endless(), 5)
+    feed = ReadAhead(endless(), 5)
     deadline = time.monotonic() + 90
     while len(taken) < 6 and time.monotonic() < deadline:
         time.sleep(0.01)

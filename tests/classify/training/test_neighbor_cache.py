@@ -16,6 +16,7 @@ from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.settings import network_config
 from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.errors import UsageError
+from dpcli.runtime.settings.catalog import Given
 from dpcli.runtime.whole_file import DiskFull
 from tests.classify.commands.test_train_predict import gestures, last_weights
 from tests.support.commands import exit_code as dpc
@@ -54,7 +55,7 @@ def fields(groups: list[Grouping]) -> list[torch.Tensor]:
 @pytest.mark.parametrize("backbone", ["pointnet2", "dgcnn", "spidercnn", "tests.support.tiny_backbone:TinyBackbone"])
 def test_kept_neighborhoods_are_those_that_a_search_finds(backbone, tmp_path):
     torch.manual_seed(0)
-    config = network_config("tiny", None, {"num_frames": 3, "points_per_frame": 64}, 3, backbone)
+    config = network_config(Given("tiny", sets={"frames": 3, "points": 64, "backbone": backbone}), 3)
     model, searched = Kinet(config), []
 
     def search(points):
@@ -90,12 +91,12 @@ def test_a_backbone_that_groups_points_of_its_own_is_refused(tmp_path):
         cloud, times = clip_points(points)
         return [Grouping(cloud + 1, times, cloud, times, torch.zeros(len(cloud), cloud.shape[1], 2, dtype=torch.int64))]
 
-    with pytest.raises(UsageError, match="--draws: this backbone groups points"):
+    with pytest.raises(UsageError, match="draws: this backbone groups points"):
         NeighborCache(search, tmp_path, 1)(torch.randn(1, 2, 8, 3), torch.tensor([0]))
 
 
 def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data, tmp_path, monkeypatch):
-    words = (*SMALL, "--epochs-dynamic", "5", "--draws", "2", "--accumulate", "2")
+    words = (*SMALL, "--set", "epochs_dynamic=5", "--set", "draws=2", "--set", "accumulate=2")
     searched: list[int] = []
 
     class Counting(NeighborCache):
@@ -118,15 +119,27 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
     assert json.loads((tmp_path / "kept" / "config.json").read_text())["schedule"]["draws"] == 2
     monkeypatch.setattr(training, "NeighborCache", NeighborCache)
     assert (
-        dpc("classify", "train", data, "-o", tmp_path / "fresh", *SMALL, "--epochs-dynamic", 5, "--accumulate", 2) == 0
+        dpc(
+            "classify",
+            "train",
+            data,
+            "-o",
+            tmp_path / "fresh",
+            *SMALL,
+            "--set",
+            "epochs_dynamic=5",
+            "--set",
+            "accumulate=2",
+        )
+        == 0
     )
     fresh = last_weights(tmp_path / "fresh")
     assert not all(torch.equal(kept[key], fresh[key]) for key in kept)  # draws that come back are another training
-    assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] is None  # older runs go on
+    assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] == 0
 
 
 def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch):
-    words = (*SMALL, "--epochs-dynamic", "4", "--draws", "2")
+    words = (*SMALL, "--set", "epochs_dynamic=4", "--set", "draws=2")
     assert dpc("classify", "train", data, "-o", tmp_path / "whole", *words) == 0
     take, taken = training.Trainer._take, []
 
@@ -145,7 +158,7 @@ def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, mo
 
 
 def test_no_room_for_neighbors_is_told_before_the_work(tmp_path):
-    model = Kinet(network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3))
+    model = Kinet(network_config(Given("tiny", sets={"frames": 2, "points": 64}), 3))
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, before[1]))
     try:
@@ -156,13 +169,13 @@ def test_no_room_for_neighbors_is_told_before_the_work(tmp_path):
 
 
 def test_draws_below_zero_are_refused(data, tmp_path, capfd):
-    assert dpc("classify", "train", data, "-o", tmp_path / "run", *SMALL, "--draws", -1) == 2
-    assert "--draws -1: expected 0" in capfd.readouterr().err
+    assert dpc("classify", "train", data, "-o", tmp_path / "run", *SMALL, "--set", "draws=-1") == 2
+    assert "draws = -1: expected at least 0" in capfd.readouterr().err
 
 
 def test_every_process_keeps_its_own(tmp_path):
     """Two caches of one folder, as two processes of torchrun have: neither reads what the other kept."""
-    model = Kinet(network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3))
+    model = Kinet(network_config(Given("tiny", sets={"frames": 2, "points": 64}), 3))
     clips = torch.randn(2, 2, 64, 3)
     one, other = (NeighborCache(model.group, tmp_path, 2) for _ in range(2))
     one(clips[:1], torch.tensor([0]))

@@ -21,7 +21,9 @@ from dpcli.classify.settings import network_config
 from dpcli.classify.training.optimizer_step import LossWatch, StageStep
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
+from dpcli.reproduce.runs import override
 from dpcli.runtime.distributed import Processes
+from dpcli.runtime.settings.catalog import Given
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from tests.classify.commands.test_train_predict import gestures
 from tests.support.commands import exit_code as dpc
@@ -32,14 +34,14 @@ SHORT = (
     *SMALL,
     "--epochs",
     "3",
-    "--epochs-dynamic",
-    "2",
+    "--set",
+    "epochs_dynamic=2",
     "--lr",
     "0.0001",
-    "--label-smoothing",
-    "0.05",
-    "--draws",
-    "1",
+    "--set",
+    "label_smoothing=0.05",
+    "--set",
+    "draws=1",
 )
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -103,7 +105,15 @@ def test_two_processes_follow_the_loss_curve_of_one(data, alone, together, tmp_p
     np.testing.assert_allclose(losses(together, "static"), losses(alone, "static"), rtol=1e-4)
     np.testing.assert_allclose(losses(together, "dynamic"), losses(alone, "dynamic"), rtol=0.02)
     assert (
-        dpc("classify", "train", data, "-o", tmp_path / "halves", *SHORT, "--epochs-dynamic", 0, "--accumulate", 2) == 0
+        dpc(
+            "classify",
+            "train",
+            data,
+            "-o",
+            tmp_path / "halves",
+            *override(SHORT, ("--set", "epochs_dynamic=0", "--set", "accumulate=2")),
+        )
+        == 0
     )
     apart = np.abs(np.array(losses(tmp_path / "halves", "static")) / losses(alone, "static") - 1)
     assert apart.max() > 1e-3, "norms of half a batch pass for norms of the whole: the comparison proves nothing"
@@ -112,20 +122,20 @@ def test_two_processes_follow_the_loss_curve_of_one(data, alone, together, tmp_p
 def test_a_batch_in_parts_has_the_gradient_of_the_batch():
     """Without batch statistics (eval mode) the parts add up exactly."""
     torch.manual_seed(0)
-    config = network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3)
+    config = network_config(Given("tiny", sets={"frames": 2, "points": 64}), 3)
     points, labels = torch.randn(4, 2, 64, 3) * 0.3, torch.tensor([0, 1, 2, 1])
     found = []
     for parts in (1, 4):
         torch.manual_seed(1)
         model = Kinet(config).eval()
-        schedule = Schedule((1, 1), batch=4, accumulate=parts, weight_decay=0.0)
+        schedule = Schedule(1, 1, batch=4, accumulate=parts, weight_decay=0.0)
         step = StageStep(model, 0, schedule, torch.device("cpu"), Processes())
         total, _, stepped = step(points, labels, 1e-3)
         assert stepped
         found.append((total, model.static.stage2.linear2.weight.grad.clone()))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-7)
-    with pytest.raises(UsageError, match="--accumulate 3"):
+    with pytest.raises(UsageError, match="accumulate = 3"):
         Schedule(batch=4, accumulate=3).share(1)
     with pytest.raises(UsageError, match="3 processes"):
         Schedule(batch=4).share(3)
@@ -134,22 +144,22 @@ def test_a_batch_in_parts_has_the_gradient_of_the_batch():
 def test_processes_that_can_t_share_a_batch_evenly_are_refused():
     check_shares(3, Schedule(batch=4), 1)
     check_shares(4, Schedule(batch=4), 2)
-    with pytest.raises(UsageError, match="--batch 4: an epoch has 3 clips"):
+    with pytest.raises(UsageError, match="batch = 4: an epoch has 3 clips"):
         check_shares(3, Schedule(batch=4), 2)
 
 
 def test_label_smoothing_is_the_loss_against_a_share_of_every_class(alone):
     """Loss of clip i: (1 - s) of its class's -log p and s of the mean over the classes."""
     torch.manual_seed(0)
-    model = Kinet(network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3)).eval()
+    model = Kinet(network_config(Given("tiny", sets={"frames": 2, "points": 64}), 3)).eval()
     points, labels = torch.randn(4, 2, 64, 3) * 0.3, torch.tensor([0, 1, 2, 1])
     with torch.no_grad():
         surprise = -torch.log_softmax(model.static_logits(points), -1).double()
     expected = 0.7 * surprise[torch.arange(4), labels].sum() + 0.3 * surprise.mean(-1).sum()
-    step = StageStep(model, 0, Schedule((1, 1), batch=4, label_smoothing=0.3), torch.device("cpu"), Processes())
+    step = StageStep(model, 0, Schedule(1, 1, batch=4, label_smoothing=0.3), torch.device("cpu"), Processes())
     assert step(points, labels, 1e-3)[0] == pytest.approx(float(expected), rel=1e-5)
     for share in (-0.1, 1.0, float("nan")):
-        with pytest.raises(UsageError, match=f"--label-smoothing {share}"):
+        with pytest.raises(UsageError, match=f"label_smoothing = {share}"):
             Schedule(label_smoothing=share)
     assert json.loads((alone / "config.json").read_text())["schedule"]["label_smoothing"] == 0.05
 
@@ -158,7 +168,7 @@ def test_label_smoothing_is_the_loss_against_a_share_of_every_class(alone):
 @pytest.mark.parametrize("backbone", ["pointnet2", "dgcnn", "spidercnn"])
 def test_mixed_precision_trains_both_streams_near_float32(backbone, backend, monkeypatch):
     monkeypatch.setenv("DPC_BACKEND", backend)
-    config = network_config("tiny", None, {"num_frames": 2, "points_per_frame": 64}, 3, backbone)
+    config = network_config(Given("tiny", sets={"frames": 2, "points": 64, "backbone": backbone}), 3)
     points, labels = (
         torch.randn(4, 2, 64, 3, generator=torch.Generator().manual_seed(0)) * 0.3,
         torch.tensor([0, 1, 2, 1]),
@@ -170,7 +180,7 @@ def test_mixed_precision_trains_both_streams_near_float32(backbone, backend, mon
             model = Kinet(config)
             if stage:
                 model.freeze_static()
-            step = StageStep(model, stage, Schedule((1, 1), batch=4, amp=amp), torch.device("cpu"), Processes())
+            step = StageStep(model, stage, Schedule(1, 1, batch=4, amp=amp), torch.device("cpu"), Processes())
             total, _, stepped = step(points, labels, 1e-3)
             assert stepped and all(p.dtype == torch.float32 for p in model.parameters())
             totals.append(total)
@@ -203,12 +213,12 @@ def test_a_diverging_run_stops_and_keeps_the_last_good_weights(data, tmp_path, c
             *SMALL,
             "--epochs",
             300,
-            "--epochs-dynamic",
-            0,
+            "--set",
+            "epochs_dynamic=0",
             "--lr",
             "1e12",
-            "--decay",
-            "constant",
+            "--set",
+            "decay=constant",
         )
         == 1
     )
@@ -234,10 +244,10 @@ def test_a_killed_loader_ends_with_a_sentence_and_the_run_continues(data, tmp_pa
     from dpcli.classify.commands import train as train_command
 
     folder = tmp_path / "run"
-    words = ("classify", "train", data, "-o", folder, *SMALL, "--epochs", 1, "--epochs-dynamic", 0)
+    words = ("classify", "train", data, "-o", folder, *SMALL, "--epochs", 1, "--set", "epochs_dynamic=0")
     with monkeypatch.context() as patch:
         patch.setattr(train_command, "ClipSource", Killed)
-        assert dpc(*words, "--workers", 1) == 1
+        assert dpc(*words, "--set", "workers=1") == 1
     said = capfd.readouterr().err
     assert "process that loads clips was killed" in said and "saved at epoch 1" in said and "Traceback" not in said
     assert dpc(*words) == 0 and "continuing" in capfd.readouterr().err
@@ -255,31 +265,26 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
             data,
             "-o",
             tmp_path / "six",
-            *longer,
-            "--epochs",
-            0,
-            "--epochs-dynamic",
-            0,
+            *override(longer, ("--epochs", "0", "--set", "epochs_dynamic=0")),
             "--init",
             alone,
-            "--centroids",
-            48,
-            24,
-            "--neighbors",
-            9,
+            "--set",
+            "centroids=48,24",
+            "--set",
+            "neighbors=9",
         )
         == 0
     )
     told = capfd.readouterr().err
-    assert "tensors taken" in told and "--static-temporal-radius" not in told
+    assert "tensors taken" in told and "static_temporal_radius" not in told
     ours, theirs = load_model(str(tmp_path / "six")), load_model(str(alone))
     config = ours[1].config
     assert (config.num_frames, config.centroids, config.neighbors) == (6, (48, 24), 9)
     for key, value in theirs[0].state_dict().items():
         assert torch.equal(ours[0].state_dict()[key], value), key
-    within = (*SHORT, "--epochs", 0, "--epochs-dynamic", 0, "--static-temporal-radius", 0)
+    within = override(SHORT, ("--epochs", "0", "--set", "epochs_dynamic=0", "--set", "static_temporal_radius=0"))
     assert dpc("classify", "train", data, "-o", tmp_path / "within", *within, "--init", alone) == 0
-    assert "--static-temporal-radius 1 goes on as it was" in capfd.readouterr().err
+    assert "--set static_temporal_radius=1 goes on as it was" in capfd.readouterr().err
     assert (
         dpc("classify", "train", data, "-o", tmp_path / "q", "--preset", "quick", "--frames", 4, "--init", alone) == 2
     )
@@ -287,7 +292,7 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
 
 
 def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, capfd):
-    """Shapes with labels, one frame each, as ModelNet40 is prepared; then `--static-from` with other classes."""
+    """Shapes with labels, one frame each, as ModelNet40 is prepared; then `static_from` with other classes."""
     rng = np.random.default_rng(0)
     with CloudsWriter(tmp_path / "shapes.h5", class_names=["ball", "rod", "disc"]) as writer:
         for i in range(9):
@@ -295,7 +300,18 @@ def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, cap
             writer.write(CloudSequence.from_frames(f"s{i}", [cloud.astype(np.float32)], label=i % 3, split="train"))
     words = ("--preset", "tiny", "--points", 128, "--batch", 3, "--validation", "none")
     assert (
-        dpc("classify", "train", tmp_path / "shapes.h5", "-o", tmp_path / "pre", "--pretrain", *words, "--epochs", 1)
+        dpc(
+            "classify",
+            "train",
+            tmp_path / "shapes.h5",
+            "-o",
+            tmp_path / "pre",
+            "--set",
+            "pretrain=true",
+            *words,
+            "--epochs",
+            1,
+        )
         == 0
     )
     model, info = load_model(str(tmp_path / "pre"))
@@ -324,20 +340,16 @@ def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, cap
             data,
             "-o",
             tmp_path / "r",
-            *SHORT,
-            "--epochs",
-            0,
-            "--static-from",
-            tmp_path / "pre",
-            "--epochs-dynamic",
-            0,
+            *override(SHORT, ("--epochs", "0", "--set", "epochs_dynamic=0")),
+            "--set",
+            f"static_from={tmp_path / 'pre'}",
         )
         == 0
     )
     assert "fresh: head.classify" in capfd.readouterr().err
     started = load_model(str(tmp_path / "r"))[0]
     assert torch.equal(started.static.stage1.linear1.weight, model.static.stage1.linear1.weight)
-    assert dpc("classify", "train", data, "-o", tmp_path / "x", "--pretrain", "--frames", 8) == 2
+    assert dpc("classify", "train", data, "-o", tmp_path / "x", "--set", "pretrain=true", "--frames", 8) == 2
     assert "clips of one frame" in capfd.readouterr().err
 
 
@@ -348,7 +360,7 @@ def test_one_class_and_absent_classes_are_named(tmp_path, make_sequence, capfd):
                 writer.write(
                     make_sequence(f"{name}{i}", label=label, frames=4, split="test" if label == 2 else "train")
                 )
-    words = ("classify", "train", "-o", tmp_path / "run", *SMALL, "--epochs", 0, "--epochs-dynamic", 0)
+    words = ("classify", "train", "-o", tmp_path / "run", *SMALL, "--epochs", 0, "--set", "epochs_dynamic=0")
     assert dpc(*words, tmp_path / "one.h5") == 3
     assert "class 'up'" in capfd.readouterr().err
     assert dpc(*words, tmp_path / "absent.h5") == 0
@@ -385,7 +397,7 @@ def test_validation_is_shared_out_among_processes(data, alone):
                 model,
                 info,
                 folder,
-                Schedule((0, 1), batch=4),
+                Schedule(0, 1, batch=4),
                 source,
                 source,
                 torch.device("cpu"),

@@ -12,9 +12,12 @@ import pytest
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
+from dpcli.cli.evaluate.output import print_tables
 from dpcli.errors import DataError, UsageError
-from dpcli.evaluate.classification.protocol import as_json, evaluate_classification
-from dpcli.evaluate.classification.tables import markdown, print_report, tables
+from dpcli.evaluate.classification.protocol import evaluate_classification
+from dpcli.evaluate.classification.result_json import classification_json
+from dpcli.evaluate.classification.tables import classification_notes, classification_tables
+from dpcli.evaluate.text_tables import markdown_tables
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 
 NAMES = ("wave", "push", "pull")
@@ -110,7 +113,7 @@ def test_truth_replaces_labels_and_splits(scores: Path, tmp_path: Path) -> None:
     truth = write_truth(tmp_path / "t.h5", {"f": 0, "e": 0, "d": 2, "c": 1, "b": 0, "a": 1})
     report = evaluate_classification(scores, truth)
     assert (report.main.correct, report.main.samples) == (4, 6)  # a f wrong; e now known; a now of split test
-    assert str(truth) in json.dumps(as_json(report, "x"))
+    assert str(truth) in json.dumps(classification_json(report, "x"))
 
 
 def test_truth_without_a_scored_sample_names_it(scores: Path, tmp_path: Path) -> None:
@@ -198,7 +201,7 @@ def many_classes(path: Path, classes: int) -> Path:
 def test_the_matrix_is_a_table_up_to_thirty_classes(tmp_path: Path) -> None:
     for classes, expected in ((30, 3), (31, 2)):
         report = evaluate_classification(many_classes(tmp_path / f"{classes}.h5", classes))
-        assert len(tables(report)) == expected
+        assert len(classification_tables(report)) == expected
 
 
 def test_a_narrow_terminal_gets_a_hint_instead_of_a_cut_matrix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,14 +213,14 @@ def test_a_narrow_terminal_gets_a_hint_instead_of_a_cut_matrix(tmp_path: Path, m
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("NO_COLOR", "1")
     narrow, pipe = Terminal(), io.StringIO()
-    print_report(report, narrow)
-    print_report(report, pipe)
+    print_tables(classification_tables(report), classification_notes(report), narrow)
+    print_tables(classification_tables(report), classification_notes(report), pipe)
     assert "widen the terminal" in narrow.getvalue() and "truth \\ predicted" not in narrow.getvalue()
     assert "truth \\ predicted" in pipe.getvalue()
     row = next(line for line in pipe.getvalue().splitlines() if line.startswith("24 action") and "%" not in line)
     counts = [int(cell) for cell in row.split("$words$")[1].split() if cell != "."]
     assert counts and sum(counts) == 4
-    assert markdown(report).count("\n| 24 action") == 2
+    assert markdown_tables(classification_tables(report), classification_notes(report)).count("\n| 24 action") == 2
 
 
 @pytest.mark.parametrize("classes", [2, 60])

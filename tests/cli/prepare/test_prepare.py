@@ -59,7 +59,7 @@ def test_skipped_samples_are_listed_and_the_good_ones_kept(tmp_path):
         (["msraction3d", "."], 3, "no MSR-Action3D files named"),
         (["msraction3d", ".", "--train-subjects", "1,two"], 2, "--train-subjects 1,two: expected whole numbers"),
         (["depth", ".", "--fx", "500"], 2, "--fx, --cx and --cy belong together"),
-        (["synthetic", "gestures", "--sampling", "best"], 2, "--sampling best: expected one of random, fps, voxel"),
+        (["synthetic", "gestures", "--sampling", "best"], 2, "'best' is not one of 'random', 'fps', 'voxel'"),
         (["synthetic", "gestures", "--jobs", "0"], 2, "--jobs"),
         (["clouds"], 2, "raw"),
     ],

@@ -4,97 +4,24 @@ from __future__ import annotations
 
 import json
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import app as evaluate
-from dpcli.cli.evaluate.compare import register
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.bootstrap import Resampling
 from dpcli.evaluate.classification.protocol import evaluate_classification
-from dpcli.evaluate.compare.paired import compare_json, compare_measured, mcnemar, pair
-from dpcli.evaluate.compare.runs import spread
-from dpcli.evaluate.compare.sample_metrics import of_values
-from dpcli.evaluate.compare.tables import compare_notes, compare_picture, compare_tables
-from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
-from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts, write_truth
-
-CLASSES = ("wave", "push", "pull")
-
-
-@pytest.fixture(scope="module")
-def app() -> typer.Typer:
-    own = typer.Typer()
-    register(own)
-    return own
-
-
-@pytest.fixture
-def run(app):
-    def call(*arguments: object) -> str:
-        result = CliRunner().invoke(app, [str(a) for a in arguments])
-        if result.exception is not None:
-            raise result.exception
-        return result.stdout
-
-    return call
-
-
-def write_scores(path: Path, wrong: set[int], count: int = 60, start: int = 0, seed: int = 0, **options) -> Path:
-    """Samples v0, v1, ... of label number % 3; those in `wrong` are scored as the next class."""
-    training = {"command": "dpc classify train x", "seed": seed}
-    history = [{"command": "dpc classify predict y", "seed": 99, "config": {"model": training}}]  # as predict writes it
-    with ScoresWriter(path, **{"class_names": CLASSES, "provenance": history, "seed": seed, **options}) as writer:
-        for i in range(start, start + count):
-            writer.write(f"v{i}", np.eye(3)[(i + (i in wrong)) % 3], label=i % 3, split="test")
-    return path
-
-
-@pytest.fixture(scope="module")
-def scores(tmp_path_factory) -> dict[str, Path]:
-    """good: 5 wrong of 60; close: 7 wrong, two of them others'; shuffled: labels at random."""
-    folder = tmp_path_factory.mktemp("scores")
-    shuffled = {int(i) for i in np.random.default_rng(0).choice(60, 40, replace=False)}
-    return {
-        "good": write_scores(folder / "good.h5", {0, 1, 2, 3, 4}, seed=0),
-        "close": write_scores(folder / "close.h5", {0, 1, 2, 10, 11, 12, 13}, seed=1),
-        "shuffled": write_scores(folder / "shuffled.h5", shuffled, seed=2),
-    }
-
-
-@pytest.fixture(scope="module")
-def parts(tmp_path_factory) -> dict[str, Path]:
-    """Eight sequences, predicted rightly, and by a twin whose part ids are shuffled and whose flow is noisy."""
-    folder = tmp_path_factory.mktemp("parts")
-    truths = [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)]
-    rng = np.random.default_rng(0)
-
-    def predicted(noise: float, shuffle: float, only: slice = slice(None)) -> list[tuple]:
-        made = []
-        for truth in truths[only]:
-            sequence, probability, pairs, motion, flow = perfect(truth, 4)
-            moved = rng.random(len(sequence.part)) < shuffle
-            sequence.part[moved] = rng.permutation(sequence.part[moved])
-            flow = [one + rng.normal(scale=noise, size=one.shape).astype(np.float32) for one in flow]
-            made.append((sequence, probability, pairs, motion, flow))
-        return made
-
-    backward = [perfect(truth, 4, pairs=CHAIN[:2]) for truth in truths]
-    return {
-        "truth": write_truth(folder / "truth.h5", truths),
-        "good": write_parts(folder / "good.h5", predicted(0.01, 0.1)),
-        "twin": write_parts(folder / "twin.h5", predicted(0.1, 1.0)),
-        "fewer": write_parts(folder / "fewer.h5", predicted(0.02, 0.2, slice(2, 8))),
-        "pairs": write_parts(folder / "pairs.h5", backward),
-    }
-
-
-# ---- compare ----
+from dpcli.evaluate.compare.file_metrics import metrics_of_values
+from dpcli.evaluate.compare.paired import compare_metrics, pair_metrics
+from dpcli.evaluate.compare.paired_picture import draw_comparison
+from dpcli.evaluate.compare.paired_tables import compare_notes, compare_tables
+from dpcli.evaluate.compare.result_json import compare_json
+from dpcli.evaluate.compare.significance_tests import mcnemar
+from dpcli.store import ScoresWriter
+from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
+from tests.support.scores_helpers import CLASSES, write_scores
 
 
 def test_identical_files_do_not_differ(run, scores, parts):
@@ -166,8 +93,11 @@ def test_pairing_takes_away_what_is_hard_for_both():
     """A constant gain under a large spread of samples: the paired interval sees it, separate ones overlap."""
     hard = np.random.default_rng(0).normal(20, 5, 30)
     tables = [{f"x{i}": {"psnr": v + shift} for i, v in enumerate(hard)} for shift in (0.2, 0)]
-    sides = [of_values(name, "video", "views", table, {"psnr": "dB"}) for name, table in zip("AB", tables, strict=True)]
-    found = pair(*sides, Resampling(500)).changes["psnr"]
+    sides = [
+        metrics_of_values(name, "video", "views", table, {"psnr": "dB"})
+        for name, table in zip("AB", tables, strict=True)
+    ]
+    found = pair_metrics(*sides, Resampling(500)).changes["psnr"]
     assert found.interval.low == pytest.approx(0.2) == found.interval.high and found.p < 0.01
     single = Resampling(500).intervals(sides[0].metric, 30)["psnr"]
     assert single.high - single.low > 2
@@ -178,9 +108,10 @@ def test_bootstrap_difference_of_means_equals_scipy():
 
     a, b = np.random.default_rng(0).normal(size=(2, 25))
     sides = [
-        of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"}) for side in (a, b)
+        metrics_of_values("x", "video", "views", {str(i): {"m": v} for i, v in enumerate(side)}, {"m": "dB"})
+        for side in (a, b)
     ]
-    found = pair(*sides, Resampling(4000)).changes["m"]
+    found = pair_metrics(*sides, Resampling(4000)).changes["m"]
     expected = bootstrap(
         (a, b),
         lambda x, y, axis=-1: (x - y).mean(axis=axis),
@@ -198,34 +129,36 @@ def test_a_table_of_values_becomes_a_whole_report(tmp_path):
     """What a video's views or frames need: tables, notes, JSON and picture from {sample: {metric: value}}."""
     tables = [{f"view {i}": {"psnr": 20 + i + s, "lpips": 0.1 * i + s / 10} for i in range(4)} for s in (0, 1)]
     sides = [
-        of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
+        metrics_of_values(f"{n}.h5", "video", "views", table, {"psnr": "dB", "lpips": "1"})
         for n, table in zip("ab", tables, strict=True)
     ]
-    report = compare_measured(*sides, Resampling(200))
+    report = compare_metrics(*sides, Resampling(200))
     found = json.loads(json.dumps(compare_json(report), allow_nan=False))
     assert found["metrics"]["psnr"]["interval"] == pytest.approx([-1, -1])
     assert (found["metrics"]["psnr"]["b_better"], found["metrics"]["lpips"]["a_better"]) == (4, 4)
     (table, changed), notes = compare_tables(report), compare_notes(report)
     assert table.rows[0][:4] == ["PSNR (dB)", "21.5", "22.5", "-1"] and len(changed.rows) == 4
     assert any("4 views" in line for line in notes) and found["units"] == {"psnr": "dB", "lpips": "1"}
-    compare_picture(report, tmp_path / "v.png")
+    draw_comparison(report, tmp_path / "v.png")
     assert (tmp_path / "v.png").stat().st_size > 5000
 
 
 def test_values_that_are_missing_or_infinite():
     units = {"psnr": "dB"}
-    a = of_values("a", "video", "views", {"x": {"psnr": 1.0}, "y": {"psnr": 2.0}, "z": {}}, units)
-    b = of_values("b", "video", "views", {"x": {"psnr": 2.0}, "y": {"psnr": 4.0}, "z": {}}, units)
-    found = pair(a, b, Resampling(200)).changes["psnr"]
+    a = metrics_of_values("a", "video", "views", {"x": {"psnr": 1.0}, "y": {"psnr": 2.0}, "z": {}}, units)
+    b = metrics_of_values("b", "video", "views", {"x": {"psnr": 2.0}, "y": {"psnr": 4.0}, "z": {}}, units)
+    found = pair_metrics(a, b, Resampling(200)).changes["psnr"]
     assert found.difference == -1.5 and (found.a_better, found.b_better, found.ties) == (0, 2, 0)
     with pytest.raises(DataError, match="psnr of 2 views is infinite: 'y', 'z'"):
-        of_values("f", "video", "views", {"x": {"psnr": 1}, "y": {"psnr": np.inf}, "z": {"psnr": -np.inf}}, units)
+        metrics_of_values(
+            "f", "video", "views", {"x": {"psnr": 1}, "y": {"psnr": np.inf}, "z": {"psnr": -np.inf}}, units
+        )
     with pytest.raises(DataError, match="no views"):
-        of_values("f", "video", "views", {}, units)
+        metrics_of_values("f", "video", "views", {}, units)
     with pytest.raises(DataError, match="unit of psnr: 'dB' in a, 'bel' in c"):
-        pair(a, of_values("c", "video", "views", {"x": {"psnr": 1}}, {"psnr": "bel"}), Resampling(0))
-    alone = of_values("a", "video", "views", {"x": {"psnr": 1.0}}, units)
-    only = pair(alone, alone, Resampling(200)).changes["psnr"]
+        pair_metrics(a, metrics_of_values("c", "video", "views", {"x": {"psnr": 1}}, {"psnr": "bel"}), Resampling(0))
+    alone = metrics_of_values("a", "video", "views", {"x": {"psnr": 1.0}}, units)
+    only = pair_metrics(alone, alone, Resampling(200)).changes["psnr"]
     assert not only.interval.defined and np.isnan(only.p)
 
 
@@ -302,227 +235,3 @@ def test_what_cannot_be_compared(run, scores, parts, tmp_path):
         run("compare", parts["truth"], parts["truth"])
     with pytest.raises(UsageError, match="--protocol and --ignore-below are for parts"):
         run("compare", scores["good"], scores["good"], "--ignore-below", 3)
-
-
-# ---- runs ----
-
-
-def test_runs_by_hand(run, scores):
-    """Accuracies 55, 53 and 20 of 60: mean and sd by numpy, t quantile of two degrees of freedom from a table."""
-    files = [scores[name] for name in ("good", "close", "shuffled")]
-    found = json.loads(run("runs", *files, "--json"))
-    values = np.array([55, 53, 20]) / 60
-    own = found["metrics"]["accuracy"]
-    assert own["values"] == pytest.approx(values) and own["n"] == 3
-    assert own["mean"] == pytest.approx(values.mean()) and own["sd"] == pytest.approx(values.std(ddof=1))
-    half = 4.302653 * values.std(ddof=1) / math.sqrt(3)
-    assert half > 0.7 and own["interval"] == [0, 1]  # which no share leaves
-    assert found["runs"] == ["seed 0", "seed 1", "seed 2"]  # of the training, not of the prediction
-    assert found["samples"]["number"] == 60 and found["denominators"] == {"runs": 3, "samples": 60}
-    text = run("runs", *files, "--markdown", "--metrics", "accuracy")
-    assert f"| ± sd | {100 * values.std(ddof=1):.1f} |" in text and "| seed 1 | 88.3 |" in text
-
-
-def test_spread_equals_scipy():
-    from scipy.stats import t
-
-    values = np.random.default_rng(0).normal(size=6)
-    found = spread(values, 0.9)
-    expected = t.interval(0.9, 5, values.mean(), values.std(ddof=1) / math.sqrt(6))
-    assert (found.interval.low, found.interval.high) == pytest.approx(expected, abs=1e-12)
-    one = spread([0.5])
-    assert one.mean == 0.5 and math.isnan(one.sd) and not one.interval.defined
-
-
-def test_the_interval_of_a_share_ends_where_its_mean_does():
-    two = spread([0.9, 0.98], share=True).interval  # two runs: 12.7 standard errors
-    assert two.low == pytest.approx(0.94 - 12.7062 * 0.04, abs=1e-4) and two.high == 1
-    assert spread([0.02, 0.1], share=True).interval.low == 0
-    for length in ([0.9, 0.98], [0.9, 1.4]):  # a length, or a share of the diameter that isn't one
-        assert spread(length, share=length[1] > 1).interval.high > 1.4
-
-
-def test_runs_of_parts_and_of_their_json_are_the_same(run, parts, tmp_path):
-    names = ("good", "twin")
-    direct = json.loads(run("runs", *(parts[name] for name in names), "--truth", parts["truth"], "--json"))
-    lines = [
-        CliRunner()
-        .invoke(
-            evaluate.app,
-            ["segmentation", str(parts[name]), "--truth", str(parts["truth"]), "--json", "--resamples", "0"],
-        )
-        .stdout
-        for name in names
-    ]
-    (tmp_path / "both.json").write_text("".join(lines))
-    by_json = json.loads(run("runs", tmp_path / "both.json", "--json"))
-    for key, own in by_json["metrics"].items():
-        for what, value in own.items():
-            assert value == pytest.approx(direct["metrics"][key][what]), (key, what)
-    assert by_json["runs"] == ["good", "twin"] and by_json["samples"] == direct["samples"]
-    assert set(direct["metrics"]) > set(by_json["metrics"])  # motion, too
-    (tmp_path / "first.json").write_text(lines[0])
-    single = run("runs", tmp_path / "first.json")
-    assert "One run only" in single
-
-
-def test_runs_that_are_not_the_same_experiment(run, scores, parts, tmp_path):
-    with pytest.raises(DataError, match="later.h5: another samples than .*number 59, not 60"):
-        run("runs", scores["good"], write_scores(tmp_path / "later.h5", set(), count=59))
-    with pytest.raises(DataError, match="moved.h5: another samples than .*names_sha256"):
-        run("runs", scores["good"], write_scores(tmp_path / "moved.h5", set(), start=3))
-    with pytest.raises(DataError, match="fewer.h5: has no 's0'"):
-        run("runs", parts["good"], parts["fewer"], "--truth", parts["truth"])
-    objects = {}
-    for protocol in ("dpc", "release"):
-        objects[protocol] = (
-            CliRunner()
-            .invoke(
-                evaluate.app,
-                ["segmentation", str(parts["good"]), "--truth", str(parts["truth"]), "--json", "--protocol", protocol],
-            )
-            .stdout
-        )
-    path = tmp_path / "mixed.json"
-    path.write_text(objects["dpc"] + objects["release"])
-    with pytest.raises(DataError, match="mixed.json:2: another protocol than .*name 'release', not 'dpc'"):
-        run("runs", path)
-    path.write_text(objects["dpc"])
-    with pytest.raises(DataError, match="another task than"):
-        run("runs", scores["good"], path)
-    for text, words in (
-        ("", "empty"),
-        ("{}\n", "not an object of"),
-        ("hello", "neither a file"),
-        ("\x00\xff", "neither"),
-        (objects["dpc"].replace('"miou": ', '"miou": NaN, "x": ', 1), "miou of 7 metrics not finite"),
-    ):
-        path.write_text(text)
-        with pytest.raises(DpcError, match=words):
-            run("runs", path)
-
-
-def test_runs_of_video_results_need_no_names(run, tmp_path):
-    """Objects of `evaluate video` carry no sample names: their denominators are compared."""
-    own = {
-        "task": "video",
-        "input": "a.h5",
-        "protocol": {"name": "dpc"},
-        "units": {"psnr": "dB", "ssim": "1"},
-        "metrics": {"psnr": 30.0, "ssim": None, "per_view": []},
-        "denominators": {"views": 2, "frames": 8},
-    }
-    path = tmp_path / "v.json"
-    path.write_text("\n".join(json.dumps(own | {"metrics": {"psnr": p, "ssim": 0.5}}) for p in (30.0, 32.0)))
-    found = json.loads(run("runs", path, "--json"))
-    assert found["metrics"]["psnr"]["mean"] == 31 and found["runs"] == ["a #1", "a #2"]
-    path.write_text("\n".join(json.dumps(own | {"denominators": {"views": 2, "frames": n}}) for n in (8, 9)))
-    with pytest.raises(DataError, match="another denominators than .*frames 9, not 8"):
-        run("runs", path)
-    path.write_text(json.dumps(own) + "\n" + json.dumps(own))
-    assert json.loads(run("runs", path, "--json"))["metrics"]["ssim"]["mean"] is None
-    assert "undefined in some runs" in run("runs", path)
-
-
-# ---- bad input of the single commands ----
-
-
-def test_intersect_of_scores_and_truth(scores, tmp_path):
-    truth = tmp_path / "truth.h5"
-    with CloudsWriter(truth, class_names=CLASSES) as writer:
-        for i in range(10, 70):
-            writer.write(CloudSequence.from_frames(f"v{i}", [np.ones((2, 3))], label=i % 3, split="test"))
-    with pytest.raises(DataError, match="has no 'v0'.* 5 more, which .*--intersect"):
-        evaluate_classification(scores["good"], truth)
-    report = evaluate_classification(scores["good"], truth, intersect=True)
-    assert report.main.samples == 50 and report.main.accuracy == 1
-    assert [(e.reason, len(e.names)) for e in report.left_out] == [("the truth doesn't have", 10), ("not scored", 10)]
-    assert evaluate_classification(scores["good"], truth, "all", intersect=True).main.samples == 50
-    far = write_scores(tmp_path / "far.h5", set(), start=200)
-    with pytest.raises(DataError, match="of which .* has none"):
-        evaluate_classification(far, truth, intersect=True)
-
-
-@pytest.mark.parametrize("task", ["segmentation", "motion"])
-def test_another_length_unit_is_an_error(task, parts, tmp_path):
-    truth = write_truth(
-        tmp_path / "mm.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit="mm"
-    )
-    result = CliRunner().invoke(evaluate.app, [task, str(parts["good"]), "--truth", str(truth)])
-    assert isinstance(result.exception, DataError) and "length_unit 'm', but 'mm' in" in str(result.exception)
-    unnamed = write_truth(
-        tmp_path / "none.h5", [truth_sequence(f"s{i}", seed=i, label=i % 2) for i in range(8)], length_unit=""
-    )
-    assert CliRunner().invoke(evaluate.app, [task, str(parts["good"]), "--truth", str(unnamed)]).exit_code == 0
-
-
-def damaged(source: Path, target: Path, change) -> Path:
-    """A copy of a file with an HDF5 data set changed behind the program's back."""
-    import shutil
-
-    import h5py
-
-    shutil.copy(source, target)
-    with h5py.File(target, "r+") as file:
-        change(file)
-    return target
-
-
-def put(name: str, row: object, value: float):
-    def change(file) -> None:
-        file[name][row] = value
-
-    return change
-
-
-def emptied(file) -> None:
-    for key in ("name", "split", "label", "scores"):
-        values = file[key][:0]
-        kind = file[key].dtype
-        del file[key]
-        file.create_dataset(key, data=values, dtype=kind)
-
-
-@pytest.mark.parametrize(
-    ("what", "change", "words"),
-    [
-        ("scores", put("scores", 3, math.nan), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
-        (
-            "scores",
-            put("scores", (slice(5, 9), 0), math.inf),
-            "4 of .* samples with NaN or infinite scores, the first 'v5'",
-        ),
-        ("scores", put("scores", 3, -math.inf), "1 of .* samples with NaN or infinite scores, the first 'v3'"),
-        ("scores", emptied, "no samples"),
-        ("parts", put("flow", 0, math.nan), "'s0': 1 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1"),
-        (
-            "parts",
-            put("flow", slice(0, 2), math.inf),
-            "'s0': 2 of .* NaN or infinite flow, the first is point 0 of flow 0 -> 1",
-        ),
-        (
-            "parts",
-            put("part_probability", 0, math.nan),
-            "'s0': 1 of .* NaN or infinite probability, the first is point 0",
-        ),
-        ("parts", put("part_motion", 0, math.nan), "'s0': motion of part 0"),
-        ("truth", put("pose", 0, math.nan), "pose"),
-        ("truth", put("points", 0, math.nan), "'s0' holds NaN or infinite coordinates"),
-    ],
-)
-def test_bad_numbers_are_named(run, scores, parts, tmp_path, what, change, words):
-    """In the single command, in a comparison and among runs: an error of one or two lines, never a number."""
-    source = scores["good"] if what == "scores" else parts[{"parts": "good"}.get(what, what)]
-    bad = damaged(source, tmp_path / "bad.h5", change)
-    task = "classification" if what == "scores" else "motion"
-    given = {"scores": [bad], "parts": [bad, "--truth", parts["truth"]], "truth": [parts["good"], "--truth", bad]}[what]
-    result = CliRunner().invoke(evaluate.app, [task, *map(str, given)])
-    assert isinstance(result.exception, DataError), result.exception
-    calls = [str(result.exception)]
-    for command in (["compare", given[0], *given], ["runs", *given]):
-        with pytest.raises(DataError) as caught:
-            run(*command)
-        calls.append(str(caught.value))
-    for text in calls:
-        assert "bad.h5" in text and len(text.splitlines()) <= 2
-        assert re.search(words, text), text

@@ -152,13 +152,13 @@ def test_loading_a_variant(tiny_folder, tmp_path, monkeypatch):
     (tmp_path / "toy").symlink_to(tiny_folder)
     size = (tiny_folder / "model.safetensors").stat().st_size
     entry = Weights("clip-laion", "toy/model.safetensors", "https://example.org/m", size, "MIT", "", "clip")
-    monkeypatch.setattr(module, "known", lambda: {"clip-laion": entry})
+    monkeypatch.setattr(module, "known_weights", lambda: {"clip-laion": entry})
     assert Clip.load(tmp_path, "laion").width == WIDTH
     with pytest.raises(DataError, match="fetch clip-laion"):
         Clip.load(tmp_path / "elsewhere", "laion")
     with pytest.raises(UsageError, match="openai, laion"):
         Clip.load(tmp_path, "google")
-    monkeypatch.setattr(module, "known", lambda: {"clip-laion": Weights(**{**vars(entry), "size": size + 1})})
+    monkeypatch.setattr(module, "known_weights", lambda: {"clip-laion": Weights(**{**vars(entry), "size": size + 1})})
     with pytest.raises(DataError, match="damaged weights"):
         Clip.load(tmp_path, "laion")
 

@@ -16,21 +16,19 @@ from PIL import Image
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.networks.i3d import I3D, ScriptedI3D, Unit, pool_same, same_padding
 from dpcli.evaluate.networks.resnet3d import ResNet3D50
-from dpcli.evaluate.networks.weights import find, weights_folder
-from dpcli.evaluate.video.frechet_features import (
+from dpcli.evaluate.networks.weights import find_weights, weights_folder
+from dpcli.evaluate.video.frechet.clip_features import (
     LONGEST,
-    VARIANTS,
     ClipFeatures,
     FeatureNetwork,
     VideoFeatures,
     VideoPair,
     build_network,
-    feature_choices,
     feature_report,
-    feature_variant,
-    prepare,
     video_distance,
 )
+from dpcli.evaluate.video.frechet.frame_inputs import prepare_frame
+from dpcli.evaluate.video.frechet.variants import VARIANTS, feature_choices, feature_variant
 from dpcli.runtime.seeds import generator
 from tests.support import network_helpers
 
@@ -211,18 +209,22 @@ def flat(levels: Iterator[float] | list[float], side: int = 8) -> list[np.ndarra
 def test_pictures_are_prepared_as_each_variant_says():
     picture = generator(0, 54).random((3, 40, 60), np.float32)
     wide = F.interpolate(torch.from_numpy(picture)[None], size=(224, 336), mode="bilinear", align_corners=False)[0]
-    torch.testing.assert_close(prepare(VARIANTS["styleganv"], picture), wide[:, :, 56:280] * 2 - 1, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        prepare_frame(VARIANTS["styleganv"], picture), wide[:, :, 56:280] * 2 - 1, rtol=0, atol=1e-6
+    )
     eight = torch.from_numpy(np.floor(picture * 255) / 255)[None]
     wide = F.interpolate(eight, size=(224, 336), mode="bilinear", align_corners=False)[0]
-    torch.testing.assert_close(prepare(VARIANTS["videogpt"], picture), wide[:, :, 56:280] * 2 - 1, rtol=0, atol=1e-6)
-    tall = prepare(VARIANTS["styleganv"], np.ascontiguousarray(picture.transpose(0, 2, 1)))
-    torch.testing.assert_close(tall, prepare(VARIANTS["styleganv"], picture).transpose(1, 2))
+    torch.testing.assert_close(
+        prepare_frame(VARIANTS["videogpt"], picture), wide[:, :, 56:280] * 2 - 1, rtol=0, atol=1e-6
+    )
+    tall = prepare_frame(VARIANTS["styleganv"], np.ascontiguousarray(picture.transpose(0, 2, 1)))
+    torch.testing.assert_close(tall, prepare_frame(VARIANTS["styleganv"], picture).transpose(1, 2))
 
 
 @pytest.mark.parametrize(("name", "side"), [("disco", 224), ("consistent4d", 224), ("r3d50", 112)])
 def test_pil_bicubic_is_of_eight_bits_in_floats(name: str, side: int):
     picture = generator(0, 55).random((3, 300, 260), np.float32) * 0.3 + 0.3
-    found = prepare(VARIANTS[name], picture)
+    found = prepare_frame(VARIANTS[name], picture)
     eight = np.rint(picture * 255).astype(np.uint8)
     back = found + torch.tensor([114.7748, 107.7354, 99.4750])[:, None, None] if side == 112 else (found + 1) * 127.5
     whole = np.asarray(Image.fromarray(eight.transpose(1, 2, 0)).resize((side, side), Image.Resampling.BICUBIC))
@@ -230,7 +232,7 @@ def test_pil_bicubic_is_of_eight_bits_in_floats(name: str, side: int):
     assert apart.max() < 1.25 and 0 < apart.mean() < 0.4  # PIL rounds the 8-bit picture, after each of two passes
     edge = np.zeros((3, 300, 260), np.float32)
     edge[:, :, 130:] = 1
-    assert prepare(VARIANTS["disco"], edge).max() > 1.001  # overshoots are kept
+    assert prepare_frame(VARIANTS["disco"], edge).max() > 1.001  # overshoots are kept
 
 
 def test_a_whole_video_is_one_clip_and_windows_slide():
@@ -272,11 +274,11 @@ def test_too_few_frames_say_how_many_are_needed():
 
 def test_bad_pictures_are_refused():
     with pytest.raises(DataError, match="divide by 255"):
-        prepare(VARIANTS["disco"], np.full((3, 8, 8), 200, np.float32))
+        prepare_frame(VARIANTS["disco"], np.full((3, 8, 8), 200, np.float32))
     with pytest.raises(DataError, match="1 values that are NaN"):
-        prepare(VARIANTS["disco"], np.where(np.arange(192).reshape(3, 8, 8) == 7, np.nan, 0.5).astype(np.float32))
+        prepare_frame(VARIANTS["disco"], np.where(np.arange(192).reshape(3, 8, 8) == 7, np.nan, 0.5).astype(np.float32))
     with pytest.raises(ValueError, match="shape"):
-        prepare(VARIANTS["disco"], np.zeros((8, 8, 3), np.float32))
+        prepare_frame(VARIANTS["disco"], np.zeros((8, 8, 3), np.float32))
     with pytest.raises(UsageError, match="expected styleganv"):
         feature_variant("tensorflow")
     with pytest.raises(UsageError, match="1 or more"):
@@ -372,7 +374,7 @@ def test_the_figure_that_common_metrics_prints(name: str):
     """8 videos of 30 black frames against white ones: 151.26; needs the real weights."""
     folder = weights_folder()
     try:
-        find(VARIANTS[name].weights, folder)
+        find_weights(VARIANTS[name].weights, folder)
     except DataError as error:
         pytest.skip(f"no weights: {error}")
     network = FeatureNetwork.load(name, folder)

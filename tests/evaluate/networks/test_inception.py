@@ -10,7 +10,9 @@ import torch
 import torch.nn.functional as F
 
 from dpcli.evaluate.networks.inception import FidInception, inception_input
-from dpcli.evaluate.video.frechet_features import VARIANTS, FeatureNetwork, VideoFeatures, prepare, video_distance
+from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork, VideoFeatures, video_distance
+from dpcli.evaluate.video.frechet.frame_inputs import prepare_frame
+from dpcli.evaluate.video.frechet.variants import VARIANTS
 from dpcli.runtime.seeds import generator
 from tests.support import network_helpers
 
@@ -156,13 +158,15 @@ def test_torchvisions_block_would_not_pass(network, one_thread):
 
 def test_the_input_is_torchmetrics(one_thread):
     frame = generator(0, 43).integers(0, 256, (3, 64, 48)).astype(np.float32) / 255
-    found = prepare(VARIANTS["inception"], frame)
+    found = prepare_frame(VARIANTS["inception"], frame)
     values = torch.from_numpy((frame * 255).round())[None]
     expected = F.interpolate(values, size=(299, 299), mode="bilinear", align_corners=False, antialias=True)
     torch.testing.assert_close(found, ((expected - 128) / 128)[0], rtol=0, atol=1e-6)
     large = generator(0, 44).random((3, 400, 400), np.float32)
     small = inception_input(torch.from_numpy(large)[None] * 255, antialias=False)
-    assert (prepare(VARIANTS["inception"], large) - small).abs().max() > 0.1  # shrinking is where antialias counts
+    assert (
+        prepare_frame(VARIANTS["inception"], large) - small
+    ).abs().max() > 0.1  # shrinking is where antialias counts
 
 
 def test_mean_over_videos_of_each_videos_own_distance(one_thread):
@@ -181,7 +185,9 @@ def test_mean_over_videos_of_each_videos_own_distance(one_thread):
         for predicted, truth in zip(*videos, strict=True):
             features.add(predicted, truth)
         pairs.append(features.result())
-        x, y = (np.stack([prepare(VARIANTS["inception"], f).double().mean((1, 2)) for f in video]) for video in videos)
+        x, y = (
+            np.stack([prepare_frame(VARIANTS["inception"], f).double().mean((1, 2)) for f in video]) for video in videos
+        )
         s, t = np.cov(x.T), np.cov(y.T)
         expected.append(np.square(x.mean(0) - y.mean(0)).sum() + np.trace(s + t - 2 * sqrtm(s @ t).real))
     found = video_distance(VARIANTS["inception"], pairs)

@@ -285,13 +285,15 @@ def test_loading_a_zoo_file(tmp_path, monkeypatch):
         "",
         "lpips",
     )
-    monkeypatch.setattr(weights_module, "known", lambda: {"squeezenet": entry})
+    monkeypatch.setattr(weights_module, "known_weights", lambda: {"squeezenet": entry})
     a, b = two_pictures(1, 32)
     assert torch.equal(Lpips.load("squeeze", tmp_path).distance(a, b), source.distance(a, b))
     with pytest.raises(DataError, match="zoo.pth: no such weights; run `dpc evaluate weights fetch squeezenet`"):
         Lpips.load("squeeze", tmp_path / "elsewhere")
     torch.save({k: v for k, v in state.items() if "9.squeeze" not in k}, tmp_path / "zoo.pth")
-    monkeypatch.setattr(weights_module, "known", lambda: {"squeezenet": Weights(**{**vars(entry), "about": True})})
+    monkeypatch.setattr(
+        weights_module, "known_weights", lambda: {"squeezenet": Weights(**{**vars(entry), "about": True})}
+    )
     with pytest.raises(DataError, match="no tensor features.9.squeeze.weight; expected weights of Trunk"):
         Lpips.load("squeeze", tmp_path)
 

@@ -21,22 +21,21 @@ from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import weights as evaluate_weights
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.evaluate.commands import weights as commands
 from dpcli.evaluate.networks import weights as module
+from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
 from dpcli.evaluate.networks.weights import (
     Weights,
     bytes_text,
-    check,
-    check_all,
-    digest_of,
-    fill,
-    find,
-    known,
-    load_state,
-    named,
-    state_of,
+    check_file,
+    check_weights,
+    find_weights,
+    known_weights,
+    sha256_of,
     weights_folder,
+    weights_named,
 )
-from dpcli.evaluate.networks.weights_fetch import fetch
+from dpcli.evaluate.networks.weights_fetch import fetch_weights
 
 CONTENT = bytes(range(256)) * 40
 ENTRY = Weights(
@@ -48,7 +47,7 @@ ENTRY = Weights(
 
 
 def test_the_list_is_whole():
-    entries = known()
+    entries = known_weights()
     needed = {
         "alexnet",
         "vgg16",
@@ -75,9 +74,9 @@ def test_the_list_is_whole():
 
 
 def test_names_of_entries_and_of_files():
-    assert named("vgg16") is named("vgg16-397923af.pth")
+    assert weights_named("vgg16") is weights_named("vgg16-397923af.pth")
     with pytest.raises(UsageError, match="no weights named 'vgg'; there are alexnet, vgg16"):
-        named("vgg")
+        weights_named("vgg")
 
 
 def test_the_folder(tmp_path, monkeypatch):
@@ -96,21 +95,21 @@ def test_the_folder(tmp_path, monkeypatch):
 
 def test_a_missing_file_is_one_line(tmp_path):
     with pytest.raises(DataError) as caught:
-        find("alexnet", tmp_path)
+        find_weights("alexnet", tmp_path)
     said = str(caught.value)
     assert "\n" not in said and str(tmp_path / "alexnet-owt-7be5be79.pth") in said
     assert (
         "`dpc evaluate weights fetch alexnet`" in said and "https://download.pytorch.org/" in said and "244 MB" in said
     )
     with pytest.raises(DataError) as caught:
-        find("resnet50-kinetics", tmp_path)
+        find_weights("resnet50-kinetics", tmp_path)
     assert "by hand" in str(caught.value) and "weights fetch" not in str(caught.value)
     (tmp_path / "clip-vit-base-patch32").mkdir()
     (tmp_path / "clip-vit-base-patch32" / "pytorch_model.bin").touch()
     with pytest.raises(DataError, match=r"patch32/config\.json: no such weights"):
-        find("clip-openai", tmp_path)
+        find_weights("clip-openai", tmp_path)
     (tmp_path / "clip-vit-base-patch32" / "config.json").touch()
-    assert find("clip-openai", tmp_path).name == "pytorch_model.bin"
+    assert find_weights("clip-openai", tmp_path).name == "pytorch_model.bin"
 
 
 @pytest.mark.parametrize(
@@ -125,15 +124,15 @@ def test_sizes_as_text(count, words):
 
 def test_check(tmp_path):
     path = tmp_path / "toy.bin"
-    assert check(path, ENTRY).state == "absent"
+    assert check_file(path, ENTRY).state == "absent"
     path.write_bytes(CONTENT)
-    found = check(path, ENTRY)
-    assert found.state == "present" and found.digest == digest_of(path) == ENTRY.sha256 and "whole" in found.said
-    prefix = check(path, replace(ENTRY, sha256=ENTRY.sha256[:8]))
-    assert prefix.state == "present" and "first 8 digits" in prefix.said
-    unknown = check(path, replace(ENTRY, sha256=""))
-    assert unknown.state == "present" and "no published digest" in unknown.said and ENTRY.sha256 in unknown.said
-    assert check(path, ENTRY, digest=False).digest == ""
+    found = check_file(path, ENTRY)
+    assert found.state == "present" and found.digest == sha256_of(path) == ENTRY.sha256 and "whole" in found.finding
+    prefix = check_file(path, replace(ENTRY, sha256=ENTRY.sha256[:8]))
+    assert prefix.state == "present" and "first 8 digits" in prefix.finding
+    unknown = check_file(path, replace(ENTRY, sha256=""))
+    assert unknown.state == "present" and "no published digest" in unknown.finding and ENTRY.sha256 in unknown.finding
+    assert check_file(path, ENTRY, digest=False).digest == ""
 
 
 def test_check_finds_damage(tmp_path):
@@ -148,20 +147,20 @@ def test_check_finds_damage(tmp_path):
         (b"", replace(ENTRY, about=True, sha256=""), "empty"),
     ):
         path.write_bytes(content)
-        found = check(path, entry)
-        assert found.state == "damaged" and words in found.said
+        found = check_file(path, entry)
+        assert found.state == "damaged" and words in found.finding
     path.write_bytes(bytes(flipped))
-    assert check(path, ENTRY, digest=False).state == "present"  # the size alone can't tell: `list` says so
+    assert check_file(path, ENTRY, digest=False).state == "present"  # the size alone can't tell: `list` says so
 
 
 def test_files_beside_count(tmp_path):
     both = replace(ENTRY, beside=(replace(ENTRY, file="config.json"),))
     (tmp_path / "toy.bin").write_bytes(CONTENT)
-    assert check_all(both, tmp_path).state == "absent"
+    assert check_weights(both, tmp_path).state == "absent"
     (tmp_path / "config.json").write_bytes(CONTENT[:9])
-    assert check_all(both, tmp_path).state == "damaged"
+    assert check_weights(both, tmp_path).state == "damaged"
     (tmp_path / "config.json").write_bytes(CONTENT)
-    assert check_all(both, tmp_path).state == "present"
+    assert check_weights(both, tmp_path).state == "present"
 
 
 # What is in it
@@ -187,17 +186,17 @@ def test_load_state_of_every_kind(tmp_path):
         {"epoch": 7, "arch": "resnet-50", "state_dict": parallel, "optimizer": optimizer}, tmp_path / "train.pth"
     )
     for name in ("a.safetensors", "a.pth", "old.pth", "train.pth"):
-        assert same(load_state(tmp_path / name), state), name
+        assert same(load_tensors(tmp_path / name), state), name
 
 
 @pytest.mark.filterwarnings("ignore:.*torch.jit:DeprecationWarning")
 def test_torchscript_only_where_it_is_expected(tmp_path):
     model = small().eval()
     torch.jit.trace(model, torch.zeros(1, 3, 8, 8)).save(str(tmp_path / "script.pt"))
-    found = load_state(tmp_path / "script.pt", script=True)
+    found = load_tensors(tmp_path / "script.pt", script=True)
     assert same({name: found[name] for name in model.state_dict()}, model.state_dict())
     with pytest.raises(DataError, match="not a plain state dict"):
-        load_state(tmp_path / "script.pt")
+        load_tensors(tmp_path / "script.pt")
 
 
 class Hostile:
@@ -222,29 +221,29 @@ def test_load_state_refuses(tmp_path):
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "cut.safetensors").read_bytes()[:100])
     for name in ("hostile", "bare", "module", "list", "empty", "numbers", "cut"):
         with pytest.raises(DataError, match=f"{name}.pth: not a plain state dict") as caught:
-            load_state(tmp_path / f"{name}.pth")
+            load_tensors(tmp_path / f"{name}.pth")
         assert "\n" not in str(caught.value)
     with pytest.raises(DataError, match="cut.safetensors: not a plain state dict"):
-        load_state(tmp_path / "cut.safetensors")
+        load_tensors(tmp_path / "cut.safetensors")
     assert not (tmp_path / "proof").exists()
     torch.save({"a": torch.tensor([1.0, torch.nan])}, tmp_path / "nan.pth")
     with pytest.raises(DataError, match="NaN or infinite values in a"):
-        load_state(tmp_path / "nan.pth")
+        load_tensors(tmp_path / "nan.pth")
 
 
 def test_state_of_compares_first(tmp_path, monkeypatch):
     state = small().state_dict()
     torch.save(state, tmp_path / "toy.bin")
-    entry = replace(ENTRY, size=(tmp_path / "toy.bin").stat().st_size, sha256=digest_of(tmp_path / "toy.bin"))
-    monkeypatch.setattr(module, "known", lambda: {"toy": entry})
-    assert same(state_of("toy", tmp_path), state)
-    monkeypatch.setattr(module, "known", lambda: {"toy": replace(entry, size=entry.size + 1)})
+    entry = replace(ENTRY, size=(tmp_path / "toy.bin").stat().st_size, sha256=sha256_of(tmp_path / "toy.bin"))
+    monkeypatch.setattr(module, "known_weights", lambda: {"toy": entry})
+    assert same(load_weights("toy", tmp_path), state)
+    monkeypatch.setattr(module, "known_weights", lambda: {"toy": replace(entry, size=entry.size + 1)})
     with pytest.raises(DataError, match="damaged weights .* fetch it again"):
-        state_of("toy", tmp_path)
-    monkeypatch.setattr(module, "known", lambda: {"toy": replace(entry, sha256="0" * 64, script=True)})
+        load_weights("toy", tmp_path)
+    monkeypatch.setattr(module, "known_weights", lambda: {"toy": replace(entry, sha256="0" * 64, script=True)})
     monkeypatch.setattr(torch.jit, "load", lambda *_, **__: pytest.fail("an archive of code, of another digest"))
     with pytest.raises(DataError, match="damaged weights"):
-        state_of("toy", tmp_path)
+        load_weights("toy", tmp_path)
 
 
 def test_fill(tmp_path):
@@ -253,12 +252,12 @@ def test_fill(tmp_path):
         source[0].weight.mul_(2)
     state = {**source.state_dict(), "classifier.weight": torch.zeros(3)}
     del state["1.num_batches_tracked"]  # files of before PyTorch 0.4.1 have none
-    fill(target, state, tmp_path)
+    fill_module(target, state, tmp_path)
     assert torch.equal(target[0].weight, source[0].weight)
     with pytest.raises(DataError, match="no tensor 1.running_var; expected weights of Sequential"):
-        fill(target, {name: value for name, value in state.items() if name != "1.running_var"}, tmp_path)
+        fill_module(target, {name: value for name, value in state.items() if name != "1.running_var"}, tmp_path)
     with pytest.raises(DataError, match=r"0.bias has shape \(5,\), expected \(4,\)"):
-        fill(target, {**state, "0.bias": torch.zeros(5)}, tmp_path)
+        fill_module(target, {**state, "0.bias": torch.zeros(5)}, tmp_path)
 
 
 # Downloads
@@ -295,18 +294,18 @@ def server(monkeypatch):
 def test_fetch(server, tmp_path, capfd):
     folder = tmp_path / "not yet" / "there"
     both = replace(server.entry, beside=(replace(server.entry, file="sub/config.json"),))
-    assert fetch(both, folder) == [folder / "toy.bin", folder / "sub" / "config.json"]
+    assert fetch_weights(both, folder) == [folder / "toy.bin", folder / "sub" / "config.json"]
     assert (folder / "toy.bin").read_bytes() == CONTENT and (folder / "sub" / "config.json").read_bytes() == CONTENT
     assert sorted(path.name for path in folder.rglob("*") if path.is_file()) == ["config.json", "toy.bin"]
     out, err = capfd.readouterr()
     assert out == "" and "whole SHA-256 checked" in err and "fetch toy" in err
-    fetch(both, folder)
+    fetch_weights(both, folder)
     assert len(server.asked) == 2 and "already there" in capfd.readouterr().err
 
 
 def test_fetch_replaces_a_damaged_file_and_tells_an_unpublished_digest(server, tmp_path, capfd):
     (tmp_path / "toy.bin").write_bytes(CONTENT[:100])
-    fetch(replace(server.entry, sha256=""), tmp_path)
+    fetch_weights(replace(server.entry, sha256=""), tmp_path)
     assert (tmp_path / "toy.bin").read_bytes() == CONTENT
     assert f"no published digest; SHA-256 is {ENTRY.sha256}" in capfd.readouterr().err
 
@@ -328,7 +327,7 @@ def test_fetch_keeps_nothing_wrong(server, tmp_path, answer, change, words):
     for name, content in before.items():
         (tmp_path / name).write_bytes(content)
     with pytest.raises(DpcError, match=words) as caught:
-        fetch(replace(server.entry, **change), tmp_path)
+        fetch_weights(replace(server.entry, **change), tmp_path)
     assert "\n" not in str(caught.value)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -338,9 +337,9 @@ def test_fetch_without_a_network(tmp_path, monkeypatch):
     with TCPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as closed:
         port = closed.server_address[1]
     with pytest.raises(DpcError, match="no connection .*Connection refused.*give the folder with --weights"):
-        fetch(replace(ENTRY, url=f"http://127.0.0.1:{port}/toy.bin"), tmp_path)
+        fetch_weights(replace(ENTRY, url=f"http://127.0.0.1:{port}/toy.bin"), tmp_path)
     with pytest.raises(DpcError, match="no direct link; download toy.bin from .* by hand and put it at"):
-        fetch(replace(ENTRY, by_hand=True), tmp_path)
+        fetch_weights(replace(ENTRY, by_hand=True), tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -351,9 +350,10 @@ def test_fetch_without_a_network(tmp_path, monkeypatch):
 def run(monkeypatch, server):
     """Run `weights ...` of a toy app, with two toy entries; what it raises is raised."""
     lost = replace(server.entry, name="lost", file="lost.bin", url=server.entry.url.replace("toy", "lost"))
-    monkeypatch.setattr(module, "known", lambda: {"toy": server.entry, "lost": lost})
+    for one in (module, commands):
+        monkeypatch.setattr(one, "known_weights", lambda: {"toy": server.entry, "lost": lost})
     app = typer.Typer()
-    evaluate_weights.register(app)
+    app.add_typer(evaluate_weights.app, name="weights")
     app.command("other")(lambda: None)
     return lambda *words: CliRunner().invoke(app, ["weights", *map(str, words)], catch_exceptions=False)
 
@@ -383,4 +383,4 @@ def test_commands_that_fail(run, tmp_path):
         run("fetch", "nothing", "--weights", tmp_path)
     with pytest.raises(DpcError, match="404"):  # the other one is fetched nevertheless
         run("fetch", "lost", "toy", "--weights", tmp_path)
-    assert check(tmp_path / "toy.bin", ENTRY).state == "present"
+    assert check_file(tmp_path / "toy.bin", ENTRY).state == "present"

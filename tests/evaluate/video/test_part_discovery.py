@@ -6,18 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from sklearn.metrics import adjusted_rand_score
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.part_discovery import (
     PART_NEIGHBORS,
     TRACK_NEIGHBORS,
-    _clusters,
-    adjusted_rand_index,
-    attach,
-    carry,
+    _kmeans_parts,
+    carry_points,
+    nearest_gaussians,
     part_score,
     surface_parts,
     track_score,
@@ -39,32 +35,11 @@ def true_track(scene: GaussianScene, points: np.ndarray, part: np.ndarray) -> np
     return np.einsum("tmij,mj->tmi", motion[..., :3, :3], points) + motion[..., :3, 3]
 
 
-@settings(max_examples=150, deadline=None)
-@given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), min_size=1, max_size=40))
-def test_adjusted_rand_index_is_scikit_learns(pairs: list[tuple[int, int]]) -> None:
-    truth, part = np.array(pairs).T
-    known = truth >= 0
-    found = adjusted_rand_index(truth, part)
-    if not known.any():
-        assert np.isnan(found)
-        return
-    assert found == pytest.approx(adjusted_rand_score(truth[known], part[known]), abs=1e-12)
-
-
-def test_adjusted_rand_index_by_hand() -> None:
-    # Hubert & Arabie: groups of 3 and 3 against 2 and 4; ordered pairs together 6+... of 30
-    truth, part = np.array([0, 0, 0, 1, 1, 1]), np.array([0, 0, 1, 1, 1, 1])
-    together, rows, columns, every = 2 + 0 + 6, 6 + 6, 2 + 12, 30
-    expected = rows * columns / every
-    assert adjusted_rand_index(truth, part) == pytest.approx((together - expected) / (13 - expected))
-    assert adjusted_rand_index(truth, 7 - part) == adjusted_rand_index(truth, part)  # names of parts don't matter
-
-
 def test_attach_takes_the_nearest_and_a_point_on_a_gaussian_has_it_alone() -> None:
     rng = np.random.default_rng(0)
     means, points, opacity = rng.normal(size=(60, 3)), rng.normal(size=(30, 3)), rng.uniform(0.2, 1, 60)
     points[0] = means[17]
-    index, weight = attach(points, means, opacity, 4)
+    index, weight = nearest_gaussians(points, means, opacity, 4)
     distance = np.linalg.norm(points[:, None] - means, axis=-1)
     assert np.array_equal(index, np.argsort(distance, 1)[:, :4])  # brute force
     near = np.take_along_axis(distance, index, 1)[1:]
@@ -77,10 +52,10 @@ def test_attach_passes_by_faint_gaussians_unless_there_are_no_others() -> None:
     means, point = np.arange(12.0)[:, None] * [1, 0, 0], np.array([[0.2, 0, 0]])
     opacity = np.full(12, 0.9)
     opacity[:3] = 0.01
-    assert sorted(attach(point, means, opacity, 4)[0][0]) == [3, 4, 5, 6]
-    assert sorted(attach(point, means, np.full(12, 0.01), 4)[0][0]) == [0, 1, 2, 3]
-    assert attach(point, means[:2], opacity[:2], 4)[0].shape == (1, 2)
-    assert np.allclose(attach(point, means, np.zeros(12), 4)[1], 0.25)  # nothing is visible: no NaN
+    assert sorted(nearest_gaussians(point, means, opacity, 4)[0][0]) == [3, 4, 5, 6]
+    assert sorted(nearest_gaussians(point, means, np.full(12, 0.01), 4)[0][0]) == [0, 1, 2, 3]
+    assert nearest_gaussians(point, means[:2], opacity[:2], 4)[0].shape == (1, 2)
+    assert np.allclose(nearest_gaussians(point, means, np.zeros(12), 4)[1], 0.25)  # nothing is visible: no NaN
 
 
 def test_the_scenes_own_parts_are_found() -> None:
@@ -143,7 +118,7 @@ def test_points_of_a_rigid_scene_are_carried_exactly() -> None:
     scene, motion = rigid_scene(rng)
     local = rng.normal(size=(50, 3))  # far from any Gaussian, too
     truth = np.einsum("tij,mj->tmi", motion[:, :3, :3], local) + motion[:, None, :3, 3]
-    assert np.abs(carry(scene, truth[0], scene.time) - truth).max() < 2e-5  # float32 quaternions
+    assert np.abs(carry_points(scene, truth[0], scene.time) - truth).max() < 2e-5  # float32 quaternions
     score = track_score(scene, truth, scene.time)
     assert score.epe < 2e-5 < score.static and (score.points, score.frames) == (50, 3)
     frozen = replace(scene, frame_quaternion=np.tile(scene.frame_quaternion[:1], (4, 1, 1)))
@@ -178,10 +153,10 @@ def test_fewer_gaussians_than_neighbors() -> None:
     scene = toy_scene(per_part=1)
     assert scene.num_gaussians == 2 < TRACK_NEIGHBORS
     points = scene.frame_mean[0].astype(np.float64)
-    assert carry(scene, points, scene.time).shape == (5, 2, 3)
+    assert carry_points(scene, points, scene.time).shape == (5, 2, 3)
     assert list(surface_parts(scene, points, 0.0)) == [0, 1]
 
 
 def test_any_seed_serves_k_means():
     points = np.random.default_rng(0).normal(size=(40, 3))
-    assert len(np.unique(_clusters(points, 3, 2**40 + 1))) == 3
+    assert len(np.unique(_kmeans_parts(points, 3, 2**40 + 1))) == 3

@@ -13,7 +13,7 @@ from dpcli.generate4d.scene.control_points import ControlPoints
 from dpcli.generate4d.scene.identification import ball_neighbors, spatial_loss, temporal_loss
 from dpcli.generate4d.scene.losses import arap_loss
 from dpcli.generate4d.scene.motion import Motion, MotionField, encode
-from dpcli.generate4d.scene.quaternion import multiply, normalize, rotate, to_matrix
+from dpcli.ops.rotations import multiply_quaternions, normalize_quaternion, quaternion_to_matrix, rotate_by_quaternion
 
 TIMES = torch.tensor([0.0, 0.4, 1.0])
 
@@ -39,17 +39,17 @@ def _field(**switches) -> MotionField:
 
 
 def _rigid_motion(points: torch.Tensor, quaternion: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    return rotate(quaternion, points) + shift
+    return rotate_by_quaternion(quaternion, points) + shift
 
 
 def test_quaternions_agree_with_scipy():
     a, a_matrix = _rotations(20, 1)
     b, b_matrix = _rotations(20, 2)
     vectors = torch.randn(20, 3, dtype=torch.float64)
-    np.testing.assert_allclose(to_matrix(a), a_matrix, atol=1e-12)
-    np.testing.assert_allclose(to_matrix(multiply(a, b)), a_matrix @ b_matrix, atol=1e-12)
-    np.testing.assert_allclose(rotate(a, vectors), np.einsum("nij,nj->ni", a_matrix, vectors), atol=1e-12)
-    assert not np.allclose(to_matrix(multiply(b, a)), a_matrix @ b_matrix)  # the order matters
+    np.testing.assert_allclose(quaternion_to_matrix(a), a_matrix, atol=1e-12)
+    np.testing.assert_allclose(quaternion_to_matrix(multiply_quaternions(a, b)), a_matrix @ b_matrix, atol=1e-12)
+    np.testing.assert_allclose(rotate_by_quaternion(a, vectors), np.einsum("nij,nj->ni", a_matrix, vectors), atol=1e-12)
+    assert not np.allclose(quaternion_to_matrix(multiply_quaternions(b, a)), a_matrix @ b_matrix)  # the order matters
 
 
 def test_the_encoding_has_sines_and_cosines_of_doubling_frequencies():
@@ -100,14 +100,16 @@ def test_parts_start_as_cells_and_turn_about_their_middle():
     torch.testing.assert_close(field.center, middle, atol=0.05, rtol=0)
     torch.nn.init.zeros_(field.movement_shift.weight)
     turn, shift = field.part_motion(TIMES)
-    torch.testing.assert_close(rotate(turn, field.center) + shift, field.center.expand(3, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        rotate_by_quaternion(turn, field.center) + shift, field.center.expand(3, 3, 3), atol=1e-5, rtol=0
+    )
 
 
 def test_the_temporal_loss_knows_the_true_partition():
     torch.manual_seed(0)
     points = torch.randn(40, 3)
     true = torch.nn.functional.one_hot(torch.arange(40) % 2, 2).float().expand(2, -1, -1)
-    turns = normalize(torch.randn(2, 4))
+    turns = normalize_quaternion(torch.randn(2, 4))
     moved = torch.stack([_rigid_motion(points[i], turns[i % 2], torch.full((3,), float(i % 2))) for i in range(40)])
     displacement = (moved - points).expand(2, -1, -1).clone().requires_grad_()
     wrong = true[:, torch.randperm(40)].clone().requires_grad_()
@@ -143,7 +145,7 @@ def test_skinning_is_equation_5_8_in_loops():
     control = ControlPoints(torch.randn(12, 3), 4).double()
     control.log_radius.data += torch.randn(12, dtype=torch.float64) * 0.3
     points = torch.randn(7, 3, dtype=torch.float64)
-    turn = normalize(torch.cat([torch.ones(2, 12, 1), torch.randn(2, 12, 3)], -1).double())
+    turn = normalize_quaternion(torch.cat([torch.ones(2, 12, 1), torch.randn(2, 12, 3)], -1).double())
     shift = torch.randn(2, 12, 3, dtype=torch.float64)
     nearest = torch.cdist(points, control.position).topk(4, largest=False).indices
     moved, quaternion = control.carry(points, nearest, _motion(turn, shift))
@@ -152,16 +154,19 @@ def test_skinning_is_equation_5_8_in_loops():
             k = nearest[i]
             weight = torch.exp(-((points[i] - control.position[k]) ** 2).sum(1) / control.log_radius[k].exp() ** 2)
             weight = weight / weight.sum()
-            there = [rotate(turn[b, j], points[i] - control.position[j]) + control.position[j] + shift[b, j] for j in k]
+            there = [
+                rotate_by_quaternion(turn[b, j], points[i] - control.position[j]) + control.position[j] + shift[b, j]
+                for j in k
+            ]
             torch.testing.assert_close(moved[b, i], (weight[:, None] * torch.stack(there)).sum(0))
-            torch.testing.assert_close(quaternion[b, i], normalize((weight[:, None] * turn[b, k]).sum(0)))
+            torch.testing.assert_close(quaternion[b, i], normalize_quaternion((weight[:, None] * turn[b, k]).sum(0)))
 
 
 def test_one_rigid_motion_of_all_control_points_carries_everything_rigidly():
     torch.manual_seed(2)
     points = torch.randn(200, 3)
     control = ControlPoints.among(points, 20)
-    turn, shift = normalize(torch.tensor([1.0, 0.3, -0.2, 0.5])), torch.tensor([0.1, -0.4, 2.0])
+    turn, shift = normalize_quaternion(torch.tensor([1.0, 0.3, -0.2, 0.5])), torch.tensor([0.1, -0.4, 2.0])
     displacement = _rigid_motion(control.position.detach(), turn, shift) - control.position.detach()
     motion = _motion(turn.expand(1, 20, 4), displacement[None])
     moved, quaternion = control.carry(points, control.nearest(points), motion)
@@ -179,7 +184,9 @@ def test_gradients_through_skinning_are_those_of_finite_differences():
 
     def outputs(points, turn, shift, position, radius):
         control.__dict__["_parameters"].update(position=position, log_radius=radius)
-        return control.carry(points, nearest, _motion(normalize(torch.cat([turn[..., :1] * 0 + 1, turn], -1)), shift))
+        return control.carry(
+            points, nearest, _motion(normalize_quaternion(torch.cat([turn[..., :1] * 0 + 1, turn], -1)), shift)
+        )
 
     position, radius = (
         control.position.detach().clone().requires_grad_(),
@@ -192,7 +199,7 @@ def test_arap_is_zero_for_rigid_motions_and_sees_a_stretch():
     torch.manual_seed(4)
     points = torch.randn(30, 3)
     neighbors = ball_neighbors(points, 2.0, 5)
-    turn = normalize(torch.randn(2, 4))
+    turn = normalize_quaternion(torch.randn(2, 4))
     rigid = torch.stack([_rigid_motion(points, q, torch.ones(3)) for q in turn])
     assert arap_loss(points, rigid, neighbors) < 1e-9
     assert arap_loss(points, points[None] * torch.tensor([1.0, 1.5, 1.0]), neighbors) > 1e-2

@@ -16,9 +16,6 @@ from dpcli.prepare.actions.depth import DepthVideos, background_depth
 from dpcli.prepare.decode.depth_files import read_depth_video, read_image, video_frames
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
 from dpcli.prepare.labels import labels_of_folders, read_labels
-from dpcli.prepare.pipeline import convert_item
-from dpcli.prepare.thinning import Thinning
-from dpcli.runtime.seeds import generator
 from tests.support.prepare_helpers import write_video
 
 RNG = np.random.default_rng(0)
@@ -37,7 +34,7 @@ def write_pngs(folder, frames):
 
 
 def read(path, **options):
-    reader = DepthVideos((path,), **options)
+    reader = DepthVideos(inputs=(path,), **options)
     return reader.read(reader.items()[0], RNG).sequence
 
 
@@ -170,7 +167,7 @@ def test_folders_of_videos_with_labels(tmp_path):
     np.save(raw / "c.npy", depth16(3))
     table = tmp_path / "labels.csv"
     table.write_text("name,label,subject,split\nc.npy,wave,3,train\na b/vidéo 9,jump,4,test\n")
-    reader = DepthVideos((raw,), labels=table)
+    reader = DepthVideos(inputs=(raw,), labels=table)
     found = [(i.name, i.label, i.subject, i.split) for i in reader.items()]
     assert found == [("a b/vidéo 9", 0, 4, "test"), ("a b/vidéo 10", -1, -1, ""), ("c.npy", 1, 3, "train")]
     assert reader.class_names == ["jump", "wave"]
@@ -181,7 +178,7 @@ def test_labels_from_folders(tmp_path):
     for name in ("wave/2.npy", "wave/10.npy", "a clap/deep/1.npy"):
         (tmp_path / "own" / name).parent.mkdir(parents=True, exist_ok=True)
         np.save(tmp_path / "own" / name, depth16())
-    reader = DepthVideos((tmp_path / "own",), label_from_folder=True)
+    reader = DepthVideos(inputs=(tmp_path / "own",), label_from_folder=True)
     assert reader.class_names == ["a clap", "wave"]
     found = [(i.name, i.label, i.split) for i in reader.items()]
     assert found == [("a clap/deep/1.npy", 0, ""), ("wave/2.npy", 1, ""), ("wave/10.npy", 1, "")]
@@ -189,10 +186,10 @@ def test_labels_from_folders(tmp_path):
     with pytest.raises(
         DataError, match=r"'2.npy' lies in no folder of its class; --label-from-folder expects CLASS/VIDEO"
     ):
-        DepthVideos((tmp_path / "own" / "wave",), label_from_folder=True).items()
+        DepthVideos(inputs=(tmp_path / "own" / "wave",), label_from_folder=True).items()
     with pytest.raises(UsageError, match="use one"):
-        DepthVideos((tmp_path,), label_from_folder=True, labels=tmp_path / "x.csv")
-    assert "label_from_folder" in reader.config and "label_from_folder" not in DepthVideos((tmp_path,)).config
+        DepthVideos(inputs=(tmp_path,), label_from_folder=True, labels=tmp_path / "x.csv")
+    assert "label_from_folder" in reader.config and "label_from_folder" not in DepthVideos(inputs=(tmp_path,)).config
 
 
 @pytest.mark.parametrize(
@@ -222,11 +219,11 @@ def test_a_stray_picture_beside_the_videos_of_a_class_is_named(tmp_path):
     for name in ("train/a/1.npy", "train/b/1.npy", "test/a/1.npy", "test/b/1.npy"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         np.save(tmp_path / name, depth16())
-    reader = DepthVideos((tmp_path,), label_from_folder=True)
+    reader = DepthVideos(inputs=(tmp_path,), label_from_folder=True)
     assert reader.class_names == ["a", "b"] and {item.split for item in reader.items()} == {"train", "test"}
     cv2.imwrite(str(tmp_path / "test" / "b" / "thumb.png"), depth16()[0])
     with pytest.raises(DataError, match="'test/b': not SPLIT/CLASS/VIDEO"):
-        DepthVideos((tmp_path,), label_from_folder=True).items()
+        DepthVideos(inputs=(tmp_path,), label_from_folder=True).items()
 
 
 @pytest.mark.parametrize(
@@ -252,7 +249,7 @@ def test_a_label_for_no_video_is_refused(tmp_path):
     np.save(tmp_path / "v.npy", depth16())
     (tmp_path / "labels.csv").write_text("v.npy,0\nw.npy,1\n")
     with pytest.raises(DataError, match="names 'w.npy', which is not among the samples"):
-        DepthVideos((tmp_path,), labels=tmp_path / "labels.csv").items()
+        DepthVideos(inputs=(tmp_path,), labels=tmp_path / "labels.csv").items()
 
 
 def save_png(path, image):
@@ -299,9 +296,9 @@ def test_a_truncated_video_gives_the_frames_it_has(tmp_path):
 
 def test_folders_without_videos(tmp_path):
     with pytest.raises(DataError, match="no depth video in it"):
-        DepthVideos((tmp_path,)).items()
+        DepthVideos(inputs=(tmp_path,)).items()
     with pytest.raises(DataError, match="no such file or folder"):
-        DepthVideos((tmp_path / "none",)).items()
+        DepthVideos(inputs=(tmp_path / "none",)).items()
 
 
 @pytest.mark.parametrize(
@@ -316,7 +313,7 @@ def test_folders_without_videos(tmp_path):
 )
 def test_impossible_options(tmp_path, options):
     with pytest.raises(UsageError):
-        DepthVideos((tmp_path,), **options)
+        DepthVideos(inputs=(tmp_path,), **options)
 
 
 def test_intrinsics_files(tmp_path):
@@ -329,22 +326,3 @@ def test_intrinsics_files(tmp_path):
         path.write_text(bad)
         with pytest.raises(DataError, match="k.json"):
             Intrinsics.from_json(path)
-
-
-def test_points_chosen_before_they_are_made_are_those_chosen_after(tmp_path):
-    """Random thinning asks for the number of points only; then the reader needn't make the others. Same draws, same bits."""
-    rng = np.random.default_rng(0)
-    depth = np.where(rng.random((6, 24, 32)) < rng.random((6, 1, 1)), rng.integers(400, 3000, (6, 24, 32)), 0)
-    depth[2] = 0  # dropped
-    depth[3, :, 5:] = 0  # fewer points than are wanted
-    np.save(tmp_path / "v.npy", depth.astype(np.uint16))
-    for options in ({}, {"near": 0.8, "far": 2.5}):
-        reader = DepthVideos((tmp_path / "v.npy",), fov=60, **options)
-        (item,) = reader.items()
-        for thinning in (Thinning(150), Thinning(150, "voxel"), Thinning(0)):
-            late = thinning.apply(reader.read(item, generator(5, 0)).sequence, generator(5, 0))
-            early = convert_item(reader, thinning, 5, (0, item)).sequence
-            assert np.array_equal(late.points, early.points) and np.array_equal(late.frame_offsets, early.frame_offsets)
-    asked = []
-    reader.read(item, generator(5, 0), lambda count: asked.append(count) or slice(0, 1))
-    assert len(asked) == 6 and asked[2] == 0, "a frame was not asked for: its draw would be another frame's"

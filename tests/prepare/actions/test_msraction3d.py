@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.actions.msraction3d import CLASS_NAMES, MSRAction3D, published, read_bin, read_mat
+from dpcli.prepare.actions.msraction3d import CLASS_NAMES, MSRAction3D, published_names, read_bin, read_mat
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from tests.support.prepare_helpers import bin_bytes, make_depth, write_msr
 
@@ -126,7 +126,7 @@ def test_the_shared_videos_are_counted_against_the_published(shared_data):
 
 
 def test_published_counts():
-    names = published()
+    names = published_names()
     by_class = [sum(name.startswith(f"a{a:02}") for name in names) for a in range(1, 21)]
     subjects = [int(name[5:7]) for name in names]
     assert len(names) == 567 and len(CLASS_NAMES) == 20
@@ -135,7 +135,9 @@ def test_published_counts():
 
 
 def test_summary_names_what_is_missing_and_what_is_extra(tmp_path):
-    write_msr(tmp_path, [n for n in published() if n != "a20_s10_e03"] + ["a01_s04_e01"], frames=1, height=1, width=1)
+    write_msr(
+        tmp_path, [n for n in published_names() if n != "a20_s10_e03"] + ["a01_s04_e01"], frames=1, height=1, width=1
+    )
     reader = MSRAction3D(tmp_path)
     lines = reader.summary(reader.items())
     assert lines[0].startswith("566 of the 567")

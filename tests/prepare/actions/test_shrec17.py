@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.actions.shrec17 import INTRINSICS, Shrec17, hand, read_regions
+from dpcli.prepare.actions.shrec17 import INTRINSICS, Shrec17, keep_only_hand, read_regions
 from dpcli.prepare.actions.shrec17_lists import GESTURES, Entry, parse_line
 from dpcli.prepare.pipeline import convert
 from dpcli.store import CloudsReader
@@ -54,13 +54,13 @@ def test_the_hand_against_another_implementation(seed, dtype, threshold):
     sizes = np.sort(np.bincount(ndimage.label(closed)[0].ravel())[1:])
     if len(sizes) > 1 and sizes[-1] - sizes[-2] < 30:
         return  # nearly equal components: which is larger may turn on the rim, where closing has two conventions
-    np.testing.assert_array_equal(hand(depth), peers_hand(depth))
+    np.testing.assert_array_equal(keep_only_hand(depth), peers_hand(depth))
 
 
 def test_steps_can_be_left_out():
     depth = hand_depth(0, 1)[0][90:170, 190:260]
-    assert (hand(depth, 0, 0) > 0).sum() == (depth > 0).sum() - 16  # the speck is the other component
-    assert ((hand(depth, 0, 0) == depth) | (depth == 120)).all()
+    assert (keep_only_hand(depth, 0, 0) > 0).sum() == (depth > 0).sum() - 16  # the speck is the other component
+    assert ((keep_only_hand(depth, 0, 0) == depth) | (depth == 120)).all()
 
 
 def test_image_coordinates_are_pixels_of_the_whole_frame(tmp_path):

@@ -15,9 +15,10 @@ import pytest
 
 from dpcli.errors import DataError, Stopped, UsageError
 from dpcli.prepare.commands import merge as module
+from dpcli.prepare.commands import sources
 from dpcli.prepare.commands.merge import merge, read_source
 from dpcli.prepare.label_map import LabelMap
-from dpcli.prepare.pipeline import convert
+from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import ROOT, ToyReader, dpc
@@ -62,7 +63,7 @@ def test_files_of_equal_classes_follow_one_another(tmp_path):
 
 
 def test_many_files_are_not_all_open_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_OPEN", 2)
+    monkeypatch.setattr(sources, "_OPEN", 2)
     paths = [write(tmp_path / f"{k}.h5", [f"{k}x"], ["p"]) for k in range(5)]
     files = module.OpenFiles()
     for path in [*paths, *paths]:
@@ -160,7 +161,7 @@ def test_the_command(two, tmp_path):
 SLOW = """
 import sys, time
 from pathlib import Path
-from dpcli.prepare.merge import OpenFiles, merge
+from dpcli.prepare.commands.merge import OpenFiles, merge
 read = OpenFiles.read
 def slowly(self, path, index):
     time.sleep(0.05)
@@ -178,7 +179,7 @@ def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkey
     if shards:
         paths = [tmp_path / f"{k}.h5" for k in range(3)]
         for index, path in enumerate(paths):
-            convert(ToyReader(count=24, bad=(3,)), path, shard=Shard(index, 3))
+            convert(ToyReader(count=24, bad=(3,)), path, Conversion(shard=Shard(index, 3)))
         script = SLOW.replace(", prefix=True", "")
     else:
         paths = [write(tmp_path / f"{k}.h5", [f"x{n}" for n in range(8)], ["p", "q"]) for k in range(3)]
@@ -241,7 +242,7 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
 
     paths = [tmp_path / f"shard{k}.h5" for k in range(2)]
     for index, path in enumerate(paths):
-        convert(ToyReader(bad=(1,)), path, shard=Shard(index, 2))
+        convert(ToyReader(bad=(1,)), path, Conversion(shard=Shard(index, 2)))
     entry = shard_of(read_source(paths[0]).provenance[-1])[1]
     for names, fine in ((["toy000"], True), (["toy000", "toy001"], False)):
         with pytest.raises(Stopped), CloudsWriter(tmp_path / "x.h5", provenance=entry, resume=True) as writer:

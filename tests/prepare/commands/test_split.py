@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.commands.split import SplitChoice, by_fraction, split
+from dpcli.prepare.commands.split import SplitChoice, draw_splits, split
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import dpc
 
@@ -118,8 +118,8 @@ def test_subjects_stay_together(whole, tmp_path):
     st.sampled_from([(0.8, 0.1, 0.1), (0.5, 0.5, 0.0), (1 / 3, 1 / 3, 1 / 3), (0.0, 0.0, 1.0), (0.99, 0.0, 0.01)]),
 )
 def test_fractions_hold_in_every_class_and_in_all(strata, seed, fractions):
-    got = by_fraction(range(len(strata)), strata, fractions, seed)
-    assert got == by_fraction(range(len(strata)), strata, fractions, seed)
+    got = draw_splits(range(len(strata)), strata, fractions, seed)
+    assert got == draw_splits(range(len(strata)), strata, fractions, seed)
     for chosen in [set(strata), *({one} for one in set(strata))]:
         own = [name for name, stratum in zip(got, strata) if stratum in chosen]
         for name, fraction in zip(("train", "validation", "test"), fractions):

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from dpcli.cli.prepare.animation import animation
+from dpcli.cli.prepare.views.animation import animation
+from dpcli.cli.prepare.views.filming import FilmingOptions
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import Material, Texture, bounding_sphere, normalized
 from dpcli.prepare.meshes.animation import animation_clip, list_clips, load_animation
-from dpcli.prepare.meshes.bone_parts import carry, choose_points, gap, heaviest_bones, rigid_parts
+from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, motion_distance, rigid_parts, track_points
 from dpcli.prepare.meshes.filming import OBJECT_RADIUS, Filming, film
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
@@ -282,7 +283,7 @@ def test_objects_fill_the_same_ball_whatever_their_size(tmp_path):
         assert reach.max() == pytest.approx(OBJECT_RADIUS, rel=1e-4)
         points = choose_points(ball, 50, generator(0))
         moved = ball.bone_pose @ np.linalg.inv(ball.bone_pose[:1])
-        carried = carry(ball, points)
+        carried = track_points(ball, points)
         for bone in (1, 2):  # bones and vertices were moved alike
             mine = heaviest_bones(ball, points) == bone
             expected = carried[0, mine] @ moved[:, bone, :3, :3].transpose(0, 2, 1) + moved[:, bone, None, :3, 3]
@@ -300,7 +301,7 @@ def test_without_travel_the_middle_stays(tmp_path):
 def test_points_of_a_part_move_as_one_body(tmp_path):
     mesh = normalized(load_animation(arm().write(tmp_path / "arm.glb"), None, 6), OBJECT_RADIUS)
     points = choose_points(mesh, 400, generator(5))
-    track, bone = carry(mesh, points), heaviest_bones(mesh, points)
+    track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
     part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(float), 0.005, 4)
     assert sorted(np.bincount(part) > 50) == [True, True]
     along = points_along(track[0])
@@ -332,7 +333,7 @@ def test_bones_that_do_not_move_on_their_own_are_one_part():
     # too small a part joins the one that carries it best
     few = np.repeat([0, 1, 2, 3], [30, 5, 2, 0])
     assert set(rigid_parts(pose, parent, few, points[:37], 1e-6, 3)) == {0}
-    assert gap(turn, turn, points) == 0 and gap(turn, root, points) > 0.5
+    assert motion_distance(turn, turn, points) == 0 and motion_distance(turn, root, points) > 0.5
 
 
 def test_tracks_lie_on_the_object_and_have_its_colors(tmp_path):
@@ -380,8 +381,8 @@ def test_from_the_command_line(tmp_path, dpc):
     assert out.read_bytes() == again.read_bytes()  # whatever the number of processes
     listed = dpc("prepare", "animation", path, "--list", "--json")
     assert json.loads(listed.stdout) == {"clips": [{"name": "Rig|Bend", "seconds": 1.0}]}
-    with pytest.raises(UsageError, match="-o/--output is missing"):
-        animation({}, path)
+    with pytest.raises(UsageError, match="-o/--output FILE is missing"):
+        animation(path, options=FilmingOptions())
     path.write_bytes(path.read_bytes()[:-9])
     broken = dpc("prepare", "animation", path, "-o", tmp_path / "c.h5")
     assert broken.returncode == 3 and b"truncated" in broken.stderr and b"Traceback" not in broken.stderr
@@ -530,7 +531,7 @@ def test_every_real_model_moves_and_has_parts(shared_data):
         mesh = normalized(load_animation(path, clip_names(read_gltf(path))[-1], 4), OBJECT_RADIUS)
         assert np.isfinite(mesh.positions).all() and np.ptp(mesh.positions, axis=0).max() > 0.01, path
         points = choose_points(mesh, 500, generator(0))
-        track, bone = carry(mesh, points), heaviest_bones(mesh, points)
+        track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
         part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(float), 0.0075, 5)
         assert part.max() + 1 <= len(set(bone)), path
         whole += [path.name] if part.max() == 0 else []

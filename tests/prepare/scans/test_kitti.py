@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.scans.kitti_det import Box, KittiDetection, parts_of_boxes, read_boxes, read_lists
 from dpcli.prepare.scans.kitti_files import (
     View,
     calibration_matrix,
-    compressed,
-    png_size,
     read_calibration,
     read_png,
     read_velodyne,
+    renumber_objects,
     training_folder,
 )
 from dpcli.prepare.scans.kitti_sf import CLASSES, KittiSceneFlow, flow_pair, unproject
@@ -401,7 +401,7 @@ def test_damaged_scans_and_lists(tmp_path):
 
 
 def test_small_pieces(tmp_path):
-    assert compressed(np.array([0, 900, 7, 7, 0])).tolist() == [0, 2, 1, 1, 0]
+    assert renumber_objects(np.array([0, 900, 7, 7, 0])).tolist() == [0, 2, 1, 1, 0]
     write_calibration(tmp_path / "c.txt", R0_rect=np.arange(9))
     found = read_calibration(tmp_path / "c.txt")
     assert list(found) == ["R0_rect"]

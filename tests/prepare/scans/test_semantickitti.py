@@ -197,8 +197,8 @@ def test_recipes_agree_with_the_readers(name):
     from typer.main import get_command
 
     from dpcli.cli.prepare.app import app
-    from dpcli.prepare.articulated import ogc_rooms
-    from dpcli.prepare.scans import kitti_det, kitti_sf, ogc
+    from dpcli.prepare.articulated import ogc, ogc_rooms
+    from dpcli.prepare.scans import kitti_det, kitti_sf
 
     recipe = tomllib.loads((ROOT / "data_recipes" / f"{name}.toml").read_text())
     assert recipe["name"] == name and {"ask", "license"} <= recipe["get"].keys() and recipe["layout"]["tree"]

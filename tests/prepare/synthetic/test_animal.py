@@ -9,11 +9,11 @@ import pytest
 from scipy.ndimage import maximum_filter
 
 from dpcli.errors import UsageError
-from dpcli.prepare.meshes.bone_parts import carry, choose_points, heaviest_bones
+from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, track_points
 from dpcli.prepare.synthetic import creature
 from dpcli.prepare.synthetic.animal import make_animal
 from dpcli.prepare.synthetic.creature import Shape
-from dpcli.prepare.synthetic.creature_mesh import field, make_skin, shape_distance
+from dpcli.prepare.synthetic.creature_mesh import make_skin, shape_distance, smooth_union
 from dpcli.prepare.synthetic.gait import MOTIONS, bone_motion, rotations, turn_bones
 from dpcli.prepare.synthetic.surface_nets import surface_nets
 from dpcli.runtime.seeds import generator
@@ -70,7 +70,7 @@ def test_the_skin_is_closed_and_hangs_on_every_bone(kind):
         owner = np.take_along_axis(skin.bones, skin.weights.argmax(1)[:, None], axis=1)[:, 0]
         assert set(owner) == set(range(len(animal.bones)))
         assert (skin.weights.max(1) > 0.99).mean() > 0.35  # mostly rigid
-        far = np.abs(field(skin.vertices[: len(skin.vertices) // 2], animal.shapes))
+        far = np.abs(smooth_union(skin.vertices[: len(skin.vertices) // 2], animal.shapes))
         assert far.max() < 0.012  # the surface lies where the shapes end, within a cell
 
 
@@ -137,7 +137,7 @@ def test_standing_feet_hardly_slide(motion):
 def test_tracks_are_exact_where_one_bone_carries_the_skin():
     mesh = make_animal("trot", 5, seed=3, cells=60)
     points = choose_points(mesh, 800, generator(0))
-    track, bone = carry(mesh, points), heaviest_bones(mesh, points)
+    track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
     corners = mesh.triangles[points.triangle]
     alone = ((mesh.weights[corners].max(2) == 1) & (mesh.bones[corners][..., 0] == bone[:, None])).all(1)
     assert alone.mean() > 0.25

@@ -149,7 +149,7 @@ def own(tmp_path, animal) -> Path:
     return Path(shutil.copytree(animal[0], tmp_path / "panda"))
 
 
-WALK = ArtemisOptions("walk", size=48, tracks=10_000)
+WALK = ArtemisOptions(motion="walk", size=48, tracks=10_000)
 
 
 def test_tracks_stay_on_the_same_pixels(animal):
@@ -210,11 +210,11 @@ def test_parts_are_the_heaviest_bones(animal):
     clip = artemis_clip(folder, WALK)
     shell = outer_shell(data["points"])
     np.testing.assert_array_equal(clip.part, data["weights"][shell].argmax(1))
-    few = artemis_clip(folder, ArtemisOptions("walk", size=48, tracks=50, seed=1))
+    few = artemis_clip(folder, ArtemisOptions(motion="walk", size=48, tracks=50, seed=1))
     assert few.track.shape == (FRAMES, 50, 3) and set(few.part.tolist()) == {0, 1}
-    again = artemis_clip(folder, ArtemisOptions("walk", size=48, tracks=50, seed=1))
+    again = artemis_clip(folder, ArtemisOptions(motion="walk", size=48, tracks=50, seed=1))
     np.testing.assert_array_equal(few.track, again.track)
-    none = artemis_clip(folder, ArtemisOptions("walk", size=48, tracks=0))
+    none = artemis_clip(folder, ArtemisOptions(motion="walk", size=48, tracks=0))
     assert none.track is None and none.part is None
 
 
@@ -237,11 +237,11 @@ def test_cameras_are_chosen_and_named(animal, capsys):
     off = (azimuths - [15, -75, 105, 195] + 180) % 360 - 180
     assert np.abs(off).max() < 35  # eight cameras about 45 degrees apart; for 15 the one at 0 is the reference itself
     assert "reference camera 0" in capsys.readouterr().err
-    clip = artemis_clip(folder, ArtemisOptions("walk", size=48, reference=3, cameras=(5, 1), train_cameras=(2,)))
+    clip = artemis_clip(folder, ArtemisOptions(motion="walk", size=48, reference=3, cameras=(5, 1), train_cameras=(2,)))
     assert clip.header.role == ["reference", "test", "test", "train"] and views_of(clip.header, data) == [3, 5, 1, 2]
     for options in ({"reference": 9}, {"cameras": (0,)}, {"cameras": (1, 1)}, {"cameras": (1,), "train_cameras": (1,)}):
         with pytest.raises(UsageError):
-            artemis_clip(folder, ArtemisOptions("walk", size=48, **options))
+            artemis_clip(folder, ArtemisOptions(motion="walk", size=48, **options))
 
 
 def test_nearest_azimuths_takes_no_camera_twice():
@@ -259,7 +259,7 @@ def test_an_incomplete_copy_is_noticed(own, capsys):
 
 
 def test_frames_are_spread_and_timed(animal):
-    clip = artemis_clip(animal[0], ArtemisOptions("walk", size=48, frames=3, fps=10))
+    clip = artemis_clip(animal[0], ArtemisOptions(motion="walk", size=48, frames=3, fps=10))
     np.testing.assert_allclose(clip.header.time, [0, 0.2, 0.4])
     assert sum(1 for _ in clip.pictures()) == 5 * 3
 
@@ -399,7 +399,7 @@ def test_bad_folders(own, kind):
 
 def test_skip_leaves_a_frame_out(own, capsys):
     (own / "img/walk/2/img_0000.jpg").unlink()
-    clip = artemis_clip(own, ArtemisOptions("walk", size=48, on_error="skip", fps=1))
+    clip = artemis_clip(own, ArtemisOptions(motion="walk", size=48, on_error="skip", fps=1))
     np.testing.assert_allclose(clip.header.time, [0, 1, 3, 4])
     assert clip.track.shape[0] == 4 and "frame 2 left out" in capsys.readouterr().err
 

@@ -18,7 +18,7 @@ from dpcli.prepare.decode.color_frames import _frame_times, _lasts, frame_number
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip
-from dpcli.prepare.views.video import VideoOptions, spread, video_clip
+from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
 from dpcli.store import ViewsReader
 
 RED = (200, 40, 30)
@@ -386,7 +386,7 @@ def test_wrong_options_are_wrong_use(options):
 
 @given(st.integers(1, 500), st.integers(0, 100))
 def test_frames_are_spread_from_the_first_to_the_last(total, count):
-    chosen = spread(total, count)
+    chosen = spread_frames(total, count)
     assert len(chosen) == (min(count, total) or total) == len(set(chosen)) and chosen == sorted(chosen)
     assert chosen[0] == 0 and (chosen[-1] == total - 1 or len(chosen) == 1)
 
@@ -425,7 +425,7 @@ def test_views_belong_to_the_frames_that_are_used(tmp_path):
     folder = save(tmp_path / "ref", moving(6))
     clip = video_clip(folder, VideoOptions(frames=3, size=32, views=six(tmp_path / "views", range(6))))
     found = read(clip)
-    for row, frame in enumerate(spread(6, 3)):
+    for row, frame in enumerate(spread_frames(6, 3)):
         np.testing.assert_allclose(centroid(found[1, row]), (16, 16 + frame), atol=0.05)
 
 

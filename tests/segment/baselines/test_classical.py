@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 import warnings
 
@@ -13,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from sklearn.metrics import rand_score
 
 from dpcli.errors import DataError, UsageError
-from dpcli.segment.baselines.classical import METHODS, classical_labels, classical_options
+from dpcli.segment.baselines.classical import classical_labels
+from dpcli.segment.baselines.settings import METHODS, ClassicalSettings
 from dpcli.segment.baselines.subspace import eigengap, sparse_affinity, spectral_parts, trajectory_affinity
 from dpcli.segment.baselines.trajectories import consistent_labels, follow, residual_motion
 
@@ -69,7 +71,8 @@ def moved(matrices: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def labels_of(toy: Toy, method: str, num_parts: int | None = None, **options: object) -> list[np.ndarray]:
-    return classical_labels(toy[0], toy[2], method, num_parts, rng=np.random.default_rng(1), options=options)
+    settings = ClassicalSettings(method=method, parts=num_parts, **options)
+    return classical_labels(toy[0], toy[2], settings, rng=np.random.default_rng(1))
 
 
 def rand_index(found: list[np.ndarray], truth: list[np.ndarray]) -> float:
@@ -152,7 +155,7 @@ def test_odd_input_has_an_answer(
     flows = {(t, u): np.zeros_like(frames[t]) + rng.standard_normal(3).astype(np.float32) for t, u in pairs}
     if kind != "still":
         flows = {pair: flow + rng.standard_normal(flow.shape).astype(np.float32) for pair, flow in flows.items()}
-    found = classical_labels(frames, flows, method, num_parts, rng=rng)
+    found = classical_labels(frames, flows, ClassicalSettings(method=method, parts=num_parts), rng=rng)
     for labels, frame in zip(found, frames, strict=True):
         assert labels.shape == (len(frame),)
         assert ((labels >= 0) & (labels < (num_parts or 8))).all()
@@ -263,20 +266,30 @@ def test_eigengap_and_spectral_parts() -> None:
     assert rand_score(order // 4, found) == 1
 
 
-def test_options_by_name() -> None:
-    options = classical_options("dbscan", {"eps": "0.3", "min_points": 4, "motion": "flow"})
-    assert (options.eps, options.min_points, options.motion) == (0.3, 4, "flow")
-    for method, values, message in (
-        ("kmeans", {}, "expected one of dbscan, ward, ssc, trajaffn"),
-        ("ward", {"eps": 1}, "no option 'eps'"),
-        ("dbscan", {"eps": "far"}, "expected float"),
-        ("dbscan", {"eps": -1}, "positive float"),
-        ("dbscan", {"eps": float("nan")}, "positive float"),
-        ("dbscan", {"min_points": 2.5}, "positive int"),
-        ("ssc", {"motion": "none"}, "expected flow, residual"),
+def test_settings_belong_to_methods() -> None:
+    assert (
+        ClassicalSettings(method="ssc").used()["fewest"] == 2
+        and ClassicalSettings(method="ssc", fewest=3).used()["fewest"] == 3
+    )
+    assert [ClassicalSettings(method=method).resolved().motion for method in METHODS] == [
+        "none",
+        "none",
+        "flow",
+        "residual",
+    ]
+    for values, message in (
+        ({"method": "kmeans"}, "method = kmeans: expected one of dbscan, ward, ssc, trajaffn"),
+        ({"method": "ward", "eps": 1.0}, "eps belongs to --method dbscan; ward has threshold, motion_weight"),
+        ({"method": "dbscan", "eps": "far"}, "eps = far: expected a number"),
+        ({"method": "dbscan", "eps": -1.0}, "eps = -1.0: expected a number above 0"),
+        ({"method": "dbscan", "eps": float("nan")}, "eps = nan: expected a number above 0"),
+        ({"method": "dbscan", "min_points": 2.5}, "min_points = 2.5: expected a whole number"),
+        ({"method": "ssc", "motion": "none"}, "motion = none: --method ssc sees only motion"),
+        ({"method": "ward", "parts": 0}, "parts = 0: expected at least 1"),
+        ({"parts": 3}, "parts belongs to --method dbscan or ward or ssc or trajaffn; the network finds its own"),
     ):
-        with pytest.raises(UsageError, match=message):
-            classical_options(method, values)
+        with pytest.raises(UsageError, match=re.escape(message)):
+            ClassicalSettings(**values)
 
 
 def test_rejects() -> None:
@@ -289,8 +302,6 @@ def test_rejects() -> None:
         ([frame, frame], {(0, 1): flow * np.nan}, "flow 0 -> 1"),
     ):
         with np.errstate(invalid="ignore"), pytest.raises(DataError, match=message):
-            classical_labels(frames, flows, "ward", rng=rng)
-    with pytest.raises(UsageError, match="--parts 0"):
-        classical_labels([frame], {}, "ward", 0, rng=rng)
-    with pytest.raises(UsageError, match="options are"):
-        classical_labels([frame], {}, "ward", rng=rng, options=classical_options("ssc"))
+            classical_labels(frames, flows, ClassicalSettings(method="ward"), rng=rng)
+    with pytest.raises(ValueError, match="name no method"):
+        classical_labels([frame], {}, ClassicalSettings(), rng=rng)

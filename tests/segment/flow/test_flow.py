@@ -11,11 +11,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpcli.errors import UsageError
-from dpcli.segment.flow import estimate_flow
-from dpcli.segment.flow import motion_proposals as starts
-from dpcli.segment.flow.estimate import body_flow, rigid_bodies
-from dpcli.segment.flow.rigid_bodies import BodySearch, _Search
-from dpcli.segment.flow.target_surface import Surface, columns
+from dpcli.segment.flow import motion_proposals
+from dpcli.segment.flow.estimators import estimate_body_flow, estimate_flow, find_bodies_at_any_scale
+from dpcli.segment.flow.rigid_bodies import BodySearch, _BodyFinder
+from dpcli.segment.flow.surface_icp import Surface, columns
 
 
 def panel(rng: np.random.Generator, count: int, corner: list, first: list, second: list) -> np.ndarray:
@@ -72,7 +71,7 @@ def test_icp_finds_the_bodies(pairs: list[tuple]) -> None:
     for first, second, truth, part in pairs:
         batch = torch.from_numpy(first)[None], torch.from_numpy(second)[None]
         flows = {method: estimate_flow(*batch, method)[0].numpy() for method in ("icp", "nearest")}
-        flows["one"] = body_flow(first, second, BodySearch(most=1))
+        flows["one"] = estimate_body_flow(first, second, BodySearch(most=1))
         for name, flow in flows.items():
             assert flow.dtype == np.float32
             mean[name].append([errors(flow, truth)[part == k].mean() for k in range(3)])
@@ -84,7 +83,7 @@ def test_icp_finds_the_bodies(pairs: list[tuple]) -> None:
 
 def test_bodies_are_the_parts(pairs: list[tuple]) -> None:
     first, second, _, part = pairs[0]
-    found = rigid_bodies(first, second)
+    found = find_bodies_at_any_scale(first, second)
     assert found.label.shape == (600,) and found.motion.shape == (found.label.max() + 1, 3, 4)
     assert 3 <= len(found.motion) <= 4
     share = [np.bincount(found.label[part == k], minlength=4) / (part == k).sum() for k in range(3)]
@@ -95,24 +94,26 @@ def test_bodies_are_the_parts(pairs: list[tuple]) -> None:
 
 def test_one_rigid_body_stays_one() -> None:
     first, second, truth, _ = pair(7, angle=0.0, pull=0.0)
-    found = rigid_bodies(first, second)
+    found = find_bodies_at_any_scale(first, second)
     assert len(found.motion) == 1
-    assert errors(body_flow(first, second), truth).mean() < 0.02
+    assert errors(estimate_body_flow(first, second), truth).mean() < 0.02
 
 
 def test_repeats_exactly_and_ignores_the_unit_of_length(pairs: list[tuple]) -> None:
     first, second, _, _ = pairs[1]
-    flow = body_flow(first, second)
-    assert np.array_equal(flow, body_flow(first, second))
-    np.testing.assert_allclose(body_flow(first * 64 + 8, second * 64 + 8) / 64, flow, atol=2e-3)
+    flow = estimate_body_flow(first, second)
+    assert np.array_equal(flow, estimate_body_flow(first, second))
+    np.testing.assert_allclose(estimate_body_flow(first * 64 + 8, second * 64 + 8) / 64, flow, atol=2e-3)
 
 
 def test_many_points_are_thinned(pairs: list[tuple]) -> None:
     rng = np.random.default_rng(0)
     first, second, truth, _ = pairs[2]
     many, index = np.repeat(first, 4, 0), np.repeat(np.arange(600), 4)
-    flow = body_flow((many + rng.normal(scale=1e-3, size=many.shape)).astype(np.float32), np.repeat(second, 3, 0))
-    few = errors(body_flow(first, second), truth).mean()
+    flow = estimate_body_flow(
+        (many + rng.normal(scale=1e-3, size=many.shape)).astype(np.float32), np.repeat(second, 3, 0)
+    )
+    few = errors(estimate_body_flow(first, second), truth).mean()
     assert flow.shape == (2400, 3) and errors(flow, truth[index]).mean() < few + 0.02
 
 
@@ -165,7 +166,9 @@ def test_normals_of_a_plane() -> None:
 
 def test_icp_recovers_a_motion_exactly() -> None:
     points = cabinet(np.random.default_rng(1))[0]
-    turn = starts.turn(np.array([[0.6, 0.0, 0.8]]), np.array([0.15]), points.mean(0))[0] + np.array([0, 0, 0, 0.02])
+    turn = motion_proposals.turn_about(np.array([[0.6, 0.0, 0.8]]), np.array([0.15]), points.mean(0))[0] + np.array(
+        [0, 0, 0, 0.02]
+    )
     moved = points @ turn[:, :3].T + turn[:, 3]
     found = Surface(moved).icp(columns(points), np.eye(3, 4), 40, 0.1, 0.01)
     np.testing.assert_allclose(found, turn, atol=1e-3)
@@ -174,7 +177,7 @@ def test_icp_recovers_a_motion_exactly() -> None:
 
 def test_starts_are_rigid_and_turn_about_their_edges() -> None:
     points = np.random.default_rng(2).random((50, 3)) * [0.4, 0.2, 0.001]
-    motions = starts.articulated(points, np.array([[1.0, 2.0, 3.0]]))
+    motions = motion_proposals.propose_motions(points, np.array([[1.0, 2.0, 3.0]]))
     rotation = motions[:, :, :3]
     np.testing.assert_allclose(
         rotation @ rotation.transpose(0, 2, 1), np.tile(np.eye(3), (len(motions), 1, 1)), atol=1e-9
@@ -188,7 +191,7 @@ def test_starts_are_rigid_and_turn_about_their_edges() -> None:
 
 def test_turn_agrees_with_scipy() -> None:
     axis, center = np.array([[2.0, -1.0, 2.0]]) / 3, np.array([0.3, 0.1, -0.2])
-    motion = starts.turn(axis, np.array([0.7]), center)[0]
+    motion = motion_proposals.turn_about(axis, np.array([0.7]), center)[0]
     np.testing.assert_allclose(motion[:, :3], Rotation.from_rotvec(0.7 * axis[0]).as_matrix(), atol=1e-12)
     np.testing.assert_allclose(motion[:, :3] @ center + motion[:, 3], center, atol=1e-12)
 
@@ -197,18 +200,18 @@ def test_components() -> None:
     points = np.concatenate([np.random.default_rng(0).random((30, 3)) + [x, 0, 0] for x in (0, 10)])
     neighbors = cKDTree(points).query(points, 6)[1][:, 1:]
     chosen = np.ones(60, bool)
-    parts = starts.components(chosen, neighbors)
+    parts = motion_proposals.find_components(chosen, neighbors)
     assert sorted(len(part) for part in parts) == [30, 30]
     chosen[:30] = False
-    assert [part.tolist() for part in starts.components(chosen, neighbors)] == [list(range(30, 60))]
+    assert [part.tolist() for part in motion_proposals.find_components(chosen, neighbors)] == [list(range(30, 60))]
 
 
 def test_every_step_of_the_search_lowers_the_energy(pairs: list[tuple]) -> None:
     first, second, _, _ = pairs[0]
-    search = _Search(Surface(first), Surface(second), BodySearch())
-    steps = [search._whole()]
-    while (more := search._one_more(steps[-1])) is not None and more.energy < steps[-1].energy:
+    search = _BodyFinder(Surface(first), Surface(second), BodySearch())
+    steps = [search._fit_one_body()]
+    while (more := search._add_best_body(steps[-1])) is not None and more.energy < steps[-1].energy:
         steps.append(more)
     assert len(steps) >= 3
     assert all(after.energy < before.energy for before, after in pairwise(steps))
-    assert search._polished(steps[-1]).energy <= steps[-1].energy
+    assert search._tighten_motions(steps[-1]).energy <= steps[-1].energy

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.segment.flow import kernels_icp
-from dpcli.segment.flow import motion_proposals as starts
-from dpcli.segment.flow.object_icp import soft_match, soft_match_reference
-from dpcli.segment.flow.rigid_bodies import BodySearch, _Search
-from dpcli.segment.flow.target_surface import Surface
+from dpcli.segment.flow import icp_kernels, motion_proposals
+from dpcli.segment.flow.object_aware_icp import soft_match, soft_match_reference
+from dpcli.segment.flow.rigid_bodies import BodySearch, _BodyFinder
+from dpcli.segment.flow.surface_icp import Surface
 from dpcli.segment.network.se3_conv import _activate, instance_norm
 from tests.support.ops_helpers import backend
 
@@ -73,7 +72,7 @@ def test_lloyd_is_k_means_written_out() -> None:
     points, center = sphere(90, 7), sphere(5, 8).astype(np.float64)
     center[4] = 100.0  # owns no point and stays
     ours, patch = center.copy(), np.empty(90, np.int64)
-    kernels_icp.lloyd_kernel(points, ours, 4, patch)
+    icp_kernels.lloyd_kernel(points, ours, 4, patch)
     for _ in range(4):
         own = ((points[:, None] - center) ** 2).sum(2).argmin(1)
         for k in np.unique(own):
@@ -84,14 +83,14 @@ def test_lloyd_is_k_means_written_out() -> None:
 @pytest.mark.parametrize("most", [1, 3, 50])
 def test_distinct_motions_are_apart_and_the_best(most: int) -> None:
     rng = np.random.default_rng(9)
-    motions = starts.shift(rng.integers(0, 3, (40, 3)) * 0.1)
+    motions = motion_proposals.shift_by(rng.integers(0, 3, (40, 3)) * 0.1)
     score, points = rng.permutation(40).astype(float), sphere(30, 1).astype(np.float64)
     chosen: list[int] = []
     for h in np.argsort(score):  # shifts move all points alike
         if all(np.abs(motions[h, :, 3] - motions[c, :, 3]).max() > 0.05 for c in chosen):
             chosen.append(int(h))
     assert 3 < len(chosen) < 40
-    assert starts.distinct(motions, score, points, 0.05, most) == chosen[:most]
+    assert motion_proposals.choose_distinct(motions, score, points, 0.05, most) == chosen[:most]
 
 
 @pytest.mark.parametrize("count", [1, 9, 127, 128, 129, 256, 512, 700])
@@ -101,7 +100,7 @@ def test_nearest_point_is_the_first_of_the_nearest(count: int) -> None:
     squared = np.empty(count, np.float32)
     for x, y, z in rng.integers(0, 4, (60, 3)).astype(np.float32):
         distance = ((cloud - np.array([[x], [y], [z]])) ** 2).sum(0)
-        at, found = kernels_icp.nearest_point(x, y, z, cloud, squared, squared.view(np.int32))
+        at, found = icp_kernels.nearest_point(x, y, z, cloud, squared, squared.view(np.int32))
         assert (at, found) == (distance.argmin(), distance.min())
 
 
@@ -112,7 +111,7 @@ def test_look_up_takes_the_nearest_of_the_neighbors_tried() -> None:
     points = np.ascontiguousarray(sphere(80, 3).T * np.float32(1.05))
     at, far = np.empty(80, np.int64), np.empty(80, np.float32)
     work = np.empty(16 * 200, np.float32)
-    kernels_icp._look_up(points, search[0], *search[2:], work, work.view(np.int32), at, far)
+    icp_kernels._look_up(points, search[0], *search[2:], work, work.view(np.int32), at, far)
     grid, origin, rate = search[4:]
     cell = ((points.T - origin) * rate).astype(int)
     center = origin + (cell + 0.5) / rate
@@ -122,7 +121,7 @@ def test_look_up_takes_the_nearest_of_the_neighbors_tried() -> None:
     np.testing.assert_allclose(far, ((surface.points[at] - points.T) ** 2).sum(1), rtol=1e-5, atol=1e-9)
 
 
-def slow_energy(search: _Search, label: np.ndarray, motion: np.ndarray, cost: np.ndarray) -> float:
+def slow_energy(search: _BodyFinder, label: np.ndarray, motion: np.ndarray, cost: np.ndarray) -> float:
     """The energy of `bodies`, term by term."""
     options, source = search.options, search.source
     place = [motion[k, :, :3] @ p + motion[k, :, 3] for k, p in zip(label, search.points)]
@@ -142,10 +141,10 @@ def slow_energy(search: _Search, label: np.ndarray, motion: np.ndarray, cost: np
 
 def test_energy_is_the_sum_of_its_terms() -> None:
     rng = np.random.default_rng(4)
-    search = _Search(Surface(sphere(90, 5)), Surface(sphere(130, 6)), BodySearch())
+    search = _BodyFinder(Surface(sphere(90, 5)), Surface(sphere(130, 6)), BodySearch())
     label = rng.integers(0, 3, 90)
     motion = np.eye(3, 4)[None] + rng.normal(0, 0.1, (3, 3, 4))
     cost = rng.random((3, 90))
-    found = search._bodies(label, motion, cost).energy
+    found = search._with_energy(label, motion, cost).energy
     assert found == pytest.approx(slow_energy(search, label, motion, cost), rel=1e-6)
     assert found != pytest.approx(slow_energy(search, label, motion[[1, 0, 2]], cost), rel=1e-3)

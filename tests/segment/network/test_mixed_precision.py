@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from dpcli.runtime.mixed_precision import full_precision, is_reduced, reduced_products, wanted
-from dpcli.segment.commands.predict import default_model
 from dpcli.segment.network.config import Layer, PartConfig
-from dpcli.segment.network.model_file import load_model
+from dpcli.segment.network.model_file import default_model, load_model
 from dpcli.segment.network.neighborhood import kernel_weights
 from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.training.losses import supervised_loss

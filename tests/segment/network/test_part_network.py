@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from dpcli.ops.kernel_convolution import kernel_convolution, kernel_convolution_reference
-from dpcli.segment.cost import convolution_macs, count_parameters, macs, paper_parameters
-from dpcli.segment.network.config import Layer, PartConfig, compact, find_config, release
+from dpcli.ops.rotations import mean_rotation, normalize_quaternion, quaternion_to_matrix
+from dpcli.segment.network.config import NETWORK_PRESETS, Layer, PartConfig, compact, release
+from dpcli.segment.network.cost import convolution_macs, count_macs, count_parameters, paper_parameters
 from dpcli.segment.network.icosahedron import find_rotation, icosahedral_group, trivial_group
 from dpcli.segment.network.kernel_points import kernel_points
-from dpcli.segment.network.motion_head import MotionHead, mean_rotation, quaternion_to_matrix, relative_labels
+from dpcli.segment.network.motion_head import MotionHead, relative_labels
 from dpcli.segment.network.neighborhood import first_neighborhood, nearest_neighborhood
 from dpcli.segment.network.part_network import PartNetwork
 from dpcli.segment.network.se3_conv import GroupConv, SpatialConv
@@ -214,7 +215,7 @@ def test_counts_of_the_released_and_the_compact_network(cloud):
     ]
     ours = PartNetwork(compact())
     assert count_parameters(ours) <= 250_000
-    assert macs(ours, torch.randn(1, 512, 3) * 0.3)["total"] <= 0.92e9
+    assert count_macs(ours, torch.randn(1, 512, 3) * 0.3)["total"] <= 0.92e9
 
 
 def test_motion_head_finds_a_rotation_of_the_group_in_matching_features():
@@ -235,7 +236,7 @@ def test_motion_head_finds_a_rotation_of_the_group_in_matching_features():
 
 def test_candidates_contain_the_rotation_of_perfect_answers():
     head = MotionHead(small())
-    rotation = quaternion_to_matrix(torch.tensor([0.9, 0.2, -0.3, 0.25]))
+    rotation = quaternion_to_matrix(normalize_quaternion(torch.tensor([0.9, 0.2, -0.3, 0.25])))
     label, wanted = relative_labels(rotation.mT, head.group)
     confidence = torch.full((1, 1, 60, 60), 1e-6)
     confidence[0, 0, torch.arange(60), label] = 1.0
@@ -262,4 +263,4 @@ def test_poor_clouds_give_finite_masks(points):
 
 def test_configurations_survive_their_text():
     for name in ("compact", "release"):
-        assert PartConfig.from_json(find_config(name).to_json()) == find_config(name)
+        assert PartConfig.from_json(NETWORK_PRESETS[name].config().to_json()) == NETWORK_PRESETS[name].config()

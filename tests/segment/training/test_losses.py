@@ -10,25 +10,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dpcli.ops import weighted_kabsch
-from dpcli.segment.flow.object_icp import object_icp
+from dpcli.segment.flow.object_aware_icp import object_aware_icp
 from dpcli.segment.network.slot_matching import (
-    assign,
     carry_mask,
-    match_sequence,
+    hungarian_assignment,
     match_slots,
+    match_slots_through_frames,
     one_hot,
     permute_slots,
     soft_iou,
 )
-from dpcli.segment.training.losses import (
-    consensus_weights,
-    dynamic_loss,
-    invariance_loss,
-    rigid_loss,
-    smoothness_loss,
-    smoothness_neighbors,
-    supervised_loss,
-)
+from dpcli.segment.smoothness import smoothness_loss, smoothness_neighbors
+from dpcli.segment.training.losses import consensus_weights, dynamic_loss, invariance_loss, rigid_loss, supervised_loss
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -186,10 +179,10 @@ def test_supervised_gradient() -> None:
 
 def test_assign_maximizes() -> None:
     score = torch.tensor(np.random.default_rng(7).normal(size=(4, 4, 4)))
-    for item, columns in zip(score, assign(score)):
+    for item, columns in zip(score, hungarian_assignment(score)):
         best = max(sum(float(item[s, order[s]]) for s in range(4)) for order in permutations(range(4)))
         assert sum(float(item[s, columns[s]]) for s in range(4)) == pytest.approx(best)
-    assert assign(torch.tensor([[[float("nan")], [1.0]]])).tolist() == [[-1, 0]]
+    assert hungarian_assignment(torch.tensor([[[float("nan")], [1.0]]])).tolist() == [[-1, 0]]
 
 
 def test_soft_iou_of_hard_masks_counts_points() -> None:
@@ -216,22 +209,22 @@ def test_match_sequence_chains_any_number_of_frames() -> None:
     frames, flows = [first[0], second[0]] * 3, [flow[0], back[0]] * 3
     orders = [torch.tensor(o) for o in ([0, 1, 2], [2, 0, 1], [1, 0, 2], [1, 2, 0], [0, 2, 1], [2, 1, 0])]
     masks = [(mask1, mask2)[t % 2][0][:, order] for t, order in enumerate(orders)]
-    found = match_sequence(frames, flows[:5], masks)
+    found = match_slots_through_frames(frames, flows[:5], masks)
     assert found.shape == (6, 3) and found[0].tolist() == [0, 1, 2]
     for t in range(6):
         assert torch.equal(masks[t][:, found[t]], (mask1, mask2)[t % 2][0])
-    assert match_sequence(frames[:1], [], masks[:1]).tolist() == [[0, 1, 2]]
+    assert match_slots_through_frames(frames[:1], [], masks[:1]).tolist() == [[0, 1, 2]]
 
 
 def test_object_icp_finds_the_motion() -> None:
     first, second, flow, mask1, mask2 = two_bodies(10)
     start = flow + 0.03 * torch.randn(flow.shape, generator=torch.Generator().manual_seed(0))
     before = (start - flow).norm(dim=-1).mean()
-    refined, rotation, translation = object_icp(first, second, mask1, mask2[..., [1, 2, 0]], start)
+    refined, rotation, translation = object_aware_icp(first, second, mask1, mask2[..., [1, 2, 0]], start)
     assert (refined - flow).norm(dim=-1).mean() < 0.3 * before
     turn = Rotation.from_matrix(rotation[0, 1].numpy()).as_rotvec()
     np.testing.assert_allclose(turn, [0, 0, 0.15], atol=0.05)
-    wrong, *_ = object_icp(first, second, mask1, mask2, start, order=torch.tensor([[1, 2, 0]]))
+    wrong, *_ = object_aware_icp(first, second, mask1, mask2, start, order=torch.tensor([[1, 2, 0]]))
     assert (wrong - flow).norm(dim=-1).mean() > before  # the slots do matter
 
 
@@ -240,7 +233,7 @@ def test_object_icp_of_a_vanished_part() -> None:
     first, second, flow, mask1, _ = two_bodies(11)
     gone = torch.zeros_like(mask1)
     gone[..., 0] = 1
-    refined, rotation, translation = object_icp(first, second, mask1, gone, flow, order=torch.tensor([[0, 1, 2]]))
+    refined, rotation, translation = object_aware_icp(first, second, mask1, gone, flow, order=torch.tensor([[0, 1, 2]]))
     assert refined.isfinite().all() and rotation.isfinite().all() and translation.isfinite().all()
     torch.testing.assert_close(refined[mask1[..., 1] > 0], flow[mask1[..., 1] > 0], rtol=0, atol=1e-4)
 
@@ -270,7 +263,7 @@ def test_golden_matching_and_icp(golden: dict[str, torch.Tensor]) -> None:
     torch.testing.assert_close(carry_mask(first, flow, mask1, second), golden["mask2_interp"], rtol=0, atol=1e-6)
     assert torch.equal(match_slots(first, flow, mask1, second, mask2), golden["match_perm"].argmax(-1))
     for steps, name in ((0, "wkabsch_flow"), (1, "oaicp_flow_1"), (20, "oaicp_flow_20")):
-        refined, rotation, translation = object_icp(first, second, mask1, mask2, flow, steps)
+        refined, rotation, translation = object_aware_icp(first, second, mask1, mask2, flow, steps)
         torch.testing.assert_close(refined, golden[name], rtol=0, atol=1e-5)
     torch.testing.assert_close(rotation, golden["oaicp_R"], rtol=0, atol=1e-5)
     torch.testing.assert_close(translation, golden["oaicp_t"], rtol=0, atol=1e-5)

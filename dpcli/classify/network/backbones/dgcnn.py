@@ -25,14 +25,14 @@ _EPS = 1e-3
 
 
 class Dense(nn.Module):
-    """Linear layer, batch norm over all rows, ReLU. A single row has no statistics: it gets the running ones."""
+    """Computes a linear layer, batch norm over all rows and ReLU. A single row has no statistics: it gets the running ones."""
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
         self.linear, self.norm = nn.Linear(inputs, width), nn.BatchNorm1d(width, eps=_EPS)
 
     def forward(self, values: Tensor) -> Tensor:
-        """(...,C) -> (...,width)."""
+        """Returns (...,width) for values (...,C)."""
         rows = self.linear(values.reshape(-1, values.shape[-1]))
         if len(rows) > 1 or isinstance(self.norm, SyncNorm):
             rows = self.norm(rows)
@@ -42,7 +42,7 @@ class Dense(nn.Module):
         return torch.relu(rows).view(*values.shape[:-1], -1)
 
     def pool(self, values: Tensor) -> Tensor:
-        """`forward(values).amax(1)`, (B,N,C) -> (B,width), keeping no array of size (B,N,width) for the gradient.
+        """Returns `forward(values).amax(1)`, (B,N,C) -> (B,width), keeping no array of size (B,N,width) for the gradient.
 
         The norm's statistics are those of a linear image, W m and W S W^T of the mean and covariance of `values`, and norm
         and ReLU keep the order of rows (turn it where the norm's scale is negative). So the gradient passes through the
@@ -58,7 +58,7 @@ class Dense(nn.Module):
 
     @full_precision
     def _normed(self, values: Tensor, place: Tensor) -> Tensor:
-        """The rows `place` (B,width) of values (B,N,C), each times its channel's weights, norm and ReLU."""
+        """Returns the rows `place` (B,width) of values (B,N,C), each times its channel's weights, norm and ReLU."""
         linear, norm = self.linear, self.norm
         largest = (gather_points(values, place) * linear.weight).sum(-1) + linear.bias
         if self.training:
@@ -71,7 +71,7 @@ class Dense(nn.Module):
 
 
 def image_statistics(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and biased variance (width) of rows (R,C) @ weight.T (C,width), without making it; differentiable."""
+    """Returns mean and biased variance (width) of rows (R,C) @ weight.T (C,width), without making it; differentiable."""
     mean = rows.mean(0)
     centered = rows - mean.detach()  # they sum to zero: no gradient of the covariance passes through the mean
     covariance = centered.T @ centered / len(rows)
@@ -80,14 +80,14 @@ def image_statistics(rows: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _remember(norm: nn.BatchNorm1d, mean: Tensor, var: Tensor, rows: int) -> None:
-    """Running statistics as BatchNorm1d keeps them, from the mean and biased variance of so many rows."""
+    """Updates running statistics as BatchNorm1d does, from the mean and biased variance of so many rows."""
     norm.num_batches_tracked += 1
     norm.running_mean.lerp_(mean.to(norm.running_mean), norm.momentum)
     norm.running_var.lerp_((var * (rows / max(rows - 1, 1))).to(norm.running_var), norm.momentum)
 
 
 class DenseHead(nn.Module):
-    """Hidden layers with dropout behind each, then class logits: what ends both published networks."""
+    """Computes class logits by hidden layers with dropout behind each, as both published networks end."""
 
     def __init__(self, inputs: int, widths: tuple[int, ...], classes: int, dropout: float) -> None:
         super().__init__()
@@ -96,18 +96,18 @@ class DenseHead(nn.Module):
         self.classify = nn.Linear(widths[-1], classes)
 
     def forward(self, values: Tensor) -> Tensor:
-        """(B,inputs) -> (B,classes)."""
+        """Returns the logits (B,classes) of features (B,inputs)."""
         for layer in self.hidden:
             values = self.dropout(layer(values))
         return self.classify(values)
 
     def macs(self) -> int:
-        """Multiply-adds of one clip."""
+        """Returns multiply-adds of one clip."""
         return sum(layer.linear.weight.numel() for layer in self.hidden) + self.classify.weight.numel()
 
 
 class EdgeConv(nn.Module):
-    """h([x_i, x_j - x_i]) with one linear layer, batch norm over all edges and ReLU; the maximum over j.
+    """Computes h([x_i, x_j - x_i]) with one linear layer, batch norm over all edges and ReLU; the maximum over j.
 
     W [x_i, x_j - x_i] = W_b x_j + (W_a - W_b) x_i, so both products act on points, before neighbors are gathered.
     """
@@ -117,7 +117,7 @@ class EdgeConv(nn.Module):
         self.linear, self.norm = nn.Linear(2 * inputs, width), nn.BatchNorm1d(width, eps=_EPS)
 
     def forward(self, features: Tensor, idx: Tensor) -> Tensor:
-        """(B,N,width) from features (B,N,C) and neighbors idx (B,N,K)."""
+        """Returns (B,N,width) from features (B,N,C) and neighbors idx (B,N,K)."""
         if not self.training:
             neighbor, own = _products(features, *self._folded())
             return torch.relu(pool_edges(neighbor, idx)[0] + own)
@@ -134,13 +134,13 @@ class EdgeConv(nn.Module):
         return torch.relu((largest + own - mean) * scale + self.norm.bias)
 
     def _together(self, features: Tensor, idx: Tensor) -> Tensor:
-        """`forward` edge by edge: the norm exchanges its statistics with the other processes of a shared run."""
+        """Computes `forward` edge by edge: the norm exchanges its statistics with the other processes of a shared run."""
         neighbor, own = _products(features, self.linear.weight, self.linear.bias)
         edges = gather_points(neighbor, idx) + own[:, :, None]
         return torch.relu(self.norm(edges.flatten(0, 2))).view_as(edges).amax(2)
 
     def activations(self, features: Tensor, idx: Tensor) -> Tensor:
-        """After norm (by its running statistics) and ReLU, before pooling: (B,N,K,width)."""
+        """Returns the activations after norm (by its running statistics) and ReLU, before pooling: (B,N,K,width)."""
         neighbor, own = _products(features, *self._folded())
         edges = gather_points(neighbor, idx)
         if edges.requires_grad or own.requires_grad:
@@ -155,13 +155,14 @@ class EdgeConv(nn.Module):
 
 @full_precision
 def _products(features: Tensor, weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """W_b x_j and (W_a - W_b) x_i + bias: (B,N,width) each. Their sum is a difference of places, so float32 it stays."""
+    """Returns W_b x_j and (W_a - W_b) x_i + bias, (B,N,width) each, in float32: their sum is a difference of places, which
+    bfloat16 would round away."""
     first, second = weight.chunk(2, 1)
     return linear(features, second), linear(features, first - second, bias)
 
 
 def edge_statistics(neighbor: Tensor, own: Tensor, idx: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and biased variance (C) of neighbor_j + own_i over all edges, without making them; differentiable.
+    """Returns mean and biased variance (C) of neighbor_j + own_i over all edges, without making them; differentiable.
 
     neighbor and own (B,N,C), idx (B,N,K), total (B,N,C) the sum of neighbor over each point's neighbors. Both parts are
     measured from their means first, so that the difference of squares keeps its digits.
@@ -177,7 +178,7 @@ def edge_statistics(neighbor: Tensor, own: Tensor, idx: Tensor, total: Tensor) -
 
 
 class InputTransform(nn.Module):
-    """A 3 x 3 matrix for each clip, from its edges; the identity before training.
+    """Computes a 3 x 3 matrix for each clip, from its edges; the identity before training.
 
     The published layers read an edge as [x_i, x_j - x_i], `SharedLayers` as [x_j - x_i, x_j], which is a linear function
     of it: the same layers can be learned, and they have as many weights.
@@ -198,7 +199,8 @@ class InputTransform(nn.Module):
 
 
 class DGCNN(Backbone):
-    """Input transform, edge convolutions on a graph that follows the features, aggregation of all layers, hidden layers.
+    """Classifies by an input transform, edge convolutions on a graph that follows the features, aggregation of all layers, and
+    hidden layers (Wang et al., 2019).
 
     Of the config: neighbors (20 as published), temporal_radius, grouping (balanced: equal shares of the frames; any other:
     the nearest of all of them), dropout (0.5 as published), and widths: edge convolutions, aggregation, input transform
@@ -217,7 +219,7 @@ class DGCNN(Backbone):
         nn.init.zeros_(self.transform.matrix.weight)
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        """The first graph, by coordinates; later ones follow from features."""
+        """Returns the first graph, by coordinates; later ones follow from features."""
         return [Grouping(points, times, points, times, self._graph(points, times))]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
@@ -231,7 +233,7 @@ class DGCNN(Backbone):
 
     @torch.no_grad()
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
-        """Four stages of one layer, each on its own graph over all points (in input coordinates), and the logits."""
+        """Returns four stages of one layer, each on its own graph over all points (in input coordinates), and the logits."""
         assert not self.training, "the dynamic stream reads a frozen static network"
         group = groups[0]
         features, levels, stages = self.transform(group.points, group.idx), [], []
@@ -251,7 +253,7 @@ class DGCNN(Backbone):
         return self.head(self.aggregate.pool(torch.cat(levels, -1)))
 
     def macs_as_written(self) -> int:
-        """Multiply-adds of one clip as papers count them: each layer on every gathered edge, without the search."""
+        """Returns multiply-adds of one clip as papers count them: each layer on every gathered edge, without the search."""
         vertices, t = self.config.num_frames * self.config.points_per_frame, self.transform
         on_edges = sum(
             layer.weight.numel() for layer in (t.edges.linear1, t.edges.linear2, *(c.linear for c in self.convs))
@@ -262,16 +264,16 @@ class DGCNN(Backbone):
 
 
 def expect_widths(config: KinetConfig, published: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
-    """`config.widths` if its parts are as many as the published ones and as long, but for the first and last. UsageError."""
+    """Returns `config.widths` if its parts are as many as the published ones and as long, but for the first and last. UsageError."""
     widths = config.widths
     fits = len(widths) == len(published) and all(part and min(part) >= 1 for part in widths)
     if not fits or any(len(a) != len(b) for a, b in zip(widths[1:-1], published[1:-1])):
-        raise UsageError(f"--backbone {config.backbone}: widths = {widths}, expected numbers like {published}")
+        raise UsageError(f"backbone = {config.backbone}: widths = {widths}, expected numbers like {published}")
     return widths
 
 
 def xavier_init(module: nn.Module) -> None:
-    """Xavier's uniform initialization of every linear layer, zero biases: that of both published networks."""
+    """Gives Xavier's uniform initialization to every linear layer, zero biases: that of both published networks."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)

@@ -34,7 +34,7 @@ def frame_size(times: Tensor) -> int:
 @full_precision
 @torch.no_grad()
 def frame_graph(features: Tensor, times: Tensor, k: int, reach: int, shared: bool) -> Tensor:
-    """The k nearest of each point among the frames at most `reach` away, (B,N,k) i64, by ascending distance.
+    """Returns the k nearest of each point among the frames at most `reach` away, (B,N,k) i64, by ascending distance.
 
     features (B,N,C) of all frames, coordinates or activations; times (B,N), frame after frame. `shared` divides the slots
     by `frame_shares` and takes the nearest of each frame; without, they are the nearest of those frames together. The point
@@ -54,7 +54,7 @@ def frame_graph(features: Tensor, times: Tensor, k: int, reach: int, shared: boo
 
 
 def _among_all_pairs(blocks: Tensor, shares: list[dict[int, int]], k: int) -> Tensor:
-    """`frame_graph` of blocks (B,T,P,C) by a kernel, which looks through the distances of a few frames at a time."""
+    """Computes `frame_graph` of blocks (B,T,P,C) by a kernel, which looks through the distances of a few frames at a time."""
     from dpcli.ops.cpu.frame_graph import nearest_kernel
 
     batch, frames, size, channels = blocks.shape
@@ -79,7 +79,7 @@ def _among_all_pairs(blocks: Tensor, shares: list[dict[int, int]], k: int) -> Te
 
 
 def _measure(query: Tensor, points: Tensor, out: Tensor) -> None:
-    """Squared distances (R,P,P) of query and points (R,P,C); for C = 3 as every search of `dpcli.ops` rounds them."""
+    """Returns squared distances (R,P,P) of query and points (R,P,C); for C = 3 as every search of `dpcli.ops` rounds them."""
     if query.shape[-1] == 3:
         out.copy_(squared_distances(query, points))
         return
@@ -88,7 +88,7 @@ def _measure(query: Tensor, points: Tensor, out: Tensor) -> None:
 
 
 def _among_nearest(blocks: Tensor, shares: list[dict[int, int]], k: int) -> Tensor:
-    """`frame_graph` of blocks (B,T,P,C) in torch, a search a frame and offset."""
+    """Computes `frame_graph` of blocks (B,T,P,C) in torch, a search a frame and offset."""
     found = [_between(blocks, offset, shares) for offset in sorted({d for row in shares for d in row}, key=_own_first)]
     distance, index = (torch.cat(parts, -1) for parts in zip(*found))
     distance, order = distance.sort(dim=-1, stable=True)
@@ -100,7 +100,7 @@ def _among_nearest(blocks: Tensor, shares: list[dict[int, int]], k: int) -> Tens
 
 
 def frame_shares(k: int, frames: int, reach: int) -> list[dict[int, int]]:
-    """How the k slots of a point of each frame are divided: {offset in time: slots} of the frames within reach.
+    """Returns how the k slots of a point of each frame are divided: {offset in time: slots} of the frames within reach.
 
     Equal parts; what is left over goes to the own frame, so that the graph of a clip played backwards is the same.
     """
@@ -135,7 +135,7 @@ def _between(blocks: Tensor, offset: int, shares: list[dict[int, int]]) -> tuple
 
 
 def _nearest(query: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Squared distances and indices (R,P,k) of the nearest of each cloud; query and points (R,P,C)."""
+    """Returns squared distances and indices (R,P,k) of the nearest of each cloud; query and points (R,P,C)."""
     if query.shape[-1] == 3:
         return knn(query, points, k)
     pieces = []
@@ -151,7 +151,7 @@ def _nearest(query: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
 
 
 def pool_edges(values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
-    """Maximum and sum over each point's neighbors, both (B,N,C), of values (B,N,C) at idx (B,N,K); differentiable.
+    """Returns maximum and sum over each point's neighbors, both (B,N,C), of values (B,N,C) at idx (B,N,K); differentiable.
 
     The gathered (B,N,K,C) are never all held: a kernel makes none, torch makes and pools them piece by piece on a CPU.
     Equally large neighbors share the maximum's gradient, as in torch.amax.
@@ -165,10 +165,11 @@ def pool_edges(values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _PooledByKernel(torch.autograd.Function):
-    """values (B,N,C), idx (B,M,K) -> maximum and sum over K, (B,M,C) each."""
+    """Computes from values (B,N,C) and idx (B,M,K) the maximum and sum over K, (B,M,C) each."""
 
     @staticmethod
     def forward(ctx, values: Tensor, idx: Tensor) -> tuple[Tensor, Tensor]:
+        """Computes the result, and keeps what the gradient needs."""
         from dpcli.ops.cpu.frame_graph import pool_kernel
 
         shape, cost = (*idx.shape[:2], values.shape[2]), idx.shape[2] * values.shape[2] * _POOL_NS
@@ -181,6 +182,7 @@ class _PooledByKernel(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, to_largest: Tensor, to_total: Tensor) -> tuple[Tensor, None]:
+        """Returns the gradients of the inputs."""
         from dpcli.ops.cpu.frame_graph import pool_back_kernel
 
         values, idx, largest = ctx.saved_tensors
@@ -191,10 +193,11 @@ class _PooledByKernel(torch.autograd.Function):
 
 
 class _PooledEdges(torch.autograd.Function):
-    """values (R,C), rows (M,K) -> maximum and sum over K, (M,C) each."""
+    """Computes from values (R,C) and rows (M,K) the maximum and sum over K, (M,C) each."""
 
     @staticmethod
     def forward(ctx, values: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Computes the result, and keeps what the gradient needs."""
         parts = []
         for piece in rows.split(_rows_a_piece(values, rows)):
             gathered = values.index_select(0, piece.reshape(-1)).view(*piece.shape, -1)
@@ -206,6 +209,7 @@ class _PooledEdges(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, to_largest: Tensor, to_total: Tensor) -> tuple[Tensor, None]:
+        """Returns the gradients of the inputs."""
         values, rows, largest = ctx.saved_tensors
         out, step = torch.zeros_like(values), _rows_a_piece(values, rows)
         pieces = (part.split(step) for part in (rows, largest, to_largest, to_total))

@@ -1,4 +1,4 @@
-"""What Kinet asks of a static network, and where the networks are found: three methods make any of them a backbone.
+"""The interface of a static network, and the lookup of networks by name. Kinet asks for three methods make any of them a backbone.
 
 A backbone turns a clip into class logits on its own (the static stream) and shows the activations of its neighborhoods
 before they are pooled; the dynamic stream fits its surfaces to those. docs/backbones.md writes one from scratch.
@@ -35,24 +35,24 @@ class Grouping:
     idx: Tensor  # (B,M,K) i64 into the N points
 
     def neighbor_times(self) -> Tensor:
-        """Frame number of each neighbor, (B,M,K)."""
+        """Returns the frame number of each neighbor, (B,M,K)."""
         return gather_points(self.times[..., None], self.idx)[..., 0]
 
     def relative(self) -> Tensor:
-        """Neighbor minus centroid, (B,M,K,3)."""
+        """Returns neighbor minus centroid, (B,M,K,3)."""
         return gather_points(self.points, self.idx) - self.centers[:, :, None]
 
 
 @dataclass
 class Stage:
-    """One set of neighborhoods and the layers that act on it: activations (B,M,K,C) before pooling, non-negative or not."""
+    """Holds one set of neighborhoods and the layers that act on it: activations (B,M,K,C) before pooling, non-negative or not."""
 
     grouping: Grouping
     activations: list[Tensor]
 
 
 class Backbone(nn.Module, ABC):
-    """A static network of point clouds. Built as `Class(config)`; `config.num_classes` is the width of its logits.
+    """Classifies point clouds: a static network. Built as `Class(config)`; `config.num_classes` is the width of its logits.
 
     `tap_widths` are the channels of the activations that `taps` shows, a tuple a stage. The points that a stage groups are
     the centroids of the stage before (in DGCNN: all points, every time).
@@ -70,43 +70,43 @@ class Backbone(nn.Module, ABC):
 
     @abstractmethod
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
-        """What the dynamic stream reads, in eval mode: each stage with its activations; and the logits."""
+        """Returns what the dynamic stream reads, in eval mode: each stage with its activations; and the logits."""
 
 
 def resolve_backbone(name: str) -> type[nn.Module]:
-    """The class of a built-in name or of `module:Class`. UsageError when there is none or it isn't a backbone.
+    """Returns the class of a built-in name or of `module:Class`. Raises UsageError when there is none or it isn't a backbone.
 
     A module of the user's is imported, and so executed: only a name that the user typed may come here.
     """
     place = BACKBONES.get(name, name)
     module, _, attribute = place.partition(":")
     if not attribute:
-        raise UsageError(f"--backbone {name}: expected {', '.join(BACKBONES)} or your own as module:Class")
+        raise UsageError(f"backbone = {name}: expected {', '.join(BACKBONES)} or your own as module:Class")
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise UsageError(f"--backbone {name}: {error}; is its folder on PYTHONPATH?") from None
+        raise UsageError(f"backbone = {name}: {error}; is its folder on PYTHONPATH?") from None
     left = getattr(found, "__abstractmethods__", ())  # named by Backbone and not written
     missing = [
         name for name in ("group", "taps", "forward") if name in left or not callable(getattr(found, name, None))
     ]
     if missing or not (isinstance(found, type) and issubclass(found, nn.Module)):
         lacks = f"lacks {', '.join(missing)}" if missing else "is no torch.nn.Module"
-        raise UsageError(f"--backbone {name}: {lacks}; docs/backbones.md shows the three methods")
+        raise UsageError(f"backbone = {name}: {lacks}; docs/backbones.md shows the three methods")
     return found
 
 
 def build_backbone(config: KinetConfig) -> nn.Module:
-    """The static network that `config.backbone` names."""
+    """Returns the static network that `config.backbone` names."""
     network = resolve_backbone(config.backbone)(config)
     widths = getattr(network, "tap_widths", None)
     if not widths or not all(isinstance(width, int) for stage in widths for width in stage):
-        raise UsageError(f"--backbone {config.backbone}: tap_widths = {widths!r}, expected integers, a tuple a stage")
+        raise UsageError(f"backbone = {config.backbone}: tap_widths = {widths!r}, expected integers, a tuple a stage")
     return network
 
 
 def clip_points(points: Tensor) -> tuple[Tensor, Tensor]:
-    """A batch of clips (B,T,P,3) as one cloud a clip: points (B,T*P,3) frame after frame, times (B,T*P)."""
+    """Returns a batch of clips (B,T,P,3) as one cloud a clip: points (B,T*P,3) frame after frame, times (B,T*P)."""
     batch, frames, count = points.shape[:3]
     times = torch.arange(frames, device=points.device, dtype=points.dtype).repeat_interleave(count)
     return points.reshape(batch, frames * count, 3), times.expand(batch, -1).contiguous()

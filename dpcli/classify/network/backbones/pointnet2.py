@@ -16,7 +16,7 @@ from dpcli.ops.grouped_mlp import frozen_activations
 
 @torch.no_grad()
 def group_clip(points: Tensor, times: Tensor, config: KinetConfig, reaches: Sequence[int]) -> list[Grouping]:
-    """Both stages' centroids (farthest points of the union of frames) and space-time neighbors. points (B,N,3), times (B,N).
+    """Returns both stages' centroids (farthest points of the union of frames) and space-time neighbors. points (B,N,3), times (B,N).
 
     reaches: frames before and after that neighbors may come from; for each of them both stages, one after the other, about
     the same centroids.
@@ -45,20 +45,22 @@ def _neighbors(
 
 
 class SetAbstraction(SharedLayers):
-    """The shared layers, max-pooled over each centroid's neighbors."""
+    """Applies the shared layers to each centroid's neighbors and takes the maximum."""
 
     def forward(self, group: Grouping, features: Tensor | None) -> Tensor:
-        """(B,M,C2) from features (B,N,F) of the points that were grouped."""
+        """Returns (B,M,C2) from features (B,N,F) of the points that were grouped."""
         return self.pool(group.points, group.centers, group.idx, features)
 
     def taps(self, group: Grouping, features: Tensor | None) -> tuple[list[Tensor], Tensor]:
-        """Both layers' activations before pooling with running statistics, (B,M,K,C1), (B,M,K,C2), and pooled, (B,M,C2)."""
+        """Returns both layers' activations before pooling with running statistics, (B,M,K,C1), (B,M,K,C2), and pooled, (B,M,C2)."""
         assert not self.training, "the dynamic stream reads a frozen static network"
         return frozen_activations(group.points, group.centers, group.idx, features, *self._arguments())
 
 
 class PointNet2(Backbone):
-    """Two set abstractions and a global head; of the config: centroids, neighbors, radii, grouping, widths.
+    """Classifies by two set abstractions and a global head (Qi et al., 2017).
+
+    Reads of the config: centroids, neighbors, radii, grouping, widths.
 
     With `static_temporal_radius` the static stream pools neighborhoods of its own, such as those within a frame, and sees no
     motion (the text's "identical to common static models"; the release pools what the dynamic stream fits). The dynamic
@@ -75,6 +77,7 @@ class PointNet2(Backbone):
         he_init(self)
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
+        """Returns the neighborhoods of both stages, of the static stream's own first where it has such and is in eval mode."""
         config = self.config
         reaches = [config.static_radius]
         if config.own_static_groups and not self.training:
@@ -88,7 +91,7 @@ class PointNet2(Backbone):
 
     @torch.no_grad()
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
-        """Both stages with their two layers' activations, and the logits, in one pass of the frozen network."""
+        """Returns both stages with their two layers' activations, and the logits, in one pass of the frozen network."""
         first, features = self.stage1.taps(groups[0], None)
         second, pooled = self.stage2.taps(groups[1], features)
         logits = self.head(groups[1].centers, pooled)
@@ -98,7 +101,7 @@ class PointNet2(Backbone):
         return [Stage(group, taps) for group, taps in zip(shown, (first, second))], logits
 
     def macs_as_written(self) -> int:
-        """Multiply-adds of one clip as papers count them: each layer on every gathered neighbor, once."""
+        """Returns multiply-adds of one clip as papers count them: each layer on every gathered neighbor, once."""
         last = (self.head.linear1, self.head.linear2)
         total = (
             self.config.centroids[1] * sum(layer.weight.numel() for layer in last) + self.head.classify.weight.numel()

@@ -28,13 +28,13 @@ _POWERS = [(a, b, c) for a in range(4) for b in range(4) for c in range(4) if 1 
 
 
 def monomials(offsets: Tensor) -> Tensor:
-    """The 19 monomials x^a y^b z^c of degree 1 to 3 of offsets (...,3), (...,19)."""
+    """Returns the 19 monomials x^a y^b z^c of degree 1 to 3 of offsets (...,3), (...,19)."""
     powers = [torch.ones_like(offsets), offsets, offsets.square(), offsets.square() * offsets]
     return torch.stack([powers[a][..., 0] * powers[b][..., 1] * powers[c][..., 2] for a, b, c in _POWERS], -1)
 
 
 class SpiderConv(nn.Module):
-    """sum_k W_k (f_k (x) g(x_k - x_i)) over the neighbors k by distance, group norm, ReLU; g has T Taylor channels."""
+    """Computes sum_k W_k (f_k (x) g(x_k - x_i)) over the neighbors k by distance, group norm, ReLU; g has T Taylor channels."""
 
     def __init__(self, inputs: int, width: int, taylor: int, neighbors: int) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class SpiderConv(nn.Module):
         self.reset()
 
     def reset(self) -> None:
-        """Published: Xavier's uniform draw, the kernel as a 1 x K convolution, each Taylor weight as a 1 x 1 one."""
+        """Draws the weights as published: Xavier's uniform draw, the kernel as a 1 x K convolution, each Taylor weight as a 1 x 1 one."""
         neighbors, inputs, width = self.kernel.shape
         limit = (6 / (neighbors * (inputs + width))) ** 0.5
         nn.init.uniform_(self.kernel, -limit, limit)
@@ -54,12 +54,12 @@ class SpiderConv(nn.Module):
         nn.init.zeros_(self.taylor.bias)
 
     def forward(self, features: Tensor, idx: Tensor, offsets: Tensor) -> Tensor:
-        """(B,N,width) from features (B,N,C), neighbors idx (B,N,K) and the monomials of their offsets (B,N,K,19)."""
+        """Returns (B,N,width) from features (B,N,C), neighbors idx (B,N,K) and the monomials of their offsets (B,N,K,19)."""
         gathered, taylor = self._factors(features, idx, offsets)
         return self._normed(_RankedProducts.apply(gathered, taylor, self.kernel))
 
     def contributions(self, features: Tensor, idx: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
-        """Each neighbor's term of the sum (B,N,K,width), and the layer's output (B,N,width)."""
+        """Returns each neighbor's term of the sum (B,N,K,width), and the layer's output (B,N,width)."""
         gathered, taylor = self._factors(features, idx, offsets)
         terms = _terms(gathered, taylor, self.kernel)
         return terms, self._normed(terms.sum(2))
@@ -78,7 +78,7 @@ def _modulated(gathered: Tensor, taylor: Tensor, k: int) -> Tensor:
 
 
 class _RankedProducts(torch.autograd.Function):
-    """sum_k modulated_k @ kernel_k, rank after rank, so that the modulated features, T times larger, are never all held.
+    """Computes sum_k modulated_k @ kernel_k, rank after rank, so that the modulated features, T times larger, are never all held.
 
     gathered (B,N,K,C), taylor (B,N,K,T), kernel (K,C*T,width) -> (B,N,width). On a CPU some rows at a time, whose modulated
     features a kernel makes Taylor channel by Taylor channel: then they stay in the cache, and so do their gradients.
@@ -86,6 +86,7 @@ class _RankedProducts(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, gathered: Tensor, taylor: Tensor, kernel: Tensor) -> Tensor:
+        """Computes the result, and keeps what the gradient needs."""
         ctx.save_for_backward(gathered, taylor, kernel)
         batch, count = gathered.shape[:2]
         out = gathered.new_zeros(batch * count, kernel.shape[-1])
@@ -105,6 +106,7 @@ class _RankedProducts(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns the gradients of the inputs."""
         gathered, taylor, kernel = ctx.saved_tensors
         to_gathered, to_taylor = (torch.empty_like(value) for value in (gathered, taylor))
         grad = grad.reshape(-1, grad.shape[-1])
@@ -134,7 +136,7 @@ class _RankedProducts(torch.autograd.Function):
 
 
 def _terms(gathered: Tensor, taylor: Tensor, kernel: Tensor) -> Tensor:
-    """modulated_k @ kernel_k for every rank k, (B,N,K,width): what `_RankedProducts` sums."""
+    """Returns modulated_k @ kernel_k for every rank k, (B,N,K,width), which `_RankedProducts` sums."""
     if torch.is_grad_enabled() or not _by_kernel(gathered):
         return torch.stack([_modulated(gathered, taylor, k) @ weight for k, weight in enumerate(kernel)], 2)
     from dpcli.ops.cpu.ranked_products import modulate_kernel
@@ -152,7 +154,7 @@ def _by_kernel(values: Tensor) -> bool:
 
 
 def _by_taylor_channel(kernel: Tensor, taylor: Tensor) -> Tensor:
-    """The rows (C,T) of each rank's weights as (T,C)."""
+    """Returns the rows (C,T) of each rank's weights as (T,C)."""
     return kernel.unflatten(1, (-1, taylor.shape[-1])).transpose(1, 2).flatten(1, 2)
 
 
@@ -173,7 +175,8 @@ def _run(kernel: Callable[..., None], product: Tensor, *arguments: Tensor | int)
 
 
 class SpiderCNN(Backbone):
-    """Four SpiderConvs on one graph, concatenated; the two largest of each channel; hidden layers.
+    """Classifies by four SpiderConvs on one graph, concatenated, the two largest of each channel, and hidden layers (Xu et al.,
+    2018).
 
     Of the config: neighbors (20 as published; the kernels' length), temporal_radius, grouping (balanced: equal shares of
     the frames; any other: the nearest of all of them), dropout (0.7 as published), and widths: convolutions, number of
@@ -194,7 +197,7 @@ class SpiderCNN(Backbone):
         self.convs = nn.ModuleList(SpiderConv(a, b, taylor, config.neighbors) for a, b in zip((3, *widths), widths))
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
-        """The one graph, by coordinates, neighbors in order of distance."""
+        """Returns the one graph, by coordinates, neighbors in order of distance."""
         config = self.config
         shared = config.grouping == "balanced"
         idx = frame_graph(points, times, config.neighbors, config.temporal_radius, shared)
@@ -211,7 +214,7 @@ class SpiderCNN(Backbone):
 
     @torch.no_grad()
     def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
-        """Four stages of one layer on the same graph: each convolution gathers what the one before pooled; and the logits."""
+        """Returns four stages of one layer on the same graph: each convolution gathers what the one before pooled; and the logits."""
         assert not self.training, "the dynamic stream reads a frozen static network"
         group, levels, stages = groups[0], [], []
         features, offsets = group.points, monomials(group.relative())
@@ -226,7 +229,7 @@ class SpiderCNN(Backbone):
         return self.head(largest.flatten(1))
 
     def macs_as_written(self) -> int:
-        """Multiply-adds of one clip as papers count them: the convolutions' and the hidden layers' products."""
+        """Returns multiply-adds of one clip as papers count them: the convolutions' and the hidden layers' products."""
         vertices, slots = self.config.num_frames * self.config.points_per_frame, self.config.neighbors
         per_point = sum(conv.kernel.numel() + slots * conv.taylor.weight.numel() for conv in self.convs)
         return vertices * per_point + self.head.macs()

@@ -11,7 +11,6 @@ import torch
 from torch import nn
 from torch.nn.functional import cross_entropy
 
-from dpcli.classify.cost import body_like_clip, count_parameters, paper_parameters
 from dpcli.classify.network.backbones.dgcnn import DGCNN, Dense, EdgeConv, edge_statistics, image_statistics
 from dpcli.classify.network.backbones.frame_graph import frame_graph, frame_shares, pool_edges
 from dpcli.classify.network.backbones.interface import build_backbone, clip_points, resolve_backbone
@@ -20,7 +19,9 @@ from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.network.sync_norm import synchronize_norms
-from dpcli.classify.presets import BACKBONE_CHANGES, find_preset, with_backbone
+from dpcli.classify.network_cost import count_parameters, paper_parameters
+from dpcli.classify.network_speed import body_like_clip
+from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, backbone_changes
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.mixed_precision import reduced_products
 from tests.support.tiny_backbone import TinyBackbone
@@ -56,7 +57,7 @@ def trained_norms(network: nn.Module) -> nn.Module:
 
 
 def published(backbone: str) -> KinetConfig:
-    return with_backbone(find_preset("thesis").config, "thesis", backbone)
+    return PRESETS["thesis"]["network"].changed(**backbone_changes("thesis", backbone))
 
 
 def test_dgcnn_has_the_published_parameters_to_the_last_one():
@@ -454,17 +455,17 @@ def test_the_input_transform_starts_as_the_identity():
 @pytest.mark.parametrize("backbone", BACKBONE_CHANGES)
 @pytest.mark.parametrize("preset", ["thesis", "release", "quick", "tiny"])
 def test_every_preset_has_the_backbone(backbone, preset):
-    config = find_preset(preset).config.changed(merge="cross", grouping="first")  # as --variant release has them
+    config = PRESETS[preset]["network"].changed(merge="cross", grouping="first")  # as variant = release has them
     with torch.device("meta"):
-        model = Kinet(with_backbone(config, preset, backbone))
+        model = Kinet(config.changed(**backbone_changes(preset, backbone)))
     assert isinstance(model.static, {"dgcnn": DGCNN, "spidercnn": SpiderCNN}[backbone])
     few, many = {"tiny": (0, 1e5), "quick": (3e5, 6e5)}.get(preset, (2e6, 1e7))
     assert few < count_parameters(model) < many
 
 
 def test_a_user_s_backbone_keeps_the_preset():
-    config = find_preset("tiny").config
-    assert with_backbone(config, "tiny", "mine:Net") == config.changed(backbone="mine:Net")
+    config = PRESETS["tiny"]["network"]
+    assert config.changed(**backbone_changes("tiny", "mine:Net")) == config.changed(backbone="mine:Net")
 
 
 # ---- a user's own
@@ -542,5 +543,5 @@ def test_names_that_are_no_backbone(name, message):
 
 @pytest.mark.parametrize("backbone", ["dgcnn", "spidercnn"])
 def test_widths_of_another_backbone_are_refused(backbone):
-    with pytest.raises(UsageError, match=f"--backbone {backbone}: widths = .*expected numbers like"):
+    with pytest.raises(UsageError, match=f"backbone = {backbone}: widths = .*expected numbers like"):
         Kinet(KinetConfig(backbone=backbone))

@@ -1,0 +1,37 @@
+"""The checks that both explanations make before they work: of the streams asked for, and of the files to write."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from dpcli.classify.network.kinet import STREAMS
+from dpcli.classify.network.model_file import ModelInfo
+from dpcli.errors import UsageError
+from dpcli.runtime.whole_file import check_target
+
+
+def chosen_streams(text: str | None, info: ModelInfo) -> tuple[str, ...]:
+    """Returns the streams that a text names, each once; without a text those that were trained. Raises UsageError on others."""
+    trained = tuple(info.notes.get("streams", STREAMS))
+    possible = (*trained, "fused") if len(trained) > 1 else trained
+    if text is None:
+        return trained
+    chosen = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    if not chosen or not set(chosen) <= set(possible):
+        raise UsageError(
+            f"--stream {text}: this model has {', '.join(possible)}; name one or more, with commas between"
+        )
+    return chosen
+
+
+def check_targets(output: str, force: bool, *pictures: tuple[Path | None, str, Sequence[str]]) -> None:
+    """Raises UsageError before the work for all that would fail after it: pictures of an unknown kind, an output that exists.
+
+    pictures: file, option and legal suffixes of each.
+    """
+    for path, option, kinds in pictures:
+        if path is not None:
+            check_target(path, option, kinds)
+    if output != "-" and Path(output).exists() and not force:
+        raise UsageError(f"{output}: exists already; --force replaces it")

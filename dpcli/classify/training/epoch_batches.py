@@ -1,0 +1,73 @@
+"""The clips of an epoch in batches: which clips, in which order, and which of them are one process's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from dpcli.classify.data.clips import Clip, ClipSource
+from dpcli.classify.training.schedule import Schedule
+from dpcli.runtime.distributed import Processes
+from dpcli.runtime.seeds import DRAWS_PER_STAGE, ClassifyStream, generator
+
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor]  # points (b,T,P,3), labels (b), numbers of the clips (b)
+
+
+class _ClipDataset(torch.utils.data.Dataset):
+    """Gives one draw's clips as arrays, for a DataLoader: points, label, and the clip's number among all draws."""
+
+    def __init__(self, source: ClipSource, clips: list[Clip], draw: int, first: int) -> None:
+        self.source, self.clips, self.draw, self.first = source, clips, draw, first
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, int, int]:
+        clip = self.clips[index]
+        points = torch.from_numpy(np.ascontiguousarray(self.source.load(clip, self.draw, index, 0), np.float32))
+        return points, int(self.source.reader.labels[clip.sequence]), self.first + index
+
+
+class EpochBatches:
+    """Gives each epoch's batches of one stage (0 static, 1 dynamic) to one of the processes.
+
+    Each clip's position in its draw, not the process, seeds what is drawn from it.
+    """
+
+    def __init__(self, source: ClipSource, schedule: Schedule, processes: Processes, stage: int) -> None:
+        self.source, self.schedule, self.processes, self.stage = source, schedule, processes, stage
+        self.share = schedule.share(processes.count) * schedule.accumulate  # clips of a batch that are this process's
+        self.clips = len(self._draw(0))  # of an epoch
+        self.count = max(self.clips // schedule.batch, 1)  # whole batches; clips left over come in another epoch
+
+    @property
+    def draws(self) -> int:
+        """The number of draws of every clip that the stage comes back to; 0 where each epoch has its own."""
+        return min(self.schedule.draws, self.schedule.epochs_dynamic) if self.stage == 1 else 0
+
+    def load(self, epoch: int, first: int) -> Iterator[Batch]:
+        """Yields this process's parts of an epoch's batches, from the batch `first` on.
+
+        Raises RuntimeError of torch when a process that loads clips ends.
+        """
+        turn = epoch % self.draws if self.draws else epoch
+        number = self.stage * DRAWS_PER_STAGE + turn
+        clips = self._draw(number)
+        order = self._order(epoch, len(clips))[: self.count * self.schedule.batch]
+        starts = range(first * self.schedule.batch + self.processes.rank * self.share, len(order), self.schedule.batch)
+        mine = [i for start in starts for i in order[start : start + self.share]]
+        dataset = _ClipDataset(self.source, clips, number, turn * len(clips))
+        workers = self.schedule.workers
+        options = {"num_workers": workers, "multiprocessing_context": "forkserver"} if workers else {}
+        yield from torch.utils.data.DataLoader(torch.utils.data.Subset(dataset, mine), self.share, **options)
+
+    def _draw(self, number: int) -> list[Clip]:
+        return self.source.epoch(number, self.schedule.clips_per_video or None)
+
+    def _order(self, epoch: int, clips: int) -> list[int]:
+        """Returns the order in which an epoch takes its clips: as drawn, or, where draws come back, another one each time."""
+        if not self.draws:
+            return list(range(clips))
+        return generator(self.source.seed, ClassifyStream.DRAW_ORDER, epoch).permutation(clips).tolist()

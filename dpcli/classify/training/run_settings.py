@@ -1,0 +1,52 @@
+"""The settings of a training run that are neither the network's nor the schedule's: which clips, and which weights to begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from dpcli.errors import UsageError
+from dpcli.runtime.settings.fields import check, setting
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """Holds which clips are trained on, which videos validate, and which weights a run starts from.
+
+    Raises UsageError where two starts are given.
+    """
+
+    timing: Literal["clips", "uniform"] = setting(
+        "clips", "Frames of a clip: consecutive ones (clips), or spread over the video (uniform)."
+    )
+    drop_short: bool = setting(
+        False, "Leave out videos shorter than a clip, as other methods do, instead of padding them."
+    )
+    validation: str = setting(
+        "auto",
+        "Videos that validate: split (the file's own validation videos); or carved from the training videos by subject,"
+        " subjects:3,5, fold:3/10 (counted from 0) or a fraction such as 0.15; or none. auto: split where the file has one,"
+        " else subject, or 0.15 without subjects.",
+    )
+    augment: Literal["ours", "peers", "release", "none"] = setting(
+        "ours",
+        "Random changes of training clips, which the augment_... settings then change one by one: ours; peers (axis scales from"
+        " the camera, as other methods have on MSR-Action3D); release (the published code's); or none.",
+    )
+    pretrain: bool = setting(
+        False,
+        "Train the static stream alone on single clouds (ModelNet40), for static_from: frames = 1, epochs_dynamic = 0.",
+    )
+    init: str | None = setting(
+        None,
+        "A trained or shipped model whose both streams to start from, such as one of other frames, or of other classes (its"
+        " last layers are fresh then).",
+    )
+    static_from: str | None = setting(
+        None, "A trained model whose static stream to start from (rows ii and iv of table 3.1)."
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+        if self.static_from and self.init:
+            raise UsageError("--init starts both streams, static_from the static one: give one of them")

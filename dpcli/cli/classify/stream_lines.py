@@ -1,0 +1,83 @@
+"""The lines that `dpc classify predict --stream` prints."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from dpcli.standard_streams import printable
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from dpcli.classify.stream.sliding_window import Prediction
+
+
+class Lines:
+    """Prints a line per prediction, at once, and one with the whole at the end: JSON or for people."""
+
+    def __init__(self, class_names: list[str], streams: Sequence[str], as_json: bool) -> None:
+        self.class_names, self.streams, self.as_json = class_names, tuple(streams), as_json
+        self.count, self.seconds, self.highest = 0, 0.0, 0.0
+
+    def write(self, made: Prediction, arrived: float, waiting: int) -> None:
+        """Prints one prediction. Its latency runs from the arrival of its last frame to this line, waiting behind earlier ones
+        included."""
+        seconds = time.monotonic() - arrived
+        self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
+        latency = round(1000 * seconds, 1)
+        if self.as_json:
+            row = {
+                "frame": made.frame,
+                **self._tops(made.scores),
+                "mean": self._top(made.mean[0]),
+                "clips": made.clips,
+                "latency_ms": latency,
+                "waiting": waiting,
+            }
+            print(json.dumps(row), flush=True)
+            return
+        behind = f", {waiting} frames waiting" if waiting else ""
+        print(
+            f"frame {made.frame}: {self._text(made.scores)}; so far {self._name(made.mean[0])}; "
+            f"{latency:.0f} ms{behind}",
+            flush=True,
+        )
+
+    def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
+        """Prints the mean over all clips, (1+S,C), and how the stream ended."""
+        average, highest = 1000 * self.seconds / max(self.count, 1), 1000 * self.highest
+        if self.as_json:
+            scores = {name: round(float(value), 6) for name, value in zip(self.class_names, mean[0])}
+            row = {
+                "end": end,
+                "frames": frames,
+                "clips": clips,
+                **self._tops(mean),
+                "scores": scores,
+                "latency_ms": {"mean": round(average, 1), "highest": round(highest, 1)},
+            }
+            print(json.dumps(row), flush=True)
+            return
+        plural = "" if clips == 1 else "s"
+        print(
+            f"{end}: {frames} frames, {clips} clip{plural}: {self._text(mean)}; "
+            f"latency {average:.0f} ms on average, at most {highest:.0f}",
+            flush=True,
+        )
+
+    def _top(self, scores: np.ndarray) -> dict:
+        best = int(scores.argmax())
+        return {"class": self.class_names[best], "probability": round(float(scores[best]), 6)}
+
+    def _tops(self, scores: np.ndarray) -> dict:
+        return {**self._top(scores[0]), **{name: self._top(row) for name, row in zip(self.streams, scores[1:])}}
+
+    def _name(self, scores: np.ndarray) -> str:
+        return f"{printable(self.class_names[int(scores.argmax())])} {scores.max():.2f}"
+
+    def _text(self, scores: np.ndarray) -> str:
+        single = ", ".join(f"{name} {self._name(row)}" for name, row in zip(self.streams, scores[1:]))
+        return f"{self._name(scores[0])} ({single})"

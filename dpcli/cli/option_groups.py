@@ -1,0 +1,54 @@
+"""Options that several commands share, written once as the fields of a frozen dataclass.
+
+@dataclass(frozen=True)
+class Camera:
+    size: Annotated[int, typer.Option("--size", help="Side of the pictures, pixels.")] = 512
+
+@app.command()
+@with_option_groups
+def film(model: Model, camera: Camera, frames: Frames = 32) -> None: ...
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any, get_type_hints
+
+
+def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the command with one option for each field of the dataclasses among its parameters.
+
+    The command is called with instances of these dataclasses. Raises ValueError when two options have one name.
+    """
+    own = inspect.signature(command, eval_str=True).parameters
+    groups = {name: one.annotation for name, one in own.items() if is_dataclass(one.annotation)}
+    options: list[inspect.Parameter] = []
+    for name, one in own.items():
+        options += _options_of(groups[name]) if name in groups else [one.replace(kind=inspect.Parameter.KEYWORD_ONLY)]
+    names = [one.name for one in options]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{command.__name__}: an option is there twice among {', '.join(names)}")
+
+    @functools.wraps(command)
+    def run(**values: Any) -> Any:
+        made = {
+            name: group(**{one.name: values.pop(one.name) for one in fields(group)}) for name, group in groups.items()
+        }
+        return command(**values, **made)
+
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in options}
+    del run.__wrapped__  # type: ignore[attr-defined]  # else typer may read the command's own parameters
+    return run
+
+
+def _options_of(group: type) -> list[inspect.Parameter]:
+    """Returns a keyword parameter for each field of a dataclass, with the field's annotation and default."""
+    hints = get_type_hints(group, include_extras=True)
+    return [
+        inspect.Parameter(one.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[one.name], default=one.default)
+        for one in fields(group)
+    ]

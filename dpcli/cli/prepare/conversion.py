@@ -1,0 +1,99 @@
+"""Options of every command that turns raw data into clouds, and the one way in which such a command runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dpcli.cli.options import Force, Jobs, OnError, Seed
+from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, PointsAtMost, Sampling
+from dpcli.errors import UsageError
+
+
+@dataclass(frozen=True)
+class ConversionOptions:
+    """Holds the options that every conversion has, whatever it reads."""
+
+    output: FileOrPipe = ""
+    points: PointsAtMost = 0
+    sampling: Sampling = "random"
+    limit: Annotated[
+        int | None, typer.Option("--limit", min=1, help="Convert only the first N samples, for a trial.")
+    ] = None
+    compression: Compression = "none"
+    on_error: OnError = "skip"
+    jobs: Jobs = None
+    shard: Annotated[
+        str,
+        typer.Option(
+            "--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them."
+        ),
+    ] = ""
+    dask: Annotated[
+        str, typer.Option("--dask", metavar="ADDRESS", help="Read on a Dask cluster: tcp://HOST:PORT, or local.")
+    ] = ""
+    check: Check = False
+    seed: Seed = 0
+    force: Force = False
+
+
+@dataclass(frozen=True)
+class PublishedConversion(ConversionOptions):
+    """Holds the same options with the number of points that the published scenes have."""
+
+    points: PointsAtMost = 8192
+    sampling: Sampling = "fps"
+
+
+def run_conversion(
+    name: str, make_reader: Callable[[], Any], options: ConversionOptions, raw: Path | None = None
+) -> None:
+    """Converts what the reader reads and prints what was written, or prints what is missing with `--check`.
+
+    name: the command's, which is also its recipe's. raw: the folder that `--check` compares with the recipe.
+    """
+    if options.check:
+        print_check(name, raw, make_reader)
+        return
+    require_output(options.output)
+    reader = make_reader()
+    from dpcli.prepare.commands.convert import convert_raw_data
+    from dpcli.prepare.pipeline import Conversion
+    from dpcli.prepare.shards import Shard
+    from dpcli.runtime.progress import log
+
+    conversion = Conversion(
+        points=options.points,
+        sampling=options.sampling,
+        limit=options.limit,
+        compression=options.compression,
+        on_error=options.on_error,
+        jobs=options.jobs,
+        shard=Shard.parse(options.shard) if options.shard else None,
+        seed=options.seed,
+        force=options.force,
+        task=f"prepare {name}",
+    )
+    report = convert_raw_data(reader, options.output, conversion, options.dask)
+    for line in report.lines():
+        log.warn(line)
+    if options.output != "-":
+        typer.echo(f"{options.output}: {report.counts()}")
+
+
+def require_output(output: str) -> None:
+    """Raises UsageError when no output was named; `--check` needs none, so the parser can't ask for it."""
+    if not output:
+        raise UsageError("-o/--output FILE is missing: the file to write, or - for a pipe")
+
+
+def print_check(name: str, raw: Path | None, make_index: Callable[[], Any], *, file: bool = False) -> None:
+    """Prints what of the recipe is in the folder and what is missing."""
+    from dpcli.prepare.recipe_check import check_folder
+
+    for line in check_folder(name, raw, make_index, file=file):
+        typer.echo(line)

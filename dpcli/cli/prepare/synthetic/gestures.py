@@ -1,0 +1,35 @@
+"""`dpc prepare synthetic gestures`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
+
+
+def gestures(
+    *,
+    videos_per_class: Annotated[int, typer.Option("--videos-per-class", help="Videos of each of the 10 classes.")] = 20,
+    frames: Annotated[int, typer.Option("--frames", help="Frames per video.")] = 24,
+    subjects: Annotated[int, typer.Option("--subjects", help="People; the first 60 % are split train.")] = 10,
+    size: Annotated[int, typer.Option("--size", help="Image width, pixels; the height is 3/4 of it.")] = 160,
+    noise: Annotated[float, typer.Option("--noise", min=0.0, help="Sensor noise; 1 is like a Kinect's.")] = 1.0,
+    conversion: ConversionOptions,
+) -> None:
+    """Makes arm gestures whose pairs differ only in the direction of time, seen by a virtual depth camera."""
+    from dpcli.prepare.synthetic.gestures import SyntheticGestures
+
+    run_conversion(
+        "gestures",
+        lambda: SyntheticGestures(
+            videos_per_class=videos_per_class,
+            frames=frames,
+            subjects=subjects,
+            size=size,
+            noise=noise,
+            seed=conversion.seed,
+        ),
+        conversion,
+    )

@@ -1,0 +1,50 @@
+"""`dpc segment predict`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dpcli.cli.options import Device, Force, Output, Picture, Seed
+from dpcli.cli.settings_options import options_of
+from dpcli.runtime.settings.catalog import Given
+from dpcli.segment.prediction_settings import CATALOG, PredictSettings
+
+EVERYDAY = ("method", "parts", "flow", "pairs", "points", "split")
+
+
+@options_of(CATALOG, EVERYDAY)
+def predict(
+    data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
+    output: Output,
+    *,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model", help="A trained part network: file, training folder or shipped name. Default: the shipped one."
+        ),
+    ] = None,
+    given: Given,
+    picture: Picture = None,
+    turntable: Annotated[
+        Path | None, typer.Option("--turntable", help="Write an animation (.gif) of the first object to this file.")
+    ] = None,
+    ply: Annotated[
+        Path | None, typer.Option("--ply", help="Write every frame as a colored .ply into this folder.")
+    ] = None,
+    seed: Seed = 0,
+    device: Device = "auto",
+    force: Force = False,
+) -> None:
+    """Find the parts of every point, the same through all frames, each part's rigid motion, and the flow between frames."""
+    settings = PredictSettings(**CATALOG.resolve(PredictSettings()._asdict(), given))
+    from dpcli.segment.commands.predict import Drawings, predict_file
+
+    drawings = Drawings(picture, turntable, ply)
+    sequences = predict_file(
+        data, output, settings, model=model, drawings=drawings, seed=seed, device=device, force=force
+    )
+    if output != "-":
+        typer.echo(f"{output}: parts of {sequences} sequences")

@@ -1,0 +1,194 @@
+"""Evaluating one file for a comparison: a scores file, a parts file, or a video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.bootstrap import WeightedMetric
+from dpcli.evaluate.choices import CLASSIFICATION_METRICS, MOTION_METRICS, SEGMENTATION_METRICS, TOP_K, VIDEO_METRICS
+from dpcli.evaluate.classification.metrics import classification_weighted, predicted_labels, top_hits
+from dpcli.evaluate.classification.protocol import evaluate_classification
+from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, history_seed, metrics_of_values
+from dpcli.evaluate.segmentation.metrics import segmentation_weighted
+from dpcli.evaluate.segmentation.motion_metrics import MAIN_TAU, RELEASE_BATCH, motion_weighted
+from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
+from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
+from dpcli.evaluate.video.sources.open_source import is_media
+from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
+
+# metrics that are no mean over views can't be compared view by view
+_VIDEO_METRICS = tuple(
+    name
+    for name in VIDEO_METRICS
+    if name not in ("clip_views", "fid_vid_r3d50", "fid_vid_inception", "parts", "tracks")
+)
+_VIDEO_FILES = ("views", "gaussians")
+_ROWS = 256
+
+
+def kind_of_file(path: Path, source: str) -> str:
+    """Returns scores, parts or video. source: how the path was named, for the message. DataError for another kind of file."""
+    kind = "views" if is_media(path) else file_kind(path)
+    if kind not in ("scores", "parts", *_VIDEO_FILES):
+        raise DataError(
+            f"{source}: a {kind} file; expected scores or parts (`dpc classify predict`, `dpc segment "
+            "predict`), a scene (`dpc generate4d fit`) or a video"
+        )
+    return "video" if kind in _VIDEO_FILES else kind
+
+
+def measure_file(path: Path, source: str, options: EvaluationOptions) -> list[FileMetrics]:
+    """Returns the metrics of a scores file or a video (one entry), or of a parts file: its segmentation and its motion.
+
+    Without `metrics`, motion is measured where the truth has poses or scene flow and the file has frame pairs. Raises
+    UsageError for metrics that the file can't have, or a parts file without a truth; DataErrors as `evaluate_*`.
+    """
+    kind = kind_of_file(path, source)
+    _check_metrics(options, kind)
+    if kind == "scores":
+        return [_measure_scores(path, source, options)]
+    if options.truth is None:
+        noun, truth = ("a video", "the true one") if kind == "video" else ("a parts file", "the clouds file")
+        raise UsageError(f"{source}: {noun} holds no truth; name {truth} with --truth FILE")
+    if kind == "video":
+        return [_measure_video(path, source, options)]
+    names = options.metrics or (*SEGMENTATION_METRICS, *(MOTION_METRICS if _has_motion(path, options.truth) else ()))
+    tasks = ((_measure_segmentation, SEGMENTATION_METRICS), (_measure_motion, MOTION_METRICS))
+    return [
+        measure(path, source, options, asked)
+        for measure, own in tasks
+        if (asked := [name for name in names if name in own])
+    ]
+
+
+def _check_metrics(options: EvaluationOptions, kind: str) -> None:
+    parts = (*SEGMENTATION_METRICS, *MOTION_METRICS)
+    legal = {"scores": CLASSIFICATION_METRICS, "parts": parts, "video": _VIDEO_METRICS}[kind]
+    wrong = [name for name in options.metrics or () if name not in legal]
+    if wrong:
+        raise UsageError(f"--metrics {wrong[0]}: of {kind} expected some of {', '.join(legal)}")
+
+
+def _has_motion(path: Path, truth: Path) -> bool:
+    with PartsReader(path) as parts, CloudsReader(truth) as clouds:
+        return bool({"pose", "scene_flow"} & set(clouds.fields)) and bool(parts.pair_counts.any())
+
+
+def _measure_scores(path: Path, source: str, options: EvaluationOptions) -> FileMetrics:
+    if options.protocol != "dpc" or options.ignore_below:
+        raise UsageError(f"{source}: a scores file; --protocol and --ignore-below are for parts files")
+    report = evaluate_classification(path, options.truth, options.split, intersect=options.intersect)
+    correct = predicted_labels(report.scores) == report.labels
+    hits = {"accuracy": correct, f"top{TOP_K}_accuracy": top_hits(report.scores, report.labels)}
+    absent = {f"top{TOP_K}_accuracy"} if len(report.class_names) <= TOP_K else set()
+    asked = [name for name in options.metrics or CLASSIFICATION_METRICS if name not in absent]
+    if not asked:
+        raise UsageError(f"{source}: top-{TOP_K} accuracy of {len(report.class_names)} classes is always 1")
+    provenance = ScoresReader(path).provenance
+    return FileMetrics(
+        source,
+        "classification",
+        "samples",
+        report.names,
+        classification_weighted(report.scores, report.labels),
+        {key: hit.astype(np.float64) for key, hit in hits.items() if key in asked},
+        dict.fromkeys(asked, "fraction"),
+        {"split": report.split, "class names": report.class_names},
+        {"true label": report.labels.tolist()},
+        report.left_out,
+        history_seed(provenance),
+        provenance,
+        correct,
+    )
+
+
+def _measure_segmentation(path: Path, source: str, options: EvaluationOptions, asked: Sequence[str]) -> FileMetrics:
+    report = evaluate_segmentation(
+        path,
+        options.truth,
+        protocol=options.protocol,
+        ignore_below=options.ignore_below,
+        split=options.split,
+        intersect=options.intersect,
+    )
+    metric = segmentation_weighted(report.sequences, options.protocol)
+    provenance = _parts_provenance(path)
+    return FileMetrics(
+        source,
+        "segmentation",
+        "sequences",
+        report.names,
+        metric,
+        _values_of_single_samples(metric, len(report.names), asked),
+        dict.fromkeys(asked, "fraction"),
+        {"split": report.split},
+        {},
+        report.left_out,
+        history_seed(provenance),
+        provenance,
+    )
+
+
+def _measure_motion(path: Path, source: str, options: EvaluationOptions, asked: Sequence[str]) -> FileMetrics:
+    report = evaluate_motion(
+        path, options.truth, protocol=options.protocol, split=options.split, intersect=options.intersect
+    )
+    batch = RELEASE_BATCH if options.protocol == "release" else None
+    metric = motion_weighted(report.statistics, MAIN_TAU[options.protocol], batch)
+    units = {"epe3d": report.length_unit, "part_rotation": "degree", "part_displacement": report.length_unit}
+    provenance = _parts_provenance(path)
+    return FileMetrics(
+        source,
+        "motion",
+        "sequences",
+        report.names,
+        metric,
+        _values_of_single_samples(metric, len(report.names), asked),
+        {name: units.get(name, "fraction") for name in asked},
+        {"split": report.split},
+        {"frame pairs": [pairs.tolist() for pairs in report.pairs]},
+        report.left_out,
+        history_seed(provenance),
+        provenance,
+    )
+
+
+def _measure_video(path: Path, source: str, options: EvaluationOptions) -> FileMetrics:
+    """Returns the metrics of a video; a view is a sample, since its frames look alike."""
+    from dpcli.evaluate.video.comparison import evaluate_video, view_values
+    from dpcli.evaluate.video.protocol import describe_protocol
+
+    if options.ignore_below or options.split:
+        raise UsageError(f"{source}: a video; --ignore-below and --split are for parts files")
+    report = evaluate_video(
+        path,
+        options.truth,
+        metrics=options.metrics or ("psnr", "ssim"),
+        protocol=options.protocol,
+        intersect=options.intersect,
+    )
+    for name, reason in report.missing.items():
+        raise DataError(f"{source}: {name} not computed: {reason}")
+    values, units = view_values(report)
+    protocol = {"protocol": describe_protocol(report.protocol)}
+    found = metrics_of_values(source, "video", "views", values, units, protocol)
+    return replace(found, left_out=report.left_out, seed=history_seed(report.history), provenance=report.history)
+
+
+def _values_of_single_samples(metric: WeightedMetric, samples: int, asked: Sequence[str]) -> dict[str, np.ndarray]:
+    """Returns the value of each sample by itself, f64 (samples) by metric."""
+    blocks = []
+    for start in range(0, samples, _ROWS):
+        rows = np.arange(start, min(start + _ROWS, samples))
+        blocks.append(metric((rows[:, None] == np.arange(samples)).astype(np.float64)))
+    return {key: np.concatenate([block[key] for block in blocks]) for key in asked}
+
+
+def _parts_provenance(path: Path) -> list[dict]:
+    with PartsReader(path) as reader:
+        return reader.provenance

@@ -1,0 +1,39 @@
+"""Runs of one experiment as a table and notes."""
+
+from __future__ import annotations
+
+from dpcli.evaluate.compare.number_text import metric_title, number_text, plain_ends
+from dpcli.evaluate.compare.runs import RunsReport
+from dpcli.evaluate.text_tables import TextTable
+
+
+def runs_tables(report: RunsReport) -> list[TextTable]:
+    """Returns one row for each run, then mean, standard deviation and interval."""
+    keys, units = list(report.units), report.units
+    header = ["run", *(metric_title(key, units[key]) for key in keys)]
+    rows = [[run.title, *(number_text(run.metrics[key], units[key]) for key in keys)] for run in report.runs]
+    spreads = report.spreads
+    rows += [
+        [f"mean of {len(report.runs)}", *(number_text(spreads[key].mean, units[key]) for key in keys)],
+        ["± sd", *(number_text(spreads[key].sd, units[key]) for key in keys)],
+        [f"{100 * report.confidence:.4g} % interval", *(plain_ends(spreads[key].interval, units[key]) for key in keys)],
+    ]
+    return [TextTable(f"{report.task.capitalize()} of {len(report.runs)} runs", header, rows)]
+
+
+def runs_notes(report: RunsReport) -> list[str]:
+    """Returns sentences on what a run is, and what the spread says."""
+    lines = [f"{run.title}: {run.source}" for run in report.runs]
+    number_of = f"{report.number} {report.kind}" if report.number else "the same samples"
+    lines.append(
+        f"All on {number_of}. sd over runs (n - 1 in the denominator); interval of the mean: Student's t, "
+        f"{len(report.runs) - 1} degrees of freedom. It says what other runs would give on these samples."
+    )
+    if len(report.runs) == 1:
+        lines.append("One run only: its spread is undefined.")
+    lines += [
+        f"{metric_title(key, '')}: undefined in some runs, so without a mean."
+        for key in report.units
+        if any(run.metrics[key] is None for run in report.runs)
+    ]
+    return lines

@@ -1,0 +1,42 @@
+"""The names of metrics as people write them."""
+
+from __future__ import annotations
+
+TITLES = {
+    "ap": "AP",
+    "pq": "PQ",
+    "f1": "F1",
+    "pre": "precision",
+    "rec": "recall",
+    "miou": "mIoU",
+    "ri": "Rand index",
+    "epe3d": "EPE3D",
+    "epe3d_no_motion": "EPE3D of no motion",
+    "accs": "AccS",
+    "accr": "AccR",
+    "outlier": "Outlier",
+    "psnr": "PSNR",
+    "psnr_foreground": "PSNR on object",
+    "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
+    "lpips": "LPIPS",
+    "fvd": "FVD",
+    "fid_vid": "FID-VID",
+    "clip": "CLIP",
+    "macro_f1": "macro F1",
+    "top5_accuracy": "top-5 accuracy",
+    "sd": "sd",
+    "p": "p",
+    "adjusted_rand_index": "adjusted Rand index",
+    "epe": "EPE",
+    "tau": "tau",
+}
+
+
+def title_of(key: str) -> str:
+    """Returns a metric's name as people write it; of a key that has none, its words.
+
+    >>> title_of("miou"), title_of("part_rotation")
+    ('mIoU', 'part rotation')
+    """
+    return TITLES.get(key, str(key).replace("_", " "))

@@ -1,0 +1,89 @@
+"""Reading published weights: plain state dicts only, nothing else is unpickled."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dpcli.errors import DataError
+from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
+
+if TYPE_CHECKING:
+    import torch
+
+
+def load_weights(name: str, folder: Path) -> dict[str, torch.Tensor]:
+    """Returns the state dict of the weights `name`. DataError when absent, damaged, or not a plain state dict.
+
+    The size is compared, and the digest of a TorchScript archive, which holds code.
+    """
+    weights, path = weights_named(name), find_weights(name, folder)
+    found = check_file(path, weights, digest=weights.script)
+    if found.state != "present":
+        raise DataError(f"{path}: damaged weights ({found.finding}); delete it and fetch it again")
+    return load_tensors(path, script=weights.script)
+
+
+def load_tensors(path: Path, script: bool = False) -> dict[str, torch.Tensor]:
+    """Returns the tensors of a .safetensors, .pth, .pt or .bin file by name, on the CPU; nothing else is unpickled.
+
+    A training checkpoint's `state_dict` is taken, and the prefix `module.` of parallel training dropped.
+    script: the file is a TorchScript archive. DataError for anything else, and for weights that are not finite.
+    """
+    state = _tensors(_read(path, script))
+    if state is None:
+        raise DataError(f"{path}: not a plain state dict; expected tensors by name")
+    bad = next((name for name, value in state.items() if not value.isfinite().all()), None)
+    if bad is not None:
+        raise DataError(f"{path}: NaN or infinite values in {bad}; fetch it again")
+    return state
+
+
+def _read(path: Path, script: bool) -> Any:
+    import torch
+
+    try:
+        if path.suffix == ".safetensors":
+            from safetensors.torch import load_file
+
+            return load_file(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about old formats, which published files have
+            if script:
+                return torch.jit.load(str(path), map_location="cpu").state_dict()
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # pickle, zip, safetensors and torch each have their own
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise DataError(f"{path}: not a plain state dict, or not whole ({reason[:150]})") from None
+
+
+def _tensors(found: Any) -> dict[str, torch.Tensor] | None:
+    import torch
+
+    if isinstance(found, dict) and isinstance(found.get("state_dict"), dict):
+        found = found["state_dict"]
+    if not isinstance(found, dict) or not found:
+        return None
+    if not all(isinstance(k, str) and isinstance(v, torch.Tensor) for k, v in found.items()):
+        return None
+    return {name.removeprefix("module."): value for name, value in found.items()}
+
+
+def fill_module(module: torch.nn.Module, state: dict[str, torch.Tensor], path: Path) -> None:
+    """Puts `state` into `module`; names that it doesn't have are left alone (a classifier's last layers, say).
+
+    DataError when one of its own is missing, or has another shape. Batch norm's step counters may be missing.
+    """
+    taken = {}
+    for name, own in module.state_dict().items():
+        if name not in state and name.endswith("num_batches_tracked"):
+            taken[name] = own
+        elif name not in state:
+            raise DataError(f"{path}: no tensor {name}; expected weights of {type(module).__name__}")
+        elif state[name].shape != own.shape:
+            found, expected = tuple(state[name].shape), tuple(own.shape)
+            raise DataError(f"{path}: {name} has shape {found}, expected {expected}")
+        else:
+            taken[name] = state[name]
+    module.load_state_dict(taken)

@@ -1,0 +1,106 @@
+"""Results of `dpc evaluate`, whatever was evaluated: samples left out, intervals, tables, one JSON object."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.text_tables import TextTable
+
+_NAMES_IN_MESSAGE = 5
+_NAMES_IN_NOTE = 10
+
+
+@dataclass
+class LeftOut:
+    """Holds samples of a file that don't count: `reason` says why, `names` which."""
+
+    reason: str
+    names: list[str]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Holds what a command found, in both forms it can be printed in.
+
+    data: the object of `--json`. tables, notes: the same for a person. incomplete: why something that was asked for is
+    missing, "" when nothing is; the command then ends with exit code 3 after it printed the rest.
+    """
+
+    data: dict[str, Any]
+    tables: list[TextTable] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    incomplete: str = ""
+
+
+def counted_split(split: str | None, splits: Sequence[str]) -> str:
+    """Returns the split whose samples count: the one asked for, else "test" where a sample is of it, else "all".
+
+    splits: the split of each sample.
+    """
+    return split or ("test" if "test" in splits else "all")
+
+
+def list_names(names: Sequence[str]) -> str:
+    """Returns a few names in quotes, and how many more there are.
+
+    >>> list_names(["a", "b"])
+    "'a', 'b'"
+    >>> list_names([str(number) for number in range(7)])
+    "'0', '1', '2', '3', '4' and 2 more"
+    """
+    more = f" and {len(names) - _NAMES_IN_MESSAGE} more" if len(names) > _NAMES_IN_MESSAGE else ""
+    return ", ".join(repr(name) for name in names[:_NAMES_IN_MESSAGE]) + more
+
+
+def left_out_note(entry: LeftOut, kind: str = "", *, named: bool = True) -> str:
+    """Returns a sentence of how many samples (of `kind`, in words) were left out and why, with a few names if `named`."""
+    shown = ", ".join(entry.names[:_NAMES_IN_NOTE]) + (", ..." if len(entry.names) > _NAMES_IN_NOTE else "")
+    count = f"{len(entry.names)} {kind}".rstrip()
+    return f"Left out, {entry.reason}: {count}{f' ({shown})' if named else ''}."
+
+
+def left_out_json(entries: Sequence[LeftOut]) -> list[dict[str, Any]]:
+    """Returns the entries as `--json` prints them: reason, count and names."""
+    return [{"reason": entry.reason, "count": len(entry.names), "names": entry.names} for entry in entries]
+
+
+def none_if_nan(value: float) -> float | None:
+    """Returns the number, or None where it is NaN (undefined): JSON has no NaN."""
+    return None if np.isnan(value) else float(value)
+
+
+def intervals_json(
+    resampling: Resampling, of: str, number: int, intervals: Mapping[str, Interval], method: str = "bootstrap, BCa"
+) -> dict[str, Any]:
+    """Returns how intervals were found and, under `metrics`, the two ends of each; None = undefined.
+
+    of: what was resampled, in words (samples, sequences, views). number: how many of them there are.
+    """
+    if not resampling.resamples:
+        return {"resamples": 0, "metrics": {}}
+    return {
+        "method": method,
+        "confidence": resampling.confidence,
+        "resamples": resampling.resamples,
+        "seed": resampling.seed,
+        "resampled": of,
+        "number": number,
+        "metrics": ends_json(intervals),
+    }
+
+
+def ends_json(intervals: Mapping[str, Interval]) -> dict[str, list[float] | None]:
+    """Returns [low, high] by metric; None = undefined."""
+    return {key: [own.low, own.high] if own.defined else None for key, own in intervals.items()}
+
+
+def samples_json(kind: str, names: Sequence[str]) -> dict[str, Any]:
+    """Returns what tells whether two results are of the same samples: their number, and a digest of the sorted names."""
+    digest = hashlib.sha256("\0".join(sorted(names)).encode()).hexdigest()
+    return {"kind": kind, "number": len(names), "names_sha256": digest}

@@ -1,0 +1,89 @@
+"""Tables of text, and numbers as they stand in them: for a terminal, or as markdown for a document."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.standard_streams import printable
+
+UNDEFINED = "-"
+
+
+@dataclass
+class TextTable:
+    """Holds a title, a header and rows of text; the first column is aligned to the left, the others to the right."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+
+    def __post_init__(self) -> None:  # names of classes and files are among them
+        self.header = [printable(cell) for cell in self.header]
+        self.rows = [[printable(cell) for cell in row] for row in self.rows]
+
+    @property
+    def width(self) -> int:
+        """How many columns of text the table takes in a terminal."""
+        cells = zip(self.header, *self.rows, strict=True)
+        return sum(max(len(cell) for cell in column) + 2 for column in cells)
+
+
+def percent(share: float | None) -> str:
+    """Returns a share as a percentage, `-` for an undefined one.
+
+    >>> percent(0.8512), percent(None)
+    ('85.1 %', '-')
+    """
+    return UNDEFINED if share is None or np.isnan(share) else f"{100 * share:.1f} %"
+
+
+def percent_ends(own: Interval | None) -> str:
+    """Returns the ends of an interval of shares; `-` where there is no interval or an undefined one.
+
+    >>> percent_ends(Interval(0.831, 0.87))
+    '83.1 - 87.0 %'
+    """
+    return f"{100 * own.low:.1f} - {percent(own.high)}" if own is not None and own.defined else UNDEFINED
+
+
+def four_digits(value: float) -> str:
+    """Returns a number to four significant digits, `-` for NaN.
+
+    >>> four_digits(0.0123456), four_digits(float("nan"))
+    ('0.01235', '-')
+    """
+    return UNDEFINED if np.isnan(value) else f"{value:.4g}"
+
+
+def four_digit_ends(own: Interval | None) -> str:
+    """Returns the ends of an interval to four significant digits; `-` where there is none or an undefined one."""
+    return f"{own.low:.4g} - {own.high:.4g}" if own is not None and own.defined else UNDEFINED
+
+
+def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
+    """Returns how the intervals were found, as a list of one sentence, or of none where there are no intervals.
+
+    of: what was resampled, in words. number: how many of them there are.
+    """
+    if not resampling.resamples:
+        return []
+    if number < 2:
+        return [f"Intervals: undefined; there is one of these {of} only, and nothing says how another would differ."]
+    return [
+        f"Intervals: {100 * resampling.confidence:.4g} %, bootstrap (BCa, {resampling.resamples} resamples of the "
+        f"{number} {of}, seed {resampling.seed}): what other {of} of this kind would give, not another training."
+    ]
+
+
+def markdown_tables(tables: list[TextTable], notes: list[str]) -> str:
+    """Returns the tables, then the notes, as markdown for a document."""
+    made = [f"**{table.title}**\n\n{_markdown_table(table)}" for table in tables]
+    return "\n\n".join([*made, *map(printable, notes)])
+
+
+def _markdown_table(table: TextTable) -> str:
+    lines = [table.header, ["---", *["---:"] * (len(table.header) - 1)], *table.rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

@@ -1,0 +1,49 @@
+"""Frechet distances of videos: FVD and FID-VID over the views of a protocol."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.evaluate.video.learned.base import FrameGap, LearnedMetric, LearnedScore
+from dpcli.evaluate.video.protocol import Networks
+
+
+class FrechetMetric(LearnedMetric):
+    """Measures a Frechet distance (FVD, FID-VID) by a variant of `frechet/variants.py`; a view is a video."""
+
+    def __init__(self, name: str, networks: Networks, folder: Path, device: str) -> None:
+        from dpcli.evaluate.video.frechet.clip_features import FeatureNetwork
+
+        variant = networks.fvd if name == "fvd" else name.removeprefix("fid_vid_")
+        self.name, self._every, self._views, self._pairs = name, networks.every, [], []
+        self._network = FeatureNetwork.load(variant, folder, device)
+
+    def start(self, view: str) -> None:
+        """Begins a video."""
+        from dpcli.evaluate.video.frechet.clip_features import VideoFeatures
+
+        self._video, self._gap = VideoFeatures(self._network, self._every), FrameGap()
+        self._views.append(view)
+
+    def add(self, predicted: np.ndarray, truth: np.ndarray, frame: int) -> None:
+        """Takes the next frame of both videos, f32 (3,H,W) in 0..1."""
+        if self._gap.before(frame):
+            self._video.restart()
+        self._video.add(predicted, truth)
+
+    def end(self) -> None:
+        """Ends the video. DataError when it had too few frames."""
+        self._pairs.append(self._video.result())
+
+    def score(self) -> LearnedScore:
+        """Returns the distance over all videos. DataError where there were too few clips for a distribution."""
+        from dpcli.evaluate.video.frechet.clip_features import video_distance
+        from dpcli.evaluate.video.frechet.variants import feature_choices
+
+        found = video_distance(self._network.variant, self._pairs)
+        each = dict(zip(self._views, found.each, strict=True)) if found.each else {}
+        counts = {"videos": found.videos, "clips": found.clips, "frames": found.frames}
+        choices = feature_choices(found.variant, self._every)
+        return LearnedScore(self.name, found.value, each, counts=counts, choices=choices)

@@ -1,0 +1,121 @@
+"""PSNR and SSIM over the frames of a video: frames -> sufficient statistics -> metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from dpcli.evaluate.proportions import divide, mean_defined
+from dpcli.evaluate.video.psnr import psnr_of
+from dpcli.evaluate.video.ssim import multi_scale, similarity
+
+
+@dataclass(frozen=True)
+class PictureStatistics:
+    """Holds one row per frame, in the order the frames came; F frames.
+
+    frame i64 (F): its number. squared f64 (F), values i64 (F): sum of squared errors, and of how many values; inside,
+    inside_values: the same over the object's pixels. data_range f64 (F). similarity f64 (F), windows i64 (F): sum of
+    SSIM, and over how many windows; multi_scale f64 (F): MS-SSIM. NaN or 0 windows where a metric wasn't asked for.
+    """
+
+    frame: np.ndarray
+    squared: np.ndarray
+    values: np.ndarray
+    inside: np.ndarray
+    inside_values: np.ndarray
+    data_range: np.ndarray
+    similarity: np.ndarray
+    windows: np.ndarray
+    multi_scale: np.ndarray
+
+    def __add__(self, other: PictureStatistics) -> PictureStatistics:
+        """Returns the statistics of both sets of frames together."""
+        return picture_merge([self, other])
+
+
+@dataclass(frozen=True)
+class PictureMetrics:
+    """Holds means over frames; psnr in dB. NaN = undefined or not asked for.
+
+    pixels: of one frame. exact: frames without any error, which count as PSNR_CAP. without_object: frames whose mask is
+    empty, which psnr_foreground leaves out. worst: frame of the largest squared error, -1 = none has any.
+    """
+
+    psnr: float
+    psnr_foreground: float
+    ssim: float
+    ms_ssim: float
+    frames: int
+    pixels: int
+    object_pixels: int
+    exact: int
+    without_object: int
+    worst: int
+
+
+def picture_update(
+    frame: int,
+    predicted: np.ndarray,  # f32 (C,H,W), finite
+    truth: np.ndarray,  # f32 (C,H,W), finite
+    *,
+    data_range: float = 1.0,
+    similarity_range: float | None = None,
+    mask: np.ndarray | None = None,  # u8 (H,W)
+    border: str = "valid",
+    metrics: Iterable[str] = ("psnr", "ssim"),
+) -> PictureStatistics:
+    """Returns the statistics of one frame. Without a mask the object's share is empty. similarity_range: SSIM's, if it has its own."""
+    from dpcli.evaluate.video.image_kernels import squared_errors  # it imports numba
+
+    inside = np.zeros(truth.shape[1:], np.uint8) if mask is None else mask
+    squared, object_squared = squared_errors(predicted, truth, inside)
+    own = data_range if similarity_range is None else similarity_range
+    whole, _, windows = similarity(predicted, truth, own, border) if "ssim" in metrics else (0.0, 0.0, 0)
+    many = multi_scale(predicted, truth, own, border) if "ms_ssim" in metrics else np.nan
+    found = (
+        frame,
+        squared,
+        truth.size,
+        object_squared,
+        int(inside.sum()) * len(truth),
+        data_range,
+        whole,
+        windows,
+        many,
+    )
+    types = (np.int64, float, np.int64, float, np.int64, float, float, np.int64, float)
+    return PictureStatistics(*(np.array([value], kind) for value, kind in zip(found, types, strict=True)))
+
+
+def picture_merge(parts: Iterable[PictureStatistics]) -> PictureStatistics:
+    """Returns the statistics of several sets of frames, one after the other. ValueError for none."""
+    rows = [[getattr(part, f.name) for f in fields(PictureStatistics)] for part in parts]
+    if not rows:
+        raise ValueError("no statistics to merge")
+    return PictureStatistics(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def frame_psnr(found: PictureStatistics) -> np.ndarray:
+    """Returns the PSNR of each frame in dB, f64 (F)."""
+    return psnr_of(found.squared, found.values, found.data_range)
+
+
+def picture_compute(found: PictureStatistics) -> PictureMetrics:
+    """Returns the metrics of RGB frames: each the mean of the frames' own values."""
+    each = frame_psnr(found)
+    objects = psnr_of(found.inside, found.inside_values, found.data_range)
+    return PictureMetrics(
+        psnr=mean_defined(each),
+        psnr_foreground=mean_defined(objects),
+        ssim=mean_defined(divide(found.similarity, found.windows)),
+        ms_ssim=mean_defined(found.multi_scale),
+        frames=len(each),
+        pixels=int(found.values[0] // 3) if len(each) else 0,
+        object_pixels=int(found.inside_values.sum() // 3),
+        exact=int((found.squared == 0).sum()),
+        without_object=int((found.inside_values == 0).sum()),
+        worst=int(found.frame[np.argmax(found.squared)]) if found.squared.any() else -1,
+    )

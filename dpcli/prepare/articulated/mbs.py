@@ -1,0 +1,152 @@
+"""`mbs-shapepart` and `mbs-sapien`, the data of MultiBodySync (Huang et al. 2021): four views of articulated objects."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.safe_pickle import read_npz_member
+from dpcli.prepare.reader import Item, Sample, describe, require_folder
+from dpcli.store import CloudSequence
+
+_SPLITS = {"train": "train", "val": "validation", "test": "test"}
+_RIGID = 1e-3  # how far R^T R of a stored matrix may be from the identity
+
+
+@lru_cache(maxsize=4)
+def read_meta(raw: Path) -> dict[str, list[int]]:
+    """Reads the numbers of the samples of each split from meta.json. Raises DataError when it is not that."""
+    path = require_folder(raw, "meta.json and data/000000.npz ... as the authors distribute it") / "meta.json"
+    try:
+        meta = json.loads(path.read_text())
+    except OSError:
+        raise DataError(f"{path}: not found; expected meta.json and a folder data/ of .npz files") from None
+    except ValueError as error:
+        raise DataError(f"{path}: not JSON ({error})") from None
+    good = isinstance(meta, dict) and set(meta) & set(_SPLITS)
+    good = good and all(isinstance(meta[s], list) and all(type(n) is int and n >= 0 for n in meta[s]) for s in meta)
+    if not good:
+        raise DataError(f'{path}: expected {{"train": [numbers], "val": [...], "test": [...]}}')
+    return meta
+
+
+@lru_cache(maxsize=4)
+def most_parts(raw: Path) -> int:
+    """Returns the largest part id of all samples, which every pose is padded to."""
+    most = 1
+    for numbers in read_meta(raw).values():
+        for number in numbers:
+            try:
+                most = max(most, int(_segmentation(raw / "data" / f"{number:06d}.npz").max()))
+            except (DataError, OSError, zipfile.BadZipFile):
+                continue  # read() will say what is wrong with it
+    return most
+
+
+def _segmentation(path: Path) -> np.ndarray:
+    with zipfile.ZipFile(path) as archive:
+        return read_npz_member(archive, path, "segm")
+
+
+def read_views(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reads one sample: points f32 (V,N,3), part ids i16 (V,N) from 0, poses f64 (V,parts,4,4).
+
+    The file has for every view v its camera pose C_v and the pose T_s,v of every part s, so a point of part s goes
+    from view i to j by C_j^-1 T_s,j T_s,i^-1 C_i; the pose of a part in the points of view v is C_v^-1 T_s,v.
+    DataError names the array that is not as it should be.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            points = read_npz_member(archive, path, "pc")
+            segm = read_npz_member(archive, path, "segm")
+            trans = read_npz_member(archive, path, "trans", pickled=True)
+    except zipfile.BadZipFile:
+        raise DataError(f"{path}: not a .npz file, perhaps truncated") from None
+    if points.ndim != 3 or points.shape[2] != 3 or points.dtype.kind != "f" or 0 in points.shape:
+        raise DataError(f"{path}: pc is {points.dtype} {points.shape}; expected floats (views, points, 3)")
+    if not np.isfinite(points).all():
+        raise DataError(f"{path}: pc holds NaN or infinity; expected finite coordinates")
+    if segm.shape != points.shape[:2] or segm.dtype.kind not in "iu":
+        raise DataError(f"{path}: segm is {segm.dtype} {segm.shape}; expected whole numbers {points.shape[:2]}")
+    if segm.min() < 1 or segm.max() > 1000:
+        raise DataError(f"{path}: segm holds ids from {segm.min()} to {segm.max()}; expected 1 to the number of parts")
+    return points.astype(np.float32), (segm - 1).astype(np.int16), _poses(path, trans, len(points), int(segm.max()))
+
+
+def _poses(path: Path, trans: Any, views: int, num_parts: int) -> np.ndarray:
+    if not isinstance(trans, dict):
+        raise DataError(f"{path}: trans holds a {type(trans).__name__}; expected a dict of 'cam' and part ids")
+    camera = _matrices(path, trans, "cam", views)
+    poses = np.stack([_matrices(path, trans, part + 1, views) for part in range(num_parts)], axis=1)
+    return np.linalg.inv(camera)[:, None] @ poses
+
+
+def _matrices(path: Path, trans: dict, key: str | int, views: int) -> np.ndarray:
+    value = trans.get(key, trans.get(str(key)))
+    if value is None:
+        raise DataError(f"{path}: trans has no {key!r}; found {', '.join(map(repr, list(trans)[:9]))}")
+    try:
+        matrices = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        matrices = np.zeros(0)
+    if matrices.shape != (views, 4, 4):
+        raise DataError(
+            f"{path}: trans[{key!r}] has shape {matrices.shape}; expected ({views}, 4, 4), one for each view"
+        )
+    rotation = matrices[:, :3, :3]
+    error = np.abs(rotation.transpose(0, 2, 1) @ rotation - np.eye(3)).max()
+    if not error < _RIGID or (np.linalg.det(rotation) < 0).any():  # a NaN is an error, too
+        raise DataError(f"{path}: trans[{key!r}] is not a rigid motion; expected a rotation and a shift")
+    return matrices
+
+
+@dataclass(frozen=True)
+class MultiBodySync:
+    """Reads a folder of meta.json and data/%06d.npz."""
+
+    raw: Path
+    class_names: ClassVar[tuple[str, ...]] = ()
+    length_unit: ClassVar[str] = "as published"
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
+        return {}
+
+    def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
+        meta, parts = read_meta(self.raw), most_parts(self.raw)
+        items = []
+        for split in (s for s in _SPLITS if s in meta):
+            for number in meta[split]:
+                path = self.raw / "data" / f"{number:06d}.npz"
+                problem = "" if path.is_file() else f"{path}: listed under {split!r} in meta.json, but not there"
+                name = f"{number:06d}"
+                items.append(Item(name, path, split=_SPLITS[split], extra={"parts": parts}, problem=problem))
+        twice = len(items) - len({item.name for item in items})
+        if twice:
+            raise DataError(f"{self.raw / 'meta.json'}: {twice} numbers are listed twice; a sample is in one split")
+        return items
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
+        points, part, poses = read_views(item.path)
+        missing = item.extra["parts"] - poses.shape[1]
+        padding = np.tile(np.eye(4), (len(poses), missing, 1, 1))
+        sequence = CloudSequence.from_frames(
+            item.name, list(points), part=list(part), pose=np.concatenate([poses, padding], axis=1), **describe(item)
+        )
+        return Sample(sequence)
+
+    def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
+        counts = {split: sum(item.split == split for item in items) for split in _SPLITS.values()}
+        return [f"{len(items)} samples ({', '.join(f'{n} {split}' for split, n in counts.items() if n)})"]

@@ -1,0 +1,26 @@
+"""The work of one worker process: one item, read and thinned. Imports little, because every worker waits for it."""
+
+from __future__ import annotations
+
+from dpcli.errors import DataError
+from dpcli.prepare.reader import Item, Reader, Sample
+from dpcli.prepare.thinning import Thinning
+from dpcli.runtime.seeds import generator
+
+
+def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:
+    """Returns the sample that the reader makes of an item, with its frames thinned.
+
+    indexed: the item's place in the index, and the item. Its randomness depends on the seed and this place alone.
+    Raises Raises DataError when the item can't be read.
+    """
+    index, item = indexed
+    if item.problem:
+        raise DataError(item.problem)
+    rng = generator(seed, index)
+    try:
+        sample = reader.read(item, rng)
+    except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
+        raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
+    sample.sequence = thinning.apply(sample.sequence, rng)
+    return sample

@@ -1,0 +1,58 @@
+"""The settings of `dpc segment predict`; nothing here needs torch, since `--help` reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from dpcli.runtime.settings.catalog import Catalog
+from dpcli.runtime.settings.fields import check, setting
+from dpcli.segment.baselines.settings import ClassicalSettings
+from dpcli.segment.network.config import Precision
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """Holds which sequences are divided, and how the flow between their frames is estimated."""
+
+    flow: str = setting(
+        "icp",
+        "Flow between frames: icp (rigid bodies), nearest (point), or the file or folder of a trained estimator"
+        " (dpc segment flow).",
+    )
+    split: str = setting("all", "Sequences of this split, or all.")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Holds what is done with the masks that a segmenter gives, and which motions are fitted to them."""
+
+    points: int = setting(
+        512, "Points of a frame that the segmenter sees; its answer is carried back to all points.", least=32
+    )
+    pairs: Literal["adjacent", "all"] = setting("adjacent", "Pairs of frames whose motions are found.")
+    icp: int = setting(20, "Steps of object-aware ICP that refine the motions.", least=0)
+    vote: bool = setting(True, "Blend each frame's mask with its neighbors', carried along the flow.")
+    split_bodies: bool = setting(True, "Divide a part of the network's whose points move as several rigid bodies.")
+    smallest: float = setting(
+        0.03, "Parts below this share of a sequence's points are given to each point's next best part.", least=0
+    )
+    normalize: bool = setting(True, "Scale each sequence to diameter 1 before it is looked at.")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+class PredictSettings(NamedTuple):
+    """Holds all settings of `dpc segment predict`, by group."""
+
+    input: InputSettings = InputSettings()
+    classical: ClassicalSettings = ClassicalSettings()
+    refinement: Refinement = Refinement()
+    precision: Precision = Precision()
+
+
+CATALOG = Catalog(input=InputSettings, classical=ClassicalSettings, refinement=Refinement, precision=Precision)

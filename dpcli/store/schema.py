@@ -1,0 +1,199 @@
+"""The contract's data sets: name, type, shape and meaning of each, by kind of file.
+
+Writers take their types and shapes from here, `file.open_store` checks what it opens against it, and the tables of
+docs/format.md are made of it (`python -m dpcli.store.schema docs/format.md`). Imports only numpy.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+SCHEMA = 1
+_TYPES = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "s": "strings"}
+_MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Field:
+    """One data set of a kind. `kind` is such as f32, i64, u8 or str; `shape` has letters where the number is the file's.
+
+    group: the name is that of a group with a data set like this for each stream.
+    """
+
+    name: str
+    kind: str
+    shape: tuple[str | int, ...]
+    meaning: str
+    optional: bool = False
+    group: bool = False
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The type as numpy's. ValueError for strings, whose type is h5py's."""
+        if self.kind == "str":
+            raise ValueError(f"{self.name}: strings have no numpy type here")
+        return np.dtype(f"{self.kind[0]}{int(self.kind[1:]) // 8}")
+
+    @property
+    def row(self) -> tuple[str | int, ...]:
+        """The shape of one entry along the first axis."""
+        return self.shape[1:]
+
+    @property
+    def sort(self) -> str:
+        """The values in words, as an error names them: numbers, whole numbers or strings."""
+        return _TYPES[self.kind[0]]
+
+    def in_words(self) -> str:
+        """Returns type and shape as the tables have them, such as `f32 (P,3)`."""
+        return f"{self.kind} ({','.join(map(str, self.shape))}){', optional' if self.optional else ''}"
+
+
+_WHO = (
+    Field("name", "str", ("S",), "unique name"),
+    Field("split", "str", ("S",), "`train`, `validation`, `test` or empty"),
+    Field("label", "i32", ("S",), "class, from 0; -1 unknown"),
+)
+_CLOUDS = (
+    Field("points", "f32", ("P", 3), "x y z in `length_unit`; camera axes are OpenCV's (x right, y down, z forward)"),
+    Field("frame_offsets", "i64", ("F+1",), "frame f is `points[frame_offsets[f]:frame_offsets[f+1]]`"),
+    Field("sequence_offsets", "i64", ("S+1",), "sequence s is frames `sequence_offsets[s]` to `sequence_offsets[s+1]`"),
+    *_WHO,
+    Field("subject", "i32", ("S",), "who is seen; -1 unknown"),
+    Field("camera", "i32", ("S",), "which camera saw it; -1 unknown"),
+    Field("time", "f64", ("F",), "seconds", optional=True),
+    Field("color", "u8", ("P", 3), "color, red green blue", optional=True),
+    Field("part", "i16", ("P",), "rigid part, from 0; -1 unknown", optional=True),
+    Field("track", "i64", ("P",), "identity of a point across frames", optional=True),
+    Field(
+        "scene_flow",
+        "f32",
+        ("P", 3),
+        "true (or, after `dpc segment estimate-flow`, estimated) displacement of a point to the sequence's next frame,"
+        " in its last frame to the one before; for motion that no `pose` tells (KITTI scene flow)",
+        optional=True,
+    ),
+    Field(
+        "pose",
+        "f64",
+        ("F", "parts", 4, 4),
+        "part-to-world, padded with identity to the file's largest number of parts",
+        optional=True,
+    ),
+)
+_LEFT_OUT = (
+    Field("skipped", "str", ("n", 2), "name and reason of every sample that was left out", optional=True),
+    Field("position", "i64", ("S",), "in a shard: the place of each sample in the whole list", optional=True),
+    Field("skipped_position", "i64", ("n",), "in a shard: the same of the samples left out", optional=True),
+    Field("activation", "f32", ("P",), "how active each point is (`dpc classify explain pac`)", True, group=True),
+)
+_PARTS = (
+    Field("part", "i16", ("P",), "predicted part, 0..K-1; -1 = in none"),
+    Field("part_probability", "f32", ("P", "K"), "probability of each part, 0..1"),
+    Field("pair", "i32", ("Q", 2), "source and target frame inside the sequence"),
+    Field("pair_offsets", "i64", ("S+1",), "sequence s has the pairs `pair_offsets[s]` to `pair_offsets[s+1]`"),
+    Field(
+        "part_motion",
+        "f32",
+        ("Q", "K", 4, 4),
+        "rigid motion of each part: x_target = M x_source; identity for a part the sequence lacks",
+    ),
+    Field(
+        "flow", "f32", ("R", 3), "displacement of the points of a pair's source frame, in their order, in `length_unit`"
+    ),
+    Field("flow_offsets", "i64", ("Q+1",), "pair q has the rows `flow_offsets[q]` to `flow_offsets[q+1]`"),
+)
+_SCORES = (
+    Field("scores", "f32", ("S", "C"), "class probabilities"),
+    *_WHO,
+    Field("streams", "f32", ("S", "C"), "the same of one stream of the network", optional=True, group=True),
+)
+_EMBEDDING = (
+    *_WHO,
+    Field("features", "f32", ("S", "D"), "the vector of each video", group=True),
+    Field("coordinates", "f32", ("S", 2), "its place in the plane", group=True),
+)
+_VIEWS = (
+    Field("rgba", "u8", ("V", "T", "H", "W", 4), "straight (not premultiplied) alpha; one picture is one chunk, gzip"),
+    Field("intrinsics", "f64", ("V", 3, 3), "pixels; pixel centers at +0.5"),
+    Field("world_to_camera", "f64", ("V", 4, 4), "rigid; camera axes are OpenCV's"),
+    Field("time", "f64", ("T",), "seconds, rising"),
+    Field("role", "str", ("V",), "`reference` (one: the input of video-to-4D), `train`, `test`"),
+    Field(
+        "track", "f32", ("T", "M", 3), "true world positions of M points of the object at every frame", optional=True
+    ),
+    Field("part", "i16", ("M",), "true rigid part or bone of these points, -1 unknown", optional=True),
+)
+_GAUSSIANS = (
+    Field("mean", "f32", ("N", 3), "canonical position"),
+    Field("log_scale", "f32", ("N", 3), "natural logarithm of the standard deviations"),
+    Field("quaternion", "f32", ("N", 4), "w x y z, unit"),
+    Field("opacity_logit", "f32", ("N",), "opacity before the logistic function"),
+    Field(
+        "sh",
+        "f32",
+        ("N", "B", 3),
+        "spherical harmonics of 3DGS, B = (degree+1)², degree 0 to 3; the color without direction is"
+        " 0.5 + 0.28209479 `sh[:, 0]`",
+    ),
+    Field("time", "f64", ("T",), "seconds, rising"),
+    Field("frame_mean", "f32", ("T", "N", 3), "where each Gaussian is in each frame; sizes and opacities stay"),
+    Field("frame_quaternion", "f32", ("T", "N", 4), "how each Gaussian is turned in each frame"),
+    Field("part", "i16", ("N",), "rigid part, -1 none"),
+    Field("part_probability", "f32", ("N", "S"), "probability of each part, 0..1"),
+    Field("part_motion", "f32", ("T", "S", 4, 4), "rigid motion of each part, canonical to frame"),
+    Field("rigid_weight", "f32", ("T", "N"), "1 = moves with its part, 0 = on its own"),
+    Field("control_point", "f32", ("K", 3), "canonical position of a control point"),
+    Field("control_radius", "f32", ("K",), "its radius of influence"),
+    Field("control_position", "f32", ("T", "K", 3), "where the control points are in each frame"),
+    Field("control_quaternion", "f32", ("T", "K", 4), "how they have turned"),
+    Field("camera_intrinsics", "f64", ("V", 3, 3), "the cameras it was fitted to, for pictures of `size`"),
+    Field("camera_world_to_camera", "f64", ("V", 4, 4), "where these cameras stand"),
+)
+EVERYWHERE = (
+    Field("class_names", "str", ("C",), "names of the classes; may be empty"),
+    Field("provenance", "str", ("n",), "one JSON object per command that led here, oldest first"),
+)
+# What a kind has beside EVERYWHERE; a `parts` file has all that a `clouds` file has, with a `part` of its own.
+TABLES = {
+    "clouds": _CLOUDS + _LEFT_OUT,
+    "views": _VIEWS,
+    "scores": _SCORES,
+    "parts": _PARTS,
+    "gaussians": _GAUSSIANS,
+    "embedding": _EMBEDDING,
+}
+KINDS = tuple(TABLES)
+
+
+def fields_of(kind: str) -> dict[str, Field]:
+    """Returns all data sets that a file of a kind may have, by name. KeyError for a kind that doesn't exist.
+
+    >>> fields_of("parts")["pair"].in_words(), fields_of("parts")["points"].dtype
+    ('i32 (Q,2)', dtype('float32'))
+    """
+    base = TABLES["clouds"] if kind == "parts" else ()
+    return {field.name: field for field in (*EVERYWHERE, *base, *TABLES[kind])}
+
+
+def table(kind: str) -> str:
+    """Returns the data sets of a kind as a table in markdown, one a line."""
+    rows = [(f"{field.name}/STREAM" if field.group else field.name, field) for field in TABLES[kind]]
+    lines = [f"| `{name}` | {field.in_words()} | {field.meaning} |\n" for name, field in rows]
+    return "".join(["| data set | type, shape | meaning |\n", "|---|---|---|\n", *lines])
+
+
+def fill_tables(text: str) -> str:
+    """Returns a page with the tables between its marks `<!-- fields: KIND -->` and `<!-- end of fields -->` made anew."""
+    return _MARKED.sub(lambda found: f"{found[1]}{table(found[2])}{found[3]}", text)
+
+
+if __name__ == "__main__":
+    import sys
+
+    for page in map(Path, sys.argv[1:]):
+        page.write_text(fill_tables(page.read_text()))

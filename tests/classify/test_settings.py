@@ -1,0 +1,122 @@
+"""Settings of a training run: a preset, what a variant or a backbone brings along, a file, and the command line over all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES
+from dpcli.classify.settings import TRAINING, network_config, training_settings
+from dpcli.errors import UsageError
+from dpcli.runtime.settings.catalog import Given
+
+
+def settings(preset: str = "quick", config: dict | None = None, **typed):
+    return training_settings(Given(preset, config or {}, typed))
+
+
+def written(given: Given, path: Path) -> dict:
+    """What a file of the settings says when it is read back."""
+    path.write_text(training_settings(given).to_toml("classify train"))
+    return TRAINING.read_config(path)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_nothing_given_is_the_preset(preset):
+    assert vars(settings(preset)) == PRESETS[preset]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "typed",
+    [
+        {},
+        {"variant": "release", "augment": "peers", "augment_turn": 0.4},
+        {"backbone": "dgcnn", "normals": False, "amp": True, "validation": "fold:1/3"},
+        {"pretrain": True, "points": 2048},
+        {"init": "some/model", "workers": None, "lr_dynamic": None, "draws": 4},
+    ],
+)
+def test_a_file_of_all_settings_gives_an_equal_run_whatever_the_preset(preset, typed, tmp_path):
+    first = Given(preset, sets=typed)
+    config = written(first, tmp_path / "settings.toml")
+    assert set(config) == set(TRAINING.settings)
+    for other in PRESETS:
+        again = training_settings(Given(other, config))
+        assert again == training_settings(first)
+        assert json.dumps(asdict(again)) == json.dumps(asdict(training_settings(first)))  # 0 and 0.0 are told apart
+
+
+def test_a_variant_brings_its_choices_below_what_is_typed():
+    config = settings(variant="release", group_size=5).network
+    expected = {**VARIANT_CHANGES["release"], "group_size": 5}
+    assert {key: getattr(config, key) for key in expected} == expected
+    assert config.centroids == PRESETS["quick"]["network"].centroids
+    back = settings("release", variant="thesis").network
+    assert {key: getattr(back, key) for key in VARIANT_CHANGES["thesis"]} == VARIANT_CHANGES["thesis"]
+    assert settings("quick", variant="thesis").network == PRESETS["quick"]["network"]  # quick is no release
+
+
+def test_a_backbone_brings_the_sizes_of_its_preset():
+    for backbone, by_preset in BACKBONE_CHANGES.items():
+        for preset, changes in by_preset.items():
+            config = network_config(Given(preset, flags={"backbone": backbone, "reduction": 0.25}), 7)
+            expected = {**changes, "reduction": 0.25, "backbone": backbone, "num_classes": 7}
+            assert {key: getattr(config, key) for key in expected} == expected
+
+
+def test_the_command_line_changes_what_a_file_says_with_all_that_follows(tmp_path):
+    """A file of all settings names each of the backbone's sizes: another backbone must not be built with these."""
+    config = written(
+        Given("tiny", sets={"backbone": "dgcnn", "variant": "release", "normals": False}), tmp_path / "s.toml"
+    )
+    back = training_settings(
+        Given("tiny", config, {"backbone": "pointnet2", "variant": "thesis", "normals": True})
+    ).network
+    assert back == PRESETS["tiny"]["network"]
+    same = training_settings(Given("tiny", config, {"backbone": "dgcnn", "dropout": 0.1})).network
+    assert same.widths == BACKBONE_CHANGES["dgcnn"]["tiny"]["widths"] and same.dropout == 0.1
+    loud = written(Given("tiny", sets={"augment_scale": 0.5}), tmp_path / "a.toml")
+    assert training_settings(Given("tiny", loud, {"augment": "none"})).augmentation.scale == 0
+
+
+def test_networks_without_normals_have_no_weights():
+    assert settings(normals=False).network.weighting == "none"
+    assert settings(normals=False, variant="release").network.weighting == "none"
+    assert settings(weighting="none").network.normals
+
+
+def test_pretraining_is_one_frame_and_no_dynamic_stage():
+    found = settings(pretrain=True, temporal_radius=2)
+    assert (found.network.num_frames, found.network.temporal_radius, found.schedule.stage_epochs) == (1, 0, (80, 0))
+    for wrong in ({"frames": 8}, {"epochs_dynamic": 3}):
+        with pytest.raises(UsageError, match="pretrain trains the static stream on clips of one frame"):
+            settings(pretrain=True, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("typed", "sentence"),
+    [
+        ({"init": "a", "static_from": "b"}, "give one of them"),
+        ({"augment_speed": 0.3, "timing": "uniform"}, "augment_speed = 0.3: speed changes random clips"),
+        ({"augment_speed": 0.3, "clips_per_video": 0}, "augment_speed = 0.3: speed changes random clips"),
+        ({"neighbors": 2}, "temporal_radius = 1: balanced grouping shares 2 neighbors among 3 frames"),
+        ({"backbone": "dgcnn", "static_temporal_radius": 0}, "dgcnn's one graph serves both streams"),
+    ],
+)
+def test_settings_that_contradict_end_with_a_sentence(typed, sentence):
+    with pytest.raises(UsageError, match=sentence):
+        settings(**typed)
+
+
+def test_the_settings_of_weights_files_stay_as_they_were():
+    """Shipped weights hold these names; the number of classes follows from the data and is no setting."""
+    names = set(json.loads(KinetConfig().to_json()))
+    assert names - {one.field for one in TRAINING.settings.values()} == {"num_classes"}
+    assert {"num_frames", "points_per_frame", "radii", "weighting"} <= names
+    config = KinetConfig(widths=((8, 8), (8, 16), (16, 32)), head=(8, 9), radii=(0.1, 0.3))
+    assert KinetConfig.from_json(config.to_json()) == config

@@ -1,0 +1,119 @@
+"""`dpc segment predict` as its users run it: files, pipes, classical methods, settings, mistakes."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dpcli.store.parts import PartsReader
+
+
+def test_predict_and_evaluate_in_a_pipe_and_with_files(dpc, data, run_folder, tmp_path):
+    predict = ("segment", "predict", data, "--model", run_folder, "--flow", "nearest", "--points", 48, "--pairs", "all")
+    done = dpc(*predict, "-o", tmp_path / "parts.h5", "--picture", tmp_path / "parts.png", "--ply", tmp_path / "ply")
+    assert done.returncode == 0, done.stderr.decode()
+    assert (tmp_path / "parts.png").read_bytes()[:4] == b"\x89PNG" and len(
+        list((tmp_path / "ply").rglob("*.ply"))
+    ) == 18
+    piped = dpc(*predict, "-o", "-")
+    assert piped.returncode == 0
+    judged = dpc("evaluate", "segmentation", "-", "--truth", data, "--json", stdin=piped.stdout)
+    assert judged.returncode == 0, judged.stderr.decode()
+    with PartsReader(tmp_path / "parts.h5") as reader:
+        assert len(reader) == 6 and reader.num_parts == 8
+        sample, sequence = reader.read_parts(0), reader.read(0)
+        assert sample.pairs.tolist() == [[i, j] for i in range(3) for j in range(3) if i != j]
+        assert np.allclose(sample.probability.sum(1), 1, atol=1e-4)
+        assert (sequence.part == sample.probability.argmax(1)).all()
+    motion = dpc("evaluate", "motion", tmp_path / "parts.h5", "--truth", data, "--json")
+    assert motion.returncode == 0 and np.isfinite(json.loads(motion.stdout)["metrics"]["epe3d"])
+
+
+@pytest.mark.parametrize("method", ["dbscan", "ward", "ssc", "trajaffn"])
+def test_classical_methods_write_the_same_kind_of_file(dpc_here, data, tmp_path, method):
+    done = dpc_here(
+        "segment", "predict", data, "--method", method, "--flow", "nearest", "-o", tmp_path / "p.h5", "--split", "test"
+    )
+    assert done.returncode == 0, done.stderr.decode()
+    with PartsReader(tmp_path / "p.h5") as reader:
+        assert reader.names == ["d4", "d5"] and reader.read(0).part.min() >= 0
+
+
+def test_too_little_memory_keeps_what_was_predicted(dpc_here, data, tmp_path, monkeypatch):
+    from dpcli.segment.commands import predict as commands
+
+    predict, asked = commands.predict_parts, []
+
+    def scarce(sequence, *rest):
+        asked.append(sequence.name)
+        if len(asked) == 3:
+            raise MemoryError
+        return predict(sequence, *rest)
+
+    monkeypatch.setattr(commands, "predict_parts", scarce)
+    words = ("segment", "predict", data, "--method", "ward", "--flow", "nearest", "--parts", 2, "--split", "all")
+    assert dpc_here(*words, "-o", tmp_path / "whole.h5").returncode == 1 and len(asked) == 3
+    assert dpc_here(*words, "-o", tmp_path / "whole.h5").returncode == 0
+    assert len(asked) == 3 + len(PartsReader(tmp_path / "whole.h5")) - 2 and not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("predict", "DATA", "-o", "OUT", "--model", "nowhere"), 2, b"no such file"),
+        (("predict", "DATA", "-o", "OUT", "--method", "kmeans"), 2, b"dbscan, ward, ssc, trajaffn"),
+        (("predict", "DATA", "-o", "OUT", "--parts", "3"), 2, b"parts belongs to --method"),
+        (
+            ("predict", "DATA", "-o", "OUT", "--method", "ward", "--pairs", "some"),
+            2,
+            b"pairs = some: expected one of adjacent, all",
+        ),
+        (("predict", "DATA", "-o", "OUT", "--method", "ward", "--split", "none"), 3, b"no sequence of split"),
+        (("predict", "nothing.h5", "-o", "OUT", "--method", "ward"), 3, b"no such file"),
+    ],
+)
+def test_mistakes_end_with_a_sentence(dpc_here, data, tmp_path, words, code, message):
+    words = [str(data) if w == "DATA" else str(tmp_path / "out") if w == "OUT" else w for w in words]
+    done = dpc_here("segment", *words)
+    assert done.returncode == code and message in done.stderr, done.stderr.decode()
+    assert b"a bug" not in done.stderr and not (tmp_path / "out").is_file()
+
+
+@pytest.mark.parametrize(
+    "words, said",
+    [
+        (("--method", "ward", "--model", "x"), "--model x: --method ward uses no network"),
+        (("--method", "ward", "--set", "max_points=1"), "max_points = 1: expected at least 2"),
+        (("--method", "ward", "--set", "threshold=inf"), "threshold = inf: expected a finite number"),
+        (("--method", "ward", "--set", "eps=0.3"), "eps belongs to --method dbscan; ward has threshold, motion_weight"),
+        (("--method", "ssc", "--set", "motion=none"), "motion = none: --method ssc sees only motion"),
+        (("--set", "max_parts=3"), "max_parts belongs to --method"),
+        (("--method", "ward", "--parts", "40000"), "--parts 40000: more than the 512 points"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(words, said, dpc_here, data, tmp_path):
+    done = dpc_here("segment", "predict", data, "-o", tmp_path / "out.h5", *words)
+    assert done.returncode == 2 and said.encode() in done.stderr, done.stderr
+    assert not (tmp_path / "out.h5").exists()
+
+
+@pytest.mark.parametrize("words", [("--picture", "no/x.png"), ("--picture", "x.foo"), ("--turntable", "x.png")])
+def test_pictures_that_cannot_be_written_are_refused_before_the_work(words, dpc_here, data, tmp_path):
+    done = dpc_here("segment", "predict", data, "-o", tmp_path / "parts.h5", words[0], tmp_path / words[1])
+    assert done.returncode in (2, 3) and words[0].encode() in done.stderr and not (tmp_path / "parts.h5").exists()
+
+
+def test_resolved_settings_stand_in_the_file(dpc_here, data, tmp_path):
+    words = ("--method", "trajaffn", "--flow", "nearest", "--points", 48, "--set", "vote=false", "--split", "test")
+    done = dpc_here("segment", "predict", data, "-o", tmp_path / "p.h5", *words)
+    assert done.returncode == 0, done.stderr
+    with PartsReader(tmp_path / "p.h5") as reader:
+        config = reader.provenance[-1]["config"]["settings"]
+    assert config["input"] == {"flow": "nearest", "split": "test"}
+    assert config["refinement"]["vote"] is False and config["refinement"]["split_bodies"] is False
+    assert config["classical"]["motion"] == "residual" and config["classical"]["fewest"] == 1
+    assert "eps" not in config["classical"]
+    told = dpc_here("info", tmp_path / "p.h5").stdout.decode()
+    assert "settings refinement  points 48, pairs adjacent, icp 20, vote false, split_bodies false" in told
