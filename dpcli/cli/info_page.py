@@ -66,8 +66,8 @@ def _write_scene(path: Path, page: Path, title: str) -> None:
 
 
 def _clouds(path: Path, facts: PageFacts, *, samples: int, chosen: Sequence[str], view: str | None) -> str:
-    from dpcli.draw.contact_sheet import default_view, parse_view
     from dpcli.draw.page.points import frame_budget, point_budget, points_page, spread
+    from dpcli.draw.view import default_view, parse_view
     from dpcli.store import CloudsReader
 
     with CloudsReader(path) as reader:
@@ -88,7 +88,7 @@ def _short_unit(unit: str) -> str:
 
 def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[int]:
     """Return the sequences to show: those named (by name, else by number), else some of each class."""
-    from dpcli.draw.contact_sheet import spread_samples
+    from dpcli.draw.clouds_sheet import spread_samples
     from dpcli.errors import DataError
 
     if not len(reader):

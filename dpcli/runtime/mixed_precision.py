@@ -45,7 +45,7 @@ def _widened(value: Any) -> Any:
 
 
 def wanted(amp: bool | None, device: torch.device) -> bool:
-    """What --amp/--no-amp mean. Without either: mixed precision on a GPU that multiplies in bfloat16, none elsewhere.
+    """Returns what the setting `amp` means here; None: mixed precision on a GPU that multiplies in bfloat16, none elsewhere.
 
     A CPU would be slowed down by it, and so would GPUs before Ampere, where torch emulates bfloat16.
     """

@@ -16,7 +16,7 @@ from typing import Any
 
 from dpcli.errors import DpcError
 from dpcli.runtime import shared_memory as handover
-from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.tuning import fast_transport, keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 
 _MOST = 1024  # processes; with far more, the counters of a pool's queue overflow
@@ -68,7 +68,7 @@ def ordered_map(
     strangers = set(multiprocessing.active_children())
     pool = executor or _new_pool(jobs)
     guarded = partial(_guarded, function)
-    work = partial(handover.packed, guarded) if own and handover.POSSIBLE else guarded
+    work = partial(handover.packed, guarded) if own and handover.POSSIBLE and fast_transport() else guarded
     waiting: deque = deque()
 
     def first() -> tuple[Any, Any]:

@@ -43,6 +43,16 @@ def keep_freed_memory() -> None:
         pass
 
 
+def fast_transport() -> bool:
+    """Returns whether large arrays take the fast ways: DPC_TRANSPORT=plain in the environment says no.
+
+    The fast ways are whole chunks written past HDF5's cache, a journal that points to them (`store.writing`), and arrays of
+    worker processes handed over in shared memory (`runtime.shared_memory`). The plain ones, for odd file systems and to
+    compare with, leave the same bytes.
+    """
+    return os.environ.get("DPC_TRANSPORT", "") != "plain"
+
+
 @functools.cache
 def choose_products() -> bool:
     """Lets oneDNN multiply float32 matrices where that is faster than torch's choice, as exactly; True where it does.

@@ -15,7 +15,7 @@ from dpcli.store.schema import fields_of
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
 from dpcli.store.writing.resumable_writer import ResumableWriter
-from dpcli.store.writing.whole_chunks import WholeChunks
+from dpcli.store.writing.whole_chunks import PlainChunks, chunk_writer
 
 COMPRESSIONS = ("none", "lzf", "gzip")
 POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence
@@ -58,16 +58,6 @@ class CloudsWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
-        super().__init__(
-            path,
-            class_names=class_names,
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        )
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
         unknown = set(fields) - set(_FIELDS)
@@ -80,13 +70,24 @@ class CloudsWriter(ResumableWriter):
         self._frames = self._points = self._unflushed = 0
         self._index: dict[str, list] = {name: [] for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
-        self._chunks: WholeChunks | None = None
+        self._chunks: PlainChunks | None = None
         self._placed: Placed | None = None
-        self._open(force)
+        super().__init__(
+            path,
+            class_names=class_names,
+            length_unit=length_unit,
+            source=source,
+            seed=seed,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        )
 
     def _create(self) -> None:
         file = self._file
         self._create_floats("points", 3)
+        if self.compression == "none":
+            self._chunks = chunk_writer(file["points"])
         for name in ("frame_offsets", "sequence_offsets"):
             file.create_dataset(name, data=np.zeros(1, _FIELD[name].dtype), maxshape=(None,), chunks=(4096,), **PACKED)
         for name, dtype in _PER_SAMPLE.items():
@@ -120,7 +121,7 @@ class CloudsWriter(ResumableWriter):
         self._note(sequence)
 
     def _note(self, sequence: CloudSequence, *said: Any) -> None:
-        """From here on the sample counts as written; `said`: what else `write` was given."""
+        """Makes the sample count as written; `said`: what else `write` was given."""
         self._record([sequence, *said], self._placed)
         self._placed = None
         self._names.add(sequence.name)
@@ -163,19 +164,14 @@ class CloudsWriter(ResumableWriter):
             self._file.create_dataset(
                 name, (0, *shape), _FIELD[name].dtype, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
             )
-        if name == "points" and self.compression == "none":
-            self._append_whole_chunks(values)
+        if name == "points" and self._chunks:
+            self._placed = self._chunks.append(values)
         else:
             self._extend(name, values)
         self._unflushed += getattr(values, "nbytes", 0)
         if self._unflushed > _FLUSH_BYTES:
             self._atomic.flush()
             self._unflushed = 0
-
-    def _append_whole_chunks(self, points: np.ndarray) -> None:
-        self._chunks = self._chunks or WholeChunks(self._file["points"])
-        places = self._chunks.append(points)
-        self._placed = (points, places) if points.dtype == np.float32 else None
 
     def _extend(self, name: str, values: np.ndarray | list) -> None:
         if name not in self._data:  # kept open: closing would write its unfinished chunk, each time

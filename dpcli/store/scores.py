@@ -38,6 +38,8 @@ class ScoresWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
+        self.streams = tuple(streams)
+        self._rows: list[tuple] = []
         super().__init__(
             path,
             class_names=class_names,
@@ -48,9 +50,6 @@ class ScoresWriter(ResumableWriter):
             force=force,
             resume=resume,
         )
-        self.streams = tuple(streams)
-        self._rows: list[tuple] = []
-        self._open(force)
 
     def write(
         self,

@@ -51,10 +51,10 @@ def _distinct_titles(results: Sequence[CollectedResult]) -> list[str]:
 
 
 def _input_name(result: CollectedResult) -> str:
-    said = result.found.get("input", "")
-    if isinstance(said, (list, tuple)):
-        said = ", ".join(PurePath(str(own)).name for own in said)
-    return result.source if said in ("", "-", None) else str(said)
+    name = result.found.get("input", "")
+    if isinstance(name, (list, tuple)):
+        name = ", ".join(PurePath(str(own)).name for own in name)
+    return result.source if name in ("", "-", None) else str(name)
 
 
 def _section(number: int, result: CollectedResult, title: str) -> Section:
@@ -69,8 +69,8 @@ def _section(number: int, result: CollectedResult, title: str) -> Section:
     truth = PurePath(str(protocol.get("truth", "")))
     if truth.suffix or len(truth.parts) > 1:  # a path, not words
         data = f"{data} of {truth.name}" if data else truth.name
-    said = [str(note) for note in found.get("notes", []) if isinstance(note, str)]
-    left = [
+    remarks = [str(note) for note in found.get("notes", []) if isinstance(note, str)]
+    left_out = [
         f"Left out, {own.get('reason', 'unknown')}: {own.get('count', len(own.get('names', [])))}."
         for own in found.get("left_out", [])
     ]
@@ -82,7 +82,7 @@ def _section(number: int, result: CollectedResult, title: str) -> Section:
         data,
         headline(found),
         [*special, *blocks, *result.extras],
-        [*said, *left, *result.notes, *notes],
+        [*remarks, *left_out, *result.notes, *notes],
         detail_lists(found),
         commands,
     )

@@ -160,9 +160,9 @@ def _check_result(found: Any, where: str) -> dict[str, Any]:
     for key in _MAPPINGS:
         if not isinstance(found.get(key, {}), dict):
             raise DataError(f"{where}: {key} is a {type(found[key]).__name__}; expected an object of names and values")
-    said = found.get("provenance", [])
-    if isinstance(said, list):  # of a comparison: one list for each side
-        flat = [entry for own in said for entry in (own if isinstance(own, list) else [own])]
+    history = found.get("provenance", [])
+    if isinstance(history, list):  # of a comparison: one list for each side
+        flat = [entry for own in history for entry in (own if isinstance(own, list) else [own])]
         found = found | {"provenance": [entry for row, entry in enumerate(flat) if entry not in flat[:row]]}
     for key in _LISTS:
         entries = found.get(key, [])
@@ -191,8 +191,8 @@ def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: 
 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
-    with CloudsReader(truth) as clouds, PartsReader(path) as said:
-        motion, provenance = "pose" in clouds.fields and bool((said.pair_counts > 0).any()), said.provenance
+    with CloudsReader(truth) as clouds, PartsReader(path) as predicted:
+        motion, provenance = "pose" in clouds.fields and bool((predicted.pair_counts > 0).any()), predicted.provenance
     options = {"split": split, "resampling": Resampling()}
     made = [
         CollectedResult(
@@ -226,14 +226,16 @@ def _video_result(path: Path, truth: Path | None, pictures: bool) -> CollectedRe
 def _add_strips(result: CollectedResult) -> None:
     """Adds pictures of the files that the object names, if they are still there; else a note that says why not."""
     protocol = result.found.get("protocol", {})
-    said, real = result.found.get("input"), protocol.get("truth")
-    if not (isinstance(said, str) and isinstance(real, str) and Path(said).exists() and Path(real).exists()):
+    predicted, truth = result.found.get("input"), protocol.get("truth")
+    if not (
+        isinstance(predicted, str) and isinstance(truth, str) and Path(predicted).exists() and Path(truth).exists()
+    ):
         result.notes.append("No pictures: the files that were compared are not where the object says.")
         return
     try:
         background = protocol.get("background")
         result.extras.append(
-            strip_figure(Path(said), Path(real), protocol=str(protocol.get("name", "dpc")), background=background)
+            strip_figure(Path(predicted), Path(truth), protocol=str(protocol.get("name", "dpc")), background=background)
         )
         result.notes.append("The pictures are of the files as they are now.")
     except (DataError, UsageError) as error:

@@ -72,9 +72,9 @@ def part_blocks(
 
 
 def _sequence_error(row: tuple[int, int], pair: SequencePair, motion: bool) -> SequenceError:
-    offsets, truth, said = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
+    offsets, truth, predicted = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
     spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-    ious = [mean_iou(truth[span], said[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
+    ious = [mean_iou(truth[span], predicted[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
     errors = []
     if motion:
         for (source, target), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
@@ -179,12 +179,12 @@ def _clouds_figure(clouds: list[tuple[str, SequenceError, int, Cloud]]) -> Figur
 def _markup(title: str, own: SequenceError, frame: int, cloud: Cloud) -> str:
     top = float(np.nanmax(cloud.error)) if np.isfinite(cloud.error).any() else 0.0
     words = f"red: end-point error up to {text_of(top)} {cloud.unit}".rstrip() if cloud.unit else "red: wrong part"
-    said = f"{title}: {own.name}, frame {frame}, mIoU {text_of(float(own.iou[frame]), 'fraction')}"
+    caption = f"{title}: {own.name}, frame {frame}, mIoU {text_of(float(own.iou[frame]), 'fraction')}"
     data = base64.b64encode(pack_cloud(cloud)).decode("ascii")
     return (
         f'<figure class="cloud" data-points="{len(cloud.points)}" data-cloud="{data}">'
-        f"<figcaption>{escape(said)} <span class=faint>{len(cloud.points)} points shown; {escape(words)}</span></figcaption>"
-        f'<canvas tabindex="0" role="img" aria-label="{escape(said)}: truth, prediction, error"></canvas></figure>'
+        f"<figcaption>{escape(caption)} <span class=faint>{len(cloud.points)} points shown; {escape(words)}</span></figcaption>"
+        f'<canvas tabindex="0" role="img" aria-label="{escape(caption)}: truth, prediction, error"></canvas></figure>'
     )
 
 

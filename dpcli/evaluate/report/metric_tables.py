@@ -107,8 +107,8 @@ def _interval_note(found: Mapping[str, Any]) -> str:
     if not own.get("resamples") or not is_number(own.get("confidence")):
         return ""
     of = f"{own.get('number', '')} {own.get('resampled', '')}".strip()
-    said = f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
-    return f"Intervals: {said}." + (" Of accuracy: Wilson." if "accuracy_interval" in found.get("metrics", {}) else "")
+    how = f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
+    return f"Intervals: {how}." + (" Of accuracy: Wilson." if "accuracy_interval" in found.get("metrics", {}) else "")
 
 
 def _grouped_metrics(metrics: Mapping[str, Any]) -> dict[str, Mapping]:

@@ -66,8 +66,8 @@ class ThesisTable:
         """Returns whether a result is of this table's task and data: by a command of its provenance, or by its class names."""
         if found.get("task") != self.task:
             return False
-        said = [str(entry.get("command", "")) for entry in found.get("provenance", [])]
-        if any(f"{words} " in f"{command} " for words in self.commands for command in said):
+        ran = [str(entry.get("command", "")) for entry in found.get("provenance", [])]
+        if any(f"{words} " in f"{command} " for words in self.commands for command in ran):
             return True
         per_class = found.get("metrics", {}).get("per_class", [])
         names = {str(row.get("name", "")).lower() for row in per_class if isinstance(row, Mapping)}
@@ -121,12 +121,13 @@ def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, 
         "setting",
         *(_header(metric, unit) for metric, unit in zip(thesis.metrics, thesis.units)),
     )
-    said = (
+    protocols = (
         "; ".join(dict.fromkeys(f"{title}: {_protocol_in_words(found)}" for title, found in ours))
         or "no result of ours is of this task"
     )
     note = (
-        f"Thesis: {thesis.protocol}. Ours: {said}. Rows marked thesis are copied from its {_place_in_thesis(thesis)}, not measured here; "
+        f"Thesis: {thesis.protocol}. Ours: {protocols}. Rows marked thesis are copied from its {_place_in_thesis(thesis)}, "
+        "not measured here; "
         "protocol, split and length unit may differ from ours."
     )
     return table(

@@ -157,7 +157,9 @@ class DepthVideos:
 
 
 def find_videos(path: Path) -> list[Path]:
-    """Returns the depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of images)."""
+    """Returns the depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of
+    images).
+    """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
     if not path.is_dir() or has_images(path):

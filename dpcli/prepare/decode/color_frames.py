@@ -82,7 +82,8 @@ def frame_numbers(stems: Sequence[str]) -> list[int]:
     follow.
 
     `frame_0001`, `1_rgba`, `cam2_000_v1` all work; 0, 1, 2, ... where no integer alone does: names without any, or not
-    equally many, or such as `1305031102.675304` (seconds, microseconds) and `12-59-58`, where the last one starts again.
+    equally many, or such as `1305031102.675304` (seconds, microseconds) and `12-59-58`, where the last one starts
+    again.
     """
     columns = _telling_columns(stems)
     if len(columns) == 1:
@@ -96,8 +97,8 @@ def frame_numbers(stems: Sequence[str]) -> list[int]:
 
 
 def _telling_columns(stems: Sequence[str]) -> list[list[int]]:
-    """Returns the columns of integers in the names that aren't the same everywhere, or the last one if all are; [] where
-    names hold none, or not equally many.
+    """Returns the columns of integers in the names that aren't the same everywhere, or the last one if all are; []
+    where names hold none, or not equally many.
     """
     rows = [[int(word) for word in re.findall(r"\d+", stem)] for stem in stems]
     if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
@@ -190,8 +191,8 @@ def _open_video(path: Path) -> Frames:
 
 
 def _frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
-    """Returns seconds of a video's frames from its first: by its rate where that is what their time stamps say, else the
-    stamps.
+    """Returns seconds of a video's frames from its first: by its rate where that is what their time stamps say, else
+    the stamps.
 
     Recordings of screens and phones have frames when something happens; their rate is a mean. Stamps are rounded to
     milliseconds in some containers and missing (0) in others.
@@ -205,7 +206,9 @@ def _frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
 
 
 def _lasts(times: np.ndarray, duration: float) -> bool:
-    """Returns whether frames at these times fill a clip that is said to last so long: the last one may stay for a while."""
+    """Returns whether frames at these times fill a clip that is said to last so long: the last one may stay for a
+    while.
+    """
     steps = np.diff(times)
     return len(steps) > 0 and duration - times[-1] <= max(2 * float(steps.max()), 0.1 * duration)
 

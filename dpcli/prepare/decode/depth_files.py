@@ -92,8 +92,8 @@ def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> 
 
 
 def _colored(frame: np.ndarray) -> bool:
-    """Returns whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of its
-    pixels.
+    """Returns whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of
+    its pixels.
     """
     some = frame[::8, ::8].astype(np.int16)
     return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLORED_SHARE)

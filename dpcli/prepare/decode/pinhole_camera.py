@@ -40,7 +40,9 @@ class Intrinsics:
 
     @classmethod
     def from_json(cls, path: Path) -> Intrinsics:
-        """Reads ``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-major]}``."""
+        """Reads ``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-
+        major]}``.
+        """
         try:
             data = json.loads(path.read_text())
         except OSError as error:

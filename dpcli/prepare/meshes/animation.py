@@ -39,7 +39,9 @@ def list_clips(path: Path) -> list[tuple[str, float]]:
 
 
 def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
-    """Reads a clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own units."""
+    """Reads a clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own
+    units.
+    """
     with _well_formed(path):
         file = read_gltf(path)
         chosen, names = choose_clip(file, clip), clip_names(file)

@@ -42,9 +42,9 @@ def rigid_parts(
     """Returns the rigid part i16 (M) of each point: 0, 1, ... in the order of their first bones.
 
     Bones are one part when, over the whole clip, the part carries a bone's points (root mean square) to within
-    ``tolerance`` of where the bone carries them: its ancestors' part if it does, else the one that does it best; a part
-    moves as its first bone. Then parts of fewer than ``smallest`` points, the smallest first, join the part that carries
-    their points best. Bones without points don't count.
+    ``tolerance`` of where the bone carries them: its ancestors' part if it does, else the one that does it best; a
+    part moves as its first bone. Then parts of fewer than ``smallest`` points, the smallest first, join the part that
+    carries their points best. Bones without points don't count.
     """
     motion = pose @ np.linalg.pinv(pose[:1])  # frame 0 -> frame t
     group = np.full(len(parent), -1)
@@ -71,7 +71,9 @@ def rigid_parts(
 
 
 def motion_distance(one: np.ndarray, other: np.ndarray, points: np.ndarray) -> float:
-    """Returns how far apart two motions (T,4,4) carry points (N,3): root mean square over the points, largest over time."""
+    """Returns how far apart two motions (T,4,4) carry points (N,3): root mean square over the points, largest over
+    time.
+    """
     difference = one - other
     apart = points @ difference[:, :3, :3].transpose(0, 2, 1) + difference[:, None, :3, 3]
     return float(np.sqrt((apart**2).sum(-1).mean(1)).max())

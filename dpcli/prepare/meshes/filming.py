@@ -29,8 +29,8 @@ _STILL = 1e-3  # of the object's radius: what moves less than this is no motion
 class Filming:
     """Says how an animated mesh is filmed. Angles in degrees; the reference camera stands at azimuth 0.
 
-    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points of
-    ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
+    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points
+    of ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
     """
 
     size: int = 512

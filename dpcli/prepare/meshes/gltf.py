@@ -1,4 +1,5 @@
-"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and 4).
+"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and
+4).
 
 The container is JSON beside a block of bytes, so the standard library reads it; `gltf_nodes` and
 `gltf_mesh` say what it means.
@@ -178,7 +179,9 @@ class Gltf:
 
 
 def read_gltf(path: Path) -> Gltf:
-    """Open a .glb or .gltf file. Raises DataError unless it is whole, version 2 and free of extensions we can't follow."""
+    """Open a .glb or .gltf file. Raises DataError unless it is whole, version 2 and free of extensions we can't
+    follow.
+    """
     try:
         data = Path(path).read_bytes()
     except IsADirectoryError:

@@ -33,7 +33,8 @@ def plain_share(pixels: np.ndarray, color: np.ndarray, tolerance: float) -> floa
     """Returns the share of pixels u8 (B,3) that are `color` (3), 0..255, within `tolerance` of the range in every
     channel.
 
-    >>> plain_share(np.array([[255, 255, 255], [250, 255, 255], [0, 0, 0], [9, 9, 9]], np.uint8), np.array([255, 255, 255]), 0.06)
+    >>> pixels = np.array([[255, 255, 255], [250, 255, 255], [0, 0, 0], [9, 9, 9]], np.uint8)
+    >>> plain_share(pixels, np.array([255, 255, 255]), 0.06)
     0.5
     """
     off = np.abs(pixels.astype(np.float32) - color).max(axis=1)
@@ -136,7 +137,9 @@ def key_out(
 
 
 def _difference(rgb: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Returns f32 (H,W): the largest difference of a channel from the background's, channel by channel, which is faster."""
+    """Returns f32 (H,W): the largest difference of a channel from the background's, channel by channel, which is
+    faster.
+    """
     channels = (np.abs(rgb[..., k].astype(np.float32) - np.float32(background[k])) for k in range(3))
     return reduce(np.maximum, channels)
 

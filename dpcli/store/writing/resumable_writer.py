@@ -29,8 +29,8 @@ class ResumableWriter(ABC):
     is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists, or what another provenance kept for
     it, and `force` is off.
 
-    A subclass calls `_open` at the end of its constructor and `_record` for each sample that is written, and says in
-    `_complete` what is left to write and in `_write_again` how a sample comes back from the journal.
+    A subclass has its own state ready before it calls this constructor, which opens the file and has `_create` and, to
+    continue, `_write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
     """
 
     kind = ""
@@ -54,6 +54,7 @@ class ResumableWriter(ABC):
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self.written_names: list[str] = []
         self._journal: Journal | None = None
+        self._open(force)
 
     def _about(self) -> dict[str, Any]:
         """What decides whether a journal is of this very work: not the words of the command, which may be spelled otherwise."""

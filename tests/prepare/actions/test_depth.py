@@ -16,9 +16,6 @@ from dpcli.prepare.actions.depth import DepthVideos, background_depth
 from dpcli.prepare.decode.depth_files import read_depth_video, read_image, video_frames
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
 from dpcli.prepare.labels import labels_of_folders, read_labels
-from dpcli.prepare.pipeline import convert_item
-from dpcli.prepare.thinning import Thinning
-from dpcli.runtime.seeds import generator
 from tests.support.prepare_helpers import write_video
 
 RNG = np.random.default_rng(0)
@@ -329,22 +326,3 @@ def test_intrinsics_files(tmp_path):
         path.write_text(bad)
         with pytest.raises(DataError, match="k.json"):
             Intrinsics.from_json(path)
-
-
-def test_points_chosen_before_they_are_made_are_those_chosen_after(tmp_path):
-    """Random thinning asks for the number of points only; then the reader needn't make the others. Same draws, same bits."""
-    rng = np.random.default_rng(0)
-    depth = np.where(rng.random((6, 24, 32)) < rng.random((6, 1, 1)), rng.integers(400, 3000, (6, 24, 32)), 0)
-    depth[2] = 0  # dropped
-    depth[3, :, 5:] = 0  # fewer points than are wanted
-    np.save(tmp_path / "v.npy", depth.astype(np.uint16))
-    for options in ({}, {"near": 0.8, "far": 2.5}):
-        reader = DepthVideos(inputs=(tmp_path / "v.npy",), fov=60, **options)
-        (item,) = reader.items()
-        for thinning in (Thinning(150), Thinning(150, "voxel"), Thinning(0)):
-            late = thinning.apply(reader.read(item, generator(5, 0)).sequence, generator(5, 0))
-            early = convert_item(reader, thinning, 5, (0, item)).sequence
-            assert np.array_equal(late.points, early.points) and np.array_equal(late.frame_offsets, early.frame_offsets)
-    asked = []
-    reader.read(item, generator(5, 0), lambda count: asked.append(count) or slice(0, 1))
-    assert len(asked) == 6 and asked[2] == 0, "a frame was not asked for: its draw would be another frame's"

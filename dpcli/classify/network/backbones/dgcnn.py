@@ -268,7 +268,7 @@ def expect_widths(config: KinetConfig, published: tuple[tuple[int, ...], ...]) -
     widths = config.widths
     fits = len(widths) == len(published) and all(part and min(part) >= 1 for part in widths)
     if not fits or any(len(a) != len(b) for a, b in zip(widths[1:-1], published[1:-1])):
-        raise UsageError(f"--backbone {config.backbone}: widths = {widths}, expected numbers like {published}")
+        raise UsageError(f"backbone = {config.backbone}: widths = {widths}, expected numbers like {published}")
     return widths
 
 

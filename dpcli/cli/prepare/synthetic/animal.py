@@ -16,7 +16,7 @@ def animal(
     options: FilmingOptions,
     motion: Annotated[
         Literal["walk", "trot", "wag", "fly", "swim"],
-        typer.Option("--motion", help="What it does: walk, trot or wag (four legs), fly (bird), swim (fish)."),
+        typer.Option("--motion", help="Its motion: walk, trot or wag (four legs), fly (bird), swim (fish)."),
     ] = "walk",
     cycles: Annotated[
         float, typer.Option("--cycles", help="Steps, wing beats or tail strokes in the clip; 0: the motion's own.")
