@@ -21,7 +21,8 @@ def tune_environment() -> None:
     """Sets what torch and numba read as they load, where the user has not: call it before either is imported.
 
     Threads that wait by spinning keep the other library's threads off the cores, and a large tensor in pages of 4 kB
-    takes longer to get from the system than to fill.
+    takes longer to get from the system than to fill. Waiting passively, eight clips of a static step of `classify train
+    --preset quick` took 0.62 s instead of 1.5 s (best of 24, two cores shared with other programs).
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
@@ -48,7 +49,8 @@ def fast_transport() -> bool:
 
     The fast ways are whole chunks written past HDF5's cache, a journal that points to them (`store.writing`), and arrays of
     worker processes handed over in shared memory (`runtime.shared_memory`). The plain ones, for odd file systems and to
-    compare with, leave the same bytes.
+    compare with, leave the same bytes. `dpc prepare msraction3d --jobs 2` took 41 to 53 s the fast way, 49 to 61 s the
+    plain one (three runs each in turn, a busy machine); writing 144 MB alone 0.26 s and 0.84 s.
     """
     return os.environ.get("DPC_TRANSPORT", "") != "plain"
 
@@ -124,7 +126,9 @@ def numba_threads_as_torch() -> None:
 def load_numba_without_blas() -> None:
     """Imports numba's array functions, as its first kernel would, without their look for scipy's BLAS.
 
-    What needs it looks again (np.dot), but for numba's np.cov and np.corrcoef, which no kernel here uses.
+    What needs it looks again (np.dot), but for numba's np.cov and np.corrcoef, which no kernel here uses. A process that
+    only samples farthest points, as the workers of `dpc prepare --sampling fps`, then has its first kernel after 3.1 s
+    instead of 4.1 s (best of three, a busy machine).
     """
     if _SCIPY_BLAS in sys.modules or "numba.np.arraymath" in sys.modules:
         return
