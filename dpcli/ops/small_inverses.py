@@ -77,6 +77,7 @@ def small_solve(matrices: Tensor, right: Tensor) -> Tensor:
 def mend_guarded_gradients(
     moments: np.ndarray,
     places: np.ndarray,
+    planes: np.ndarray,
     guard: tuple[float, str],
     grad: np.ndarray,
     grad_matrix: np.ndarray,
@@ -85,9 +86,10 @@ def mend_guarded_gradients(
     """Sets the gradients of the fits whose determinant a guard moved, which the kernel `solve_planes_back` leaves wrong.
 
     moments f32 (centroids,entries,groups); places i64 (n,n+1): which of a fit's entries are its normal matrix and right
-    side; guard: least determinant and name; grad f32 (centroids,n,groups) at the planes; grad_matrix f32
-    (centroids,n,n,groups), changed in place: G + G'; moved bool (centroids,groups). By autograd of the torch twin: a
-    kernel of 190 lines took 0.84 of the time of a step of the dynamic stream in preset thesis, and is not worth them.
+    side; planes f32 (centroids,n,groups): the kernel's solutions; guard: least determinant and name; grad f32
+    (centroids,n,groups) at the planes; grad_matrix f32 (centroids,n,n,groups), changed in place: G + G'; moved bool
+    (centroids,groups). By autograd of the torch twin: a kernel of 190 lines took 0.84 of the time of a step of the
+    dynamic stream in preset thesis, and is not worth them.
     """
     centroid, group = np.nonzero(moved)
     if not len(centroid):
@@ -97,7 +99,11 @@ def mend_guarded_gradients(
     at_inverse = torch.from_numpy(grad[centroid, :, group])[:, :, None] * right[:, None]
     with torch.inference_mode(False), torch.enable_grad():
         leaf = matrices.clone().requires_grad_()
-        found = torch.autograd.grad(_inverse(leaf, *guard), leaf, at_inverse.clone())[0].numpy()
+        inverse = _inverse(leaf, *guard)
+        found = torch.autograd.grad(inverse, leaf, at_inverse.clone())[0].numpy()
+    # of a determinant that is zero but for rounding the twin may see the other sign: no direction is right there
+    solved = (inverse.detach() * right[:, None]).sum(-1).numpy()
+    found[(solved * planes[centroid, :, group]).sum(1) < 0] = 0
     grad_matrix[centroid, :, :, group] = found + found.transpose(0, 2, 1)
 
 

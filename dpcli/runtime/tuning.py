@@ -20,11 +20,13 @@ _SCIPY_BLAS = "scipy.linalg.cython_blas"
 def tune_environment() -> None:
     """Sets what torch and numba read as they load, where the user has not: call it before either is imported.
 
-    Threads that wait by spinning keep the other library's threads off the cores. Waiting passively, a static step of eight
-    clips of `classify train
-    --preset quick` took 0.62 s instead of 1.5 s (best of 24, two cores shared with other programs).
+    Threads that wait by spinning keep the other library's threads off the cores: waiting passively, a static step of
+    `classify train --preset quick` (8 clips) took 0.62 s instead of 1.5 s, best of 24 on two cores that others used, too.
+    A large tensor in pages of 4 kB takes longer to get from the system than to fill: large pages made static training of
+    large clips 1.5 times as fast (docs/experiments/speed.md); twelve small clips gain nothing by them.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 
 def keep_freed_memory() -> None:
