@@ -19,7 +19,7 @@ def reduced_products(device: torch.device, on: bool) -> AbstractContextManager:
 
 
 def is_reduced(tensor: Tensor) -> bool:
-    """Whether products of this tensor's device are made in bfloat16 here."""
+    """Returns whether products of this tensor's device are made in bfloat16 here."""
     return torch.is_autocast_enabled(tensor.device.type)
 
 

@@ -39,6 +39,14 @@ class CloudsWriter(ResumableWriter):
     `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose). Set before the
     block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
     kept in the file; a shard may be empty.
+
+    >>> from dpcli.store import CloudSequence, CloudsReader
+    >>> with CloudsWriter("two.h5", class_names=["wave"]) as writer:
+    ...     for name in ("a", "b"):
+    ...         writer.write(CloudSequence.from_frames(name, [np.zeros((5, 3)), np.ones((2, 3))], label=0))
+    >>> with CloudsReader("two.h5") as reader:
+    ...     reader.names, reader.frame_counts.tolist(), reader.read(1, frames=[1]).points.shape
+    (['a', 'b'], [2, 2], (2, 3))
     """
 
     kind = "clouds"
@@ -98,7 +106,7 @@ class CloudsWriter(ResumableWriter):
             self._create_field(file, name)
 
     def _create_floats(self, name: str, width: int) -> None:
-        """A data set of f32 (rows, width), uncompressed unless --compression says otherwise."""
+        """Makes a data set of f32 (rows, width), uncompressed unless --compression says otherwise."""
         filters = {} if self.compression == "none" else {"compression": self.compression, "shuffle": True}
         rows = max(1, POINTS_PER_CHUNK * 3 // width)
         self._file.create_dataset(
@@ -115,7 +123,7 @@ class CloudsWriter(ResumableWriter):
         # pose is created with the first sample, which tells the number of parts
 
     def write(self, sequence: CloudSequence) -> None:
-        """Append one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
+        """Appends one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
         self._check(sequence)
         self._append_sequence(sequence)
         self._note(sequence)

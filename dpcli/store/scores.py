@@ -60,7 +60,7 @@ class ScoresWriter(ResumableWriter):
         split: str = "",
         streams: dict[str, np.ndarray] | None = None,
     ) -> None:
-        """One sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
+        """Adds one sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
         own = streams or {}
         for key, row in (("scores", scores), *own.items()):  # a stream may be called scores, too
             if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():

@@ -404,10 +404,12 @@ def test_the_film_shows_one_frame_of_all_cameras(tmp_path, dpc_here):
     colors = write_views(tmp_path / "v.h5")
     assert dpc_here("info", tmp_path / "v.h5", "--page", tmp_path / "v.html").returncode == 0
     script = """
-    const middle = (canvas) => [...canvas.getContext("2d").getImageData(9, 9, 1, 1).data].join();
+    const seen = () => [...document.querySelectorAll("canvas")]
+      .map((canvas) => [...canvas.getContext("2d").getImageData(9, 9, 1, 1).data].join()).join(";");
     whenReady(() => {
+      const before = seen();
       document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
-      setTimeout(() => { root.dataset.seen = [...document.querySelectorAll("canvas")].map(middle).join(";"); }, 300);
+      setInterval(() => { if (seen() !== before) root.dataset.seen = seen(); }, 100);
     });"""
     shown = show(tmp_path / "v.html", tmp_path, "frame=1", script, wanted="seen")
     seen = [[int(value) for value in own.split(",")] for own in shown.attribute("seen").split(";")]

@@ -33,8 +33,9 @@ def plain_share(pixels: np.ndarray, color: np.ndarray, tolerance: float) -> floa
     """Returns the share of pixels u8 (B,3) that are `color` (3), 0..255, within `tolerance` of the range in every
     channel.
 
-    >>> plain_share(np.array([[255, 255, 255], [250, 255, 255], [0, 0, 0], [9, 9, 9]], np.uint8), np.array([255, 255,
-    255]), 0.06) 0.5
+    >>> pixels = np.array([[255, 255, 255], [250, 255, 255], [0, 0, 0], [9, 9, 9]], np.uint8)
+    >>> plain_share(pixels, np.array([255, 255, 255]), 0.06)
+    0.5
     """
     off = np.abs(pixels.astype(np.float32) - color).max(axis=1)
     return float((off <= 255 * tolerance).mean())

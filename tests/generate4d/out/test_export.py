@@ -273,8 +273,8 @@ def test_an_export_flows_into_the_segmenter(dpc, scene_file, tmp_path):
         "2",
         "--flow",
         "nearest",
-        "--icp",
-        "0",
+        "--set",
+        "icp=0",
         stdin=clouds.stdout,
     )
     assert said.returncode == 0, said.stderr.decode()

@@ -116,4 +116,4 @@ def test_resolved_settings_stand_in_the_file(dpc_here, data, tmp_path):
     assert config["classical"]["motion"] == "residual" and config["classical"]["fewest"] == 1
     assert "eps" not in config["classical"]
     told = dpc_here("info", tmp_path / "p.h5").stdout.decode()
-    assert "settings refinement  points 48, pairs adjacent, icp 20, vote false, split_bodies false" in told
+    assert "settings refinement  icp 20, normalize true, pairs adjacent, points 48" in told
