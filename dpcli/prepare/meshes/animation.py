@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,6 +39,21 @@ def list_clips(path: Path) -> list[tuple[str, float]]:
         choose_clip(file, None)
         clips = [read_clip(file, index) for index in range(len(clip_names(file)))]
     return [(clip.name, clip.end - clip.start) for clip in clips]
+
+
+def clip_outputs(path: Path, output: str) -> list[tuple[str, str]]:
+    """Returns (clip, file) for every clip of a model: OUT.h5 becomes OUT_Walk.h5, OUT_Run.h5, ...
+
+    Characters that a file's name should not have become _; names that are the same then get their clip's number.
+    """
+    with _well_formed(path):
+        choose_clip(file := read_gltf(path), None)
+        names = clip_names(file)
+    short = [re.sub(r"[^\w.-]+", "_", name.split("|")[-1]).strip("_.")[:80] or "clip" for name in names]
+    many = [key for key, count in Counter(name.lower() for name in short).items() if count > 1]
+    short = [f"{name}_{index}" if name.lower() in many else name for index, name in enumerate(short)]
+    place = Path(output)
+    return [(name, str(place.with_name(f"{place.stem}_{end}{place.suffix}"))) for name, end in zip(names, short)]
 
 
 def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:

@@ -283,6 +283,21 @@ def test_clips_by_name_by_number_and_by_what_is_listed(tmp_path, wanted, name):
         load_animation(path, "9", 2)
 
 
+def test_all_clips_at_once(tmp_path, dpc):
+    path = named("Rig|Walk", "Rig|run/fast", "walk", "").write(tmp_path / "m.glb")
+    options = ("--frames", 2, "--size", 16, "--tracks", 8, "--jobs", 1, "--azimuths", "60")
+    done = dpc("prepare", "animation", path, "-o", tmp_path / "v.h5", *options, "--all-clips")
+    assert done.returncode == 0, done.stderr
+    assert sorted(file.name for file in tmp_path.glob("*.h5")) == [
+        "v_Walk_0.h5",
+        "v_clip_3.h5",
+        "v_run_fast.h5",
+        "v_walk_2.h5",
+    ]
+    for odd in (("-o", "-"), ("-o", tmp_path / "v.h5", "--clip", "walk")):
+        assert dpc("prepare", "animation", path, *odd, "--all-clips").returncode == 2
+
+
 def test_a_clip_s_name_moves_no_cursor(tmp_path):
     path = named("\x1b[31mred\u202e\nx", "größe").write(tmp_path / "m.glb")
     assert [name for name, _ in list_clips(path)] == ["\\x1b[31mred\\u202e\\nx", "größe"]
