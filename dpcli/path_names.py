@@ -46,5 +46,5 @@ def path_inside(root: Path | None, folder: Path, name: str) -> Path:
     except (OSError, RuntimeError):  # a circle of links
         inside = False
     if not inside:
-        raise DataError(f"{name[:80]!r} lies outside {as_utf8(str(root))}; only files in that folder are opened")
+        raise DataError(f"{name[:80]!r} lies outside the folder {as_utf8(str(root))}; only files in it are opened")
     return place

@@ -19,22 +19,31 @@ def geometry_triangles(path: Path, geometry: Any, root: Path | None, notes: Coun
 
     Mesh files outside ``root`` are refused (None: they may lie anywhere); those in other units are scaled and noted.
     """
-    import trimesh
-
-    scale = 1.0
-    if geometry.box is not None:
-        mesh = trimesh.creation.box(extents=geometry.box.size)
-    elif geometry.cylinder is not None:
-        mesh = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=48)
-    elif geometry.sphere is not None:
-        mesh = trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
-    elif geometry.mesh is not None:
+    if geometry.mesh is not None:
         mesh = _load_mesh(path, geometry.mesh.filename, root)
         scale = 1.0 if geometry.mesh.scale is None else geometry.mesh.scale
         scale = np.asarray(scale, np.float64) * _meters(path, mesh, geometry.mesh.filename, notes)
-    else:
-        return np.zeros((0, 3, 3))
-    return np.asarray(mesh.vertices, np.float64)[mesh.faces] * np.asarray(scale, np.float64)
+        if scale.shape not in ((), (3,)):
+            raise DataError(f"{path}: the scale of its mesh {geometry.mesh.filename} is not one or three numbers")
+        return np.asarray(mesh.vertices, np.float64)[mesh.faces] * scale
+    try:
+        mesh = _solid(geometry)
+    except (TypeError, ValueError, AttributeError, IndexError, OverflowError) as error:
+        raise DataError(f"{path}: a box, cylinder or sphere has no valid size ({error})") from None
+    return np.zeros((0, 3, 3)) if mesh is None else np.asarray(mesh.vertices, np.float64)[mesh.faces]
+
+
+def _solid(geometry: Any) -> Any:
+    """Returns the mesh of a box, cylinder or sphere; None for what has no shape."""
+    import trimesh
+
+    if geometry.box is not None:
+        return trimesh.creation.box(extents=np.asarray(geometry.box.size, np.float64).reshape(3))
+    if geometry.cylinder is not None:
+        return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=48)
+    if geometry.sphere is not None:
+        return trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
+    return None
 
 
 def resolve(path: Path, name: str, root: Path | None) -> Path:
@@ -42,6 +51,9 @@ def resolve(path: Path, name: str, root: Path | None) -> Path:
 
     Raises DataError when the name leads out of ``root``.
     """
+    if not name:
+        raise DataError(f"{path}: a mesh without a filename; name its file")
+    name = name.replace("\\", "/")  # written on Windows
     plain = name.split("://", 1)[1] if "://" in name else name
     tails = [plain, plain.split("/", 1)[1]] if name.startswith("package://") and "/" in plain else [plain]
     folders = [path.parent]

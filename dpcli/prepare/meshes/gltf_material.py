@@ -40,6 +40,8 @@ def read_material(file: Gltf, index: int) -> Material:
     texture, color, emission = _references(file, index)
     unlit = "KHR_materials_unlit" in extensions
     strength = float(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
+    if not 0 <= strength < np.inf:
+        raise file.fail(f"material {index}: its emission has the strength {strength}; export the file again")
     glow = tuple(strength * value for value in _numbers(file, index, entry.get("emissiveFactor"), (0, 0, 0)))
     shines = any(glow) and not unlit
     return Material(

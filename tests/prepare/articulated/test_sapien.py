@@ -329,6 +329,42 @@ def test_one_bad_urdf_never_ends_the_others(text, words, tmp_path):
     assert words in bad.problem and "bad/mobility.urdf: " in bad.problem and not good.problem
 
 
+@settings(max_examples=150, derandomize=True, deadline=None)
+@given(data=st.data())
+def test_damage_to_a_urdf_ends_in_a_sentence_or_not_at_all(data):
+    """Any cut, any changed byte: read, or refused with the file's name."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = cabinet(Path(folder, "r.urdf"))
+        whole = path.read_bytes()
+        place = data.draw(st.integers(0, len(whole) - 1))
+        if data.draw(st.booleans()):
+            path.write_bytes(whole[:place])
+        else:
+            value = data.draw(st.sampled_from(b'0 -.e"<>/nax\xb0\0'))
+            path.write_bytes(whole[:place] + bytes([value]) + whole[place + 1 :])
+        try:
+            assert load(path).num_bodies >= 1
+        except DataError as error:
+            assert "r.urdf" in str(error)
+
+
+@pytest.mark.parametrize(
+    "shape", ['<box size="1 2"/>', '<cylinder radius="1"/>', "<sphere/>", "<box/>", "<mesh/>", "<cone/>"]
+)
+def test_solids_without_a_size_are_refused(shape, tmp_path):
+    elements = [link("a", box(1, 1, 1)), link("b", shape), joint("j", "a", "b")]
+    path = write_urdf(tmp_path / "r.urdf", *elements)
+    with pytest.raises(DataError, match="r.urdf: "):
+        load(path)
+
+
+def test_names_written_on_windows(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "c.obj").write_text(CUBE_OBJ)
+    elements = [link("a", '<mesh filename="meshes\\c.obj"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
+    assert len(load(write_urdf(tmp_path / "r.urdf", *elements)).triangles) == 24
+
+
 def test_a_declared_encoding_is_read(tmp_path):
     path = two(tmp_path)
     path.write_bytes(b'<?xml version="1.0" encoding="iso-8859-1"?><!-- 90\xb0 -->' + path.read_bytes().split(b"?>")[-1])
@@ -350,7 +386,16 @@ def test_objects_within_objects_and_the_category_of_their_meta_file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["../../secret.obj", "{outside}", "file://{outside}", "package://../../secret.obj", "link.obj", "a/\1.obj"]
+    "name",
+    [
+        "../../secret.obj",
+        "{outside}",
+        "file://{outside}",
+        "package://../../secret.obj",
+        "..\\..\\secret.obj",
+        "link.obj",
+        "a/\1.obj",
+    ],
 )
 def test_nothing_outside_the_folder_is_opened(name, tmp_path):
     outside, raw = tmp_path / "secret.obj", tmp_path / "raw" / "1"
