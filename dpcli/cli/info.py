@@ -208,6 +208,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         unit = found["length_unit"] if axis in "xyz" else ""
         text = f"{ends[0]:.5g} to {ends[1]:.5g} {unit}".rstrip() if ends else "no finite values"
         lines.append((f"range {axis}", text))
+    lines += _shift_lines(found.get("shifts", {}))
     for key in ("fields", "streams"):
         if key in found:
             lines.append((key, ", ".join(found[key]) or "none"))
@@ -225,6 +226,17 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
         lines += [(name.replace("_", " "), f"{value:.4g}") for name, value in found["metrics"].items()]
     source = f" from {found['source']}" if found["source"] else ""
     return [*lines, ("made by", f"dpc {found['version']}{source}, seed {found['seed']}")]
+
+
+def _shift_lines(shifts: dict[str, list[float]]) -> list[tuple[str, str]]:
+    """What was taken off the coordinates of sequences: added to their points it gives the original ones."""
+    lines = [
+        ("shift", f"{name}: {', '.join(f'{value:.10g}' for value in shift)} (points + shift: the original coordinates)")
+        for name, shift in list(shifts.items())[:_SKIPPED_SHOWN]
+    ]
+    if len(shifts) > _SKIPPED_SHOWN:
+        lines.append(("shift", f"... and {len(shifts) - _SKIPPED_SHOWN} more; --json lists all"))
+    return lines
 
 
 def _skipped_lines(skipped: list[dict[str, str]]) -> list[tuple[str, str]]:

@@ -13,22 +13,25 @@ from dpcli.errors import DataError
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("part", "<i4")]
 )
-_NAMES = {"f": "float", "u": "uchar", "i": "int"}
+_NAMES = {"<f4": "float", "<f8": "double", "|u1": "uchar", "<i4": "int"}
 
 
 def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: np.ndarray) -> None:
-    """Writes one frame of points f32 (N,3), colors u8 (N,3) (None: by part), part ids (N) as an int property `part`.
+    """Writes one frame of points f32 or f64 (N,3), which stay so, colors u8 (N,3) (None: by part), part ids (N).
 
+    The ids are an int property `part`.
     Binary, little-endian, PLY 1.0 (Turk 1994). DataError on shapes that don't fit, or when it can't be written.
     """
     colors = part_colors(part) if colors is None else colors
     count = len(points)
     if points.shape != (count, 3) or colors.shape != (count, 3) or part.shape != (count,):
         raise DataError(f"{path}: points {points.shape}, colors {colors.shape} and part {part.shape} don't fit")
-    rows = np.empty(count, _VERTEX)
-    for column, values in zip(_VERTEX.names, [*points.T, *colors.T, part], strict=True):
+    wide = "<f8" if points.dtype == np.float64 else "<f4"
+    vertex = np.dtype([(name, wide if name in "xyz" else _VERTEX[name]) for name in _VERTEX.names])
+    rows = np.empty(count, vertex)
+    for column, values in zip(vertex.names, [*points.T, *colors.T, part], strict=True):
         rows[column] = values
-    properties = [f"property {_NAMES[_VERTEX[name].kind]} {name}" for name in _VERTEX.names]
+    properties = [f"property {_NAMES[vertex[name].str]} {name}" for name in vertex.names]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
     try:
         path.write_bytes(("\n".join(header) + "\n").encode("ascii") + rows.tobytes())
@@ -37,7 +40,10 @@ def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, part: n
 
 
 def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
-    """Writes every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which is made."""
+    """Writes every frame of a sequence, colored by part, as 0000.ply, 0001.ply, ... in `folder`, which is made.
+
+    A sequence that was shifted (maps) is written where the raw data have it, in float64.
+    """
     if sequence.part is None:
         raise DataError(f"sample {sequence.name!r} has no parts to write; `dpc segment predict` finds them")
     try:
@@ -48,5 +54,7 @@ def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
     for t in range(sequence.num_frames):
         span = slice(offsets[t], offsets[t + 1])
         paths.append(folder / f"{t:04d}.ply")
-        write_ply(paths[-1], sequence.points[span], None, sequence.part[span])
+        points = sequence.points[span]
+        points = points if sequence.shift is None else points.astype(np.float64) + sequence.shift
+        write_ply(paths[-1], points, None, sequence.part[span])
     return paths

@@ -17,6 +17,7 @@ class PointSequence(Protocol):
     frame_offsets: np.ndarray  # [T + 1]
     color: np.ndarray | None  # [P, 3]
     part: np.ndarray | None  # [P]
+    shift: np.ndarray | None  # [3], what was taken off the original coordinates
 
     @property
     def num_frames(self) -> int:

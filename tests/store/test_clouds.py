@@ -346,3 +346,17 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 def test_missing_folder_is_said(tmp_path):
     with pytest.raises(DpcError, match="does not exist"):
         CloudsWriter(tmp_path / "no" / "a.h5")
+
+
+def test_class_names_may_be_missing_where_no_sample_has_a_label(tmp_path):
+    sequence = CloudSequence.from_frames("a", [np.ones((3, 3))])
+    for label in (-1, 0):
+        path = tmp_path / f"{label}.h5"
+        sequence.label = label
+        with CloudsWriter(path) as writer:
+            writer.write(sequence)
+        with h5py.File(path, "a") as file:
+            del file["class_names"]
+    assert CloudsReader(tmp_path / "-1.h5").class_names == []
+    with pytest.raises(DataError, match="class_names' is missing, though samples have labels"):
+        CloudsReader(tmp_path / "0.h5")

@@ -20,6 +20,13 @@ Sampling = Annotated[
     typer.Option("--sampling", help="How --points chooses: at random, farthest points (fps), or one per voxel."),
 ]
 Stride = Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")]
+Pattern = Annotated[
+    str,
+    typer.Option(
+        "--pattern",
+        help="Which files of a folder are its frames, such as '*.depth.png'. Default: found by their names.",
+    ),
+]
 LabelTable = Annotated[
     Path | None, typer.Option("--labels", help="CSV file of labels; its columns: name,label[,subject][,split].")
 ]

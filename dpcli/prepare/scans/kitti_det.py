@@ -13,6 +13,7 @@ from dpcli.prepare.decode.png import png_size
 from dpcli.prepare.reader import Item, Sample, describe
 from dpcli.prepare.scans.kitti_files import (
     IMAGE_SIZE,
+    OUTSIDE,
     View,
     calibration_matrix,
     check_coordinates,
@@ -178,6 +179,7 @@ class KittiDetection:
         boxes = [b for b in read_boxes(item.path / "label_2" / f"{item.name}.txt") if b.kind in self.objects]
         part = parts_of_boxes(points, boxes)
         notes = {
+            OUTSIDE: len(scan) - len(points),
             "scans cropped to 1242x375, their image_2 is missing": int(size == IMAGE_SIZE and not image.is_file()),
             "scans without an object": int(not part.any()),
             "boxes without a point": len(boxes) - len(np.unique(part[part > 0])),

@@ -12,6 +12,8 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import decode_gray_png
 from dpcli.prepare.reader import require_folder
 
+OUTSIDE = "points outside the camera's view, --near and --far dropped"
+_SHORTEST_FOCAL = 10.0  # pixels; less is no camera but a matrix that somebody had to fill in
 COORDINATES = ("published", "camera")
 IMAGE_SIZE = (1242, 375)  # pixels, width and height of most of KITTI's pictures
 
@@ -144,6 +146,16 @@ class View:
         inside = (w > 0) & (points[:, 2] < self.far)
         inside &= (u >= 0) & (u < size[0] * w) & (v >= 0) & (v < size[1] * w)
         return points[inside], ahead[inside]
+
+
+def is_no_camera(projection: np.ndarray) -> bool:
+    """Returns whether a projection f64 (4,4) is the identity or the like, as in scans of one's own without a camera."""
+    return abs(float(projection[0, 0])) < _SHORTEST_FOCAL
+
+
+def to_camera_axes(scan: np.ndarray) -> np.ndarray:
+    """Returns a scan (N,3) (x forward, y left, z up), where no camera was calibrated, in a camera's axes: f64 (N,3)."""
+    return np.stack([-scan[:, 1], -scan[:, 2], scan[:, 0]], axis=1).astype(np.float64)
 
 
 def renumber_objects(ids: np.ndarray) -> np.ndarray:

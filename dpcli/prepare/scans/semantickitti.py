@@ -13,13 +13,16 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.prepare.scans.kitti_files import (
     IMAGE_SIZE,
+    OUTSIDE,
     View,
     calibration_matrix,
     check_coordinates,
+    is_no_camera,
     orient_points,
     read_calibration,
     read_velodyne,
     renumber_objects,
+    to_camera_axes,
 )
 from dpcli.store import CloudSequence
 
@@ -39,6 +42,7 @@ CLASSES = {
 LABELED = tuple(f"{number:02}" for number in range(11))
 GROUPS = {"all": LABELED, "without-08": tuple(s for s in LABELED if s != "08"), "only-08": ("08",)}
 VALIDATION = "08"
+_WHOLE = "scans kept whole, because P2 in calib.txt is no camera's (focal length below 10 pixels)"
 
 
 def read_labels(path: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -146,28 +150,36 @@ class SemanticKitti:
             raise DataError(f"{path}: missing; the crop to the camera's view needs it")
         found = read_calibration(path)
         to_camera, projection = (calibration_matrix(found, path, key) for key in ("Tr", "P2"))
-        kept = [self._scan(item.path, name, to_camera, projection) for name in item.extra["scans"]]
+        whole = is_no_camera(projection)
+        kept = [self._scan(item.path, name, to_camera, None if whole else projection) for name in item.extra["scans"]]
+        notes = {_WHOLE: len(kept)} if whole else {OUTSIDE: sum(dropped for _, _, dropped in kept)}
         motions = self._alignment(item)
-        clouds = [
-            orient_points(points @ m[:3, :3].T + m[:3, 3], self.coordinates)
-            for (points, _), m in zip(kept, motions, strict=True)
-        ]
-        sizes = np.cumsum([len(ids) for _, ids in kept])[:-1]
-        part = renumber_objects(np.concatenate([ids for _, ids in kept]))  # over all frames: an object keeps its number
+        moved = [points @ m[:3, :3].T + m[:3, 3] for (points, _, _), m in zip(kept, motions, strict=True)]
+        clouds = [orient_points(to_camera_axes(points) if whole else points, self.coordinates) for points in moved]
+        sizes = np.cumsum([len(ids) for _, ids, _ in kept])[:-1]
+        part = renumber_objects(
+            np.concatenate([ids for _, ids, _ in kept])
+        )  # over all frames: an object keeps its number
         if not min(map(len, clouds)):
             raise DataError(f"{item.name}: a scan without a point in the camera's view within {self.view.far} m")
         sequence = CloudSequence.from_frames(item.name, clouds, part=np.split(part, sizes), **describe(item))
-        return Sample(sequence, {} if part.any() else {"samples without an object": 1})
+        notes |= {} if part.any() else {"samples without an object": 1}
+        return Sample(sequence, {what: count for what, count in notes.items() if count})
 
     def _scan(
-        self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns points in camera axes f64 (M,3) and object ids i64 (M), 0 = background."""
+        self, folder: Path, name: str, to_camera: np.ndarray, projection: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray, int]:
+        """Returns points in camera axes f64 (M,3), object ids i64 (M), 0 = background, and how many points were dropped.
+
+        Without a projection all points are kept, where ``to_camera`` puts them.
+        """
         scan = read_velodyne(folder / "velodyne" / f"{name}.bin")
         semantic, label = read_labels(folder / "labels" / f"{name}.label", len(scan))
         label[~np.isin(semantic, [number for kind in self.objects for number in CLASSES[kind]])] = 0
+        if projection is None:
+            return scan.astype(np.float64) @ to_camera[:3, :3].T + to_camera[:3, 3], label, 0
         points, index = self.view.crop(scan, to_camera, projection, IMAGE_SIZE)
-        return points, label[index]
+        return points, label[index], len(scan) - len(index)
 
     def _alignment(self, item: Item) -> np.ndarray:
         """Returns f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities

@@ -1,0 +1,163 @@
+"""Numbers in the names of frames: which run, which are times, and the order they put files in."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_DATE = re.compile(
+    r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
+)
+_SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
+_SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9))  # digits of a time since 1970 -> decimal places among them
+
+
+@dataclass(frozen=True)
+class Name:
+    """Holds a file name taken apart: the parts between its numbers (one more than these), and the numbers as written.
+
+    A date with its time of day counts as one number, that of its seconds since 1970.
+    """
+
+    text: str
+    parts: tuple[str, ...]
+    suffix: str
+    numbers: tuple[str, ...]
+    is_time: tuple[bool, ...]
+
+    @property
+    def shape(self) -> str:
+        """Returns the name without suffix, in small letters, with ``*`` for every number."""
+        return "*".join(self.parts).casefold()
+
+
+def parse_name(text: str) -> Name:
+    """Returns a file's name taken apart.
+
+    >>> parse_name("frame-000012.depth.png").shape, parse_name("scan_3.25.ply").numbers
+    ('frame-*.depth', ('3.25',))
+    """
+    path = Path(text)
+    stem, parts, numbers, is_time, end = path.stem, [], [], [], 0
+    while end < len(stem):
+        match, written, timed = _next_number(stem, end)
+        if match is None:
+            break
+        parts.append(stem[end : match.start()])
+        numbers.append(written)
+        is_time.append(timed)
+        end = match.end()
+    return Name(text, (*parts, stem[end:]), path.suffix.lower(), tuple(numbers), tuple(is_time))
+
+
+def _next_number(stem: str, start: int) -> tuple[re.Match[str] | None, str, bool]:
+    """Returns the first number from ``start`` on, how it is written as one, and whether it is a date or seconds and parts."""
+    plain = _NUMBER.search(stem, start)
+    if plain is None:
+        return None, "", False
+    if (date := _DATE.match(stem, plain.start())) and (seconds := _since_1970(date)):
+        return date, seconds, True
+    if parts := _SECONDS.match(stem, plain.start()):
+        return parts, f"{parts[1]}.{parts[2] or parts[3]}", True
+    return plain, plain[0], False
+
+
+def _since_1970(match: re.Match[str]) -> str:
+    year, month, day, hour, minute, second, fraction = match.groups()
+    try:
+        moment = datetime(int(year), int(month), int(day), int(hour), int(minute), 0, tzinfo=timezone.utc)
+    except ValueError:  # such as month 13: it is no date
+        return ""
+    return f"{int(moment.timestamp()) + int(second)}" + (f".{fraction}" if fraction else "")
+
+
+class NumberColumns:
+    """Looks at the numbers of all names of one shape, because one alone doesn't tell what it means.
+
+    Whether ``5.10`` comes before ``5.9`` depends on the others: decimals are written with trailing zeros or without,
+    seconds and nanoseconds with a point between them may lack leading zeros.
+    """
+
+    def __init__(self, names: Sequence[Name]) -> None:
+        self.names = names
+        self.columns = list(zip(*(name.numbers for name in names))) if names and names[0].numbers else []
+        self.counted = [_counts_after_point(column) for column in self.columns]
+
+    def varying(self) -> list[int]:
+        """Returns which columns hold more than one number."""
+        return [k for k, column in enumerate(self.columns) if len(set(column)) > 1]
+
+    def key(self, name: Name) -> tuple[Any, ...]:
+        """Returns the sort key of a name: its numbers one after the other, and its spelling last."""
+        return (*(_value(number, counted) for number, counted in zip(name.numbers, self.counted)), name.text)
+
+    def pattern(self) -> str:
+        """Returns the names with ``*`` where they differ."""
+        first, varying = self.names[0], set(self.varying())
+        shown = [
+            "*" if k in varying or len(self.names) == 1 or first.is_time[k] else number
+            for k, number in enumerate(first.numbers)
+        ]
+        text = first.parts[0] + "".join(number + part for number, part in zip(shown, first.parts[1:]))
+        return text + Path(first.text).suffix
+
+    def running_numbers(self) -> np.ndarray | None:
+        """Returns the whole numbers in which the names differ, i64 (F); None when they differ in more, or in none."""
+        varying = self.varying()
+        if len(varying) != 1 or any("." in number for number in self.columns[varying[0]]):
+            return None
+        numbers = [int(number) for number in self.columns[varying[0]]]
+        rising = all(a < b for a, b in zip(numbers, numbers[1:]))
+        return np.array(numbers, np.int64) if rising and numbers[-1] < 2**62 else None
+
+    def times(self) -> np.ndarray | None:
+        """Returns the seconds between the first name's time and each, f64 (F); None unless all hold times, rising."""
+        for column in self.varying():
+            seconds = self._seconds(column)
+            if seconds is not None and all(a < b for a, b in zip(seconds, seconds[1:])):
+                since = np.array([float(second - seconds[0]) for second in seconds])
+                if np.median(np.diff(since)) >= _SHORTEST:
+                    return since
+        return None
+
+    def _seconds(self, column: int) -> list[Decimal] | None:
+        numbers = self.columns[column]
+        if all(name.is_time[column] for name in self.names):
+            return [_in_seconds(number, self.counted[column]) for number in numbers]
+        if all("." in number and len(number.partition(".")[2]) >= 6 for number in numbers):  # as %f and ROS write them
+            return [_in_seconds(number, False) for number in numbers]
+        for digits, places in _EPOCHS:
+            if all(len(number) == digits and number[0] in "12" for number in numbers):
+                return [Decimal(number).scaleb(-places) for number in numbers]
+        return None
+
+
+def _counts_after_point(column: Sequence[str]) -> bool:
+    """Returns whether digits after the point count by themselves, as in versions and nanoseconds without leading zeros.
+
+    Numbers that count never begin with 0 and some end with it; fractions cut short begin with 0 and never end with it.
+    """
+    after = [number.partition(".")[2] for number in column if "." in number]
+    if len({len(digits) for digits in after}) < 2:
+        return False
+    return all(digits[0] != "0" or digits == "0" for digits in after) and any(digits[-1] == "0" for digits in after)
+
+
+def _value(number: str, counted: bool) -> tuple[int, Decimal]:
+    whole, _, after = number.partition(".")
+    return int(whole), Decimal(after or 0) if counted else Decimal(f"0.{after or 0}")
+
+
+def _in_seconds(number: str, counted: bool) -> Decimal:
+    """Returns seconds; digits that count by themselves are nanoseconds."""
+    whole, after = _value(number, counted)
+    return whole + (after.scaleb(-9) if counted else after)

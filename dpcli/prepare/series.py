@@ -1,0 +1,281 @@
+"""Series of frames in a folder: which files make one clip, in which order, and the times that their names tell.
+
+Files belong together when their names differ in numbers only. Where several series lie in one folder, one is chosen by
+rule or by the pattern that a user gives; the others are named, and where no rule decides, so is the choice to make.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.name_numbers import Name, NumberColumns, parse_name
+from dpcli.prepare.reader import natural_key
+
+_LISTED = 5
+TEXTS = (".txt", ".csv", ".tsv")
+_BESIDE = re.compile(
+    r"(read[-_ ]?me|licen[cs]e|copying|changelog|notes?|poses?|traj\w*|odom\w*|ground[-_ ]?truth|gt|times?|time_?stamps?|"
+    r"calib\w*|camera\w*|intrinsics?|extrinsics?|k|labels?|classes|meta\w*|info|index|files?|list|train|val|test|splits?|"
+    r"associations?|imu|gps|oxts|config|settings|requirements|cmakelists)([-_. ].*)?",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class Series:
+    """Holds the files of one series in their order; ``left_out`` names what else lay there, a phrase each."""
+
+    folder: Path
+    names: tuple[str, ...]
+    pattern: str
+    left_out: tuple[str, ...] = ()
+    numbered: bool = True
+    suffix: str = field(default="", compare=False)
+
+    @property
+    def paths(self) -> list[Path]:
+        """Returns the files in their order."""
+        return [self.folder / name for name in self.names]
+
+    @property
+    def stems(self) -> frozenset[str]:
+        """Returns the names without their suffixes."""
+        return frozenset(Path(name).stem for name in self.names)
+
+    def described(self) -> str:
+        """Returns pattern and number of files, such as ``frame_*.png (30 files)``, or the one file's name."""
+        return self.names[0] if len(self.names) == 1 else f"{self.pattern} ({len(self.names)} files)"
+
+    def numbers(self) -> np.ndarray | None:
+        """Returns the running numbers in the names, i64 (F), rising; None when the names hold none, or more than one."""
+        return NumberColumns([parse_name(name) for name in self.names]).running_numbers() if self.numbered else None
+
+    def times(self) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (F), rising, where the names are times; None when they are not."""
+        return NumberColumns([parse_name(name) for name in self.names]).times() if self.numbered else None
+
+    def frame_times(self, fps: float | None) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (F): numbers in the names divided by ``fps``, so that what is missing
+        leaves a gap, or else what the names tell; None when neither says anything.
+        """
+        if fps is None:
+            return self.times()
+        numbers = None if self.times() is not None else self.numbers()
+        places = np.arange(len(self.names)) if numbers is None else _evenly(numbers)
+        return places / fps
+
+
+def missing_numbers(numbers: np.ndarray | None) -> list[str]:
+    """Returns which numbers are missing in rising ones, i64 (F), such as ``["3 to 6", "9"]``; a common step is no gap.
+
+    >>> missing_numbers(np.array([0, 1, 2, 7, 8]))
+    ['3 to 6']
+    >>> missing_numbers(np.array([0, 5, 10]))
+    []
+    """
+    if numbers is None or len(numbers) < 2:
+        return []
+    steps = np.diff(numbers)
+    step = int(np.gcd.reduce(steps))
+    found = []
+    for place in np.flatnonzero(steps > step):
+        first, last = int(numbers[place]) + step, int(numbers[place + 1]) - step
+        found.append(str(first) if first == last else f"{first} to {last}")
+    return found
+
+
+def about_series(clips: Sequence[tuple[str, Series]]) -> list[str]:
+    """Returns lines for the log about what of a folder is not in its clip: other files, and numbers that are missing.
+
+    clips: (name of the sample, its series).
+    """
+    lines = []
+    for name, series in clips:
+        if series.left_out:
+            others = ", ".join(series.left_out[:_LISTED]) + (" ..." if series.left_out[_LISTED:] else "")
+            lines.append(f"{name}: its frames are {series.described()}; left out: {others}")
+        gaps = missing_numbers(series.numbers()) if series.times() is None else []
+        if gaps:
+            missing = ", ".join(gaps[:_LISTED]) + (" ..." if gaps[_LISTED:] else "")
+            lines.append(f"{name}: its frames are numbered with gaps: {missing} missing")
+    more = len(lines) - 2 * _LISTED
+    return lines if more <= 0 else [*lines[: 2 * _LISTED], f"... and {more} more such folders"]
+
+
+def _evenly(numbers: np.ndarray) -> np.ndarray:
+    """Returns how many steps each number is behind the first; a common step of 2 or more counts as one."""
+    return (numbers - numbers[0]) // max(int(np.gcd.reduce(np.diff(numbers))), 1) if len(numbers) > 1 else numbers * 0
+
+
+def is_hidden(name: str) -> bool:
+    """Returns whether a file is none of the user's: hidden, as what macOS puts beside a file (``._x``), or a lock."""
+    return name.startswith((".", "~$"))
+
+
+def is_beside(name: str) -> bool:
+    """Returns whether a text's name says that it is about the frames (README, poses, times, labels, ...), not one."""
+    path = Path(name)
+    return path.suffix.lower() in TEXTS and _BESIDE.fullmatch(path.stem) is not None
+
+
+def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
+    """Returns the series among the names of files, largest first; names without numbers make one for each suffix."""
+    groups: dict[tuple[str, str], list[Name]] = {}
+    for name in map(parse_name, names):
+        groups.setdefault((name.shape if name.numbers else "", name.suffix), []).append(name)
+    found = [_made(folder, part) for group in groups.values() for part in _objects(group)]
+    scattered = sum(len(one.names) for one in found if one.numbered and len(one.names) == 1)
+    if scattered > 2 and 2 * scattered > sum(len(one.names) for one in found if one.numbered):
+        found = _joined(folder, found)  # such as hashes: their letters are no pattern
+    return sorted(found, key=lambda one: (-len(one.names), one.names))
+
+
+def _objects(group: list[Name]) -> list[list[Name]]:
+    """Returns the files of one shape by object, where each object's frames are counted anew, such as ``cup1_0, cup1_1,
+    cup2_0, cup2_1``.
+    """
+    varying = NumberColumns(group).varying()
+    if len(varying) < 2 or any(name.is_time[column] for name in group for column in varying):
+        return [group]
+    *outer, inner = varying
+    parts: dict[tuple[str, ...], list[Name]] = {}
+    for name in group:
+        parts.setdefault(tuple(name.numbers[column] for column in outer), []).append(name)
+    counts = [sorted(float(name.numbers[inner]) for name in part) for part in parts.values()]
+    anew = all(len(own) > 1 and own == [counts[0][0] + k for k in range(len(own))] for own in counts)
+    return list(parts.values()) if anew and len(parts) > 1 else [group]
+
+
+def _made(folder: Path, names: list[Name]) -> Series:
+    columns = NumberColumns(names)
+    ordered = tuple(name.text for name in sorted(names, key=columns.key))
+    numbered = bool(names[0].numbers)
+    pattern = columns.pattern() if numbered else f"*{names[0].suffix}"
+    return Series(folder, ordered, pattern, numbered=numbered, suffix=names[0].suffix)
+
+
+def _joined(folder: Path, found: list[Series]) -> list[Series]:
+    """Returns one series for each suffix."""
+    by_suffix: dict[str, list[str]] = {}
+    for one in found:
+        by_suffix.setdefault(one.suffix, []).extend(one.names)
+    return [
+        Series(folder, tuple(sorted(names, key=natural_key)), f"*{suffix}", numbered=False, suffix=suffix)
+        for suffix, names in by_suffix.items()
+    ]
+
+
+def choose_series(
+    folder: Path,
+    names: Sequence[str],
+    *,
+    pattern: str = "",
+    suffixes: Sequence[str] = (),
+    wanted: str = "",
+    judge: Callable[[Path], bool] | None = None,
+) -> Series | None:
+    """Returns the one series that is the clip; None when the folder holds nothing but hidden files and texts about frames,
+    or nothing that fits the pattern.
+
+    names: the files of ``folder`` that may be frames. pattern: what a user chose, such as ``*.depth.png``. suffixes: in
+    the order in which two files of one name are preferred. wanted: a regular expression for names that say what is looked
+    for. judge: whether a file can be a frame, asked of one file of each series when nothing else decides. Raises DataError
+    that lists the series when no rule decides.
+    """
+    shown = [name for name in names if not is_hidden(name)]
+    if pattern:
+        return _by_pattern(folder, shown, pattern)
+    frames = [name for name in shown if not is_beside(name)]
+    beside = [name for name in shown if is_beside(name)]
+    if not frames:
+        return None
+    found = _mixed_formats(folder, all_series(folder, frames))
+    left_out: list[Series] = []
+    rules = (_numbered, lambda s: _preferred(s, suffixes), _no_texts, lambda s: _wanted(s, wanted), _more_than_one)
+    for rule in rules:
+        kept = rule(found)
+        left_out += [one for one in found if one not in kept]
+        found = kept
+    if len(found) > 1 and judge is not None:
+        kept = [one for one in found if judge(one.paths[0])] or found
+        left_out += [one for one in found if one not in kept]
+        found = kept
+    if len(found) > 1:
+        raise DataError(
+            f"{folder}: holds {len(found)} series of frames: {', '.join(one.described() for one in found[:6])}; name one:"
+            f" --pattern '{found[0].pattern}', or put each into a folder of its own"
+        )
+    return replace(found[0], left_out=(*(one.described() for one in left_out), *sorted(beside)))
+
+
+def _by_pattern(folder: Path, names: list[str], pattern: str) -> Series | None:
+    matching = [name for name in names if fnmatchcase(name, pattern)]
+    if not matching:
+        return None
+    found = all_series(folder, matching)
+    others = all_series(folder, [name for name in names if not fnmatchcase(name, pattern)])
+    one = found[0] if len(found) == 1 else _joined_all(folder, found, pattern)
+    return replace(one, left_out=tuple(other.described() for other in others))
+
+
+def _joined_all(folder: Path, found: list[Series], pattern: str) -> Series:
+    names = sorted((name for one in found for name in one.names), key=natural_key)
+    return Series(folder, tuple(names), pattern, numbered=False)
+
+
+def _mixed_formats(folder: Path, found: list[Series]) -> list[Series]:
+    """Returns the series, those of one shape joined where no frame is there twice: a clip whose files changed format."""
+    shapes: dict[tuple[str, bool], list[Series]] = {}
+    for one in found:
+        own = one.pattern[: -len(one.suffix)] if one.suffix else one.pattern
+        shapes.setdefault((own.casefold(), one.numbered), []).append(one)
+    joined = []
+    for same in shapes.values():
+        stems = [stem for one in same for stem in one.stems]
+        texts = {one.suffix in TEXTS for one in same}
+        if len(same) > 1 and same[0].numbered and len(set(stems)) == len(stems) and len(texts) == 1:
+            joined.append(_made_of(folder, same))
+        else:
+            joined += same
+    return joined
+
+
+def _made_of(folder: Path, same: list[Series]) -> Series:
+    names = [parse_name(name) for one in same for name in one.names]
+    one = _made(folder, names)
+    return replace(one, pattern=one.pattern[: -len(one.suffix)] + ".*" if one.suffix else one.pattern)
+
+
+def _numbered(found: list[Series]) -> list[Series]:
+    return [one for one in found if one.numbered] or found
+
+
+def _preferred(found: list[Series], suffixes: Sequence[str]) -> list[Series]:
+    """Returns the series without twins: those that hold the same frames in a format that is less preferred."""
+    ranks = {suffix: rank for rank, suffix in enumerate(suffixes)}
+    kept: list[Series] = []
+    for one in sorted(found, key=lambda one: ranks.get(one.suffix, len(ranks))):
+        if not any(other.suffix != one.suffix and one.stems & other.stems for other in kept):
+            kept.append(one)
+    return [one for one in found if one in kept]
+
+
+def _no_texts(found: list[Series]) -> list[Series]:
+    return [one for one in found if one.suffix not in TEXTS] or found
+
+
+def _wanted(found: list[Series], wanted: str) -> list[Series]:
+    if not wanted:
+        return found
+    return [one for one in found if re.search(wanted, one.pattern, re.IGNORECASE)] or found
+
+
+def _more_than_one(found: list[Series]) -> list[Series]:
+    return [one for one in found if len(one.names) > 1] or found

@@ -1,0 +1,131 @@
+"""Arrays: every type and order of NumPy's files, colors of any range, and the number of columns of a `.bin`."""
+
+from __future__ import annotations
+
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_npy, read_npz
+from dpcli.prepare.cloud_formats.colors import as_bytes
+from dpcli.prepare.scans.clouds import CloudFolders
+
+quick = settings(
+    max_examples=60, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+@quick
+@given(data=st.data())
+def test_what_numpy_writes_is_read_back(tmp_path, data):
+    kind = data.draw(st.sampled_from(["f2", "<f4", ">f4", "<f8", ">f8", "<i2", ">i4", "<u2", "u1"]))
+    width, count = data.draw(st.integers(3, 7)), data.draw(st.integers(5, 30))
+    rng = np.random.default_rng(data.draw(st.integers(0, 9)))
+    array = rng.uniform(0, 200, (count, width)).astype(kind)
+    form = data.draw(st.sampled_from(["C", "F", "structured", "npz"]))
+    if form == "structured":
+        order = data.draw(st.permutations(["x", "y", "z", "v"]))
+        rows = np.zeros(count, [(name, kind) for name in order])
+        for k, name in enumerate("xyz"):
+            rows[name] = array[:, k]
+        np.save(tmp_path / "a.npy", rows)
+        found = read_npy(tmp_path / "a.npy", keep=["v"])
+        assert found.extra["v"].tolist() == [0] * count
+    elif form == "npz":
+        np.savez_compressed(tmp_path / "a.npz", xyz=array, v=np.arange(count))
+        found = read_npz(tmp_path / "a.npz", keep=["v"])
+        assert found.extra["v"].tolist() == list(range(count))
+    else:
+        np.save(tmp_path / "a.npy", np.asarray(array, order=form))
+        found = read_npy(tmp_path / "a.npy")
+    np.testing.assert_array_equal(found.points, array[:, :3].astype(np.float64))
+
+
+def test_an_array_that_lies_on_its_side_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 1000)))
+    with pytest.raises(DataError, match=r"\(3, 1000\); expected a row for each point"):
+        read_npy(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        (np.float32([[0, 0.5, 1]]), [0, 128, 255]),
+        (np.float32([[0, 100, 255]]), [0, 100, 255]),
+        (np.float64([[121, 131, 193]]), [121, 131, 193]),
+        (np.uint16([[39, 57, 249]]), [39, 57, 249]),
+        (np.uint16([[0, 32768, 65535]]), [0, 128, 255]),
+        (np.float64([[0, 32768, 65535]]), [0, 128, 255]),
+        (np.int32([[1, 2, 3]]), [1, 2, 3]),
+        (np.uint8([[1, 0, 1]]), [1, 0, 1]),
+    ],
+)
+def test_ranges_of_color(values, expected):
+    (found,) = as_bytes([values])
+    assert found.dtype == np.uint8 and found.tolist() == [expected]
+
+
+@pytest.mark.parametrize("values", [[[-1.0, 0, 0]], [[np.nan, 0, 0]], [[256.0, 3, 4]], [[1e6, 0, 0]]])
+def test_colors_of_no_range_are_refused(values):
+    with pytest.raises(DataError, match="expected 0 to 255, fractions from 0 to 1, or 16 bits"):
+        as_bytes([np.float64(values)])
+
+
+def scan(columns: int, count: int, seed: int) -> np.ndarray:
+    """A scan of a room as a lidar has it, x y z and then reflectance, ring, time or normals."""
+    rng = np.random.default_rng(seed)
+    points = np.stack([rng.normal(0, 12, count), rng.normal(0, 9, count), rng.normal(-1, 0.6, count)], axis=1)
+    further = [rng.uniform(0, 1, count), rng.integers(0, 32, count), rng.uniform(0, 0.1, count)]
+    return np.column_stack([points, *further[: columns - 3]]).astype("<f4")
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("count", [360, 4096, 30_000])
+def test_columns_are_told_by_their_look(tmp_path, columns, count):
+    paths = []
+    for seed in range(3):
+        paths.append(tmp_path / f"{seed}.bin")
+        scan(columns, count, seed).tofile(paths[-1])
+    assert guess_bin_columns(paths) == (columns, True)
+
+
+def test_few_points_are_kitti_s_unless_a_reflectance_is_negative(tmp_path):
+    values = np.random.default_rng(0).normal(size=(8, 3)).astype("<f4")
+    values.tofile(tmp_path / "0.bin")
+    assert guess_bin_columns([tmp_path / "0.bin"]) == (3, False)
+    np.abs(values).tofile(tmp_path / "0.bin")
+    assert guess_bin_columns([tmp_path / "0.bin"]) == (4, True)
+    reader = CloudFolders(tmp_path)
+    values.tofile(tmp_path / "0.bin")
+    sample = reader.read(reader.items()[0], np.random.default_rng(0))
+    np.testing.assert_array_equal(sample.sequence.points, values)
+    (note,) = sample.notes
+    assert "3 float32 a point" in note and "other numbers fit as well" in note and "--bin-columns" in note
+
+
+def test_a_bin_of_another_type_is_refused(tmp_path):
+    np.random.default_rng(0).normal(size=(60, 4)).astype("<f8").tofile(tmp_path / "0.bin")
+    with pytest.raises(DataError, match="no coordinates in float32"):
+        read_bin(tmp_path / "0.bin", 4)
+
+
+def test_damaged_arrays_are_named(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.ones((4, 3), np.float32))
+    whole = path.read_bytes()
+    for old, new in ((b"(4, 3)", b"(9**9,"), (b"(4, 3), }", b"(4, 3)   "), (b"(4, 3)", b"(9999999999, 3)")):
+        path.write_bytes(whole.replace(old, new))
+        with pytest.raises(DataError, match="a.npy: not a readable .npy"):
+            read_npy(path)
+    np.savez(tmp_path / "b.npz", other=np.ones(3))
+    path.write_bytes((tmp_path / "b.npz").read_bytes())
+    with pytest.raises(DataError, match="a.npy: not a readable .npy"):
+        read_npy(path)
+    with zipfile.ZipFile(tmp_path / "c.npz", "w") as archive:
+        archive.writestr("points", b"no array")
+    with pytest.raises(DataError, match="expected one called points"):
+        read_npz(tmp_path / "c.npz")

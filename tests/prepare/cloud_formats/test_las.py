@@ -1,0 +1,109 @@
+"""LAS and LAZ: every point format that laspy writes is read back; 8-bit colors, and the unit that a file declares."""
+
+from __future__ import annotations
+
+import laspy
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.colors import as_bytes
+from dpcli.prepare.cloud_formats.las import read_las
+from dpcli.prepare.scans.clouds import CloudFolders
+
+quick = settings(
+    max_examples=40, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def make(form: int, points: np.ndarray, scale: float = 0.001) -> laspy.LasData:
+    las = laspy.create(point_format=form, file_version="1.4" if form > 5 else "1.3" if form > 3 else "1.2")
+    las.header.scales, las.header.offsets = [scale] * 3, np.floor(points.min(0))
+    las.x, las.y, las.z = points.T
+    return las
+
+
+@quick
+@given(data=st.data())
+def test_what_laspy_writes_is_read_back(tmp_path, data):
+    form, suffix = data.draw(st.integers(0, 10)), data.draw(st.sampled_from([".las", ".laz"]))
+    if suffix == ".laz" and form in (4, 5, 9, 10):
+        suffix = ".las"  # wave packets are not compressed
+    scale = data.draw(st.sampled_from([1e-4, 0.001, 0.01]))
+    rng = np.random.default_rng(data.draw(st.integers(0, 9)))
+    points = rng.uniform(-50, 50, (data.draw(st.integers(1, 40)), 3)) + data.draw(st.sampled_from([0, 500_000]))
+    las = make(form, points, scale)
+    las.intensity = rng.integers(0, 65536, len(points)).astype(np.uint16)
+    colored = "red" in las.point_format.dimension_names
+    color = rng.integers(1, 65536, (len(points), 3)).astype(np.uint16)
+    if colored:
+        las.red, las.green, las.blue = color.T
+    path = tmp_path / f"a{suffix}"
+    las.write(str(path))
+    cloud = read_las(path, keep=["intensity"])
+    np.testing.assert_allclose(cloud.points, points, atol=scale)
+    np.testing.assert_array_equal(cloud.extra["intensity"], las.intensity)
+    assert (cloud.color is not None) == colored
+    if colored:
+        np.testing.assert_array_equal(cloud.color, color)
+
+
+@pytest.mark.parametrize("factor", [1, 257])
+def test_bytes_and_words_of_color(tmp_path, factor):
+    """A dark frame (all below 256) beside a bright one of 16 bits is dark, not bright."""
+    points = np.random.default_rng(0).uniform(0, 1, (30, 3))
+    color = np.random.default_rng(1).integers(0, 200, (30, 3))
+    las = make(2, points)
+    las.red, las.green, las.blue = (color * factor).astype(np.uint16).T
+    las.write(str(tmp_path / "a.las"))
+    (found,) = as_bytes([read_las(tmp_path / "a.las").color])
+    np.testing.assert_array_equal(found, color)
+    dark = np.full((2, 3), 40, np.uint16)
+    assert as_bytes([read_las(tmp_path / "a.las").color, dark])[1][0, 0] == (40 if factor == 1 else 0)
+
+
+def test_colors_that_nobody_filled_in_are_none(tmp_path):
+    make(3, np.ones((4, 3))).write(str(tmp_path / "a.las"))
+    assert read_las(tmp_path / "a.las").color is None
+
+
+@pytest.mark.parametrize(("code", "name", "meters"), [(9002, "ft", 0.3048), (9003, "us-ft", 1200 / 3937)])
+def test_feet_that_a_file_declares_become_meters(tmp_path, code, name, meters):
+    points = np.random.default_rng(0).uniform(0, 20, (30, 3))
+    las = make(0, points, 1e-4)
+    keys = GeoKeyDirectoryVlr()
+    keys.geo_keys = [GeoKeyEntryStruct(3076, 0, 1, code)]
+    keys.geo_keys_header.number_of_keys = 1
+    las.header.vlrs.append(keys)
+    (tmp_path / "in").mkdir()
+    las.write(str(tmp_path / "in" / "0.las"))
+    assert read_las(tmp_path / "in" / "0.las").unit == name
+    reader = CloudFolders(tmp_path / "in")
+    sample = reader.read(reader.items()[0], np.random.default_rng(0))
+    np.testing.assert_allclose(sample.sequence.points, points * meters, atol=1e-4)
+    assert sample.notes == {f"sequences converted from {name} to m, as their files declare": 1}
+    kept = CloudFolders(tmp_path / "in", scale=1.0)
+    np.testing.assert_allclose(kept.read(kept.items()[0], np.random.default_rng(0)).sequence.points, points, atol=1e-4)
+
+
+def test_a_damaged_laz_is_named(tmp_path):
+    make(0, np.random.default_rng(0).uniform(0, 1, (500, 3))).write(str(tmp_path / "a.laz"))
+    whole = (tmp_path / "a.laz").read_bytes()
+    (tmp_path / "a.laz").write_bytes(whole[:-200])
+    with pytest.raises(DataError, match="a.laz: (not a readable LAZ|truncated)"):
+        read_las(tmp_path / "a.laz")
+
+
+@pytest.mark.parametrize(("place", "value"), [(100, 0xFFFFFFFF), (96, 0xFFFFFF), (94, 0xFFFF)])
+def test_a_header_that_counts_what_is_not_there_is_refused_at_once(tmp_path, place, value):
+    """laspy reads records as long as the header says, into all memory."""
+    path = tmp_path / "a.las"
+    make(3, np.ones((9, 3))).write(str(path))
+    data = bytearray(path.read_bytes())
+    data[place : place + (2 if place == 94 else 4)] = value.to_bytes(2 if place == 94 else 4, "little")
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="truncated or damaged: its header says"):
+        read_las(path)

@@ -1,0 +1,138 @@
+"""Texts: every delimiter, decimal sign, encoding and quoting that people's programs write is read back equal."""
+
+from __future__ import annotations
+
+import csv
+import io
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
+from dpcli.prepare.cloud_formats.text_cloud import read_text
+
+POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
+quick = settings(
+    max_examples=150, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def read(path, text, encoding="utf-8", **options):
+    path.write_bytes(text.encode(encoding))
+    return read_text(path, **options)
+
+
+@quick
+@given(data=st.data())
+def test_what_csv_writers_write_is_read_back(tmp_path, data):
+    delimiter = data.draw(st.sampled_from([",", ";", "\t", "|", " "]))
+    comma = delimiter != " " and data.draw(st.booleans())
+    quoting = data.draw(st.sampled_from([csv.QUOTE_MINIMAL, csv.QUOTE_ALL]))
+    encoding = data.draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "latin-1"]))
+    order = data.draw(st.permutations(["x", "y", "z", "größe" if encoding != "latin-1" else "size"]))
+    trailing, ends = data.draw(st.booleans()) and delimiter != " ", data.draw(st.sampled_from(["\n", "\r\n", "\r"]))
+    rng = np.random.default_rng(data.draw(st.integers(0, 9)))
+    values = np.round(rng.normal(0, 10.0 ** data.draw(st.integers(-2, 5)), (data.draw(st.integers(1, 12)), 4)), 3)
+    file = io.StringIO()
+    writer = csv.writer(file, delimiter=delimiter, quoting=quoting, lineterminator=ends)
+    writer.writerow([*order, *([""] if trailing else [])])
+    for row in values:
+        cells = [f"{value:.3f}".replace(".", "," if comma else ".") for value in row]
+        writer.writerow([*cells, *([""] if trailing else [])])
+    (tmp_path / "a.csv").write_bytes(file.getvalue().encode(encoding))
+    found = read_text(tmp_path / "a.csv").points
+    np.testing.assert_allclose(found, values[:, [order.index(axis) for axis in "xyz"]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x;y;z\n0,126;-0,132;0,64\n0,105;-0,536;0,362\n-1,265;-0,623;0,041\n",
+        "0,126 -0,132 0,64\n0,105  -0,536 0,362\n-1,265 -0,623 0,041\n",
+        "3\n0.126 -0.132 0.64\n0.105 -0.536 0.362\n-1.265 -0.623 0.041\n",
+        "//X Y Z\n0.126 -0.132 0.64\n0.105 -0.536 0.362\n-1.265 -0.623 0.041\n",
+        "# a lidar log\n# x y z\n0.126 -0.132 0.64\n0.105 -0.536 0.362\n-1.265 -0.623 0.041\n",
+        "sep=;\nX;Y;Z\n0,126;-0,132;0,64\n0,105;-0,536;0,362\n-1,265;-0,623;0,041\n",
+        "Radar 77 GHz\nrecorded,Monday\nz,y,x,\n0.64,-0.132,0.126,\n0.362,-0.536,0.105,\n0.041,-0.623,-1.265,\n",
+        "x,y,z,class\n0.126,-0.132,0.64,car\n0.105,-0.536,0.362,a bus\n-1.265,-0.623,0.041,\n",
+        '"x","y","z"\n"0.126","-0.132","0.64"\n"0.105","-0.536","0.362"\n"-1.265","-0.623","0.041"\n',
+        "0.126, -0.132, 0.64\n0.105, -0.536, 0.362\n\n-1.265, -0.623, 0.041",
+        "x,y,z\n1.26e-1,-1.32E-01,+.64\n0.105,-0.536,0.362\n-1.265,-0.623,0.041\n",
+        "Points:0,Points:1,Points:2,id\n0.126,-0.132,0.64,0\n0.105,-0.536,0.362,1\n-1.265,-0.623,0.041,2\n",
+    ],
+)
+def test_texts_of_the_same_points(tmp_path, text):
+    np.testing.assert_allclose(read(tmp_path / "a.csv", text).points, POINTS)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x;y;z\n1.234,5;-2,25;1.000.000,5\n", [1234.5, -2.25, 1000000.5]),
+        ('x,y,z\n"1,234.5","2.25","448,000.249"\n', [1234.5, 2.25, 448000.249]),
+        ("x;y;z\n448'000.5;1;2\n", [448000.5, 1, 2]),
+        ("x;y;z\n1 234,5;1;2\n", [1234.5, 1, 2]),
+        ("x,y,z\n,2,nan\n", [np.nan, 2, np.nan]),
+        ("x,y,z\nNULL,2,1e30\n", [np.nan, 2, 1e30]),
+    ],
+)
+def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
+    np.testing.assert_allclose(read(tmp_path / "a.csv", text).points, [expected])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y,z\n0,126,-0,132,0,640\n", "a.csv:2: 6 values; .*decimal commas between commas"),
+        ("0,126,-0,132,0,640\n0,105,-0,536,0,362\n", "a.csv:1: decimal commas between commas can't be told apart"),
+        ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
+        ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
+        ("x,y,z\n", "a header, but no rows"),
+        ("\n\n", "no rows"),
+        ("range,azimuth,elevation\n1,2,3\n", "columns range, azimuth, elevation; expected x, y and z"),
+        ("x,y,z,pos_x,X\n1,2,3,4,5\n", "columns x, X could each be x"),
+        ("x_mm,y_mm,z_m\n1,2,3\n", "different units"),
+        ("frame,x,y,z\n0,1,2,3\n1,1,2,3\n", "'frame' numbers 2 frames; --frame-column frame"),
+    ],
+)
+def test_what_cannot_be_told_is_refused(tmp_path, text, message):
+    with pytest.raises(DataError, match=message):
+        read(tmp_path / "a.csv", text)
+
+
+def test_one_frame_of_a_table_is_a_cloud(tmp_path):
+    assert read(tmp_path / "a.csv", "frame,x,y,z\n7,1,2,3\n7,4,5,6\n").points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_bytes_that_are_no_text(tmp_path):
+    (tmp_path / "a.txt").write_bytes(bytes(range(256)) * 4)
+    with pytest.raises(DataError, match="a.txt: not text"):
+        read_text(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize(
+    ("names", "places", "unit"),
+    [
+        ("x y z", [0, 1, 2], ""),
+        ("X [m]|Y [m]|Z [m]", [0, 1, 2], "m"),
+        ("time|Pos_X(mm)|Pos_Y(mm)|Pos_Z(mm)", [1, 2, 3], "mm"),
+        ("vx vy vz posX posY posZ", [3, 4, 5], ""),
+        ("field.x field.y field.z", [0, 1, 2], ""),
+        ("Easting Northing Elevation", [0, 1, 2], ""),
+        ("x y z pos_x pos_y pos_z", [0, 1, 2], ""),
+        ("z_ft y_ft x_ft", [2, 1, 0], "ft"),
+        ("point_x point_y point_z", [0, 1, 2], ""),
+        ("x-coordinate y-coordinate z-coordinate", [0, 1, 2], ""),
+    ],
+)
+def test_styles_of_headers(names, places, unit):
+    assert find_axes(names.split("|") if "|" in names else names.split()) == (places, unit)
+
+
+def test_names_that_mean_something_else():
+    assert find_axes(["vx", "vy", "vz"]) is None and find_axes(["x", "y", "range"]) is None
+    assert find_colors(["r", "azimuth", "g"]) == [] and find_colors(["x", "Red", "Green", "Blue"]) == [1, 2, 3]
+    assert find_frame_column(["scan", "frame_id", "x"]) == "frame_id" and find_frame_column(["x", "time"]) is None

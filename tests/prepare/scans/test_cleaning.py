@@ -1,0 +1,120 @@
+"""What is no measurement is dropped and counted; shifts are kept; what can't be in meters is doubted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.prepare.closing_line import closing_lines
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.commands.merge import merge
+from dpcli.prepare.pipeline import Conversion, convert
+from dpcli.prepare.scans.cleaning import AT_ORIGIN, IMPOSSIBLE, NOT_FINITE, clean
+from dpcli.prepare.scans.clouds import CloudFolders
+from dpcli.prepare.shards import Shard
+from dpcli.store import CloudsReader
+
+POINTS = np.random.default_rng(1).uniform(0.5, 2, (20, 3))
+
+
+def frames_of(folder, *frames):
+    folder.mkdir(parents=True, exist_ok=True)
+    for t, frame in enumerate(frames):
+        np.save(folder / f"{t}.npy", frame)
+    return folder
+
+
+def convert_folder(folder, path, **options):
+    return convert(CloudFolders(folder, **options), path, Conversion(jobs=1))
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        ([0.0, 0, 0], AT_ORIGIN),
+        ([-0.0, 0, 0], AT_ORIGIN),
+        ([1e30, 1, 1], IMPOSSIBLE),
+        ([-3.4e38, 0, 0], IMPOSSIBLE),
+        ([-9999.0] * 3, IMPOSSIBLE),
+        ([65535.0] * 3, IMPOSSIBLE),
+        ([np.nan, 1, 1], NOT_FINITE),
+        ([-np.inf, 1, 1], NOT_FINITE),
+    ],
+)
+def test_points_that_nobody_measured(bad, reason):
+    cloud = Cloud(np.vstack([POINTS[:5], [bad] * 3, POINTS[5:]]), extra={"v": np.arange(23, dtype=np.float32)})
+    assert clean([cloud]) == {reason: 3}
+    np.testing.assert_array_equal(cloud.points, POINTS)
+    assert cloud.extra["v"].tolist() == [*range(5), *range(8, 23)]
+
+
+def test_one_corner_at_the_origin_is_kept_unless_another_frame_tells():
+    corner = np.vstack([np.zeros((1, 3)), POINTS])
+    assert clean([Cloud(corner), Cloud(corner)]) == {}
+    assert clean([Cloud(corner), Cloud(np.vstack([corner, np.zeros((1, 3))]))]) == {AT_ORIGIN: 3}
+    assert clean([Cloud(np.vstack([np.zeros((1, 3)), POINTS + 448_000]))]) == {AT_ORIGIN: 1}
+
+
+def test_ordinary_points_on_diagonals_and_axes_stay():
+    points = np.array([[1.0, 1, 1], [0, 0, 1], [5, 0, 0], [-9999, 1, 2]])
+    assert clean([Cloud(points)]) == {}
+
+
+def test_the_shift_is_kept_told_and_undone(tmp_path):
+    base = np.array([448_000.0, 5_411_000, 300])
+    frames_of(tmp_path / "in" / "map", POINTS + base, POINTS + base + 1)
+    frames_of(tmp_path / "in" / "near", POINTS)
+    report = convert_folder(tmp_path / "in", tmp_path / "a.h5")
+    with CloudsReader(tmp_path / "a.h5") as reader:
+        far, near = reader.read(0), reader.read(1)
+    np.testing.assert_allclose(far.original_frame(1), POINTS + base + 1, atol=1e-6)
+    assert near.shift is None and far.shift.tolist() == np.floor((POINTS + base).min(0)).tolist()
+    np.testing.assert_allclose(near.original_frame(0), POINTS, atol=1e-6)
+    assert report.closing[1] == "map: (448000, 5411000, 300) was taken off its coordinates; the file keeps it as shift"
+
+
+def test_shards_and_merges_keep_shifts(tmp_path):
+    for k in range(3):
+        frames_of(tmp_path / "in" / f"s{k}", POINTS + 1e6 * k)
+    convert_folder(tmp_path / "in", tmp_path / "whole.h5")
+    reader = CloudFolders(tmp_path / "in")
+    for index in range(2):
+        convert(reader, tmp_path / f"{index}.h5", Conversion(shard=Shard(index, 2)))
+    merge([tmp_path / "0.h5", tmp_path / "1.h5"], tmp_path / "merged.h5")
+    assert (tmp_path / "merged.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
+    merge([tmp_path / "whole.h5"], tmp_path / "again.h5", prefix=True)
+    with CloudsReader(tmp_path / "again.h5") as file:
+        assert file.shifts[:, 0].tolist() == [0, 1e6, 2e6]
+
+
+@pytest.mark.parametrize(
+    ("points", "doubt"),
+    [
+        (POINTS * 1.6e7, "more than 100 km wide"),
+        ((POINTS - 1) * 4000, "if these are millimeters, give --scale 1000"),
+        (POINTS * 1000 + 448_000, ""),
+        (POINTS * 100 - 80, ""),
+    ],
+)
+def test_lengths_that_no_sensor_sees(tmp_path, points, doubt):
+    reader = CloudFolders(frames_of(tmp_path / "in", points))
+    notes = reader.read(reader.items()[0], np.random.default_rng(0)).notes
+    assert any(doubt in note for note in notes) if doubt else not any("wide" in n or "around" in n for n in notes)
+    reader = CloudFolders(tmp_path / "in", unit="mm")
+    assert not any("--scale" in note for note in reader.read(reader.items()[0], np.random.default_rng(0)).notes)
+
+
+def test_the_closing_line_is_what_a_person_can_check(tmp_path):
+    box = np.array([[1.0, 0, 0], [3, 1, 0.5], [2, 0.5, 0.25], [0, 0, 0], [0, 0, 0], [np.nan, 0, 0]])
+    frames_of(tmp_path / "in", box, box, box)
+    report = convert_folder(tmp_path / "in", tmp_path / "a.h5", fps=30)
+    assert report.closing == [
+        "median distance 2.08 m, extent 2 x 1 x 0.5 m, 3 frames at 30 fps, 6 points at (0,0,0) dropped,"
+        " 3 points with NaN or infinity dropped"
+    ]
+    frames_of(tmp_path / "many" / "a", box)
+    frames_of(tmp_path / "many" / "b", box, box)
+    one = convert(CloudFolders(tmp_path / "many"), tmp_path / "b.h5", Conversion(jobs=1)).closing
+    two = convert(CloudFolders(tmp_path / "many"), tmp_path / "c.h5", Conversion(jobs=2)).closing
+    assert one == two and "2 sequences of 1 to 2 frames without times, 6 points at (0,0,0) dropped" in one[0]
+    assert closing_lines(tmp_path / "b.h5", {})[0] in one[0]

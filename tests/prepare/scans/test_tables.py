@@ -1,0 +1,187 @@
+"""Tables of many frames: columns of frames and sequences, gaps, times, kept columns, labels, in texts and Parquet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.pipeline import Conversion, convert
+from dpcli.prepare.scans.frames_of_tables import JOINED
+from dpcli.prepare.scans.tables import TableSequences
+from dpcli.store import CloudsReader
+
+RNG = np.random.default_rng(0)
+quick = settings(
+    max_examples=40, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+def write(path, rows, header="frame,x,y,z"):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def frames(*numbers, points=2):
+    return [(number, number + k / 10, 1, 2) for number in numbers for k in range(points)]
+
+
+def sequences(raw, **options):
+    reader = TableSequences(raw, **options)
+    return [reader.read(item, RNG) for item in reader.items()]
+
+
+def test_frames_by_a_column_with_times(tmp_path):
+    path = write(tmp_path / "log.csv", frames(3, 4, 7))
+    (sample,) = sequences(path, fps=10)
+    assert sample.sequence.name == "log" and sample.notes == {}
+    np.testing.assert_allclose(sample.sequence.time, [0, 0.1, 0.4])
+    np.testing.assert_allclose(sample.sequence.frame(2), [[7, 1, 2], [7.1, 1, 2]])
+    (strided,) = sequences(path, fps=10, stride=2)
+    np.testing.assert_allclose(strided.sequence.time, [0, 0.4])
+    assert TableSequences(path).fields == ()
+
+
+def test_gaps_and_restarts_begin_sequences(tmp_path):
+    path = write(tmp_path / "log.csv", frames(0, 1, 2, 9, 10, 0, 1))
+    found = sequences(path, gap=3)
+    assert [(s.sequence.name, s.sequence.num_frames) for s in found] == [("log/000", 3), ("log/001", 2), ("log/002", 2)]
+    (joined,) = sequences(path)
+    assert joined.sequence.num_frames == 5 and joined.notes == {JOINED: 2}
+    assert [s.sequence.num_frames for s in sequences(path, gap=7)] == [5, 2]
+
+
+def test_sequences_by_a_column(tmp_path):
+    rows = [(run, *row) for run in ("b", "a") for row in frames(0, 1)] + [("b", 5, 5, 5, 5)]
+    path = write(tmp_path / "log.csv", rows, "run,frame,x,y,z")
+    found = sequences(path, sequence_column="run")
+    assert [(s.sequence.name, s.sequence.num_frames) for s in found] == [("log/b", 3), ("log/a", 2)]
+    found = sequences(path, sequence_column="run", gap=2)
+    assert [s.sequence.name for s in found] == ["log/b/000", "log/b/001", "log/a/000"]
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("timestamp", ["10.25", "10.5", "11"], [0, 0.25, 0.75]),
+        ("t_ms", [0, 33, 66], [0, 0.033, 0.066]),
+        ("timestamp", [1600000000000, 1600000000100, 1600000000300], [0, 0.1, 0.3]),
+        ("stamp_ns", [10**18, 10**18 + 10**8, 10**18 + 3 * 10**8], [0, 0.1, 0.3]),
+        ("frame", [0, 5, 10], None),
+        ("frame", ["a.png", "b.png", "c.png"], None),
+    ],
+)
+def test_times_are_what_the_column_tells_or_absent(tmp_path, name, values, expected):
+    path = write(tmp_path / "a.csv", [(value, 1, 2, k) for value in values for k in (1, 2)], f"{name},x,y,z")
+    (sample,) = sequences(path, frame_column=name)
+    assert sample.sequence.num_frames == 3
+    if expected is None:
+        assert sample.sequence.time is None
+        (sample,) = sequences(path, frame_column=name, fps=10)
+        expected = [0, 0.1, 0.2]
+    np.testing.assert_allclose(sample.sequence.time, expected, atol=1e-6)
+
+
+def test_kept_columns_and_colors_are_in_the_file(tmp_path):
+    rows = [(f, 1, 2, k, 255, 0, 10 * k, f + k / 4) for f in (0, 1) for k in (1, 2, 3)]
+    path = write(tmp_path / "log.csv", rows, "frame,x,y,z,r,g,b,doppler [m/s]")
+    reader = TableSequences(path, keep=("doppler [m/s]",))
+    assert reader.summary(reader.items()) == ["1 sequence in 1 table, frames by column 'frame'"]
+    assert "not read: doppler" in TableSequences(path).summary(TableSequences(path).items())[0]
+    convert(reader, tmp_path / "out.h5", Conversion(points=2))
+    with CloudsReader(tmp_path / "out.h5") as file:
+        assert file.fields == ("color", "field_doppler [m_s]")
+        sequence = file.read(0)
+    assert sequence.color.shape == (4, 3)
+    blue = sequence.color[:, 2] / 10
+    np.testing.assert_allclose(sequence.extra["field_doppler [m_s]"], np.repeat([0, 1], 2) + blue / 4)
+
+
+def test_labels_of_tables(tmp_path):
+    for name in ("walk/a", "walk/b", "run/a"):
+        write(tmp_path / "in" / f"{name}.csv", frames(0, 1, 8))
+    reader = TableSequences(tmp_path / "in", gap=2, label_from_folder=True)
+    assert reader.class_names == ["run", "walk"]
+    assert [(i.name, i.label) for i in reader.items()][:3] == [("run/a/000", 0), ("run/a/001", 0), ("walk/a/000", 1)]
+    labels = tmp_path / "in" / "labels.csv"
+    labels.write_text("name,label,subject,split\nrun/a,3,7,test\n")
+    items = TableSequences(tmp_path / "in", labels=labels).items()
+    assert [(i.name, i.label, i.subject, i.split) for i in items][0] == ("run/a", 3, 7, "test")
+
+
+def test_a_bad_table_is_skipped_and_named(tmp_path):
+    write(tmp_path / "in" / "a.csv", frames(0, 1))
+    write(tmp_path / "in" / "b.csv", [("0", 1, 2, "word")])
+    report = convert(TableSequences(tmp_path / "in"), tmp_path / "out.h5", Conversion())
+    assert report.written == 1
+    ((name, reason),) = report.skipped
+    assert name == "b" and "b.csv:2: column 'z' holds 'word'" in reason
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frame_column": "scan"}, "--frame-column scan: no such column; found frame, x, y, z"),
+        ({"sequence_column": "run"}, "--sequence-column run: no such column"),
+        ({"keep": ("snr",)}, "--keep-fields snr: no such column"),
+    ],
+)
+def test_columns_that_are_not_there(tmp_path, options, message):
+    path = write(tmp_path / "a.csv", frames(0, 1))
+    (item,) = TableSequences(path, **options).items()
+    assert message in item.problem
+
+
+def test_tables_that_cannot_be_split(tmp_path):
+    (item,) = TableSequences(write(tmp_path / "a.csv", [(1, 2, 3)], "x,y,z")).items()
+    assert "which column numbers the frames? --frame-column NAME says it; found x, y, z" in item.problem
+    (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
+    assert "1 rows, the first is 1, have no number in 'frame'" in item.problem
+    (item,) = TableSequences(write(tmp_path / "c.csv", [("p", 1, 2, 3)]), gap=2).items()
+    assert "--gap needs numbers" in item.problem
+    with pytest.raises(UsageError, match="--gap 0: expected more than 0"):
+        TableSequences(tmp_path / "a.csv", gap=0)
+    with pytest.raises(DataError, match="does not exist"):
+        TableSequences(tmp_path / "none").items()
+    write(tmp_path / "two" / "a.csv", frames(0))
+    write(tmp_path / "two" / "a.txt", frames(0))
+    with pytest.raises(DataError, match="same name in another format"):
+        TableSequences(tmp_path / "two").items()
+
+
+@quick
+@given(data=st.data())
+def test_parquet_is_read_as_pyarrow_wrote_it(tmp_path, data):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    kind = data.draw(st.sampled_from(["float32", "float64", "int16", "int64"]))
+    count = data.draw(st.integers(2, 30))
+    rng = np.random.default_rng(data.draw(st.integers(0, 9)))
+    points = rng.uniform(-90, 90, (count, 3)).astype(kind)
+    points[0] = 1  # an integer 0 0 0 twice would be no return
+    number = np.sort(rng.integers(0, 4, count))
+    order = data.draw(st.permutations(["x", "y", "z", "frame", "run"]))
+    columns = {**dict(zip("xyz", points.T)), "frame": number, "run": np.array(["a"] * count)}
+    table = pyarrow.table({name: columns[name] for name in order})
+    path = tmp_path / "a.parquet"
+    parquet.write_table(
+        table,
+        path,
+        compression=data.draw(st.sampled_from(["none", "snappy", "gzip", "zstd"])),
+        use_dictionary=data.draw(st.booleans()),
+        row_group_size=data.draw(st.sampled_from([1, 7, 1000])),
+    )
+    (sample,) = sequences(path, sequence_column="run")
+    np.testing.assert_allclose(sample.sequence.points, points.astype(np.float32))
+    assert sample.sequence.num_frames == len(np.unique(number))
+
+
+def test_a_truncated_parquet_is_named(tmp_path):
+    (tmp_path / "a.parquet").write_bytes(b"PAR1 and then nothing")
+    pytest.importorskip("pyarrow")
+    (item,) = TableSequences(tmp_path / "a.parquet").items()
+    assert "a.parquet: not a readable Parquet table" in item.problem
