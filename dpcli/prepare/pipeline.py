@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.shards import WHOLE, Shard, describe_shard
@@ -71,7 +72,10 @@ class Conversion:
 
 @dataclass
 class Report:
-    """Tells what a conversion did. ``skipped`` holds (name, reason); ``notes`` counts what readers left out."""
+    """Tells what a conversion did. ``skipped`` holds (name, reason); ``notes`` counts what readers left out.
+
+    ``closing`` is what a person can check: the lines of `closing_lines`.
+    """
 
     written: int = 0
     frames: int = 0
@@ -79,6 +83,7 @@ class Report:
     skipped: list[tuple[str, str]] = field(default_factory=list)
     notes: Counter = field(default_factory=Counter)
     was_complete: bool = False
+    closing: list[str] = field(default_factory=list)
 
     def lines(self) -> list[str]:
         """Returns what was left out, in words; nothing goes unmentioned."""
@@ -156,13 +161,18 @@ def convert(
     if not conversion.force and already_made(output, provenance, CloudsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
-        return count_samples(report, output)
+        return _closed(count_samples(report, output), output)
     work = partial(convert_item, reader, conversion.thinning, conversion.seed)
     with stop_requested() as stop, _open_writer(output, reader, conversion, provenance, resume) as writer:
         run = _Run(writer, report, stop, conversion, items)
         run.stream(work, slots or conversion.processes, executor)
         writer.skipped = report.skipped
-    return count_samples(report, output)
+    return _closed(count_samples(report, output), output)
+
+
+def _closed(report: Report, output: Path) -> Report:
+    report.closing = closing_lines(output, report.notes)
+    return report
 
 
 def _open_writer(

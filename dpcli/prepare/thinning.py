@@ -9,7 +9,6 @@ import numpy as np
 from dpcli.errors import UsageError
 from dpcli.prepare.reader import offsets
 from dpcli.store import CloudSequence
-from dpcli.store.sequence import POINT_FIELDS
 
 METHODS = ("random", "fps", "voxel")
 _SEARCH_STEPS = 20
@@ -57,12 +56,7 @@ class Thinning:
             frame = sequence.points[start : start + count]
             index = self.choose(frame, rng) if count > self.points else np.arange(count)
             chosen.append(index + start)
-        sequence.frame_offsets = offsets(np.array([len(c) for c in chosen], np.int64))
-        index = np.concatenate(chosen)
-        for name in ("points", *POINT_FIELDS):
-            values = getattr(sequence, name)
-            if values is not None:
-                setattr(sequence, name, values.take(index, axis=0))
+        sequence.take_points(np.concatenate(chosen), offsets(np.array([len(c) for c in chosen], np.int64)))
         return sequence
 
 

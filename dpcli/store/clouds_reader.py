@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.store.file import open_store, read_provenance, read_skipped, read_strings, root_attributes
+from dpcli.store.schema import KEPT
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
 OPTIONAL = ("time", *POINT_FIELDS, "pose")
@@ -39,7 +40,7 @@ class CloudsReader:
         self.attributes = root_attributes(file)
         self.provenance = read_provenance(file)
         self.skipped = read_skipped(file)
-        self.class_names = read_strings(file, "class_names")
+        self.class_names = read_strings(file, "class_names", optional=True)
         self.length_unit = str(file.attrs.get("length_unit", ""))
         self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
         self.labels, self.subjects, self.cameras = (self._column(file, key) for key in ("label", "subject", "camera"))
@@ -58,9 +59,12 @@ class CloudsReader:
             raise DataError(
                 f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {len(self.class_names)} classes"
             )
-        self.fields = tuple(key for key in OPTIONAL if key in file)
+        if "class_names" not in file and (self.labels >= 0).any():
+            raise DataError(f"{self.path}: data set 'class_names' is missing, though samples have labels; make it again")
+        self.shifts = self._read_shifts(file)
+        self.fields = (*(key for key in OPTIONAL if key in file), *(key for key in file if key.startswith(KEPT)))
         for key in self.fields:
-            rows = self.num_points if key in POINT_FIELDS else frames
+            rows = frames if key in ("time", "pose") else self.num_points
             if len(file[key]) != rows:
                 raise DataError(f"{self.path}: {key} has {len(file[key])} rows, expected {rows}")
 
@@ -72,6 +76,15 @@ class CloudsReader:
                 f"{self.path}: {name} has shape {file[name].shape}, expected (n{''.join(f', {d}' for d in tail)})"
             )
         return file[name]
+
+    def _read_shifts(self, file: h5py.File) -> np.ndarray:
+        """What was taken off the original coordinates of each sequence, f64 (S,3); zeros where nothing was."""
+        if "shift" not in file:
+            return np.zeros((len(self.names), 3))
+        shifts = self._data(file, "shift", (3,))[:]
+        if len(shifts) != len(self.names) or not np.isfinite(shifts).all():
+            raise DataError(f"{self.path}: shift has {len(shifts)} rows, expected {len(self.names)} of 3 finite numbers")
+        return shifts
 
     def _column(self, file: h5py.File, name: str) -> np.ndarray:
         column = self._data(file, name, ())[:]
@@ -152,6 +165,7 @@ class CloudsReader:
             raise DataError(
                 f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
             )
+        shift = self.shifts[index]
         return CloudSequence(
             self.names[index],
             values.pop("points"),
@@ -160,6 +174,8 @@ class CloudsReader:
             int(self.labels[index]),
             int(self.subjects[index]),
             int(self.cameras[index]),
+            shift=shift if shift.any() else None,
+            extra={key: values.pop(key) for key in [key for key in values if key.startswith(KEPT)]},
             **values,
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import STRING, write_positions, write_skipped
-from dpcli.store.schema import fields_of
+from dpcli.store.schema import KEPT, fields_of
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
 from dpcli.store.writing.resumable_writer import ResumableWriter
@@ -36,7 +36,8 @@ class CloudsWriter(ResumableWriter):
 
     A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
     the samples of a compressed file.
-    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose). Set before the
+    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, and kept columns,
+    `field_NAME`); a shift is written where a sample has one. Set before the
     block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
     kept in the file; a shard may be empty.
     """
@@ -70,14 +71,16 @@ class CloudsWriter(ResumableWriter):
         )
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
-        unknown = set(fields) - set(_FIELDS)
+        kept = sorted(name for name in set(fields) if name.startswith(KEPT))
+        unknown = set(fields) - {*_FIELDS, *kept}
         if unknown:
             raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
-        self.fields, self.compression = tuple(name for name in _FIELDS if name in fields), compression
+        self.fields, self.compression = (*(n for n in _FIELDS if n in fields), *kept), compression
         self.skipped: list[tuple[str, str]] = []
         self.positions: tuple[list[int], list[int]] | None = None
         self._names: set[str] = set()
         self._frames = self._points = self._unflushed = 0
+        self._shifts: list[np.ndarray | None] = []
         self._index: dict[str, list] = {name: [] for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
         self._chunks: WholeChunks | None = None
@@ -107,8 +110,8 @@ class CloudsWriter(ResumableWriter):
     def _create_field(self, file: h5py.File, name: str) -> None:
         if name == "time":
             file.create_dataset(name, (0,), _FIELD[name].dtype, maxshape=(None,), chunks=(4096,), **PACKED)
-        elif name in POINT_FIELDS:
-            dtype, shape = POINT_FIELDS[name]
+        elif name in POINT_FIELDS or name.startswith(KEPT):
+            dtype, shape = POINT_FIELDS.get(name, (np.float32, ()))
             chunks = (POINTS_PER_CHUNK, *shape)
             file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunks, **PACKED)
         # pose is created with the first sample, which tells the number of parts
@@ -133,7 +136,7 @@ class CloudsWriter(ResumableWriter):
         sequence.validate(len(self.class_names))
         if sequence.name in self._names:
             raise DataError(f"sample {sequence.name!r}: the name appears twice; names identify samples")
-        missing = [name for name in self.fields if getattr(sequence, name) is None]
+        missing = [name for name in self.fields if sequence.value(name) is None]
         if missing:
             raise DataError(f"sample {sequence.name!r}: no {', '.join(missing)}, though the other samples have it")
         if "pose" in self.fields and "pose" in self._file:
@@ -146,11 +149,12 @@ class CloudsWriter(ResumableWriter):
     def _append_sequence(self, sequence: CloudSequence) -> None:
         self._append("points", sequence.points)
         for name in self.fields:
-            self._append(name, getattr(sequence, name))
+            self._append(name, sequence.value(name))
         self._append("frame_offsets", sequence.frame_offsets[1:] + self._points)
         self._append("sequence_offsets", [self._frames + sequence.num_frames])
         for name in _PER_SAMPLE:
             self._append(name, [getattr(sequence, name)])
+        self._shifts.append(sequence.shift)
         self._points += len(sequence.points)
         self._frames += sequence.num_frames
 
@@ -199,6 +203,13 @@ class CloudsWriter(ResumableWriter):
         for name, values in self._index.items():
             if values:
                 self._extend(name, values)
+        self._write_shifts()
         write_skipped(self._file, self.skipped)
         write_positions(self._file, self.positions)
         self._file.flush()
+
+    def _write_shifts(self) -> None:
+        """The samples' shifts, f64 (S,3), zero where one has none; nothing where none has, as most files."""
+        rows = [np.zeros(3) if shift is None else np.asarray(shift, np.float64) for shift in self._shifts]
+        if np.any(rows):
+            self._file.create_dataset("shift", data=np.array(rows))

@@ -13,7 +13,7 @@ from dpcli import __version__
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_pipe
-from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of
+from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 STRING = h5py.string_dtype("utf-8")
@@ -97,7 +97,7 @@ def _check_types(file: h5py.File, path: Path) -> None:
     """Raises DataError where a data set holds other values than its kind has under that name; unknown names pass."""
     known = fields_of(str(file.attrs["dpc_kind"]))
     for name, item in file.items():
-        field = known.get(name)
+        field = find_field(known, name)
         if field is None or _holds(item, field):
             continue
         expected = f"data sets of {field.sort} below it" if field.group else f"a data set of {field.sort}"
@@ -185,9 +185,11 @@ def read_positions(file: h5py.File) -> tuple[list[int], list[int]] | None:
     return file["position"][:].tolist(), file["skipped_position"][:].tolist()
 
 
-def read_strings(file: h5py.File, name: str) -> list[str]:
-    """A string data set as a list; DataError when it is absent."""
+def read_strings(file: h5py.File, name: str, *, optional: bool = False) -> list[str]:
+    """A string data set as a list; when it is absent, none where that is `optional`, else DataError."""
     if name not in file:
+        if optional:
+            return []
         raise DataError(f"{file.filename}: data set {name!r} is missing; the file is incomplete, make it again")
     try:
         return list(file[name].asstr()[:])

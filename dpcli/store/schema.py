@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 SCHEMA = 1
+KEPT = "field_"  # what the name of a column begins with that was kept on request
 _TYPES = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "s": "strings"}
 _MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", re.DOTALL)
 
@@ -84,6 +85,15 @@ _CLOUDS = (
         "part-to-world, padded with identity to the file's largest number of parts",
         optional=True,
     ),
+    Field(
+        "shift",
+        "f64",
+        ("S", 3),
+        "what was taken off the coordinates of a sequence, because float32 can't hold them (maps); add it to its points"
+        " to have the original ones, over any `--scale`. Absent where nothing was",
+        optional=True,
+    ),
+    Field(f"{KEPT}NAME", "f32", ("P",), "a column of the raw data, kept on request (`--keep-fields NAME`)", True),
 )
 _LEFT_OUT = (
     Field("skipped", "str", ("n", 2), "name and reason of every sample that was left out", optional=True),
@@ -178,6 +188,11 @@ def fields_of(kind: str) -> dict[str, Field]:
     """
     base = TABLES["clouds"] if kind == "parts" else ()
     return {field.name: field for field in (*EVERYWHERE, *base, *TABLES[kind])}
+
+
+def find_field(known: dict[str, Field], name: str) -> Field | None:
+    """Returns what a kind, whose fields are `known`, says of a data set of that name; None where it says nothing."""
+    return known.get(f"{KEPT}NAME" if name.startswith(KEPT) else name)
 
 
 def table(kind: str) -> str:

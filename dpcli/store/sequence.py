@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.store.schema import TABLES
+from dpcli.store.schema import KEPT, TABLES
 
 POINT_FIELDS = {
-    field.name: (field.dtype, field.row)
-    for field in TABLES["clouds"]
-    if field.optional and field.shape[0] == "P" and not field.group
+    one.name: (one.dtype, one.row)
+    for one in TABLES["clouds"]
+    if one.optional and one.shape[0] == "P" and not one.group and not one.name.startswith(KEPT)
 }  # name -> dtype, shape of one point
 
 
@@ -24,7 +24,8 @@ class CloudSequence:
     points f32 (P,3) in the file's length unit; frame_offsets i64 (T+1), from 0 to P; label counts from 0, -1 = unknown;
     time f64 (T) seconds; color u8 (P,3); part i16 (P) rigid part; track i64 (P) identity of a point over frames;
     scene_flow f32 (P,3) true displacement to the next frame, in the last frame to the one before; for motion that no
-    pose tells; pose f64 (T,parts,4,4) part-to-world.
+    pose tells; pose f64 (T,parts,4,4) part-to-world; shift f64 (3) what was taken off the original coordinates; extra:
+    columns of the raw data that were kept, f32 (P) each, by the name that the file has for them (`field_NAME`).
     """
 
     name: str
@@ -40,6 +41,8 @@ class CloudSequence:
     track: np.ndarray | None = None
     scene_flow: np.ndarray | None = None
     pose: np.ndarray | None = None
+    shift: np.ndarray | None = None
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
 
     @classmethod
     def from_frames(cls, name: str, frames: list[np.ndarray], **fields: Any) -> CloudSequence:
@@ -58,6 +61,30 @@ class CloudSequence:
     def frame(self, t: int) -> np.ndarray:
         """Points of frame t, f32 (N_t,3), a view."""
         return self.points[self.frame_offsets[t] : self.frame_offsets[t + 1]]
+
+    def original_frame(self, t: int) -> np.ndarray:
+        """Points of frame t where the raw data have them, f64 (N_t,3): with the shift added."""
+        return self.frame(t).astype(np.float64) + (0.0 if self.shift is None else self.shift)
+
+    def value(self, name: str) -> Any:
+        """A field by its name in the file, kept columns among them; None when the sample lacks it."""
+        return self.extra.get(name) if name.startswith(KEPT) else getattr(self, name)
+
+    def without(self, name: str) -> None:
+        """Forgets a field by its name in the file."""
+        if name.startswith(KEPT):
+            self.extra.pop(name, None)
+        else:
+            setattr(self, name, None)
+
+    def take_points(self, rows: np.ndarray, frame_offsets: np.ndarray) -> None:
+        """Keeps only the points `rows` (i64), in this order, with their fields; `frame_offsets` (T+1) cuts them."""
+        self.frame_offsets = frame_offsets
+        for name in ("points", *POINT_FIELDS):
+            values = getattr(self, name)
+            if values is not None:
+                setattr(self, name, values.take(rows, axis=0))
+        self.extra = {name: values.take(rows) for name, values in self.extra.items()}
 
     def validate(self, num_classes: int = 0) -> None:
         """Raise DataError unless shapes, offsets, label and values are as the class says."""
@@ -90,6 +117,11 @@ class CloudSequence:
             if value is not None and (value.shape != (len(self.points), *shape) or value.dtype != dtype):
                 expected = (len(self.points), *shape)
                 raise DataError(f"{where}: {key} is {value.dtype} {value.shape}, expected {np.dtype(dtype)} {expected}")
+        for key, value in self.extra.items():
+            if value.shape != (len(self.points),) or value.dtype != np.float32:
+                raise DataError(f"{where}: {key} is {value.dtype} {value.shape}, expected float32 {(len(self.points),)}")
+        if self.shift is not None and (np.shape(self.shift) != (3,) or not np.isfinite(self.shift).all()):
+            raise DataError(f"{where}: shift is {self.shift}, expected 3 finite numbers")
         if self.scene_flow is not None and not np.isfinite(self.scene_flow).all():
             raise DataError(f"{where}: scene_flow holds NaN or infinity; drop the points whose motion is unknown")
         if self.time is not None and self.time.shape != (self.num_frames,):

@@ -75,6 +75,7 @@ def _clouds(path: Path) -> dict[str, Any]:
             "frame_interval": _spread(_intervals(reader), float),
             "fields": list(reader.fields),
             "range": ranges,
+            "shifts": {name: shift.tolist() for name, shift in zip(reader.names, reader.shifts) if shift.any()},
             **_who(reader.class_names, reader.labels, reader.splits),
             "subjects": _count(_known(reader.subjects)),
             "cameras": _count(_known(reader.cameras)),

@@ -162,7 +162,7 @@ def test_a_kill_while_going_on_loses_nothing(killed, tmp_path, monkeypatch, reac
 
 
 def test_a_journal_of_another_version_starts_over(killed, tmp_path):
-    (tmp_path / ".a.h5.part").write_bytes(killed[0].replace(b"dpc journal 2", b"dpc journal 1", 1))
+    (tmp_path / ".a.h5.part").write_bytes(killed[0].replace(b"dpc journal 3", b"dpc journal 2", 1))
     (tmp_path / ".a.h5.new").write_bytes(killed[2])
     go_on(tmp_path, 0)
     assert digest(tmp_path / "a.h5") == killed[3]

@@ -73,10 +73,10 @@ def cloud_files() -> CloudFiles:
 
 
 def _read_points(path: Path) -> np.ndarray:
-    """Returns the points of a file, those with NaN left out as `dpc prepare clouds` does: organized clouds mark gaps so."""
+    """Returns the points of a file, without those that are no measurement, as `dpc prepare clouds` does."""
     from dpcli.prepare.decode.cloud_files import read_cloud
-    from dpcli.prepare.scans.clouds import drop_invalid
+    from dpcli.prepare.scans.cleaning import clean
 
     cloud = read_cloud(path)
-    drop_invalid(cloud)
+    clean([cloud])
     return cloud.points

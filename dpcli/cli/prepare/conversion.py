@@ -81,6 +81,8 @@ def run_conversion(
     report = convert_raw_data(reader, options.output, conversion, options.dask)
     for line in report.lines():
         log.warn(line)
+    for line in report.closing:
+        log.info(line)
     if options.output != "-":
         typer.echo(f"{options.output}: {report.counts()}")
 

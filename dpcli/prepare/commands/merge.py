@@ -305,5 +305,5 @@ def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: in
         sequence.label = label
     sequence.name = source.prefix + sequence.name
     for name in set(source.fields) - set(pattern.fields):
-        setattr(sequence, name, None)
+        sequence.without(name)
     return sequence

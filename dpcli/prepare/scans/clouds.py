@@ -11,37 +11,42 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
-from dpcli.prepare.decode.cloud_files import SUFFIXES, Cloud, read_cloud
+from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
-from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
+from dpcli.prepare.reader import Item, Sample, require_folder
+from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.prepare.scans.cloud_series import find_sequences
 from dpcli.prepare.series import Series, about_series
-from dpcli.store import CloudSequence
+from dpcli.store.schema import KEPT
 
-_FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
+_LOOKED_AT = 5  # frames that tell how many columns a .bin has
 
 
 @dataclass(frozen=True)
 class CloudFolders:
-    """Reads point cloud files. ``scale``: input units per unit of length in the output."""
+    """Reads point cloud files. ``scale``: input units per unit of length in the output; ``keep``: further columns."""
 
     raw: Path
-    bin_columns: int = 4
-    scale: float = 1.0
+    bin_columns: int | None = None
+    scale: float | None = None
     unit: str = "m"
     fps: float | None = None
     stride: int = 1
     label_from_folder: bool = False
     labels: Path | None = None
+    keep: tuple[str, ...] = ()
     pattern: str = ""
 
     def __post_init__(self) -> None:
         if self.labels and self.label_from_folder:
             raise UsageError("--labels and --label-from-folder were both given; use one")
-        if not self.scale > 0 or (self.fps is not None and not self.fps > 0):
+        if self.fps is not None and not self.fps > 0:
             raise UsageError("--scale and --fps must be more than 0")
-        if self.bin_columns < 3:
+        if self.bin_columns is not None and self.bin_columns < 3:
             raise UsageError(f"--bin-columns {self.bin_columns}: expected 3 (x y z) or more")
+        Lengths(self.scale, self.unit)
 
     @property
     def class_names(self) -> list[str]:
@@ -56,7 +61,8 @@ class CloudFolders:
     @property
     def fields(self) -> tuple[str, ...]:
         """Returns ``color`` among the fields when the very first frame has colors; then every frame must."""
-        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ())
+        kept = tuple(f"{KEPT}{name}" for name in self.keep)
+        return (("time",) if self._timed else ()) + (("color",) if self._has_color else ()) + kept
 
     @property
     def config(self) -> dict[str, Any]:
@@ -108,33 +114,24 @@ class CloudFolders:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         series = item.extra["series"]
         paths = series.paths[:: self.stride]
-        clouds = [read_cloud(path, self.bin_columns) for path in paths]
-        notes = {"points with NaN or infinity dropped": sum(drop_invalid(cloud) for cloud in clouds)}
-        counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
-        kept, dropped = drop_empty_frames(str(item.path), counts)
-        notes = {what: count for what, count in {**notes, **dropped}.items() if count}
-        points = np.concatenate([clouds[t].points for t in kept])
-        if self.scale != 1:
-            points = points.astype(np.float64) / self.scale
-        if np.abs(points).max() > _FAR_AWAY:
-            points = points - np.floor(points[: counts[kept[0]]].min(0))
-            notes["sequences shifted to their first frame's corner for precision"] = 1
-        color = self._colors(item, paths, clouds) if item.extra["color"] else None
-        time = series.frame_times(self.fps)[:: self.stride][kept] if self._timed else None
-        return Sample(
-            CloudSequence(
-                item.name, points.astype(np.float32), offsets(counts[kept]), time=time, color=color, **describe(item)
-            ),
-            notes,
-        )
+        columns, notes = self._bin_columns(paths)
+        clouds = [read_cloud(path, columns, self.keep) for path in paths]
+        if item.extra["color"]:
+            _require_colors(paths, clouds)
+        time = series.frame_times(self.fps)[:: self.stride] if self._timed else None
+        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
+        sample.notes |= notes
+        return sample
 
-    def _colors(self, item: Item, paths: list[Path], clouds: list[Cloud]) -> np.ndarray:
-        plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None]
-        if plain:
-            raise DataError(
-                f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"
-            )
-        return np.concatenate([cloud.color for cloud in clouds if cloud.color is not None])
+    def _bin_columns(self, paths: list[Path]) -> tuple[int | None, dict[str, int]]:
+        """Returns how many columns the ``.bin`` frames of one sequence have, and a note where that had to be guessed."""
+        frames = [path for path in paths if path.suffix.lower() == ".bin" and path.stat().st_size]
+        if self.bin_columns or not frames:
+            return self.bin_columns, {}
+        columns, sure = guess_bin_columns(frames[:: max(1, len(frames) // _LOOKED_AT)][:_LOOKED_AT])
+        doubt = "" if sure else ", though other numbers fit as well"
+        note = f"sequences of .bin read as {columns} float32 a point, by their look{doubt} (--bin-columns says it)"
+        return columns, {} if columns == 4 and sure else {note: 1}
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
@@ -145,12 +142,9 @@ class CloudFolders:
         return lines + about_series([(item.name, item.extra["series"]) for item in items])
 
 
-def drop_invalid(cloud: Cloud) -> int:
-    """Removes points with NaN or infinity (organized clouds mark "no return" so) in place, and returns how many there
-    were.
-    """
-    valid = np.isfinite(cloud.points).all(1)
-    if not valid.all():
-        cloud.points = cloud.points[valid]
-        cloud.color = None if cloud.color is None else cloud.color[valid]
-    return int(len(valid) - valid.sum())
+def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:
+    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None]
+    if plain:
+        raise DataError(
+            f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"
+        )

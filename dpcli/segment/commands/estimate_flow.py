@@ -81,6 +81,8 @@ def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) 
         sequence.camera,
         time=sequence.time,
         pose=sequence.pose,
+        shift=sequence.shift,
+        extra={name: values[rows] for name, values in sequence.extra.items()},
         **taken,
     )
 

@@ -27,7 +27,7 @@ from dpcli.store.sequence import CloudSequence
 
 Placed = tuple[np.ndarray, list[tuple[int, int]]]  # an array, (offset in the HDF5 file, bytes) of its first bytes
 
-_MAGIC = b"dpc journal 2\n"  # another number is not read: that work starts over
+_MAGIC = b"dpc journal 3\n"  # another number is not read: that work starts over
 _LENGTHS, _CHECK = struct.Struct("<QI"), struct.Struct("<I")  # bytes of content, of its JSON; CRC-32 of these and it
 _PAGE = 4096
 _SYNC_SECONDS = 10.0  # a kill loses nothing that was written; only a power cut could, and then this much
@@ -231,6 +231,8 @@ def _packed(value: Any, arrays: list[np.ndarray], placed: Placed | None = None) 
         return packed
     if isinstance(value, (list, tuple)):
         return {"list": [_packed(one, arrays, placed) for one in value]}
+    if isinstance(value, dict):
+        return {"dict": {key: _packed(one, arrays, placed) for key, one in value.items()}}
     if isinstance(value, np.generic):
         return value.item()
     return value
@@ -248,6 +250,8 @@ def _unpacked(value: Any, arrays: memoryview, taken: list[int], data: int) -> An
         return np.frombuffer(bytearray(there) + rest if len(there) else rest, dtype).reshape(shape)
     if "list" in value:
         return [_unpacked(one, arrays, taken, data) for one in value["list"]]
+    if "dict" in value:
+        return {key: _unpacked(one, arrays, taken, data) for key, one in value["dict"].items()}
     if "sequence" in value:
         return CloudSequence(**{key: _unpacked(one, arrays, taken, data) for key, one in value["sequence"].items()})
     return value

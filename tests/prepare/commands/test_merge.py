@@ -160,7 +160,7 @@ def test_the_command(two, tmp_path):
 SLOW = """
 import sys, time
 from pathlib import Path
-from dpcli.prepare.merge import OpenFiles, merge
+from dpcli.prepare.commands.merge import OpenFiles, merge
 read = OpenFiles.read
 def slowly(self, path, index):
     time.sleep(0.05)

@@ -2,25 +2,66 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 from dpcli.cli.prepare.options import LabelTable, Pattern, Stride
 
+if TYPE_CHECKING:
+    from dpcli.prepare.scans.clouds import CloudFolders
+    from dpcli.prepare.scans.tables import TableSequences
+
+
+@dataclass(frozen=True)
+class CloudUnits:
+    """Holds the options that say what the numbers in the files mean."""
+
+    bin_columns: Annotated[
+        int | None, typer.Option("--bin-columns", help="float32 values per point of a .bin. Default: by their look.")
+    ] = None
+    scale: Annotated[
+        float | None,
+        typer.Option("--scale", help="Input units per unit of length in the output. Default: the files', else 1."),
+    ] = None
+    unit: Annotated[str, typer.Option("--unit", help="Name of the output's unit of length.")] = "m"
+    keep_fields: Annotated[
+        str, typer.Option("--keep-fields", metavar="A,B", help="Further columns to keep, as field_A, field_B.")
+    ] = ""
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """Returns the names of the columns to keep, in their order, each once."""
+        return tuple(dict.fromkeys(name.strip() for name in self.keep_fields.split(",") if name.strip()))
+
+
+@dataclass(frozen=True)
+class TableColumns:
+    """Holds the options of tables whose rows are the points of many frames."""
+
+    frame_column: Annotated[
+        str, typer.Option("--frame-column", help="Column that numbers the frames of a table. Default: by its name.")
+    ] = ""
+    sequence_column: Annotated[
+        str, typer.Option("--sequence-column", help="Column that names the sequences of a table.")
+    ] = ""
+    gap: Annotated[
+        float | None,
+        typer.Option("--gap", help="A jump of more than this between frame numbers, or a fall, begins a sequence."),
+    ] = None
+
 
 def clouds(
     raw: Annotated[
-        Path, typer.Argument(help="Folder of .ply .pcd .npy .npz .bin .csv .las .xyz frames, or of such folders.")
+        Path,
+        typer.Argument(help="Folder of .ply .pcd .las .laz .npy .npz .bin .csv .xyz frames, or of such; or one table."),
     ],
+    units: CloudUnits,
+    table: TableColumns,
     *,
-    bin_columns: Annotated[
-        int, typer.Option("--bin-columns", help="float32 values per point of a .bin; KITTI has 4.")
-    ] = 4,
-    scale: Annotated[float, typer.Option("--scale", help="Input units per unit of length in the output.")] = 1.0,
-    unit: Annotated[str, typer.Option("--unit", help="Name of the output's unit of length.")] = "m",
     fps: Annotated[
         float | None, typer.Option("--fps", help="Frames per second; writes the time of every frame.")
     ] = None,
@@ -36,25 +77,29 @@ def clouds(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Returns point cloud files: a folder is a sequence, its files are the frames.
+    """Returns point cloud files: a folder is a sequence, its files are the frames; or tables with a column of frames.
 
     For example: dpc prepare clouds scans --fps 10 -o own.h5
     """
-    from dpcli.prepare.scans.clouds import CloudFolders
+    shared = {
+        "scale": units.scale,
+        "unit": units.unit,
+        "keep": units.kept,
+        "fps": fps,
+        "stride": stride,
+        "label_from_folder": label_from_folder,
+        "labels": labels,
+    }
+    run_conversion("clouds", lambda: _make_reader(raw, units, table, pattern, shared), conversion, raw)
 
-    run_conversion(
-        "clouds",
-        lambda: CloudFolders(
-            raw=raw,
-            bin_columns=bin_columns,
-            scale=scale,
-            unit=unit,
-            fps=fps,
-            stride=stride,
-            label_from_folder=label_from_folder,
-            labels=labels,
-            pattern=pattern,
-        ),
-        conversion,
-        raw,
-    )
+
+def _make_reader(
+    raw: Path, units: CloudUnits, table: TableColumns, pattern: str, shared: dict[str, Any]
+) -> CloudFolders | TableSequences:
+    """Returns the reader of a table, or of folders of tables where an option says so, else of folders of frames."""
+    from dpcli.prepare.scans.clouds import CloudFolders
+    from dpcli.prepare.scans.tables import TABLES, TableSequences
+
+    if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():
+        return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
+    return CloudFolders(raw, bin_columns=units.bin_columns, pattern=pattern, **shared)

@@ -1,0 +1,85 @@
+"""The line at the end of a conversion by which a person sees whether lengths, frames and times are right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.store import CloudsReader
+
+_SEQUENCES, _FRAMES = 32, 4  # looked at, spread evenly: the line takes milliseconds, however large the file
+_POINTS = 1 << 20
+_SHIFTS_SHOWN = 20
+
+
+def closing_lines(path: Path, notes: Mapping[str, int]) -> list[str]:
+    """Returns the line about a finished clouds file, and one for each sequence that was shifted; none of an empty file.
+
+    notes: how many points and frames readers dropped, by reason. Distances are those from the origin, the extent is the
+    box around a sequence; both are the median of up to 32 sequences, of 4 frames each, and the same in every run.
+    """
+    with CloudsReader(path) as reader:
+        if not len(reader):
+            return []
+        said = [*_lengths(reader), _frames(reader)]
+        said += [f"{count} {what}" for what, count in sorted(notes.items()) if what.endswith("dropped") and count]
+        return [", ".join(said), *_shifts(reader)]
+
+
+def _lengths(reader: CloudsReader) -> list[str]:
+    distances, extents = [], []
+    places = np.unique(np.linspace(0, len(reader) - 1, min(_SEQUENCES, len(reader))).astype(int))
+    left = _POINTS
+    for place in places.tolist():
+        count = int(reader.frame_counts[place])
+        frames = np.unique(np.linspace(0, count - 1, min(_FRAMES, count)).astype(int)).tolist()
+        points = np.concatenate([reader.read(place, [t], fields=()).points for t in frames])
+        distances.append(float(np.median(np.sqrt(np.einsum("ij,ij->i", points, points)))))
+        extents.append(points.max(0) - points.min(0))
+        left -= len(points)
+        if left < 0:
+            break
+    unit = f" {reader.length_unit}" if reader.length_unit else ""
+    extent = " x ".join(_number(value) for value in np.median(extents, axis=0))
+    shown = [f"extent {extent}{unit}"]
+    if not reader.shifts[places].any():  # else the origin is no sensor
+        shown.insert(0, f"median distance {_number(float(np.median(distances)))}{unit}")
+    return shown
+
+
+def _frames(reader: CloudsReader) -> str:
+    counts = reader.frame_counts
+    low, high = int(counts.min()), int(counts.max())
+    shown = f"{low}" if low == high else f"{low} to {high}"
+    if len(reader) > 1:
+        shown = f"{len(reader)} sequences of {shown}"
+    shown += " frame" if high == 1 else " frames"
+    if "time" not in reader.fields:
+        return shown + (" without times" if high > 1 else "")
+    steps = np.diff(reader.file["time"][:])
+    ends = np.cumsum(counts)[:-1] - 1
+    steps = np.delete(steps, ends[ends < len(steps)])
+    steps = steps[steps > 0]
+    return f"{shown} at {_number(float(1 / np.median(steps)))} fps" if len(steps) else shown
+
+
+def _shifts(reader: CloudsReader) -> list[str]:
+    moved = np.flatnonzero(reader.shifts.any(axis=1)).tolist()
+    lines = []
+    for place in moved[:_SHIFTS_SHOWN]:
+        shift = ", ".join(f"{value:.10g}" for value in reader.shifts[place])
+        lines.append(f"{reader.names[place]}: ({shift}) was taken off its coordinates; the file keeps it as shift")
+    if len(moved) > _SHIFTS_SHOWN:
+        lines.append(f"... and off {len(moved) - _SHIFTS_SHOWN} more; dpc info --json lists all")
+    return lines
+
+
+def _number(value: float) -> str:
+    """Returns three digits, or all before the point.
+
+    >>> _number(1.41832), _number(16_012_345.6), _number(0.0)
+    ('1.42', '16,012,346', '0')
+    """
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -1,0 +1,120 @@
+"""Arrays of numbers: NumPy's files, and bare float32 as KITTI and nuScenes have them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+
+_POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
+_COLOR_KEYS = ("color", "colors", "rgb")
+_COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
+_BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
+_TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
+_LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coordinates
+
+
+def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads an array of rows, x y z first, or a structured one with fields of these names."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise DataError(f"{path}: not a readable .npy array ({error})") from None
+    return _cloud_of_array(path, array, keep)
+
+
+def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files}
+    except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
+        raise DataError(f"{path}: not a readable .npz archive ({error})") from None
+    key = next((k for k in _POINT_KEYS if k in arrays), None)
+    if key is None:
+        raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
+    cloud = _cloud_of_array(path, arrays[key], ())
+    color = next((arrays[k] for k in _COLOR_KEYS if k in arrays), None)
+    if color is not None:
+        rows = len(cloud.points)
+        if color.dtype.kind not in "uif" or color.ndim != 2 or color.shape[0] != rows or color.shape[1] not in (3, 4):
+            raise DataError(f"{path}: colors {color.dtype} {color.shape}; expected numbers {(rows, 3)}")
+        cloud.color = color[:, :3]
+    columns = {name: values for name, values in arrays.items() if values.shape == (len(cloud.points),)}
+    missing = [name for name in keep if name not in columns]
+    if missing:
+        raise DataError(f"{path}: --keep-fields {missing[0]}: no such array of one number a point")
+    cloud.extra = {name: columns[name].astype(np.float32) for name in keep}
+    return cloud
+
+
+def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud:
+    if array.dtype.names:
+        flat = array.reshape(-1)
+        return cloud_of_columns(path, {name: flat[name] for name in array.dtype.names}, keep)
+    if keep:
+        raise DataError(f"{path}: --keep-fields {keep[0]}: its columns have no names")
+    if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "uif":
+        raise DataError(f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (points, 3 or more)")
+    if len(array) in (3, 4) and array.shape[1] > 16:
+        raise DataError(f"{path}: array of shape {array.shape}; expected a row for each point: save its transpose (.T)")
+    return Cloud(array[:, :3].astype(np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64))
+
+
+def read_bin(path: Path, columns: int) -> Cloud:
+    """Reads float32 values, ``columns`` for each point, x y z first."""
+    size = path.stat().st_size
+    if size % (4 * columns):
+        raise DataError(
+            f"{path}: {size} bytes are no whole number of points of {columns} float32; truncated, or see --bin-columns"
+        )
+    values = np.fromfile(path, "<f4").reshape(-1, columns)[:, :3]
+    size_of = np.abs(values[np.isfinite(values)])
+    if np.mean((size_of > _LARGEST) | ((size_of > 0) & (size_of < _SMALLEST))) > 0.01:
+        raise DataError(f"{path}: its bytes are no coordinates in float32 (another type, or a header before them)")
+    return Cloud(np.ascontiguousarray(values))
+
+
+def guess_bin_columns(paths: Sequence[Path]) -> tuple[int, bool]:
+    """Returns how many float32 a point of some ``.bin`` files of one sequence has, and whether the numbers leave no doubt.
+
+    In the right number of columns each holds values of one kind: little spread within, more between. Where that decides
+    nothing, 4 (x y z reflectance, as KITTI has it) needs a fourth column without negative values; else it is 3.
+    """
+    sizes = [path.stat().st_size for path in paths]
+    possible = [c for c in _COLUMNS if all(size % (4 * c) == 0 for size in sizes)]
+    if not possible:
+        return 4, True  # reading says what is wrong
+    values = [np.fromfile(path, "<f4", _FLOATS).astype(np.float64) for path in paths]
+    near = _likely(values, possible)
+    if 4 in near and all(_is_reflectance(one[: len(one) // 4 * 4].reshape(-1, 4)[:, 3]) for one in values):
+        return 4, True
+    chosen = min(c for c in near if c != 4 or near == [4])
+    return chosen, len(near) == 1
+
+
+def _likely(values: list[np.ndarray], possible: list[int]) -> list[int]:
+    """Returns the numbers of columns that explain the values about as well as the best one, without their multiples."""
+    near = sorted(c for c in possible if c <= 6) or possible
+    if sum(map(len, values)) >= _TELLING:
+        costs = {c: float(np.mean([_cost(one, c) for one in values])) for c in possible}
+        near = sorted(c for c in possible if costs[c] <= min(costs.values()) + _BY_CHANCE)
+    return [c for c in near if not any(c > other and c % other == 0 for other in near)]
+
+
+def _cost(values: np.ndarray, columns: int) -> float:
+    """Returns how badly columns tell the values: the mean logarithm of their spread, nats a value."""
+    table = values[: len(values) // columns * columns].reshape(-1, columns)
+    table = table[np.isfinite(table).all(1)]
+    if len(table) < 2:
+        return float("inf")
+    spread = np.subtract(*np.percentile(table, [84, 16], axis=0)) / 2 + 1e-3 * (np.abs(table).max(0) + 1e-6)
+    return float(np.log(spread).mean()) + 0.5 * columns * np.log(len(table)) / table.size
+
+
+def _is_reflectance(column: np.ndarray) -> bool:
+    return bool((column >= 0).all() and (column <= 65535).all())

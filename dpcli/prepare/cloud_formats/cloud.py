@@ -1,0 +1,93 @@
+"""A cloud as it lies in a file, and how named columns become one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
+
+
+@dataclass
+class Cloud:
+    """Holds points f32 or f64 (N,3) as stored, NaN where the file has it.
+
+    color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
+    coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
+    names of those that points and colors came from.
+    """
+
+    points: np.ndarray
+    color: np.ndarray | None = None
+    unit: str = ""
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+    columns: tuple[str, ...] = ()
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Keeps only some points: a mask bool (N), or indices."""
+        self.points = self.points[rows]
+        self.color = None if self.color is None else self.color[rows]
+        self.extra = {name: values[rows] for name, values in self.extra.items()}
+
+
+def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str] = ()) -> Cloud:
+    """Returns the cloud that named columns (N) of any number types describe, with the columns ``keep`` beside.
+
+    Raises DataError when x, y and z are not among them, or a column to keep isn't.
+    """
+    names = list(columns)
+    axes = named_axes(path, names)
+    if axes is None:
+        raise DataError(f"{path}: fields {', '.join(names)[:80]}; expected x, y and z among them")
+    points = as_points([columns[names[place]] for place in axes[0]])
+    colors = find_colors(names)
+    color = None
+    if len(colors) == 3:
+        color = np.stack([columns[names[place]] for place in colors], axis=1)
+    elif colors:
+        color = unpack_rgb(columns[names[colors[0]]])
+    used = tuple(names[place] for place in (*axes[0], *colors))
+    return Cloud(points, color, axes[1], kept_columns(path, columns, keep), used)
+
+
+def named_axes(path: Path, names: Sequence[str]) -> tuple[list[int], str] | None:
+    """Returns what `find_axes` does; its DataError names the file."""
+    try:
+        return find_axes(names)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def as_points(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Returns three columns (N) as (N,3): f32 where all are, else f64, which holds every other type's meters."""
+    kind = np.float32 if all(c.dtype.kind == "f" and c.dtype.itemsize <= 4 for c in columns) else np.float64
+    points = np.empty((len(columns[0]), 3), kind)
+    for axis, column in enumerate(columns):
+        points[:, axis] = column
+    return points
+
+
+def kept_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str]) -> dict[str, np.ndarray]:
+    """Returns the columns that were asked for, f32 (N), by name. Raises DataError when one is missing or no numbers."""
+    for name in keep:
+        if name not in columns:
+            raise DataError(f"{path}: --keep-fields {name}: no such column; found {', '.join(columns) or 'no names'}")
+        if columns[name].dtype.kind not in "fiub" or columns[name].ndim != 1:
+            raise DataError(f"{path}: --keep-fields {name}: holds no numbers, one a point; leave it out")
+    return {name: columns[name].astype(np.float32) for name in keep}
+
+
+def unpack_rgb(packed: np.ndarray) -> np.ndarray | None:
+    """Returns colors u8 (N,3) of numbers 0xRRGGBB (or 0xAARRGGBB): whole ones, or float32 whose bytes hold them, as PCL
+    has them; None of anything else.
+    """
+    if packed.dtype.kind == "f" and packed.dtype.itemsize == 4:
+        packed = np.ascontiguousarray(packed).view(np.uint32)
+    elif packed.dtype.kind == "f" and (packed != np.floor(packed)).any():
+        return None
+    values = packed.astype(np.int64)
+    return np.stack([values >> 16 & 255, values >> 8 & 255, values & 255], axis=1).astype(np.uint8)

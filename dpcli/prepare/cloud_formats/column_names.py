@@ -1,0 +1,121 @@
+"""What the names of columns mean: which hold x, y and z and in which unit, which a color, which number frames."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from dpcli.errors import DataError
+
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "in": 0.0254, "us-ft": 1200 / 3937, "km": 1e3}  # meters
+_SPELLED = {
+    **{word: "m" for word in ("m", "meter", "meters", "metre", "metres")},
+    **{word: "mm" for word in ("mm", "millimeter", "millimeters", "millimetre", "millimetres")},
+    **{word: "cm" for word in ("cm", "centimeter", "centimeters", "centimetre", "centimetres")},
+    **{word: "ft" for word in ("ft", "foot", "feet")},
+    **{word: "in" for word in ("inch", "inches")},
+    "km": "km",
+}
+_ABOUT_POINTS = frozenset(
+    "point points pt pos position coord coords coordinate coordinates cartesian cart field fields loc location data p"
+    " xyz local world global axis vertex".split()
+)
+_ABOUT_COLORS = frozenset("diffuse color colour colors colours col vertex rgb scalar field channel point points".split())
+_MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height", "altitude", "z"))
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
+_PACKED = ("rgb", "rgba", "rgb24", "rgba32")
+_FRAME = re.compile(
+    r"#?(frame|scan|sweep|image|cloud)s?[ _.-]?(id|ids|no|nr|num|number|idx|index|count|counter|seq)?", re.IGNORECASE
+)
+
+
+def words_of(name: str) -> list[str]:
+    """Returns the words of a column's name in small letters.
+
+    >>> words_of("posX [mm]"), words_of("Points:0"), words_of("//X"), words_of("detected_object.y_m")
+    (['pos', 'x', 'mm'], ['points', '0'], ['x'], ['detected', 'object', 'y', 'm'])
+    """
+    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+", name)]
+
+
+def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
+    """Returns the places of x, y and z among the names, and their unit ("" where they name none); None without them.
+
+    A plain ``x`` goes before ``pos_x``. Raises DataError when several names say the same, so that none can be chosen.
+    """
+    ranked = [[_axis(name) for name in names], _map_axes(names), _numbered_axes(names)]
+    for level in range(3):
+        found = [[place for place, axis in enumerate(ranked[0]) if axis and axis[:2] == (k, level)] for k in range(3)]
+        if any(len(places) > 1 for places in found):
+            twice = next(places for places in found if len(places) > 1)
+            raise DataError(
+                f"columns {', '.join(names[place] for place in twice)} could each be {'xyz'[found.index(twice)]};"
+                " leave one of them in the file, or call it by that letter"
+            )
+        if all(found):
+            units = {ranked[0][places[0]][2] for places in found}  # type: ignore[index]
+            return [places[0] for places in found], _one_unit(units)
+    for axes in ranked[1:]:
+        found = [[place for place, axis in enumerate(axes) if axis == k] for k in range(3)]
+        if all(len(places) == 1 for places in found):
+            return [places[0] for places in found], _one_unit({unit_of(names[places[0]]) for places in found})
+    return None
+
+
+def unit_of(name: str) -> str:
+    """Returns the unit that a name ends with, as in UNITS, "" where it says none."""
+    words = words_of(name)
+    return _SPELLED.get(words[-1], "") if len(words) > 1 else ""
+
+
+def _one_unit(units: set[str]) -> str:
+    if len(units) > 1:
+        raise DataError(f"x, y and z have different units ({', '.join(sorted(unit or 'none' for unit in units))})")
+    return units.pop()
+
+
+def _axis(name: str) -> tuple[int, int, str] | None:
+    """Returns axis (0 to 2), how plainly the name says it (0: best), and the unit."""
+    words = words_of(name)
+    unit = _SPELLED.get(words[-1], "") if len(words) > 1 else ""
+    rest = words[:-1] if unit else words
+    letters = [word for word in rest if word in ("x", "y", "z")]
+    others = [word for word in rest if word not in ("x", "y", "z")]
+    if len(letters) != 1 or not set(others) <= _ABOUT_POINTS:
+        return None
+    return "xyz".index(letters[0]), 2 if others else 1 if unit else 0, unit
+
+
+def _map_axes(names: Sequence[str]) -> list[int | None]:
+    def axis(name: str) -> int | None:
+        words = words_of(name)
+        return next((k for k, known in enumerate(_MAP_NAMES) if words and words[0] in known), None)
+
+    return [axis(name) for name in names]
+
+
+def _numbered_axes(names: Sequence[str]) -> list[int | None]:
+    """Returns axes of names such as ``Points:0``, as ParaView writes them."""
+
+    def axis(name: str) -> int | None:
+        *rest, last = words_of(name) or [""]
+        return int(last) if last in ("0", "1", "2") and rest and set(rest) <= _ABOUT_POINTS else None
+
+    return [axis(name) for name in names]
+
+
+def find_colors(names: Sequence[str]) -> list[int]:
+    """Returns the places of red, green and blue among the names, or of the one that holds all three; [] without."""
+    plain = [[word for word in words_of(name) if word not in _ABOUT_COLORS] for name in names]
+    for trio in _COLORS:
+        places = [[place for place, words in enumerate(plain) if words == [color]] for color in trio]
+        if all(places):
+            return [own[0] for own in places]
+    return [place for place, name in enumerate(names) if name.strip().lower() in _PACKED][:1]
+
+
+def find_frame_column(names: Sequence[str]) -> str | None:
+    """Returns the one name that says it numbers frames, None when none or several do."""
+    found = [name for name in names if _FRAME.fullmatch(name.strip())]
+    plain = [name for name in found if name.strip().lower().startswith(("frame", "#frame"))] or found
+    return plain[0] if len(plain) == 1 else None

@@ -1,0 +1,54 @@
+"""Parquet tables, by pyarrow, which is an extra: it is large, and few have such tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, DpcError
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+
+
+class ParquetTable:
+    """Offers a Parquet file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import pyarrow.parquet as parquet
+        except ImportError:
+            raise DpcError('Parquet needs pyarrow: pip install "dpc-toolkit[parquet]"') from None
+        self.path = path
+        try:
+            self._table: Any = parquet.read_table(path)
+        except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
+            raise DataError(f"{path}: not a readable Parquet table, perhaps truncated ({error})") from None
+        self.names = tuple(self._table.column_names)
+
+    def columns(self, places: Sequence[int]) -> np.ndarray:
+        """Returns some columns as numbers f64 (N,k), NaN where a cell is empty."""
+        found = []
+        for place in places:
+            values = self._table.column(place).to_numpy()
+            if values.dtype.kind == "M":
+                values = np.where(np.isnat(values), np.nan, values.astype("datetime64[ns]").astype(np.int64) / 1e9)
+            try:
+                found.append(values.astype(np.float64))
+            except (TypeError, ValueError):
+                raise DataError(f"{self.path}: column {self.names[place]!r} holds no numbers") from None
+        return np.stack(found, axis=1) if found else np.zeros((self._table.num_rows, 0))
+
+    def words(self, place: int) -> list[str]:
+        """Returns the cells of a column as text."""
+        return [str(value) for value in self._table.column(place).to_pylist()]
+
+
+def read_parquet(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads one cloud from a table with columns x, y and z."""
+    from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table, refuse_frames
+
+    table = ParquetTable(path)
+    refuse_frames(table)
+    return cloud_of_table(table, keep)

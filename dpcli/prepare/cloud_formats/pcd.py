@@ -1,0 +1,144 @@
+"""PCD files of the Point Cloud Library, versions 0.5 to 0.7: text, binary and compressed, every type it offers."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.text_numbers import TextTable
+
+_DATA = ("ascii", "binary", "binary_compressed")
+_TYPES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
+_MOST_BYTES = 1 << 32  # of a compressed cloud, unpacked
+
+
+@dataclass(frozen=True)
+class Header:
+    """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data."""
+
+    kind: np.dtype
+    points: int
+    data: str
+    length: int
+    lines: int
+
+
+def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads the points. Raises DataError when the header contradicts itself, or the data end early."""
+    data = path.read_bytes()
+    header = _read_header(path, data)
+    body = memoryview(data)[header.length :]
+    if header.data == "ascii":
+        columns = _read_text(path, bytes(body), header)
+    elif header.data == "binary":
+        found = len(body) // header.kind.itemsize
+        if found < header.points:
+            raise _truncated(path, header.points, found)
+        rows = np.frombuffer(body, header.kind, header.points)
+        columns = {name: rows[name] for name in header.kind.names or ()}
+    else:
+        columns = _read_compressed(path, body, header)
+    shown = {name: column for name, column in columns.items() if not name.startswith("_")}  # padding
+    return cloud_of_columns(path, shown, keep)
+
+
+def _truncated(path: Path, declared: int, found: int) -> DataError:
+    return DataError(f"{path}: truncated: its header says {declared} points, it has room for {found}")
+
+
+def _read_header(path: Path, data: bytes) -> Header:
+    said: dict[str, list[str]] = {}
+    start = 3 if data.startswith(b"\xef\xbb\xbf") else 0
+    lines = 0
+    while "DATA" not in said:
+        end = data.find(b"\n", start, start + 65536)
+        if end < 0 or lines > 100:
+            raise DataError(f"{path}: not a PCD point cloud: no number of points in its header")
+        words = data[start:end].decode("latin-1").split()
+        if words and not words[0].startswith("#"):
+            said[words[0].upper()] = words[1:]
+        start, lines = end + 1, lines + 1
+    points = said.get("POINTS") or [str(np.prod([int(n) for key in ("WIDTH", "HEIGHT") for n in said.get(key, [])]))]
+    if not points[0].isdigit() or "WIDTH" not in said and "POINTS" not in said:
+        raise DataError(f"{path}: not a PCD point cloud: no number of points in its header")
+    form = said["DATA"][0].lower() if said["DATA"] else ""
+    if form not in _DATA:
+        raise DataError(f"{path}: DATA {form}; expected {', '.join(_DATA)}")
+    return Header(_row_type(path, said), int(points[0]), form, start, lines)
+
+
+def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:
+    names = said.get("FIELDS") or said.get("COLUMNS") or []
+    sizes, types = said.get("SIZE", ["4"] * len(names)), said.get("TYPE", ["F"] * len(names))
+    counts = said.get("COUNT", ["1"] * len(names))
+    if not names or not len(names) == len(sizes) == len(types) == len(counts):
+        raise DataError(f"{path}: FIELDS, SIZE, TYPE and COUNT of its header have different lengths")
+    row, taken = [], set()
+    for place, (name, size, kind, count) in enumerate(zip(names, sizes, types, counts)):
+        if kind.upper() not in _TYPES or not size.isdigit() or int(size) not in _TYPES[kind.upper()]:
+            raise DataError(f"{path}: field {name} has TYPE {kind} SIZE {size}, which PCD doesn't know")
+        if not count.isdigit() or not 0 < int(count) < 65536:
+            raise DataError(f"{path}: field {name} has COUNT {count}; expected 1 or more")
+        for part in range(int(count)):
+            own = name if int(count) == 1 and name != "_" else f"{name}_{place}_{part}"
+            if own in taken:
+                raise DataError(f"{path}: field {name} is there twice")
+            taken.add(own)
+            row.append((own, f"<{kind.lower()}{size}"))
+    return np.dtype(row)
+
+
+def _read_text(path: Path, body: bytes, header: Header) -> dict[str, np.ndarray]:
+    names = header.kind.names or ()
+    lines = [(k, line) for k, line in enumerate(body.decode("latin-1").splitlines(), header.lines + 1) if line.strip()]
+    if len(lines) < header.points:
+        raise _truncated(path, header.points, len(lines))
+    lines = lines[: header.points]
+    table = TextTable(path, tuple(names), [line for _, line in lines], [k for k, _ in lines], None)
+    values = table.columns(range(len(names)))
+    columns = {}
+    for k, name in enumerate(names):
+        kind, column = header.kind[name], values[:, k]
+        whole = kind.kind == "f" or (np.isfinite(column).all() and (column == np.floor(column)).all())
+        packed = name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()  # whole numbers, as some write them
+        columns[name] = column if packed or not whole else column.astype(kind)
+    return columns
+
+
+def _read_compressed(path: Path, body: memoryview, header: Header) -> dict[str, np.ndarray]:
+    """Returns the columns, which lie one after the other in one block packed by LZF."""
+    if len(body) < 8:
+        raise _truncated(path, header.points, 0)
+    packed, size = struct.unpack("<II", body[:8])
+    if size != header.points * header.kind.itemsize or size > _MOST_BYTES:
+        raise DataError(
+            f"{path}: {size} bytes for {header.points} points of {header.kind.itemsize}; truncated or damaged"
+        )
+    if len(body) < 8 + packed:
+        raise DataError(f"{path}: truncated: {len(body) - 8} of its {packed} compressed bytes are left")
+    raw = _unpack_lzf(path, bytes(body[8 : 8 + packed]), size) if size else b""
+    columns, start = {}, 0
+    for name in header.kind.names or ():
+        kind = header.kind[name]
+        columns[name] = np.frombuffer(raw, kind, header.points, start)
+        start += header.points * kind.itemsize
+    return columns
+
+
+def _unpack_lzf(path: Path, packed: bytes, size: int) -> bytes:
+    """Returns bytes that LZF packed. HDF5 files may be packed by it, too: h5py, which brings it, unpacks a chunk."""
+    import h5py
+
+    with h5py.File("lzf", "w", driver="core", backing_store=False) as file:
+        chunk = file.create_dataset("chunk", (size,), np.uint8, chunks=(size,), compression="lzf")
+        chunk.id.write_direct_chunk((0,), packed)
+        try:
+            return chunk[:].tobytes()
+        except OSError:
+            raise DataError(f"{path}: its compressed points are damaged; copy it again") from None

@@ -1,0 +1,153 @@
+"""PLY files (Turk 1994): text, little- or big-endian, properties of any type in any order, elements in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.text_numbers import TextTable
+
+_TYPES = {
+    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
+    **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "long": "i8", "int64": "i8"},
+    **{"ulong": "u8", "uint64": "u8", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
+}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+_HEADER_BYTES = 1 << 20
+
+
+@dataclass
+class Element:
+    """Holds what a header says of one element; ``properties`` are names and numpy types, of lists the type is ""."""
+
+    name: str
+    count: int
+    properties: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def has_lists(self) -> bool:
+        """Returns whether its rows have no common length."""
+        return any(not kind for _, kind in self.properties)
+
+
+def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads the vertices. Raises DataError when they end early, or hold what their types can't."""
+    with path.open("rb") as file:
+        order, elements = _read_header(path, file)
+        place = next((k for k, element in enumerate(elements) if element.name in ("vertex", "point")), None)
+        if place is None:
+            raise DataError(f"{path}: no element vertex in its header; expected a point cloud or a mesh")
+        vertex, before = elements[place], elements[:place]
+        if order and (vertex.has_lists or any(element.has_lists for element in before)):
+            return cloud_of_columns(path, _read_with_lists(path, vertex), keep)
+        columns = _read_binary(path, file, order, vertex, before) if order else _read_text(path, file, vertex, before)
+    return cloud_of_columns(path, columns, keep)
+
+
+def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
+    """Returns the byte order ("" for text) and the elements; the file stands behind the header."""
+    head = file.read(_HEADER_BYTES)
+    mark = 3 if head.startswith(b"\xef\xbb\xbf") else 0
+    end = head.find(b"end_header")
+    if head[mark : mark + 3] != b"ply" or end < 0:
+        raise DataError(f"{path}: not a PLY point cloud: no number of points in its header")
+    after = end + len(b"end_header")
+    after += 2 if head[after : after + 2] == b"\r\n" else 1
+    order, elements = None, []
+    for line in head[mark:end].decode("latin-1").splitlines():
+        words = line.split()
+        if words[:1] == ["format"] and len(words) > 1:
+            order = _ORDERS.get(words[1])
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            elements.append(Element(words[1], int(words[2])))
+        elif words[:1] == ["property"] and elements and len(words) >= 3:
+            elements[-1].properties.append((words[-1], _property_type(path, words)))
+    if order is None:
+        raise DataError(f"{path}: its header names no format; expected ascii, binary_little_endian or binary_big_endian")
+    file.seek(after)
+    return order, elements
+
+
+def _property_type(path: Path, words: list[str]) -> str:
+    kind = _TYPES.get(words[1].lower(), "")
+    if not kind and words[1] != "list":
+        raise DataError(f"{path}: property {words[-1]} has the type {words[1]}, which PLY doesn't know")
+    return kind
+
+
+def _read_binary(
+    path: Path, file: BinaryIO, order: str, vertex: Element, before: list[Element]
+) -> dict[str, np.ndarray]:
+    skipped = sum(
+        element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties) for element in before
+    )
+    names = _unique_names(path, vertex)
+    kind = np.dtype([(name, order + kind) for name, (_, kind) in zip(names, vertex.properties)])
+    start = file.tell() + skipped
+    found = max(path.stat().st_size - start, 0) // kind.itemsize if kind.itemsize else 0
+    _require_all(path, vertex.count, found)
+    file.seek(start)
+    rows = np.fromfile(file, kind, vertex.count)
+    return {name: rows[name] for name in names}
+
+
+def _read_text(path: Path, file: BinaryIO, vertex: Element, before: list[Element]) -> dict[str, np.ndarray]:
+    names = _unique_names(path, vertex)
+    head = file.tell()
+    body = file.read().decode("latin-1")
+    file.seek(0)
+    first = file.read(head).count(b"\n") + 1
+    lines = [(k, line) for k, line in enumerate(body.splitlines(), first) if line.strip()]
+    lines = lines[sum(element.count for element in before) :][: vertex.count]
+    _require_all(path, vertex.count, len(lines))
+    if vertex.has_lists:
+        raise DataError(f"{path}: its vertices hold lists; expected one number for each property")
+    table = TextTable(path, tuple(names), [line for _, line in lines], [k for k, _ in lines], None)
+    values = table.columns(range(len(names)))
+    return {
+        name: _typed(path, name, values[:, k], np.dtype(kind))
+        for k, (name, (_, kind)) in enumerate(zip(names, vertex.properties))
+    }
+
+
+def _typed(path: Path, name: str, values: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """Returns numbers in the type that the header says. Raises DataError at the first vertex that doesn't fit it."""
+    if kind.kind == "f":
+        return values.astype(kind)
+    ends = np.iinfo(kind)
+    bad = np.flatnonzero(~((values >= ends.min) & (values <= ends.max)) | (values != np.floor(values)))
+    if len(bad):
+        raise DataError(
+            f"{path}: {name} of vertex {bad[0]} is {values[bad[0]]:g}; its type holds whole numbers from {ends.min} to"
+            f" {ends.max}"
+        )
+    return values.astype(kind)
+
+
+def _read_with_lists(path: Path, vertex: Element) -> dict[str, np.ndarray]:
+    """Returns the columns of vertices in or behind lists, whose rows must be read one by one."""
+    import plyfile
+
+    try:
+        data = plyfile.PlyData.read(str(path))[vertex.name].data
+    except Exception as error:  # plyfile.PlyParseError, ValueError, MemoryError of damaged counts
+        raise DataError(f"{path}: truncated or damaged ({error})") from None
+    return {name: np.asarray(data[name]) for name, kind in vertex.properties if kind}
+
+
+def _unique_names(path: Path, vertex: Element) -> list[str]:
+    names = [name for name, _ in vertex.properties]
+    if len(set(names)) != len(names):
+        raise DataError(f"{path}: a property is there twice: {', '.join(names)}"[:200])
+    return names
+
+
+def _require_all(path: Path, declared: int, found: int) -> None:
+    if found < declared:
+        raise DataError(f"{path}: truncated: its header says {declared} points, it has room for {found}")

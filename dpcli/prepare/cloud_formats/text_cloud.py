@@ -1,0 +1,55 @@
+"""Clouds in texts: columns with names, or x y z first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, named_axes
+from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
+from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
+
+
+def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
+    """Reads one cloud from a text. Raises DataError when it holds several frames, or is no table of numbers."""
+    table = read_text_table(path)
+    refuse_frames(table)
+    return cloud_of_table(table, keep)
+
+
+def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
+    """Returns the points of all rows of a table, with colors where it has them."""
+    if not table.names:
+        if keep:
+            raise DataError(f"{table.path}: --keep-fields {keep[0]}: its columns have no names")
+        if table.width < 3:
+            raise DataError(
+                f"{table.path}: array of shape {(len(table.lines), table.width)}; expected numbers (points, 3 or more)"
+            )
+        values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
+        return Cloud(values[:, :3])
+    axes = named_axes(table.path, table.names)
+    if axes is None:
+        raise DataError(f"{table.path}: columns {', '.join(table.names)[:80]}; expected x, y and z among them")
+    places = [*axes[0], *find_colors(table.names), *(table.names.index(name) for name in keep if name in table.names)]
+    places = list(dict.fromkeys(places))
+    values = table.columns(places)
+    return cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
+
+
+def refuse_frames(table: TextTable) -> None:
+    """Raises DataError when a column numbers several frames, which one cloud would mix up."""
+    name = find_frame_column(table.names)
+    if name is None or name in ("x", "y", "z"):
+        return
+    try:
+        count = len(np.unique(table.columns([table.names.index(name)])))
+    except DataError:
+        return  # words, such as the names of pictures
+    if count > 1:
+        raise DataError(
+            f"{table.path}: its column {name!r} numbers {count} frames; --frame-column {name} makes them a sequence"
+        )

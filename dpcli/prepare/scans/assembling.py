@@ -1,0 +1,114 @@
+"""From the clouds of one sequence, as they lie in their files, to a sample: cleaned, in one unit, near the origin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.colors import as_bytes
+from dpcli.prepare.cloud_formats.column_names import UNITS
+from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
+from dpcli.prepare.scans.cleaning import clean
+from dpcli.store import CloudSequence
+from dpcli.store.schema import KEPT
+
+_FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
+_WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
+SHIFTED = "sequences shifted to their first frame's corner for precision"
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Says how lengths become the output's. scale: input units per unit of length, None where the user said nothing and
+    the file's own unit counts; unit: the name of the output's.
+    """
+
+    scale: float | None = None
+    unit: str = "m"
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and not self.scale > 0:
+            raise UsageError("--scale and --fps must be more than 0")
+
+    def divisor(self, clouds: Sequence[Cloud]) -> tuple[float, dict[str, int]]:
+        """Returns what the coordinates are divided by, and a note where the files themselves decided that."""
+        declared = {cloud.unit for cloud in clouds} - {""}
+        if self.scale is not None or self.unit != "m" or not declared - {"m"}:
+            return self.scale or 1.0, {}
+        if len({cloud.unit for cloud in clouds}) > 1:
+            names = ", ".join(sorted(cloud.unit or "none" for cloud in clouds))
+            raise DataError(f"its frames declare different units ({names[:80]}); --scale says what they are in")
+        (name,) = declared
+        return 1 / UNITS[name], {f"sequences converted from {name} to m, as their files declare": 1}
+
+
+def assemble(
+    item: Item,
+    clouds: list[Cloud],
+    lengths: Lengths,
+    *,
+    color: bool = False,
+    time: np.ndarray | None = None,
+) -> Sample:
+    """Returns the sample of frames that were read, in their order. Raises DataError where no point is left.
+
+    color: every frame has one. time: seconds of each frame, f64 (T), or None. What is dropped is counted by reason.
+    """
+    notes = clean(clouds)
+    counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
+    kept, dropped = drop_empty_frames(str(item.path), counts)
+    divisor, converted = lengths.divisor([clouds[t] for t in kept])
+    notes |= {**dropped, **converted}
+    points = np.concatenate([clouds[t].points for t in kept])
+    if divisor != 1:
+        points = points.astype(np.float64) / divisor
+    points, shift = _near_origin(points, int(counts[kept[0]]))
+    if shift is not None:
+        notes[SHIFTED] = 1
+    if lengths.unit == "m":
+        notes |= _doubts(points, shift)
+    extra = {f"{KEPT}{name}": np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
+    sequence = CloudSequence(
+        item.name,
+        points.astype(np.float32, copy=False),
+        offsets(counts[kept]),
+        time=None if time is None else time[kept],
+        color=_colors(item, [clouds[t] for t in kept]) if color else None,
+        shift=shift,
+        extra=extra,
+        **describe(item),
+    )
+    return Sample(sequence, notes)
+
+
+def _near_origin(points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Returns the points less the corner of their first frame (its ``first`` points), and that corner f64 (3), or None
+    where float32 holds them as they are.
+    """
+    if max(points.max(), -points.min()) <= _FAR_AWAY:
+        return points, None
+    corner = np.floor(points[:first].astype(np.float64).min(0))
+    return points - corner, corner
+
+
+def _doubts(points: np.ndarray, shift: np.ndarray | None) -> dict[str, int]:
+    """Returns notes about lengths that no sensor sees."""
+    low, high = points.min(0), points.max(0)
+    widest = float((high - low).max())
+    if widest > _ABSURD:
+        return {"sequences more than 100 km wide; are they in meters? --scale N divides them": 1}
+    origin = -shift if shift is not None else np.zeros(3)
+    if widest > _WIDE and ((low <= origin) & (origin <= high)).all():
+        return {"sequences that reach 1 km around their sensor; if these are millimeters, give --scale 1000": 1}
+    return {}
+
+
+def _colors(item: Item, clouds: list[Cloud]) -> np.ndarray:
+    try:
+        return np.concatenate(as_bytes([cloud.color for cloud in clouds if cloud.color is not None]))
+    except DataError as error:
+        raise DataError(f"{item.path}: {error}") from None

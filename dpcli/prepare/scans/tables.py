@@ -1,0 +1,209 @@
+"""Tables of many frames, as radars and lidars log them: a row is a point, a column numbers the frames."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.path_names import as_utf8
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.parquet import ParquetTable
+from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table
+from dpcli.prepare.cloud_formats.text_numbers import read_text_table
+from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
+from dpcli.prepare.reader import Item, Sample, natural_key
+from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.prepare.scans.frames_of_tables import JOINED, Rows, frame_column, split_rows
+from dpcli.store.schema import KEPT
+
+TABLES = (".csv", ".tsv", ".parquet", ".txt", ".xyz", ".asc")
+
+
+@dataclass(frozen=True)
+class TableSequences:
+    """Reads one table, or those of a folder. frame_column: "" for the one whose name says it; the rest as `CloudFolders`
+    and `split_rows` have it.
+    """
+
+    raw: Path
+    frame_column: str = ""
+    sequence_column: str = ""
+    gap: float | None = None
+    scale: float | None = None
+    unit: str = "m"
+    fps: float | None = None
+    stride: int = 1
+    label_from_folder: bool = False
+    labels: Path | None = None
+    keep: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.labels and self.label_from_folder:
+            raise UsageError("--labels and --label-from-folder were both given; use one")
+        if self.fps is not None and not self.fps > 0:
+            raise UsageError("--scale and --fps must be more than 0")
+        if self.gap is not None and not self.gap > 0:
+            raise UsageError(f"--gap {self.gap:g}: expected more than 0, in the numbers of the frame column")
+        Lengths(self.scale, self.unit)
+
+    @property
+    def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
+        return self._label_table.class_names if self._label_table else []
+
+    @property
+    def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
+        return self.unit
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Returns the optional fields that every sample has."""
+        kept = tuple(f"{KEPT}{name}" for name in self.keep)
+        color, time = self._found
+        return (("time",) if time else ()) + (("color",) if color else ()) + kept
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
+        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+
+    @cached_property
+    def _paths(self) -> dict[str, Path]:
+        """Returns the tables by the names of their sequences."""
+        if self.raw.is_file():
+            return {as_utf8(self.raw.stem): self.raw}
+        if not self.raw.is_dir():
+            raise DataError(f"{self.raw}: does not exist; expected a table ({', '.join(TABLES)}), or a folder of tables")
+        labels = self.labels.resolve() if self.labels else None
+        found = [path for path in _tables_below(self.raw) if path.resolve() != labels]
+        if not found:
+            raise DataError(f"{self.raw}: no tables ({', '.join(TABLES)})")
+        named = {as_utf8(path.relative_to(self.raw).with_suffix("").as_posix()): path for path in found}
+        if len(named) < len(found):
+            twins = next(path for path in found if path not in named.values())
+            raise DataError(f"{twins}: there is a table of the same name in another format; keep one of them")
+        return named
+
+    @cached_property
+    def _found(self) -> tuple[bool, bool]:
+        """Returns whether the first good table has colors and whether its frames have times."""
+        for path in self._paths.values():
+            try:
+                loaded = self._load(path)
+            except DataError:
+                continue  # a bad sample: the next one tells
+            return loaded.cloud.color is not None, loaded.parts[0].times(loaded.column, self.fps) is not None
+        return False, bool(self.fps)
+
+    @cached_property
+    def _label_table(self) -> LabelTable | None:
+        if self.labels:
+            return read_labels(self.labels)
+        names = [item.name for item in self._items]
+        return labels_of_folders(self.raw, names, "CLASS/TABLE") if self.label_from_folder else None
+
+    @cached_property
+    def _items(self) -> list[Item]:
+        items = []
+        for name, path in self._paths.items():
+            try:
+                parts = self._load(path).parts
+            except DataError as error:
+                items.append(Item(name, path, problem=str(error)))
+                continue
+            for place, part in enumerate(parts):
+                own = f"{name}/{as_utf8(part.name)}" if part.name else name
+                extra = {"part": place, "color": self._found[0], "time": self._found[1]}
+                items.append(Item(own, path, extra=extra))
+        return items
+
+    def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
+        return self._label_table.apply(self._items) if self._label_table else self._items
+
+    def _load(self, path: Path) -> Loaded:
+        facts = path.stat()
+        return _load(
+            path,
+            (facts.st_size, facts.st_mtime_ns),
+            self.frame_column,
+            self.sequence_column,
+            self.gap,
+            self.keep,
+        )
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
+        loaded = self._load(item.path)
+        part = loaded.parts[item.extra["part"]]
+        if item.extra["color"] and loaded.cloud.color is None:
+            raise DataError(f"{item.path}: no colors, though the first table of all has them")
+        time = part.times(loaded.column, self.fps)
+        if item.extra["time"] and time is None:
+            raise DataError(f"{item.path}: {loaded.column!r} holds no times, though that of the first table does")
+        clouds = loaded.frames(part)[:: self.stride]
+        time = time[:: self.stride] if time is not None and item.extra["time"] else None
+        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
+        sample.notes |= {JOINED: part.joined} if part.joined else {}
+        return sample
+
+    def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds and lacks."""
+        tables = len(self._paths)
+        lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} in {tables} table{'s' if tables != 1 else ''}"]
+        good = next((item for item in items if not item.problem), None)
+        if good:
+            loaded = self._load(good.path)
+            unused = ", ".join(name for name in loaded.unused if name not in self.keep)
+            lines[0] += f", frames by column {loaded.column!r}" + (f"; not read: {unused} (--keep-fields)" if unused else "")
+        return lines
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Holds a table that was read: all its points, its sequences, the frame column, and columns that nobody asked for."""
+
+    cloud: Cloud
+    parts: list[Rows]
+    column: str
+    unused: tuple[str, ...]
+
+    def frames(self, part: Rows) -> list[Cloud]:
+        """Returns the frames of one sequence."""
+        found = []
+        for start, stop in zip(part.offsets[:-1], part.offsets[1:]):
+            rows = part.rows[start:stop]
+            color = None if self.cloud.color is None else self.cloud.color[rows]
+            extra = {name: values[rows] for name, values in self.cloud.extra.items()}
+            found.append(Cloud(self.cloud.points[rows], color, self.cloud.unit, extra))
+        return found
+
+
+@lru_cache(maxsize=2)  # a table holds many sequences; each process reads it once
+def _load(
+    path: Path, facts: tuple[int, int], wanted: str, sequences: str, gap: float | None, keep: tuple[str, ...]
+) -> Loaded:
+    if not facts[0]:
+        raise DataError(f"{path}: the file is empty")
+    table = ParquetTable(path) if path.suffix.lower() == ".parquet" else read_text_table(path)
+    column = frame_column(table, wanted)
+    cloud = cloud_of_table(table, keep)
+    axes = cloud.columns
+    unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
+    return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused)
+
+
+def _tables_below(folder: Path) -> Iterator[Path]:
+    for place, folders, names in os.walk(folder):
+        folders.sort(key=natural_key)
+        for name in sorted(names, key=natural_key):
+            if name.lower().endswith(TABLES) and not name.startswith("."):
+                yield Path(place) / name
