@@ -60,7 +60,9 @@ class CloudsReader:
                 f"{self.path}: label {self.labels[worst]} of {self.names[worst]!r}, but {len(self.class_names)} classes"
             )
         if "class_names" not in file and (self.labels >= 0).any():
-            raise DataError(f"{self.path}: data set 'class_names' is missing, though samples have labels; make it again")
+            raise DataError(
+                f"{self.path}: data set 'class_names' is missing, though samples have labels; make it again"
+            )
         self.shifts = self._read_shifts(file)
         self.fields = (*(key for key in OPTIONAL if key in file), *(key for key in file if key.startswith(KEPT)))
         for key in self.fields:
@@ -83,7 +85,9 @@ class CloudsReader:
             return np.zeros((len(self.names), 3))
         shifts = self._data(file, "shift", (3,))[:]
         if len(shifts) != len(self.names) or not np.isfinite(shifts).all():
-            raise DataError(f"{self.path}: shift has {len(shifts)} rows, expected {len(self.names)} of 3 finite numbers")
+            raise DataError(
+                f"{self.path}: shift has {len(shifts)} rows, expected {len(self.names)} of 3 finite numbers"
+            )
         return shifts
 
     def _column(self, file: h5py.File, name: str) -> np.ndarray:

@@ -119,7 +119,9 @@ class CloudSequence:
                 raise DataError(f"{where}: {key} is {value.dtype} {value.shape}, expected {np.dtype(dtype)} {expected}")
         for key, value in self.extra.items():
             if value.shape != (len(self.points),) or value.dtype != np.float32:
-                raise DataError(f"{where}: {key} is {value.dtype} {value.shape}, expected float32 {(len(self.points),)}")
+                raise DataError(
+                    f"{where}: {key} is {value.dtype} {value.shape}, expected float32 {(len(self.points),)}"
+                )
         if self.shift is not None and (np.shape(self.shift) != (3,) or not np.isfinite(self.shift).all()):
             raise DataError(f"{where}: shift is {self.shift}, expected 3 finite numbers")
         if self.scene_flow is not None and not np.isfinite(self.scene_flow).all():

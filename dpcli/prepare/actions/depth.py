@@ -18,6 +18,8 @@ from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, DepthVideo, frame_s
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.recordings.depth import read_recorded_depth
+from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
@@ -62,6 +64,7 @@ class DepthVideos:
     label_from_folder: bool = False
     calibration: Calibration | None = None
     pattern: str = ""
+    topic: str = ""
     length_unit: ClassVar[str] = "m"
 
     def __post_init__(self) -> None:
@@ -86,9 +89,9 @@ class DepthVideos:
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        apart = ("inputs", "labels", "label_from_folder", "far", "calibration", "pattern")
+        apart = ("inputs", "labels", "label_from_folder", "far", "calibration", "pattern", "topic")
         values = {k: v for k, v in asdict(self).items() if k not in apart}
-        given = {"label_from_folder": self.label_from_folder, "pattern": self.pattern}
+        given = {"label_from_folder": self.label_from_folder, "pattern": self.pattern, "topic": self.topic}
         if self.calibration:
             given["calibration"] = {k: v for k, v in asdict(self.calibration).items() if k != "source"}
         return {**values, "far": self.far if np.isfinite(self.far) else None, **{k: v for k, v in given.items() if v}}
@@ -117,7 +120,7 @@ class DepthVideos:
             name = as_utf8(path.relative_to(given).as_posix() if path != given else path.name)
             if name in items:
                 raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
-            items[name] = Item(name, path, extra={"series": series})
+            items[name] = Item(name, path, extra={"series": series, "recording": is_recording(path)})
         return list(items.values())
 
     def items(self) -> list[Item]:
@@ -126,8 +129,8 @@ class DepthVideos:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        video = read_depth_video(item.path, self.stride, item.extra["series"])
-        camera = self._camera(*video.frames.shape[1:])
+        video, recorded = self._video(item)
+        camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
         depth, unit = self._inverted(depth, item.path), 1 / scale
@@ -141,7 +144,16 @@ class DepthVideos:
         sequence = CloudSequence(
             item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
         )
+        if item.extra["recording"] and not (recorded or self.calibration or self.intrinsics or self.fov):
+            notes[f"recordings without camera_info, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
         return Sample(sequence, {**notes, **dropped})
+
+    def _video(self, item: Item) -> tuple[DepthVideo, Calibration | None]:
+        """Returns the frames of an item, and the camera that a recording describes."""
+        if not item.extra["recording"]:
+            return read_depth_video(item.path, self.stride, item.extra["series"]), None
+        frames, time, camera = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(frames, time), camera
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
@@ -176,15 +188,18 @@ class DepthVideos:
             raise DataError(f"{path}: depths of type {kind}; --invert needs unsigned integers, whose range is known")
         return np.where(frames > 0, np.iinfo(kind).max - frames, 0)
 
-    def _camera(self, height: int, width: int) -> Intrinsics:
-        if self.calibration:
-            return self.calibration.of_pictures(width, height)
+    def _camera(self, width: int, height: int, recorded: Calibration | None) -> Intrinsics:
+        """Returns the user's camera, or the one that a recording describes, or one of a usual field of view."""
+        calibration = self.calibration or (None if self.intrinsics or self.fov else recorded)
+        if calibration:
+            return calibration.of_pictures(width, height)
         return self.intrinsics or Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
-        if not self.intrinsics and not self.calibration and self.fov is None:
+        unknown = not (self.intrinsics or self.calibration or self.fov)
+        if unknown and not all(item.extra["recording"] for item in items):
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
             )
@@ -203,9 +218,10 @@ class DepthVideos:
 
 
 def _tells_time(item: Item) -> bool:
-    """Returns whether an item says when its frames were taken: by a video's time stamps, or by the names of its frames."""
+    """Returns whether an item says when its frames were taken: by time stamps inside, or by the names of its frames."""
     series: Series | None = item.extra["series"]
-    return series.times() is not None if series else item.path.suffix.lower() in VIDEO_SUFFIXES
+    stamped = item.extra["recording"] or item.path.suffix.lower() in VIDEO_SUFFIXES
+    return series.times() is not None if series else stamped
 
 
 def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None]]:
@@ -215,12 +231,13 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
-    if not path.is_dir():
+    if not path.is_dir() or is_recording(path):
         return [(path, None)]
     if own := frame_series(path, pattern):
         return [(path, own)]
     found: list[tuple[Path, Series | None]] = []
     suffixes = (*VIDEO_SUFFIXES, ".npy")
+    found += [(recording, None) for recording in find_recordings(path)]
     for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
         folders[:] = [name for name in folders if not is_hidden(name)]
         clips = [(Path(folder, name), frame_series(Path(folder, name), pattern)) for name in folders]
@@ -233,6 +250,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         raise DataError(
-            f"{path}: no depth video in it{asked}; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)}"
+            f"{path}: no depth video in it{asked}; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)},"
+            " or recordings (.bag, .mcap, .db3)"
         )
     return found

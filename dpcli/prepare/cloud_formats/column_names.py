@@ -20,7 +20,9 @@ _ABOUT_POINTS = frozenset(
     "point points pt pos position coord coords coordinate coordinates cartesian cart field fields loc location data p"
     " xyz local world global axis vertex".split()
 )
-_ABOUT_COLORS = frozenset("diffuse color colour colors colours col vertex rgb scalar field channel point points".split())
+_ABOUT_COLORS = frozenset(
+    "diffuse color colour colors colours col vertex rgb scalar field channel point points".split()
+)
 _MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height", "altitude", "z"))
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
 _PACKED = ("rgb", "rgba", "rgb24", "rgba32")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, DpcError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud
 
 
 class ParquetTable:

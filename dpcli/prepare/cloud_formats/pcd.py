@@ -106,7 +106,9 @@ def _read_text(path: Path, body: bytes, header: Header) -> dict[str, np.ndarray]
     for k, name in enumerate(names):
         kind, column = header.kind[name], values[:, k]
         whole = kind.kind == "f" or (np.isfinite(column).all() and (column == np.floor(column)).all())
-        packed = name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()  # whole numbers, as some write them
+        packed = (
+            name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()
+        )  # whole numbers, as some write them
         columns[name] = column if packed or not whole else column.astype(kind)
     return columns
 

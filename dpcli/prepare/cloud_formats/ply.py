@@ -69,7 +69,9 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
         elif words[:1] == ["property"] and elements and len(words) >= 3:
             elements[-1].properties.append((words[-1], _property_type(path, words)))
     if order is None:
-        raise DataError(f"{path}: its header names no format; expected ascii, binary_little_endian or binary_big_endian")
+        raise DataError(
+            f"{path}: its header names no format; expected ascii, binary_little_endian or binary_big_endian"
+        )
     file.seek(after)
     return order, elements
 
@@ -84,9 +86,7 @@ def _property_type(path: Path, words: list[str]) -> str:
 def _read_binary(
     path: Path, file: BinaryIO, order: str, vertex: Element, before: list[Element]
 ) -> dict[str, np.ndarray]:
-    skipped = sum(
-        element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties) for element in before
-    )
+    skipped = sum(element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties) for element in before)
     names = _unique_names(path, vertex)
     kind = np.dtype([(name, order + kind) for name, (_, kind) in zip(names, vertex.properties)])
     start = file.tell() + skipped

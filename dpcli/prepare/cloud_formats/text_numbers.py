@@ -108,7 +108,9 @@ class TextTable:
                 value = _number(row[place], decimal)
                 if value is None:
                     name = f"column {self.names[place]!r}" if self.names else f"column {place + 1}"
-                    raise DataError(f"{self.path}:{number}: {name} holds {row[place]!r:.60}; expected numbers in columns")
+                    raise DataError(
+                        f"{self.path}:{number}: {name} holds {row[place]!r:.60}; expected numbers in columns"
+                    )
                 values[k, column] = value
         return values
 
@@ -198,7 +200,9 @@ def _find_header(path: Path, numbered: list[tuple[int, str]], delimiter: str | N
     place, (number, line) = next(
         ((place, one) for place, one in enumerate(numbered) if not one[1].startswith(_COMMENT)), (0, numbered[0])
     )
-    if not all(re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)):
+    if not all(
+        re.fullmatch(_NUMBER, cell) or cell.lower() in _MISSING | {"inf", "-inf"} for cell in _rough_cells(line)
+    ):
         words = ", ".join(_names(line, delimiter) or line.split())[:80]
         raise DataError(f"{path}:{number}: columns {words}; expected x, y and z among them, or numbers only")
     return place, []
@@ -209,7 +213,7 @@ def _names(line: str, delimiter: str | None) -> list[str]:
     line = re.sub(r"^(#|//|%)+\s*", "", line)
     sign = delimiter or next((d for d in "\t;,|" if d in line), None)
     if sign is None:
-        return [cell.strip('"\'') for cell in line.split()]
+        return [cell.strip("\"'") for cell in line.split()]
     cells = next(csv.reader([line], delimiter=sign, skipinitialspace=True))
     return [cell.strip().strip("'\"").strip() for cell in _trimmed([cell.strip() for cell in cells])]
 
@@ -235,7 +239,9 @@ def _without_count(path: Path, rows: list[tuple[int, str]]) -> list[tuple[int, s
         return rows
     count, rest = int(rows[0][1]), rows[1:]
     if len(rest) != count:
-        raise DataError(f"{path}: says {count} points in line {rows[0][0]}, holds {len(rest)}; truncated, or two clouds")
+        raise DataError(
+            f"{path}: says {count} points in line {rows[0][0]}, holds {len(rest)}; truncated, or two clouds"
+        )
     return rest
 
 

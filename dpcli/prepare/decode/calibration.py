@@ -313,9 +313,17 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     if values is None and any(f"k{k}" in own for k in (1, 2)):
         values = [own.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
-    if not _are_numbers(flat) or not any(flat):
+    return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat) if _are_numbers(flat) else ()
+
+
+def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, ...]:
+    """Returns the coefficients of a lens, none where all are 0. name: of its model.
+
+    Raises DataError for a model that isn't read.
+    """
+    if not any(flat):
         return ()
-    model = str(_first(own, _MODEL) or "").lower().replace("distortion.", "").replace("-", "_")
+    model = name.lower().replace("distortion.", "").replace("-", "_")
     if model not in _BROWN or len(flat) not in (4, 5, 8, 12, 14):
         raise DataError(
             f"{path}: its lens is of model {model or 'unknown'} with {len(flat)} coefficients that aren't all 0; expected"

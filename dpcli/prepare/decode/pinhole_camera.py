@@ -66,7 +66,10 @@ def _straightened(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -
     bent = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
     cv2 = load_cv2()
     precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-    found = cv2.undistortPointsIter(bent, np.eye(3), np.array(distortion), None, None, precise)
+    if hasattr(cv2, "undistortPointsIter"):  # what OpenCV 4 calls it
+        found = cv2.undistortPointsIter(bent, np.eye(3), np.array(distortion), None, None, precise)
+    else:
+        found = cv2.undistortPoints(bent, np.eye(3), np.array(distortion), criteria=precise)
     return found.reshape(len(y), len(x), 2)
 
 

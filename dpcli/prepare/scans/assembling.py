@@ -47,12 +47,7 @@ class Lengths:
 
 
 def assemble(
-    item: Item,
-    clouds: list[Cloud],
-    lengths: Lengths,
-    *,
-    color: bool = False,
-    time: np.ndarray | None = None,
+    item: Item, clouds: list[Cloud], lengths: Lengths, *, color: bool = False, time: np.ndarray | None = None
 ) -> Sample:
     """Returns the sample of frames that were read, in their order. Raises DataError where no point is left.
 

@@ -81,7 +81,9 @@ class TableSequences:
         if self.raw.is_file():
             return {as_utf8(self.raw.stem): self.raw}
         if not self.raw.is_dir():
-            raise DataError(f"{self.raw}: does not exist; expected a table ({', '.join(TABLES)}), or a folder of tables")
+            raise DataError(
+                f"{self.raw}: does not exist; expected a table ({', '.join(TABLES)}), or a folder of tables"
+            )
         labels = self.labels.resolve() if self.labels else None
         found = [path for path in _tables_below(self.raw) if path.resolve() != labels]
         if not found:
@@ -132,12 +134,7 @@ class TableSequences:
     def _load(self, path: Path) -> Loaded:
         facts = path.stat()
         return _load(
-            path,
-            (facts.st_size, facts.st_mtime_ns),
-            self.frame_column,
-            self.sequence_column,
-            self.gap,
-            self.keep,
+            path, (facts.st_size, facts.st_mtime_ns), self.frame_column, self.sequence_column, self.gap, self.keep
         )
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
@@ -163,7 +160,9 @@ class TableSequences:
         if good:
             loaded = self._load(good.path)
             unused = ", ".join(name for name in loaded.unused if name not in self.keep)
-            lines[0] += f", frames by column {loaded.column!r}" + (f"; not read: {unused} (--keep-fields)" if unused else "")
+            lines[0] += f", frames by column {loaded.column!r}" + (
+                f"; not read: {unused} (--keep-fields)" if unused else ""
+            )
         return lines
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
-from dpcli.cli.prepare.options import LabelTable, Pattern, Stride
+from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 from dpcli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -68,7 +68,8 @@ class DepthPixels:
 
 def depth(
     inputs: Annotated[
-        list[Path], typer.Argument(help="Videos (.avi .mp4 .mkv .mov), .npy, folders of images, or folders of these.")
+        list[Path],
+        typer.Argument(help="Videos (.avi .mp4 .mkv .mov), .npy, folders of images, recordings, or folders of these."),
     ],
     camera: DepthCamera,
     pixels: DepthPixels,
@@ -78,6 +79,7 @@ def depth(
     ] = None,
     stride: Stride = 1,
     pattern: Pattern = "",
+    topic: Topic = "",
     label_from_folder: Annotated[
         bool,
         typer.Option(
@@ -107,6 +109,7 @@ def depth(
             labels=labels,
             label_from_folder=label_from_folder,
             pattern=pattern,
+            topic=topic,
         ),
         conversion,
     )
