@@ -31,11 +31,15 @@ class Messages:
         sequence = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=time, frame_id="sensor", **sequence)
 
-    def cloud(self, points: np.ndarray, stamp: int = START, *, height: int = 1, padding: int = 0, big: bool = False) -> Any:
+    def cloud(
+        self, points: np.ndarray, stamp: int = START, *, height: int = 1, padding: int = 0, big: bool = False
+    ) -> Any:
         """A PointCloud2 of a structured array (N), whose rows end in unused bytes."""
         kind = points.dtype.newbyteorder(">" if big else "<")
         fields = [
-            self.make("sensor_msgs/msg/PointField", name=n, offset=kind.fields[n][1], datatype=TYPES[kind[n].str[1:]], count=1)
+            self.make(
+                "sensor_msgs/msg/PointField", name=n, offset=kind.fields[n][1], datatype=TYPES[kind[n].str[1:]], count=1
+            )
             for n in kind.names
         ]
         width = len(points) // height
@@ -48,7 +52,9 @@ class Messages:
             is_dense=True,
         )  # fmt: skip
 
-    def image(self, frame: np.ndarray, stamp: int = START, *, encoding: str = "16UC1", big: bool = False, padding: int = 0) -> Any:
+    def image(
+        self, frame: np.ndarray, stamp: int = START, *, encoding: str = "16UC1", big: bool = False, padding: int = 0
+    ) -> Any:
         rows = frame.astype(frame.dtype.newbyteorder(">" if big else "<"))
         data = b"".join(row.tobytes() + b"\0" * padding for row in rows)
         return self.make(
@@ -67,13 +73,16 @@ class Messages:
         data = cv2.imencode(".png", stored)[1].tobytes()
         data = head + data if "compressedDepth" in form else data
         return self.make(
-            "sensor_msgs/msg/CompressedImage", header=self.header(stamp), format=form, data=np.frombuffer(data, np.uint8)
+            "sensor_msgs/msg/CompressedImage",
+            header=self.header(stamp),
+            format=form,
+            data=np.frombuffer(data, np.uint8),
         )
 
-    def camera(self, k: list[float], width: int, height: int, *, d: tuple[float, ...] = (0.0,) * 5, p: Any = None) -> Any:
-        roi = self.make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
+    def camera(
+        self, k: list[float], width: int, height: int, *, d: tuple[float, ...] = (0.0,) * 5, p: Any = None
+    ) -> Any:
+        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         arrays = {"d": np.array(d), "k": np.array(k), "r": np.eye(3).reshape(-1)}
         arrays["p"] = np.zeros(12) if p is None else np.array(p, float)
         named = {name.upper() if self.ros1 else name: values for name, values in arrays.items()}

@@ -15,7 +15,7 @@ from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.deep_video import deep_frames
 from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import decode_gray_png
-from dpcli.prepare.decode.video_streams import depth_stream
+from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
@@ -42,6 +42,14 @@ class DepthVideo:
 
 def open_video(path: Path):  # -> cv2.VideoCapture
     """Opens an OpenCV capture that yields 16-bit gray frames unharmed and 8-bit ones expanded to the full range."""
+    capture = _opened(path)
+    if not capture.isOpened():
+        raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
+    return capture
+
+
+def _opened(path: Path):  # -> cv2.VideoCapture
+    """Returns the capture of `open_video`, also one that could not be opened. Raises DataError when there is no file."""
     if not path.is_file():
         raise DataError(f"{path}: no such video")
     cv2, name = load_cv2(), utf8_path(path, "OpenCV")
@@ -52,8 +60,6 @@ def open_video(path: Path):  # -> cv2.VideoCapture
     if capture.isOpened() and int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _GRAY16:
         if not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0):  # an OpenCV that takes it at the opening only
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, [*single, cv2.CAP_PROP_CONVERT_RGB, 0])
-    if not capture.isOpened():
-        raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
     return capture
 
 
@@ -86,14 +92,14 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
 
     Of several streams the one of depth is taken. Raises DataError where gray of more than 8 bits would be cut.
     """
-    capture = open_video(path)
+    capture = _opened(path)
     try:
         tag, rate = int(capture.get(load_cv2().CAP_PROP_CODEC_PIXEL_FORMAT)), _declared_rate(capture)
         one_stream = (
             path.suffix.lower() == ".avi"
         )  # in others depth often lies beside color; asking takes a tenth of a second
         stream = None if one_stream and tag in (_GRAY16, *_EIGHT_BITS) else depth_stream(path)
-        if stream is None or (stream.place == 0 and (stream.is_eight_bits or stream.pixel_format == "gray16le")):
+        if stream is None or (stream.place == 0 and _is_plain(stream)):
             stamps: list[float | None] = []
             frames = list(_decoded(capture, path, 0, None, stride, stamps))
             return frames, rising_times(stamps, rate, stride)
@@ -106,6 +112,11 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
         )
     kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
     return [frame for frame, _ in kept], rising_times([seconds for _, seconds in kept], rate, stride)
+
+
+def _is_plain(stream: VideoStream) -> bool:
+    """Returns whether OpenCV gives a stream's pixels unharmed."""
+    return stream.is_eight_bits or (stream.pixel_format == "gray16le" and not stream.written_bits)
 
 
 def rising_times(stamps: Sequence[float | None], rate: float | None, stride: int = 1) -> np.ndarray | None:

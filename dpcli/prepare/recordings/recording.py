@@ -95,7 +95,7 @@ class Recording:
 
     def _list(self, fitting: list[str], what: str) -> str:
         if fitting:
-            return f"choose one with --topic: {', '.join(fitting[:_LISTED])} hold {what}"
+            return f"choose one that holds {what} with --topic: {', '.join(fitting[:_LISTED])}"
         held = ", ".join(f"{name} ({kind})" for name, (kind, _) in list(self.topics.items())[:_LISTED])
         return f"no topic holds {what}; it has {held or 'no messages'}"
 

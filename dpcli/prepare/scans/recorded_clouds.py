@@ -64,6 +64,10 @@ class RecordedClouds:
     @cached_property
     def _names(self) -> dict[str, Path]:
         """Returns the recordings by the names of their sequences."""
+        if not self.raw.exists():
+            raise DataError(
+                f"{self.raw}: no such file or folder; expected a recording (.bag, .mcap, .db3), or a folder of some"
+            )
         found = find_recordings(self.raw)
         if not found:
             raise DataError(f"{self.raw}: no recording in it; expected .bag, .mcap, .db3, or folders of ROS 2 bags")
