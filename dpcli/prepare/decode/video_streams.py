@@ -98,7 +98,7 @@ def depth_stream(path: Path) -> VideoStream:
     Raises DataError when nothing decides, or when its pixels would not arrive as they were stored.
     """
     streams = video_streams(path)
-    if not streams:
+    if not any(one.width and one.pixel_format != "none" for one in streams):
         raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
     called = [one for one in streams if "depth" in one.title.lower()]
     deep = [one for one in streams if one.deep_bits]
