@@ -97,7 +97,7 @@ def _commands_of(line: str) -> Iterator[list[str]]:
             part.append(word)
             continue
         at = next((i for i, one in enumerate(part) if one == "dpc" or one.endswith("/dpc")), None)
-        if at is not None and part[at + 1 :] and part[0] != "for":
+        if at is not None and part[at + 1 :] and part[at - 1 : at] != ["in"]:
             yield part[at + 1 :]
         for quoted in (one for one in part if "dpc " in one):
             yield from _commands_of(quoted)
