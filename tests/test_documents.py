@@ -25,6 +25,7 @@ from tests.support.documents import (
     faults,
     links,
     option_faults,
+    setting_faults,
     spans,
 )
 
@@ -161,7 +162,10 @@ def command_faults(text: str, about: str = "") -> Iterator[str]:
             yield from faults([*WORDS_FOR[name], *value.split()])
     for span in spans(text):  # a few words of a command line
         if re.match(r"--?[a-z]", span):
-            yield from option_faults(re.split(r"[ /,]+", span), dpc().below.get(about, anything()), about or "dpc")
+            room = Has(dpc().below.get(about, anything()).options, anything().settings)
+            yield from option_faults(re.split(r"[ /]|, ", span), room, about or "dpc")
+        elif about in dpc().below and re.fullmatch(r"[a-z_]+=\S+", span):
+            yield from setting_faults(span, anything(), "dpc")
 
 
 @cache
@@ -169,7 +173,7 @@ def anything() -> Has:
     """What any command, or a program behind a goal of the Makefile, takes."""
     programs = [ROOT / file for file in FILES if file.startswith(("dpcli/reproduce", "tests/fuzz"))]
     options = {name for path in programs for name in re.findall(r'"(--[a-z][\w-]*)"', path.read_text())}
-    return Has(dpc().options | options, dpc().settings)
+    return Has(dpc().options | dict.fromkeys(options, set()), dpc().settings)
 
 
 @each_document()

@@ -120,25 +120,37 @@ def assigned(text: str) -> list[tuple[str, str]]:
 
 @dataclass
 class Has:
-    """What a command takes: its options and the names of its settings; of a group, what any command of it takes."""
+    """What a command takes: its options and settings; of a group, what any command of it takes.
 
-    options: set[str] = field(default_factory=set)
-    settings: set[str] = field(default_factory=set)
+    options, settings: the legal words of each by name, none where a value is not one of a few words.
+    """
+
+    options: dict[str, set[str]] = field(default_factory=dict)
+    settings: dict[str, set[str]] = field(default_factory=dict)
     below: dict[str, Has] = field(default_factory=dict)
+
+    def add(self, other: Has) -> None:
+        """Take what the other takes, too; a name that takes any value in one of them takes any."""
+        for own, more in ((self.options, other.options), (self.settings, other.settings)):
+            for name, words in more.items():
+                own[name] = own[name] | words if own.get(name) and words else set() if name in own else set(words)
 
 
 def _has(command: click.Command) -> Has:
-    below = {name: _has(one) for name, one in getattr(command, "commands", {}).items()}
-    own = Has(below=below)
+    has = Has(below={name: _has(one) for name, one in getattr(command, "commands", {}).items()})
+    context = click.Context(command)
     for one in command.params:
-        own.options.update(opt for opt in (*one.opts, *one.secondary_opts) if opt.startswith("-"))
+        words = {item.value for item in one.shell_complete(context, "") if item.type == "plain"}
         if one.name == "set_values":
-            words = one.shell_complete(click.Context(command), "")
-            own.settings = {word.value.partition("=")[0] for word in words}
-    for other in below.values():
-        own.options |= other.options
-        own.settings |= other.settings
-    return own
+            for name, _, word in (item.partition("=") for item in words):
+                has.settings.setdefault(name, set()).update({word} - {""})
+            words = set()
+        for opt in (*one.opts, *one.secondary_opts):
+            if opt.startswith("-"):
+                has.options[opt] = words
+    for other in has.below.values():
+        has.add(other)
+    return has
 
 
 @cache
@@ -163,12 +175,28 @@ def faults(words: list[str]) -> Iterator[str]:
 
 
 def option_faults(words: list[str], has: Has, where: str) -> Iterator[str]:
-    """Which of the words are options, or names after `--set`, that a command lacks."""
+    """Which of the words are options, or settings after `--set`, that a command lacks, and which values are not legal."""
     for word, following in zip(words, [*words[1:], ""]):
         name, _, value = word.partition("=")
-        if re.match(r"--?[A-Za-z]", name) and name not in has.options | _ANYWHERE:
+        value = value or following
+        if name in _ANYWHERE or not re.match(r"--?[A-Za-z]", name):
+            continue
+        legal = has.options.get(name)
+        if legal is None:
             yield f"{where} has no option {name}"
+        elif legal and value and not _FREE.match(value) and not legal.issuperset(value.split("|")):
+            yield f"{where} {name} takes no {value}"
         elif name == "--set":
-            setting = (value or following).partition("=")[0].replace("-", "_")
-            if setting and not _FREE.match(setting) and setting not in has.settings:
-                yield f"{where} has no setting {setting}"
+            yield from setting_faults(value, has, where)
+
+
+def setting_faults(word: str, has: Has, where: str) -> Iterator[str]:
+    """Whether the name in NAME=VALUE is no setting of a command, or the value not legal."""
+    name, _, value = word.partition("=")
+    legal = has.settings.get(name.replace("-", "_"))
+    if _FREE.match(name) or not name:
+        return
+    if legal is None:
+        yield f"{where} has no setting {name}"
+    elif legal and value and not _FREE.match(value) and value not in legal:
+        yield f"{where} takes no {name}={value}"
