@@ -60,7 +60,7 @@ function followTheme(changed) {
   return () => { chosen = root.hasAttribute("data-dark") ? "light" : "dark"; show(); };
 }
 
-// Keys do what `table` says, but not while a field is filled in, and a space on a button presses it.
+// Keys do what `table` says whatever has the focus; only fields of text keep theirs, and a slider its arrows.
 function listenToKeys(table) {
   window.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
