@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
 KINDS = (".mp4", ".gif", ".png")
 _X264 = ("-crf", "18", "-preset", "veryfast", "-threads", "2", "-movflags", "+faststart")  # crf 18: visually lossless
+_BT709 = (  # browsers take untagged videos for BT.709 from some size on, while FFmpeg converts by BT.601
+    *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709", "-color_primaries", "bt709"),
+    *("-color_trc", "bt709", "-color_range", "tv"),
+)
 _COLORS = 255  # of an animation
 _PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from
 
@@ -70,7 +74,7 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
             pix_fmt_out="yuv420p",
             macro_block_size=1,
             quality=None,
-            output_params=list(_X264),
+            output_params=[*_X264, *_BT709],
             ffmpeg_log_level="error",
         )
         with closing(writer):  # ends the encoder, also where a picture fails
