@@ -34,7 +34,7 @@ _FULL_RANGE = 2
 
 @dataclass(frozen=True)
 class VideoLook:
-    """Tells of a video what one pass finds: its number of frames, their seconds or None, and whether they have alpha."""
+    """Tells of a video what one pass finds: its number of frames, their seconds or None, and whether alpha shows."""
 
     count: int
     times: tuple[float, ...] | None
@@ -69,11 +69,12 @@ def video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
 def _look(path: Path, changed: int, size: int) -> VideoLook:
     container, stream = _open(path)
     with closing(container):
-        stamps, first, failed = [], None, False
+        stamps, first, failed, alpha = [], None, False, False
         try:
             for frame in _decoded(path, container, stream):
-                first = first or frame
-                stamps.append(0.0 if frame.time is None else frame.time)
+                first, alpha = first or frame, alpha or _is_transparent(frame)
+                # Frames that the decoder held back until the end know no time base of their own.
+                stamps.append(0.0 if frame.pts is None else float(frame.pts * stream.time_base))
         except DataError:
             failed = True
         if first is None:
@@ -82,8 +83,14 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
         _tell_display(path, first, stream)
-    alpha = any(component.is_alpha for component in first.format.components)
     return VideoLook(len(stamps), None if times is None else tuple(times.tolist()), alpha)
+
+
+def _is_transparent(frame) -> bool:  # av.VideoFrame
+    """Returns whether any pixel can be seen through: some writers fill an alpha channel that nobody asked for."""
+    if not any(component.is_alpha for component in frame.format.components):
+        return False
+    return bool(frame.reformat(format="rgba").to_ndarray()[..., 3].min() < 255)
 
 
 def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
