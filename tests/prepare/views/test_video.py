@@ -525,6 +525,25 @@ def test_known_cameras_are_turned_into_our_world_exactly(tmp_path):
     assert (np.diff(heights) > 0.05).all()  # what rises in the scene rises along +y
 
 
+def test_masks_that_the_file_names_cut_the_object_out(tmp_path):
+    folder, _ = blender_folder(tmp_path / "scene")
+    whole = read(transforms_clip(folder, VideoOptions(size=64)))
+    data = json.loads((folder / "transforms_train.json").read_text())
+    (folder / "masks").mkdir()
+    for number, frame in enumerate(data["frames"]):
+        path = folder / f"{frame['file_path']}.png"
+        rgba = np.asarray(Image.open(path))
+        Image.fromarray(rgba[..., 3]).save(folder / "masks" / f"{number}.png")
+        Image.fromarray(np.dstack([rgba[..., :3], np.full(rgba.shape[:2], 255, np.uint8)])).save(path)
+        frame["mask_path"] = f"masks/{number}.png"
+    data.update(camera_model="OPENCV", k1=0.0, k2=0.0)  # no distortion is no lens
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    cut = read(transforms_clip(folder, VideoOptions(size=64)))
+    assert cut.keys() == whole.keys()
+    for key, picture in cut.items():
+        np.testing.assert_array_equal(picture, whole[key])
+
+
 def test_a_moving_camera_is_told_apart(tmp_path):
     folder, _ = blender_folder(tmp_path / "scene", cameras=1, moving_camera=True)
     with pytest.raises(DataError, match="the camera moves"):
@@ -542,6 +561,11 @@ def test_a_moving_camera_is_told_apart(tmp_path):
         (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4 x 4"),
         (lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "not a camera-to-world"),
         (lambda d: d.update(frames=[]), "no frames"),
+        (lambda d: d.update(k1=-0.1, camera_model="OPENCV"), "k1 -0.1; expected pictures without lens distortion"),
+        (lambda d: d["frames"][0].update(p2=0.01), "p2 0.01; expected"),
+        (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "camera_model OPENCV_FISHEYE"),
+        (lambda d: d.update(is_fisheye=True), "fisheye"),
+        (lambda d: d["frames"][0].update(mask_path="../m.png"), "outside the folder"),
     ],
 )
 def test_bad_transforms(tmp_path, change, message):
