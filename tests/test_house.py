@@ -167,3 +167,15 @@ def undocumented(node: ast.AST, name: str) -> Iterator[str]:
 
 def test_everything_public_is_documented():
     assert [one for name, path in MODULES.items() for one in undocumented(ast.parse(path.read_text()), name)] == []
+
+
+RELATIVE = ("What", "Which", "Where", "How", "Of", "Whether", "As", "With", "When", "Who")
+
+
+def test_docstrings_begin_with_a_subject_or_a_verb():
+    """A relative clause alone says neither who acts nor what is returned."""
+    for name, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+                words = (ast.get_docstring(node) or "").split()
+                assert not words or words[0] not in RELATIVE, f"{name}: {' '.join(words[:8])} ..."

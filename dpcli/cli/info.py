@@ -229,7 +229,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _shift_lines(shifts: dict[str, list[float]]) -> list[tuple[str, str]]:
-    """What was taken off the coordinates of sequences: added to their points it gives the original ones."""
+    """Returns the lines of shifts: added to the points of its sequence, a shift gives the original coordinates."""
     lines = [
         ("shift", f"{name}: {', '.join(f'{value:.10g}' for value in shift)} (points + shift: the original coordinates)")
         for name, shift in list(shifts.items())[:_SKIPPED_SHOWN]

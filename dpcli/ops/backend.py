@@ -1,4 +1,4 @@
-"""Which implementation runs, on how many threads, in pieces of what size; and the checks that all operations share.
+"""Chooses which implementation runs, on how many threads and in pieces of what size, and holds the shared checks.
 
 Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorized, chunked),
 and `numba`, the fast kernels for CPU tensors. The environment variable DPC_BACKEND=torch|numba overrides the choice.

@@ -1,4 +1,4 @@
-"""From a reader to a file: items are read in worker processes and written in order by the one writer."""
+"""Leads from a reader to a file: items are read in worker processes and written in order by the one writer."""
 
 from __future__ import annotations
 

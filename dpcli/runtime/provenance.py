@@ -1,4 +1,4 @@
-"""What a command records about itself in the file it writes."""
+"""Records what a command says about itself in the file it writes."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class CloudsReader:
         return file[name]
 
     def _read_shifts(self, file: h5py.File) -> np.ndarray:
-        """What was taken off the original coordinates of each sequence, f64 (S,3); zeros where nothing was."""
+        """Returns what was taken off the original coordinates of each sequence, f64 (S,3); zeros where nothing was."""
         if "shift" not in file:
             return np.zeros((len(self.names), 3))
         shifts = self._data(file, "shift", (3,))[:]

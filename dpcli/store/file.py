@@ -1,4 +1,4 @@
-"""What every file of the contract has in common: the root attributes, safe opening, provenance."""
+"""Holds what every file of the contract has in common: the root attributes, safe opening, provenance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a file of the contract holds, as data: kind, counts, lengths, classes, ranges, provenance."""
+"""Summarizes a file of the contract, as data: kind, counts, lengths, classes, ranges, provenance."""
 
 from __future__ import annotations
 

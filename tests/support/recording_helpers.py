@@ -47,10 +47,17 @@ class Messages:
         step = kind.itemsize * width
         data = b"".join(rows[k * step : (k + 1) * step] + b"\xff" * padding for k in range(height))
         return self.make(
-            "sensor_msgs/msg/PointCloud2", header=self.header(stamp), height=height, width=width, fields=fields,
-            is_bigendian=big, point_step=kind.itemsize, row_step=step + padding, data=np.frombuffer(data, np.uint8),
+            "sensor_msgs/msg/PointCloud2",
+            header=self.header(stamp),
+            height=height,
+            width=width,
+            fields=fields,
+            is_bigendian=big,
+            point_step=kind.itemsize,
+            row_step=step + padding,
+            data=np.frombuffer(data, np.uint8),
             is_dense=True,
-        )  # fmt: skip
+        )
 
     def image(
         self, frame: np.ndarray, stamp: int = START, *, encoding: str = "16UC1", big: bool = False, padding: int = 0
@@ -58,10 +65,15 @@ class Messages:
         rows = frame.astype(frame.dtype.newbyteorder(">" if big else "<"))
         data = b"".join(row.tobytes() + b"\0" * padding for row in rows)
         return self.make(
-            "sensor_msgs/msg/Image", header=self.header(stamp), height=frame.shape[0], width=frame.shape[1],
-            encoding=encoding, is_bigendian=int(big), step=frame.shape[1] * frame.itemsize + padding,
+            "sensor_msgs/msg/Image",
+            header=self.header(stamp),
+            height=frame.shape[0],
+            width=frame.shape[1],
+            encoding=encoding,
+            is_bigendian=int(big),
+            step=frame.shape[1] * frame.itemsize + padding,
             data=np.frombuffer(data, np.uint8),
-        )  # fmt: skip
+        )
 
     def compressed(self, frame: np.ndarray, stamp: int = START, *, form: str = "16UC1; compressedDepth png") -> Any:
         """A CompressedImage of depth u16, or f32 by its inverse, with the header of image_transport when ``form`` says so."""
@@ -87,9 +99,16 @@ class Messages:
         arrays["p"] = np.zeros(12) if p is None else np.array(p, float)
         named = {name.upper() if self.ros1 else name: values for name, values in arrays.items()}
         return self.make(
-            "sensor_msgs/msg/CameraInfo", header=self.header(START), height=height, width=width,
-            distortion_model="plumb_bob", binning_x=0, binning_y=0, roi=roi, **named,
-        )  # fmt: skip
+            "sensor_msgs/msg/CameraInfo",
+            header=self.header(START),
+            height=height,
+            width=width,
+            distortion_model="plumb_bob",
+            binning_x=0,
+            binning_y=0,
+            roi=roi,
+            **named,
+        )
 
 
 def write_recording(path: Path, kind: str, messages: Messages, content: list[tuple[str, int, Any]]) -> Path:

@@ -1,4 +1,4 @@
-"""What `dpc generate4d export` does; the options are in `cli/generate4d/export.py`."""
+"""Does the work of `dpc generate4d export`; the options are in `cli/generate4d/export.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From projected Gaussians to pixels on a CPU: the autograd function around the kernels of `cpu_pixels`."""
+"""Turns projected Gaussians into pixels on a CPU: the autograd function around the kernels of `cpu_pixels`."""
 
 from __future__ import annotations
 

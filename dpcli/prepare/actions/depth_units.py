@@ -1,4 +1,4 @@
-"""What raw depths mean: marks of pixels that saw nothing, raw units per meter, and whether the result can be true."""
+"""Says what raw depths mean: marks of pixels that saw nothing, raw units per meter, and whether the result can be true."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,11 +118,13 @@ def _refuse_videos(folder: Path) -> None:
     names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in suffixes and path.name[0] != ".")
     if not names:
         return
+    kinds = sorted({Path(name).suffix for name in names})
+    patterns = " ".join(f"{shlex.quote(str(folder))}/*{kind}" for kind in kinds)
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     raise DataError(
         f"{folder}: {len(names)} videos, one clip is wanted: {', '.join(names[:_LISTED])}{more}\n"
         f"Name one of them: {folder / names[0]}; or take all, each into a file of its own: "
-        f'for clip in {folder}/*; do dpc prepare video "$clip" -o "$clip.h5"; done'
+        f'for clip in {patterns}; do dpc prepare video "$clip" -o "$clip.h5"; done'
     )
 
 

@@ -1,4 +1,4 @@
-"""Which video streams a file holds, and in which pixel format each of them comes: what ffmpeg says about it."""
+"""Finds the video streams of a file and the pixel format of each, as ffmpeg describes them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What single ROS messages hold: points (PointCloud2), depth (Image, CompressedImage) and a camera (CameraInfo)."""
+"""Decodes single ROS messages: points (PointCloud2), depth (Image, CompressedImage) and a camera (CameraInfo)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a capture's own world into ours: y up, the object at the origin in a sphere of known radius, azimuth 0 in
+"""Maps a capture's own world into ours: y up, the object at the origin in a sphere of known radius, azimuth 0 in
 front.
 """
 

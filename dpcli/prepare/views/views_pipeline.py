@@ -1,4 +1,4 @@
-"""From a clip to a `views` file: pictures are made and written one after the other."""
+"""Leads from a clip to a `views` file: pictures are made and written one after the other."""
 
 from __future__ import annotations
 

@@ -163,10 +163,18 @@ def test_two_series_of_a_folder_are_named(pictures, tmp_path):
 
 
 def test_a_folder_of_videos_lists_them(pictures, tmp_path):
+    folder = tmp_path / "my clips"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("no clip")
     for name in ("b.mp4", "a.mp4"):
-        film(pictures, tmp_path / name, *PLAIN)
-    with pytest.raises(DataError, match="2 videos, one clip is wanted: a.mp4, b.mp4"):
-        open_frames(tmp_path)
+        film(pictures, folder / name, *PLAIN)
+    with pytest.raises(DataError, match="2 videos, one clip is wanted: a.mp4, b.mp4") as error:
+        open_frames(folder)
+    loop = (
+        str(error.value).partition("of its own: ")[2].replace('dpc prepare video "$clip" -o "$clip.h5"', 'echo "$clip"')
+    )
+    said = subprocess.run(["bash", "-c", loop], capture_output=True, text=True).stdout
+    assert said.split("\n")[:-1] == [str(folder / "a.mp4"), str(folder / "b.mp4")]
 
 
 @pytest.mark.parametrize("kind", ["few values", "palette", "colors", "16 bits", "small values"])

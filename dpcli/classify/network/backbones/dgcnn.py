@@ -273,7 +273,7 @@ def expect_widths(config: KinetConfig, published: tuple[tuple[int, ...], ...]) -
 
 
 def xavier_init(module: nn.Module) -> None:
-    """Gives Xavier's uniform initialization to every linear layer, zero biases: that of both published networks."""
+    """Initializes every linear layer by Xavier's uniform rule with zero biases, as both published networks do."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
