@@ -215,6 +215,7 @@ class _Run:
         with Progress(self.conversion.task, total=len(self.items), unit="video") as bar:
             bar.skip(len(self.items) - len(self.todo))
             try:
+                jobs = min(jobs, len(self.todo))  # one item needs no process of its own
                 for indexed, result in ordered_map(work, self.todo, jobs, executor):
                     self.take(indexed, result, bar)
                     self.stop.check(self.kept())

@@ -92,6 +92,8 @@ def _near_origin(points: np.ndarray, first: int) -> tuple[np.ndarray, np.ndarray
 
 def _doubts(points: np.ndarray, shift: np.ndarray | None) -> dict[str, int]:
     """Returns notes about lengths that no sensor sees."""
+    if shift is None and max(points.max(), -points.min()) <= _WIDE / 2:  # a sensor's, as nearly always
+        return {}
     low, high = points.min(0), points.max(0)
     widest = float((high - low).max())
     if widest > _ABSURD:
