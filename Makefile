@@ -141,7 +141,8 @@ T42     := table/4.2
 HELD    := Box,Knife,Refrigerator
 PARTS   := --split test --force
 MADE_OF := --test-categories $(HELD) --fractions 1,0,0
-T42_TRAIN ?= --validation 0.03 --epochs 6 --batch 4 --lr 0.0015 --motion-after 0.4 --update-after 0.5 --consensus-after 0.6
+T42_TRAIN ?= --validation 0.03 --epochs 6 --batch 4 --lr 0.0015 \
+    --set motion_after=0.4 --set update_after=0.5 --set consensus_after=0.6
 
 table-4.2: $(READY)
 	$(if $(SAPIEN),,$(error make table-4.2 needs SAPIEN=folder, a folder of CATEGORY/ID/mobility.urdf))
@@ -149,7 +150,7 @@ table-4.2: $(READY)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T42)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T42)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
 	$(DPC) segment train $(T42)/train.h5 -o $(T42)/model $(T42_TRAIN)
-	$(DPC) segment train $(T42)/train.h5 -o $(T42)/plain $(T42_TRAIN) --group trivial --flows-of $(T42)/model
+	$(DPC) segment train $(T42)/train.h5 -o $(T42)/plain $(T42_TRAIN) --set group=trivial --set flows_of=$(T42)/model
 	$(DPC) segment predict $(T42)/test.h5 -o $(T42)/ours.h5 $(PARTS) --model $(T42)/model --picture $(T42)/ours.png
 	$(DPC) segment predict $(T42)/test.h5 -o $(T42)/without-equivariance.h5 $(PARTS) --model $(T42)/plain
 	$(DPC) segment predict $(T42)/test.h5 -o $(T42)/one-part.h5 $(PARTS) --method ward --parts 1

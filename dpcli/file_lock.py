@@ -13,7 +13,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS)  # fil
 
 
 def open_alone(path: Path) -> int:
-    """Open and lock, made if absent; again if another process finished and removed the file in between.
+    """Opens and locks a file, made if absent; again if another process finished and removed the file in between.
 
     Closing the number releases it. DpcError when another process holds the file.
     """

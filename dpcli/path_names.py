@@ -1,4 +1,4 @@
-"""Names taken from paths: short ones that tell files apart, and what becomes of paths that are not UTF-8."""
+"""Names and paths: short ones that tell files apart, those that are not UTF-8, those that a file names inside itself."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dpcli.errors import DataError
 
 
 def as_utf8(text: str) -> str:
-    r"""Text from a path as HDF5 can hold it: a byte that is not UTF-8 is spelled ``\xe9``."""
+    r"""Returns text from a path as HDF5 can hold it: a byte that is not UTF-8 is spelled ``\xe9``."""
     return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def utf8_path(path: Path, library: str) -> str:
-    """The path for a library that takes only UTF-8 (OpenCV's videos crash otherwise). DataError when it is none."""
+    """Returns the path for a library that takes only UTF-8 (OpenCV's videos crash otherwise). DataError when it is none."""
     text = str(path)
     if as_utf8(text) != text:
         raise DataError(
@@ -24,7 +24,27 @@ def utf8_path(path: Path, library: str) -> str:
 
 
 def short_names(paths: Sequence[str | Path]) -> list[str]:
-    """A name for each file: its stem; where several share one, their folder's (`seed0/scores.h5`: seed0). May still repeat."""
+    """Returns a name for each file: its stem; where several share one, their folder's (`seed0/scores.h5`: seed0). May still repeat."""
     stems = [as_utf8(Path(path).stem) for path in paths]
     folders = [as_utf8(Path(path).resolve().parent.name) for path in paths]
     return [folder or stem if stems.count(stem) > 1 else stem for stem, folder in zip(stems, folders)]
+
+
+def path_inside(root: Path | None, folder: Path, name: str) -> Path:
+    """Returns where ``name``, which stands in a file, lies below ``folder``; nothing is opened.
+
+    Raises DataError when it leaves ``root``: by ``..``, as an absolute path, or through a link. root None: it may.
+    """
+    plain = name.removeprefix("file://")
+    if "\0" in plain or any(len(part.encode("utf-8", "surrogateescape")) > 255 for part in plain.split("/")):
+        raise DataError(f"the name {name[:80]!r} cannot be a file's; expected a path below {as_utf8(str(folder))}")
+    place = folder / plain
+    if root is None:
+        return place
+    try:
+        inside = place.resolve().is_relative_to(root.resolve())
+    except (OSError, RuntimeError):  # a circle of links
+        inside = False
+    if not inside:
+        raise DataError(f"{name[:80]!r} lies outside the folder {as_utf8(str(root))}; only files in it are opened")
+    return place

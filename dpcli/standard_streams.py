@@ -11,7 +11,7 @@ _UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff
 
 
 def ready_streams() -> None:
-    """Before anything is opened: what is printed to a closed stream goes nowhere, and a letter that can't be shown is spelled.
+    """Makes what is printed to a closed stream go nowhere, and spells a letter that can't be shown; before anything is opened.
 
     stdin stays None when it is closed, so that who wants it can tell. The number of a closed stream is taken, else the next
     file to be opened would get it, and with it all that is printed.
@@ -30,5 +30,5 @@ def ready_streams() -> None:
 
 
 def printable(text: str, kept: str = "") -> str:
-    r"""Text from a file as a terminal may get it: a control character that is not `kept` is spelled, such as ``\x1b``."""
+    r"""Returns text from a file as a terminal may get it: a control character that is not `kept` is spelled, such as ``\x1b``."""
     return _UNSEEN.sub(lambda found: found[0] if found[0] in kept else found[0].encode("unicode_escape").decode(), text)

@@ -109,3 +109,73 @@ def test_every_folder_says_what_lives_there():
     for path in MODULES.values():
         if path.name == "__init__.py":
             assert ast.get_docstring(ast.parse(path.read_text())), f"{path.relative_to(ROOT)} has no docstring"
+
+
+def functions(path: Path) -> Iterator[ast.FunctionDef]:
+    yield from (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef))
+
+
+def is_kernel(node: ast.FunctionDef) -> bool:
+    """Whether a function is compiled by numba, whose kernels take plain arrays and so many of them."""
+    return any("kernel" in ast.unparse(one) or "inlined" in ast.unparse(one) for one in node.decorator_list)
+
+
+def parameters(node: ast.FunctionDef) -> int:
+    names = [one.arg for one in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+    return len([name for name in names if name not in ("self", "cls", "ctx")])
+
+
+# The rasterizer is called as gsplat's; a layer of set abstraction is one autograd function of all its weights.
+WIDE = ("dpcli.ops.splatting.", "dpcli.ops.grouped_mlp", "dpcli.cli.")
+
+
+def test_no_function_takes_more_than_ten_parameters():
+    wide = [
+        f"{name}.{node.name}"
+        for name, path in MODULES.items()
+        if not name.startswith(WIDE)
+        for node in functions(path)
+        if parameters(node) > 10 and not is_kernel(node)
+    ]
+    assert wide == []
+
+
+def test_files_and_functions_are_short():
+    lengths = sorted(node.end_lineno - node.lineno + 1 for path in MODULES.values() for node in functions(path))
+    assert lengths[int(0.95 * len(lengths))] < 30
+    assert [name for name, path in MODULES.items() if path.read_text().count("\n") > 500] == []
+
+
+def test_only_the_command_line_prints_results():
+    """Results go to stdout in `cli` (and in the programs of `reproduce`); other rooms may write to stderr."""
+    for name, path in MODULES.items():
+        if not name.startswith(("dpcli.cli", "dpcli.reproduce")):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Call) and ast.unparse(node.func) == "print":
+                    assert any(one.arg == "file" for one in node.keywords), f"{name} line {node.lineno} prints"
+
+
+def undocumented(node: ast.AST, name: str) -> Iterator[str]:
+    """The public classes, functions and methods below a node that have no docstring."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.FunctionDef, ast.ClassDef)) and not child.name.startswith("_"):
+            if ast.get_docstring(child) is None:
+                yield f"{name}.{child.name}"
+            if isinstance(child, ast.ClassDef):
+                yield from undocumented(child, f"{name}.{child.name}")
+
+
+def test_everything_public_is_documented():
+    assert [one for name, path in MODULES.items() for one in undocumented(ast.parse(path.read_text()), name)] == []
+
+
+RELATIVE = ("What", "Which", "Where", "How", "Of", "Whether", "As", "With", "When", "Who")
+
+
+def test_docstrings_begin_with_a_subject_or_a_verb():
+    """A relative clause alone says neither who acts nor what is returned."""
+    for name, path in MODULES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)):
+                words = (ast.get_docstring(node) or "").split()
+                assert not words or words[0] not in RELATIVE, f"{name}: {' '.join(words[:8])} ..."

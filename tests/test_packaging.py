@@ -21,6 +21,7 @@ DISTRIBUTION = {
     "PIL": "pillow",
     "cv2": "opencv-python-headless",
     "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
     "libusb_package": "libusb-package",
 }
 
@@ -78,7 +79,9 @@ def test_what_is_imported_is_declared_and_nothing_more() -> None:
 
     declared = names(project()["dependencies"])
     extras = project()["optional-dependencies"]
-    optional = names([text for extra in ("cluster", "gsplat", "parquet", "zero123") for text in extras[extra]])
+    optional = names(
+        [text for extra in ("cluster", "exr", "gsplat", "parquet", "recordings", "zero123") for text in extras[extra]]
+    )
     optional |= {"dask", "huggingface-hub", "llvmlite"}  # come with distributed, diffusers and numba
     used = set().union(*(imported(path) for path in (ROOT / "dpcli").rglob("*.py")))
     foreign = {name for name in used - {"dpcli"} if name not in sys.stdlib_module_names}

@@ -72,7 +72,7 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
             dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
         else:
             room = import_module(f"dpcli.cli.{name}.app").app
-            dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about)
+            dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about, cls=SectionedGroup)
     return dpc
 
 
@@ -156,7 +156,7 @@ def _explain(error: BaseException) -> int:
     if _out_of_memory(error):
         log.error(
             f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"
-            " at a time: --batch or --accumulate in training, --points, --frames, --size, --jobs"
+            " at a time: --batch, or --set accumulate=2 in `classify train`, --points, --frames, --size, --jobs"
         )
         return 1
     if isinstance(error, OSError) and error.filename is not None and error.strerror:

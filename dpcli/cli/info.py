@@ -141,6 +141,19 @@ def _show(found: dict[str, Any]) -> None:
     for number, entry in enumerate(found["provenance"], 1):
         short = _shortened(str(entry.get("command", "")))
         console.print(f"{'provenance' if number == 1 else '':<20} {number}. {printable(short)}", markup=False)
+    for name, value in _settings_lines(found):
+        console.print(printable(f"{name:<20} {value}"), markup=False)
+
+
+def _settings_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """Returns the settings of the command that made the file, one line a group, where its provenance has them."""
+    from dpcli.runtime.settings.value_types import write_text
+
+    groups = found["provenance"][-1].get("config", {}).get("settings", {}) if found["provenance"] else {}
+    return [
+        (f"settings {group}", ", ".join(f"{name} {write_text(value)}" for name, value in values.items()))
+        for group, values in groups.items()
+    ]
 
 
 def _show_model(told: dict[str, Any]) -> None:
@@ -216,7 +229,7 @@ def _lines(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _shift_lines(shifts: dict[str, list[float]]) -> list[tuple[str, str]]:
-    """What was taken off the coordinates of sequences: added to their points it gives the original ones."""
+    """Returns the lines of shifts: added to the points of its sequence, a shift gives the original coordinates."""
     lines = [
         ("shift", f"{name}: {', '.join(f'{value:.10g}' for value in shift)} (points + shift: the original coordinates)")
         for name, shift in list(shifts.items())[:_SKIPPED_SHOWN]

@@ -21,9 +21,16 @@ _PICTURES, _SIDE = 480, 256  # pictures on a page of views; pixels of the longer
 
 
 def write_info_page(
-    path: Path, page: Path, *, title: str, kind: str, rows: Sequence[tuple[str, str]], samples: int, chosen: Sequence[str],
+    path: Path,
+    page: Path,
+    *,
+    title: str,
+    kind: str,
+    rows: Sequence[tuple[str, str]],
+    samples: int,
+    chosen: Sequence[str],
     view: str | None,
-) -> list[str]:  # fmt: skip
+) -> list[str]:
     """Write a page about the file of a kind; return what it leaves out, in sentences.
 
     rows: facts (name, value) for its panel. samples: most sequences of a page of clouds. chosen: only these sequences, by name or
@@ -66,8 +73,8 @@ def _write_scene(path: Path, page: Path, title: str) -> None:
 
 
 def _clouds(path: Path, facts: PageFacts, *, samples: int, chosen: Sequence[str], view: str | None) -> str:
-    from dpcli.draw.contact_sheet import default_view, parse_view
     from dpcli.draw.page.points import frame_budget, point_budget, points_page, spread
+    from dpcli.draw.view import default_view, parse_view
     from dpcli.store import CloudsReader
 
     with CloudsReader(path) as reader:
@@ -88,7 +95,7 @@ def _short_unit(unit: str) -> str:
 
 def _chosen(reader: CloudsReader, chosen: Sequence[str], samples: int) -> list[int]:
     """Return the sequences to show: those named (by name, else by number), else some of each class."""
-    from dpcli.draw.contact_sheet import spread_samples
+    from dpcli.draw.clouds_sheet import spread_samples
     from dpcli.errors import DataError
 
     if not len(reader):
@@ -125,10 +132,16 @@ def _sequence(reader: CloudsReader, row: int, frames: list[int], most: int, axes
     name = reader.class_names[label] if 0 <= label < len(reader.class_names) else ""
     title = " · ".join(word for word in (printable(reader.names[row]), printable(name), reader.splits[row]) if word)
     return PageSequence(
-        title, frames, int(reader.frame_counts[row]), kept["points"],
-        time=np.concatenate(kept["time"]) if "time" in kept else None, part=kept.get("part"), color=kept.get("color"),
-        label=label, class_name=printable(name),
-    )  # fmt: skip
+        title,
+        frames,
+        int(reader.frame_counts[row]),
+        kept["points"],
+        time=np.concatenate(kept["time"]) if "time" in kept else None,
+        part=kept.get("part"),
+        color=kept.get("color"),
+        label=label,
+        class_name=printable(name),
+    )
 
 
 def _cloud_words(reader: CloudsReader, kind: str) -> str:
@@ -176,9 +189,13 @@ def _views(path: Path, facts: PageFacts) -> str:
         views.sort(key=lambda view: view != header.reference)
         frames = spread(header.num_frames, max(_PICTURES // len(views), 8)).tolist()
         facts.subtitle = " · ".join(
-            [f"views of {printable(header.name)}", _many(header.num_views, "camera"), _many(header.num_frames, "frame"),
-             f"{header.size[0]}×{header.size[1]} pixels"]
-        )  # fmt: skip
+            [
+                f"views of {printable(header.name)}",
+                _many(header.num_views, "camera"),
+                _many(header.num_frames, "frame"),
+                f"{header.size[0]}×{header.size[1]} pixels",
+            ]
+        )
         for word, shown, there in (("cameras", views, header.num_views), ("frames", frames, header.num_frames)):
             if len(shown) < there:
                 facts.notes.append(f"Showing {len(shown):,} of {there:,} {word}, evenly spread.")

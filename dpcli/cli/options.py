@@ -9,13 +9,14 @@ import typer
 
 from dpcli.errors import UsageError
 
-_LARGEST_SEED = 2**63 - 1
+_LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
+
 Output = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
 Scene = Annotated[str, typer.Argument(help="A gaussians file, or - for a pipe.")]
 
 
 def _read_seed(text: str) -> int:
-    """Return the seed. Raises UsageError unless it is a whole number that torch and an HDF5 attribute hold."""
+    """Returns the seed. Raises UsageError unless it is a whole number that torch and an HDF5 attribute hold."""
     try:
         seed = int(text)
     except ValueError:

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +15,15 @@ from dpcli.path_names import utf8_path
 from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import check_replaced, whole_file
 
+if TYPE_CHECKING:
+    from PIL import Image
+
 KINDS = (".mp4", ".gif", ".png")
 _X264 = ("-crf", "18", "-preset", "veryfast", "-threads", "2", "-movflags", "+faststart")  # crf 18: visually lossless
+_BT709 = (  # browsers take untagged videos for BT.709 from some size on, while FFmpeg converts by BT.601
+    *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709", "-color_primaries", "bt709"),
+    *("-color_trc", "bt709", "-color_range", "tv"),
+)
 _COLORS = 255  # of an animation
 _PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from
 
@@ -66,7 +74,7 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
             pix_fmt_out="yuv420p",
             macro_block_size=1,
             quality=None,
-            output_params=list(_X264),
+            output_params=[*_X264, *_BT709],
             ffmpeg_log_level="error",
         )
         with closing(writer):  # ends the encoder, also where a picture fails
@@ -100,11 +108,23 @@ def _gif(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     from PIL import Image
 
     whole = list(pictures)
-    chosen = np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1)
-    table = Image.fromarray(chosen).quantize(_COLORS)  # one for all pictures, so that nothing flickers
+    table = _color_table(np.concatenate(whole[:: max(1, len(whole) // (_PALETTE_FRAMES - 1))], axis=1))
     images = [Image.fromarray(picture).quantize(palette=table, dither=Image.Dither.NONE) for picture in whole]
     pause = max(2, round(100 / fps)) * 10  # milliseconds; GIF counts in hundredths and players slow down below two
     images[0].save(path, save_all=True, append_images=images[1:], duration=pause, loop=0, disposal=1)
+
+
+def _color_table(picture: np.ndarray) -> Image.Image:
+    """Returns a palette for all pictures, so that nothing flickers; it has the most frequent color, mostly the ground, exactly."""
+    from PIL import Image
+
+    packed = picture[..., 0].astype(np.int32) << 16 | picture[..., 1].astype(np.int32) << 8 | picture[..., 2]
+    values, counts = np.unique(packed, return_counts=True)
+    frequent = int(values[counts.argmax()])
+    colors = Image.fromarray(picture).quantize(_COLORS).getpalette()
+    table = Image.new("P", (1, 1))
+    table.putpalette([*colors[: 3 * _COLORS], frequent >> 16, frequent >> 8 & 255, frequent & 255])
+    return table
 
 
 def _png(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:

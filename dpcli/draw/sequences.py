@@ -1,4 +1,4 @@
-"""What the drawing of point clouds needs of a sequence and of a reader, whoever read them."""
+"""Declares what the drawing of point clouds needs of a sequence and of a reader, whoever read them."""
 
 from __future__ import annotations
 

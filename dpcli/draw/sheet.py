@@ -77,12 +77,11 @@ def write_line(draw: Any, place: tuple[int, int], text: str, room: int, ink: RGB
 
 def save_picture(image: Any, path: Path) -> None:
     """Writes a PIL image, or an array u8 (H,W,3), whole or not at all. Raises DataError when it can't be written."""
-    from PIL import Image
+    import imageio.v3 as imageio
 
-    image = Image.fromarray(image) if isinstance(image, np.ndarray) else image
     try:
         with whole_file(path) as part:
-            image.save(part)
+            imageio.imwrite(part, np.asarray(image), extension=path.suffix)
     except (ValueError, OSError) as error:
         raise DataError(f"{path}: the picture cannot be written ({error}); name a .png in an existing folder") from None
 

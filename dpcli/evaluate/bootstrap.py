@@ -60,7 +60,7 @@ class Interval:
 
     @property
     def defined(self) -> bool:
-        """Whether the interval has ends."""
+        """Tells whether the interval has ends."""
         return not np.isnan(self.low)
 
 

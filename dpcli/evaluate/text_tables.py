@@ -26,7 +26,7 @@ class TextTable:
 
     @property
     def width(self) -> int:
-        """How many columns of text the table takes in a terminal."""
+        """Returns how many columns of text the table takes in a terminal."""
         cells = zip(self.header, *self.rows, strict=True)
         return sum(max(len(cell) for cell in column) + 2 for column in cells)
 

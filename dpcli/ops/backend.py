@@ -1,4 +1,4 @@
-"""Which implementation runs, on how many threads, in pieces of what size; and the checks that all operations share.
+"""Chooses which implementation runs, on how many threads and in pieces of what size, and holds the shared checks.
 
 Two backends exist: `torch`, the reference, which runs on any device (on CUDA it is the GPU path: vectorized, chunked),
 and `numba`, the fast kernels for CPU tensors. The environment variable DPC_BACKEND=torch|numba overrides the choice.
@@ -25,7 +25,7 @@ _THREAD_NS = 4e6
 
 @functools.cache
 def numba_available() -> bool:
-    """Whether numba imports; says so once on stderr if not."""
+    """Returns whether numba imports; says so once on stderr if not."""
     try:
         import numba  # noqa: F401
     except Exception as error:  # a broken llvmlite raises more than ImportError
@@ -35,7 +35,7 @@ def numba_available() -> bool:
 
 
 def chosen_backend(device: torch.device | str = "cpu") -> str:
-    """Backend for tensors on `device`: "numba" on CPU where it imports, else "torch". Reads DPC_BACKEND.
+    """Returns the backend for tensors on `device`: "numba" on CPU where it imports, else "torch". Reads DPC_BACKEND.
 
     DPC_BACKEND=numba has no say over tensors on another device: their only path is torch.
     Raises UsageError when DPC_BACKEND is something else than torch or numba.
@@ -50,7 +50,7 @@ def chosen_backend(device: torch.device | str = "cpu") -> str:
 
 @contextlib.contextmanager
 def reference_only() -> Iterator[None]:
-    """A block in which `chosen_backend` says torch: for what watches torch's operations, which kernels and threads hide."""
+    """Makes `chosen_backend` say torch for the length of a block: for what watches torch's operations, which kernels and threads hide."""
     before = os.environ.get("DPC_BACKEND")
     os.environ["DPC_BACKEND"] = "torch"
     try:
@@ -63,7 +63,7 @@ def reference_only() -> Iterator[None]:
 
 
 def run_in_threads(kernel: Callable[..., None], arguments: tuple, total: int, item_ns: float) -> None:
-    """Call kernel(*arguments, first, last) on windows that cover 0..total-1, one per thread.
+    """Calls kernel(*arguments, first, last) on windows that cover 0..total-1, one per thread.
 
     For kernels that release the GIL: one call each, since a thread that has to come back for the GIL may find its
     holder preempted. As many threads as torch has, but none for less than 4 ms of work by the estimate item_ns: torch's
@@ -83,14 +83,14 @@ def run_in_threads(kernel: Callable[..., None], arguments: tuple, total: int, it
 
 
 def row_blocks(rows: int, elements_per_row: int, device: torch.device) -> list[slice]:
-    """Cut `rows` into slices whose pairwise blocks stay within the memory bound of `device`."""
+    """Cuts `rows` into slices whose pairwise blocks stay within the memory bound of `device`."""
     bound = _BLOCK_ELEMENTS.get(device.type, _BLOCK_ELEMENTS["cpu"])
     step = max(1, bound // max(1, elements_per_row))
     return [slice(first, min(first + step, rows)) for first in range(0, rows, step)]
 
 
 def positions(name: str, tensor: torch.Tensor) -> torch.Tensor:
-    """Check a (B,N,3) tensor of positions and return it detached as float32. Raises ValueError."""
+    """Checks a (B,N,3) tensor of positions and returns it detached as float32. Raises ValueError."""
     if tensor.ndim != 3 or tensor.shape[-1] != 3:
         raise ValueError(f"{name} must have shape (B,N,3), but has {tuple(tensor.shape)}")
     if not tensor.is_floating_point():
@@ -102,7 +102,7 @@ def positions(name: str, tensor: torch.Tensor) -> torch.Tensor:
 
 
 def _is_finite(tensor: torch.Tensor) -> bool:
-    """Whether all values are finite; their sum is the cheaper first look, numpy's wakes no OpenMP threads."""
+    """Returns whether all values are finite; their sum is the cheaper first look, numpy's wakes no OpenMP threads."""
     if tensor.device.type == "cpu":
         with np.errstate(all="ignore"):
             array = tensor.numpy()
@@ -111,7 +111,7 @@ def _is_finite(tensor: torch.Tensor) -> bool:
 
 
 def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: torch.device) -> torch.Tensor | None:
-    """Check ragged `lengths` (B,) i64 in 1..most. Raises ValueError."""
+    """Checks ragged `lengths` (B,) i64 in 1..most. Raises ValueError."""
     if lengths is None:
         return None
     lengths = torch.as_tensor(lengths, device=device)
@@ -123,13 +123,13 @@ def row_lengths(lengths: torch.Tensor | None, batch: int, most: int, device: tor
 
 
 def squared_distances(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Squared distances (B,M,N) of a (B,M,3) and b (B,N,3): (dx*dx + dy*dy) + dz*dz, the order every kernel keeps."""
+    """Computes squared distances (B,M,N) of a (B,M,3) and b (B,N,3): (dx*dx + dy*dy) + dz*dz, the order every kernel keeps."""
     dx, dy, dz = ((a[..., axis, None] - b[..., None, :, axis]) for axis in range(3))
     return dx.mul_(dx).add_(dy.mul_(dy)).add_(dz.mul_(dz))
 
 
 def ordered_keys(distances: torch.Tensor) -> torch.Tensor:
-    """Unique int64 keys (..., N) that sort as (distance, index): non-negative float bits above, the index below.
+    """Returns unique int64 keys (..., N) that sort as (distance, index): non-negative float bits above, the index below.
 
     torch.topk breaks ties as it likes; on these keys it cannot.
     """
@@ -138,10 +138,10 @@ def ordered_keys(distances: torch.Tensor) -> torch.Tensor:
 
 
 def key_distances(keys: torch.Tensor) -> torch.Tensor:
-    """The float32 distances inside `ordered_keys`."""
+    """Returns the float32 distances inside `ordered_keys`."""
     return keys.bitwise_right_shift(32).to(torch.int32).view(torch.float32)
 
 
 def key_indices(keys: torch.Tensor) -> torch.Tensor:
-    """The indices inside `ordered_keys`."""
+    """Returns the indices inside `ordered_keys`."""
     return keys.bitwise_and(0xFFFFFFFF)

@@ -30,7 +30,7 @@ def space_time_ball_query(
     *,
     order: str = "first",
 ) -> tuple[torch.Tensor, torch.Tensor]:  # [B, M, k], [B, M]
-    """Up to k neighbors of each centroid in space and time: indices (B,M,k) i64 and hit counts (B,M) i64 in 0..k.
+    """Finds up to k neighbors of each centroid in space and time: indices (B,M,k) i64 and hit counts (B,M) i64 in 0..k.
 
     Point j is a neighbor of centroid i when d = |t_i - t_j| < R and dist(i,j) < radii[d], both strict; distances are
     compared squared, in float32. times are whole frame indices (integers, or floats holding integers), in any order.
@@ -43,6 +43,12 @@ def space_time_ball_query(
     Indices carry no gradient: gather with them. Backends: numba on CPU (frames found by bisection when the times are
     sorted), torch elsewhere; same indices. Raises ValueError on wrong shapes, non-finite values, fractional times, or
     fewer slots than frames within reach ("balanced").
+
+    >>> points = torch.tensor([[[0.0, 0, 0], [0.3, 0, 0], [0.3, 0, 0], [0.1, 0, 0]]])
+    >>> times = torch.tensor([[0, 0, 1, 2]])  # within 0.5 in its own frame, within 0.2 one frame away, never farther
+    >>> found, hits = space_time_ball_query(points, times, points[:, :1], times[:, :1], [0.5, 0.2], 3)
+    >>> found.tolist(), hits.tolist()
+    ([[[0, 1, 0]]], [[2]])
     """
     arguments = (*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
     if chosen_backend(points.device) == "torch":
@@ -51,7 +57,11 @@ def space_time_ball_query(
 
 
 def balanced_shares(k: int, reach: int) -> list[int]:
-    """How k slots are shared among the frames from `reach` before to `reach` after: equally, to one."""
+    """Returns how k slots are shared among the frames from `reach` before to `reach` after: equally, to one.
+
+    >>> balanced_shares(8, 1)
+    [2, 3, 3]
+    """
     frames = 2 * reach + 1
     return [k * (i + 1) // frames - k * i // frames for i in range(frames)]
 
@@ -66,7 +76,7 @@ def space_time_ball_query_reference(
     *,
     order: str = "first",
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The torch twin of `space_time_ball_query`: all pairs, in blocks of bounded memory."""
+    """Is the torch twin of `space_time_ball_query`: all pairs, in blocks of bounded memory."""
     return _any_torch(*_checked(points, times, centroids, centroid_times, radii, k, order), k, order)
 
 

@@ -14,7 +14,7 @@ def fps(
     start: int = 0,
     lengths: torch.Tensor | None = None,  # [B]
 ) -> torch.Tensor:  # [B, num_samples]
-    """Farthest point sampling: indices (B,S) i64 into each cloud, the first always `start`.
+    """Samples farthest points: indices (B,S) i64 into each cloud, the first always `start`.
 
     Each further index maximizes the squared Euclidean distance (float32) to all chosen ones; ties go to the lowest
     index, also among points already chosen, so once every distinct position is taken index 0 repeats.
@@ -22,6 +22,10 @@ def fps(
     a cloud's n points, the sequence repeats from its beginning: index s equals index s mod n.
     Backends: numba (exact bucketed search) on CPU, torch elsewhere; both give the same indices.
     Raises ValueError on wrong shapes, non-finite coordinates, lengths out of range, or start beyond a cloud's end.
+
+    >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]]])
+    >>> fps(line, 3).tolist()  # the farthest from the first, then the farthest from both
+    [[0, 3, 2]]
     """
     points, lengths = _checked(points, num_samples, start, lengths)
     if chosen_backend(points.device) == "torch" or points.shape[0] == 0:
@@ -39,7 +43,7 @@ def fps(
 def fps_reference(
     points: torch.Tensor, num_samples: int, *, start: int = 0, lengths: torch.Tensor | None = None
 ) -> torch.Tensor:
-    """The torch twin of `fps`: same arguments, same indices, one vectorized pass over all points per sample."""
+    """Is the torch twin of `fps`: same arguments, same indices, one vectorized pass over all points per sample."""
     points, lengths = _checked(points, num_samples, start, lengths)
     return _fps_torch(points, num_samples, start, lengths)
 

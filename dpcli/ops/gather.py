@@ -11,11 +11,15 @@ _ENTRY_NS = 0.4  # measured, per number that is added
 
 
 def gather_points(features: Tensor, idx: Tensor) -> Tensor:
-    """features (B,N,C), idx (B,...) i64 in 0..N-1 -> (B,...,C), differentiable in features.
+    """Takes rows by index: features (B,N,C), idx (B,...) i64 in 0..N-1 -> (B,...,C), differentiable in features.
 
     Backward adds each row's gradient to its source: by a kernel per cloud on CPU (threads never share a cloud, so sums
     repeat exactly), by index_add_ elsewhere. Raises ValueError on wrong shapes and, on CPU, on indices out of range (on
     a GPU that look would stall the stream, and an index past a cloud's end reads its neighbor in the batch).
+
+    >>> import torch
+    >>> gather_points(torch.tensor([[[1.0], [2.0], [3.0]]]), torch.tensor([[2, 0]])).tolist()
+    [[[3.0], [1.0]]]
     """
     _check(features, idx)
     batch, count, channels = features.shape
@@ -30,9 +34,13 @@ def gather_points(features: Tensor, idx: Tensor) -> Tensor:
 
 
 def gather_mean(features: Tensor, idx: Tensor) -> Tensor:
-    """Mean of each row's neighbors, features (B,N,C), idx (B,M,K) i64 -> (B,M,C): `gather_points(features, idx).mean(2)`.
+    """Computes the mean of each row's neighbors, features (B,N,C), idx (B,M,K) i64 -> (B,M,C): `gather_points(features, idx).mean(2)`.
 
     On a CPU the (B,M,K,C) in between are never made. Differentiable in features; errors as `gather_points`.
+
+    >>> import torch
+    >>> gather_mean(torch.tensor([[[1.0], [2.0], [4.0]]]), torch.tensor([[[0, 1], [2, 2]]])).tolist()
+    [[[1.5], [4.0]]]
     """
     kernel = features.dtype in (torch.float32, torch.float64) and chosen_backend(features.device) == "numba"
     if not kernel or idx.ndim != 3 or not idx.numel():

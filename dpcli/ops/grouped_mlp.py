@@ -103,7 +103,7 @@ def frozen_activations(
     linear2: tuple[Tensor, Tensor],
     norm2: Norm,
 ) -> tuple[list[Tensor], Tensor]:
-    """As `grouped_activations` with given statistics, but without gradients, and pooled: the two activations, (B,M,C2)."""
+    """Computes as `grouped_activations` with given statistics, but without gradients, and pooled: the two activations, (B,M,C2)."""
     with torch.no_grad():
         plain = (
             points.dtype != torch.float32
@@ -287,7 +287,7 @@ class _FromPositions:
         self.kernels.back_xyz(*arrays, *self.arrays, first, self.sums[task].numpy())
 
     def gradients(self) -> tuple[Tensor | None, ...]:
-        """Of (table, offset, weight, bias, norm weight, norm bias); table and offset are not inputs here."""
+        """Returns the gradients of (table, offset, weight, bias, norm weight, norm bias); table and offset are not inputs here."""
         total, moments = self.sums.sum(0)[0], self.sums.sum(0)[1:].t()
         inverse, weight = self.inverse.double(), self.weight.double()
         centered = moments - torch.outer(total, self.mean)
@@ -341,7 +341,7 @@ class _FromTable:
         self.kernels.back_table(*arrays, self.inputs[2], first, *self.targets)
 
     def gradients(self) -> tuple[Tensor | None, ...]:
-        """Of (table, offset, weight, bias, norm weight, norm bias); weight and bias are reached through the table."""
+        """Returns the gradients of (table, offset, weight, bias, norm weight, norm bias); weight and bias are reached through the table."""
         neighbors = self.idx.shape[2]
         reach = torch.zeros(*self.table.shape[:2], 4, dtype=torch.float64)
         self.kernels.reach(self.idx.numpy(), self.centers.numpy(), reach.numpy())
@@ -363,7 +363,7 @@ class _FromTable:
 
 
 class _Room:
-    """Where a thread's piece of activations lives, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
+    """Holds a thread's piece of activations lives, narrow and wide, as tensors (rows,C) and as the arrays that kernels take."""
 
     def __init__(self, hidden: Tensor, wide: Tensor) -> None:
         self.hidden, self.wide = hidden, wide

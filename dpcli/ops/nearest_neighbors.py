@@ -27,7 +27,7 @@ def knn(
     *,
     lengths: torch.Tensor | None = None,  # [B]
 ) -> tuple[torch.Tensor, torch.Tensor]:  # [B, M, k], [B, M, k]
-    """Squared distances (B,M,k) f32 and indices (B,M,k) i64 of the k nearest points, ascending.
+    """Finds squared distances (B,M,k) f32 and indices (B,M,k) i64 of the k nearest points, ascending.
 
     Ties go to the lowest index.
     lengths: valid points per cloud; padding behind them is never found (but must be finite). Slots beyond a cloud's
@@ -35,6 +35,10 @@ def knn(
     Backends: numba on CPU (buckets with bounding boxes; exact, ties included), torch elsewhere (all pairs, in blocks of
     bounded memory); both give the same numbers. Raises ValueError on wrong shapes, non-finite coordinates, lengths out
     of range.
+
+    >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]])
+    >>> knn(torch.tensor([[[0.9, 0, 0]]]), line, 2)[1].tolist()
+    [[[1, 0]]]
     """
     query, points, lengths = _checked(query, points, k, lengths)
     if chosen_backend(points.device) == "torch" or query.numel() == 0:
@@ -45,7 +49,7 @@ def knn(
 def knn_reference(
     query: torch.Tensor, points: torch.Tensor, k: int, *, lengths: torch.Tensor | None = None
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The torch twin of `knn`: same arguments, same result."""
+    """Is the torch twin of `knn`: same arguments, same result."""
     query, points, lengths = _checked(query, points, k, lengths)
     return _knn_torch(query, points, k, lengths)
 

@@ -18,7 +18,7 @@ def weighted_kabsch(
     target: Tensor,  # [B, N, 3]
     weights: Tensor,  # [B, N, S]
 ) -> tuple[Tensor, Tensor]:  # [B, S, 3, 3], [B, S, 3]
-    """Rotation R (B,S,3,3), det +1, and translation t (B,S,3) that minimize sum_i w_is |R_s x_i + t_s - y_i|^2.
+    """Fits rotation R (B,S,3,3), det +1, and translation t (B,S,3) that minimize sum_i w_is |R_s x_i + t_s - y_i|^2.
 
     Kabsch 1976 with the sign of the determinant fixed (Umeyama 1991); the thesis's T-hat of section 4.4.4. Weights are
     zero or more and need no norm. What the points leave open (all equal, on a line) is settled toward no turn.
@@ -27,6 +27,11 @@ def weighted_kabsch(
     values coincide (a gradient through the SVD itself is not), and zero along turns that the points leave open.
     Backends: a numba kernel on CPU in float32 where no gradient is wanted, else torch; equal up to rounding.
     Raises ValueError on shapes that don't fit.
+
+    >>> corner = torch.eye(3)[None]
+    >>> rotation, shift = weighted_kabsch(corner, corner + torch.tensor([0.0, 0.0, 2.0]), torch.ones(1, 3, 1))
+    >>> torch.allclose(rotation[0, 0], torch.eye(3), atol=1e-5), shift.round(decimals=4).tolist()
+    (True, [[[0.0, 0.0, 2.0]]])
     """
     _check(source, target, weights)
     if not _by_kernel(source, target, weights):
@@ -41,7 +46,7 @@ def weighted_kabsch(
 
 
 def weighted_kabsch_reference(source: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The torch twin of `weighted_kabsch`: same arguments, same result up to rounding."""
+    """Is the torch twin of `weighted_kabsch`: same arguments, same result up to rounding."""
     _check(source, target, weights)
     return _kabsch_torch(source, target, weights)
 
@@ -67,7 +72,12 @@ def apply_motions(
     rotation: Tensor,  # [B, S, 3, 3]
     translation: Tensor,  # [B, S, 3]
 ) -> Tensor:  # [B, S, N, 3]
-    """Every point moved by every motion: out[b,s,n] = R_s x_n + t_s."""
+    """Moves every point by every motion: out[b,s,n] = R_s x_n + t_s.
+
+    >>> shifts = torch.tensor([[[0.0, 0, 0], [0, 0, 5]]])
+    >>> apply_motions(torch.ones(1, 1, 3), torch.eye(3).expand(1, 2, 3, 3), shifts).tolist()
+    [[[[1.0, 1.0, 1.0]], [[1.0, 1.0, 6.0]]]]
+    """
     return points[:, None] @ rotation.mT + translation[:, :, None]
 
 
@@ -77,9 +87,13 @@ def rigid_flow(
     rotation: Tensor,  # [B, S, 3, 3]
     translation: Tensor,  # [B, S, 3]
 ) -> Tensor:  # [B, N, 3]
-    """Displacement of each point by its slots' motions, blended by the mask: sum_s m_ns (R_s x_n + t_s) - x_n.
+    """Computes the displacement of each point by its slots' motions, blended by the mask: sum_s m_ns (R_s x_n + t_s) - x_n.
 
     Backends as `weighted_kabsch`. Raises ValueError on shapes that don't fit.
+
+    >>> shifts, half = torch.tensor([[[0.0, 0, 0], [0, 0, 4]]]), torch.tensor([[[0.5, 0.5]]])
+    >>> rigid_flow(torch.ones(1, 1, 3), half, torch.eye(3).expand(1, 2, 3, 3), shifts).tolist()
+    [[[0.0, 0.0, 2.0]]]
     """
     (batch, count), slots = points.shape[:2], mask.shape[-1]
     wanted = ((batch, count, 3), (batch, count, slots), (batch, slots, 3, 3), (batch, slots, 3))
@@ -97,7 +111,7 @@ def rigid_flow(
 
 
 def rigid_flow_reference(points: Tensor, mask: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
-    """The torch twin of `rigid_flow`: same arguments, same result up to rounding."""
+    """Is the torch twin of `rigid_flow`: same arguments, same result up to rounding."""
     return torch.einsum("bns,bsnd->bnd", mask, apply_motions(points, rotation, translation)) - points
 
 
@@ -122,13 +136,13 @@ def _check(source: Tensor, target: Tensor, weights: Tensor) -> None:
 
 @torch.no_grad()
 def _rounding(mean: Tensor, other: Tensor, share: Tensor) -> Tensor:
-    """How large a covariance (B,S) rounding alone makes: of points about `mean`, with others (B,S,N,3) that do spread."""
+    """Returns how large a covariance (B,S) rounding alone makes: of points about `mean`, with others (B,S,N,3) that do spread."""
     deviation = (share * other.square().sum(-1)).sum(-1).sqrt()
     return 4 * torch.finfo(mean.dtype).eps * mean.square().sum(-1).sqrt() * deviation
 
 
 class _Rotation(torch.autograd.Function):
-    """The rotation nearest to M = sum w (y - y_mean)(x - x_mean)^T: V diag(1,1,det) U^T of M = V diag(s) U^T."""
+    """Finds the rotation nearest to M = sum w (y - y_mean)(x - x_mean)^T: V diag(1,1,det) U^T of M = V diag(s) U^T."""
 
     @staticmethod
     def forward(ctx, matrix: Tensor, noise: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""Readers of raw data, one file per format; each yields samples and the pipeline writes them."""
+"""This room turns raw data into files: a reader per format yields samples, and the pipeline thins and writes them."""

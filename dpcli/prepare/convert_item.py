@@ -11,8 +11,8 @@ from dpcli.runtime.seeds import generator
 def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:
     """Returns the sample that the reader makes of an item, with its frames thinned.
 
-    indexed: the item's place in the index, and the item. Its randomness depends on the seed and this place alone. Raises
-    Raises DataError when the item can't be read.
+    indexed: the item's place in the index, and the item. Its randomness depends on the seed and this place alone.
+    Raises Raises DataError when the item can't be read.
     """
     index, item = indexed
     if item.problem:

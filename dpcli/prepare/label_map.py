@@ -1,4 +1,4 @@
-"""Which class of which file becomes which class: what joins sources with different class lists.
+"""Label maps: a file says which class of which source becomes which, so that sources with unlike classes can be joined.
 
     classes = ["wave", "push"]     # optional: the order of the new classes; else as they first appear
 
@@ -65,7 +65,8 @@ class LabelMap:
         """Returns the new classes, and for each (file, its classes) the new number of each of its classes, None = left
         out.
 
-        DataError: the lists disagree and nothing maps them; a name in the map that no file has; a class not in `classes`.
+        DataError: the lists disagree and nothing maps them; a name in the map that no file has; a class not in
+        `classes`.
         """
         if not (self.classes or self.labels or self.files):
             _require_equal(sources)

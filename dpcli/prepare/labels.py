@@ -77,8 +77,9 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     """Takes each name's first folder for its class; where all begin with train, val(idation) or test, that is the split
     and the next one the class. Classes are numbered in alphabetical order.
 
-    names: relative to `root`, parts with `/`. layout: what a name holds at least, such as `CLASS/VIDEO`. Raises DataError when one
-    holds less, or when most lie in folders of splits and some do not: those splits would silently become classes.
+    names: relative to `root`, parts with `/`. layout: what a name holds at least, such as `CLASS/VIDEO`. Raises
+    DataError when one holds less, or when most lie in folders of splits and some do not: those splits would silently
+    become classes.
     """
     least = len(layout.split("/"))
     parts = {name: name.split("/") for name in names}

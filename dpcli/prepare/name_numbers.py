@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from decimal import Decimal
-from pathlib import Path
+from functools import lru_cache
+from os.path import splitext
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ _DATE = re.compile(
 _SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_NOTHING = Decimal(0)
 _EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9))  # digits of a time since 1970 -> decimal places among them
 
 
@@ -40,14 +42,15 @@ class Name:
         return "*".join(self.parts).casefold()
 
 
+@lru_cache(maxsize=1 << 16)  # a name is asked for its order, its number and its time
 def parse_name(text: str) -> Name:
     """Returns a file's name taken apart.
 
     >>> parse_name("frame-000012.depth.png").shape, parse_name("scan_3.25.ply").numbers
     ('frame-*.depth', ('3.25',))
     """
-    path = Path(text)
-    stem, parts, numbers, is_time, end = path.stem, [], [], [], 0
+    stem, suffix = splitext(text)
+    parts, numbers, is_time, end = [], [], [], 0
     while end < len(stem):
         match, written, timed = _next_number(stem, end)
         if match is None:
@@ -56,7 +59,7 @@ def parse_name(text: str) -> Name:
         numbers.append(written)
         is_time.append(timed)
         end = match.end()
-    return Name(text, (*parts, stem[end:]), path.suffix.lower(), tuple(numbers), tuple(is_time))
+    return Name(text, (*parts, stem[end:]), suffix.lower(), tuple(numbers), tuple(is_time))
 
 
 def _next_number(stem: str, start: int) -> tuple[re.Match[str] | None, str, bool]:
@@ -64,9 +67,10 @@ def _next_number(stem: str, start: int) -> tuple[re.Match[str] | None, str, bool
     plain = _NUMBER.search(stem, start)
     if plain is None:
         return None, "", False
-    if (date := _DATE.match(stem, plain.start())) and (seconds := _since_1970(date)):
+    digits = len(plain[0])
+    if digits >= 4 and (date := _DATE.match(stem, plain.start())) and (seconds := _since_1970(date)):
         return date, seconds, True
-    if parts := _SECONDS.match(stem, plain.start()):
+    if digits >= 10 and (parts := _SECONDS.match(stem, plain.start())):
         return parts, f"{parts[1]}.{parts[2] or parts[3]}", True
     return plain, plain[0], False
 
@@ -108,7 +112,7 @@ class NumberColumns:
             for k, number in enumerate(first.numbers)
         ]
         text = first.parts[0] + "".join(number + part for number, part in zip(shown, first.parts[1:]))
-        return text + Path(first.text).suffix
+        return text + splitext(first.text)[1]
 
     def running_numbers(self) -> np.ndarray | None:
         """Returns the whole numbers in which the names differ, i64 (F); None when they differ in more, or in none."""
@@ -153,7 +157,9 @@ def _counts_after_point(column: Sequence[str]) -> bool:
 
 
 def _value(number: str, counted: bool) -> tuple[int, Decimal]:
-    whole, _, after = number.partition(".")
+    whole, point, after = number.partition(".")
+    if not point:
+        return int(whole), _NOTHING
     return int(whole), Decimal(after or 0) if counted else Decimal(f"0.{after or 0}")
 
 

@@ -1,4 +1,4 @@
-"""From a reader to a file: items are read in worker processes and written in order by the one writer."""
+"""Leads from a reader to a file: items are read in worker processes and written in order by the one writer."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _LISTED = 20  # skipped samples and notes named one by one at the end; -v names 
 class Conversion:
     """Says how raw data become a file, whatever reads them; none of `jobs`, `force` and `task` changes the bytes.
 
-    points, sampling: see Thinning. limit: only the first items. compression: that of the coordinates. on_error: ``skip``
-    bad samples or ``stop`` at one. jobs: processes, None for as many as there are CPUs. shard: only its items, for
-    ``merge``; it may turn out empty. force: start over. task: what the progress bar calls it. Raises UsageError for
-    another word or number.
+    points, sampling: see Thinning. limit: only the first items. compression: that of the coordinates. on_error:
+    ``skip`` bad samples or ``stop`` at one. jobs: processes, None for as many as there are CPUs. shard: only its
+    items, for ``merge``; it may turn out empty. force: start over. task: what the progress bar calls it. Raises
+    UsageError for another word or number.
     """
 
     points: int = 0
@@ -120,8 +120,8 @@ def configuration(reader: Reader, thinning: Thinning, items: list[Item], compres
 def _fingerprint(path: Path) -> str:
     """Returns what tells an item's data from others of that name without reading them.
 
-    That is a file's size, or a folder's list of names and the size of its last file: not its place or date, which copying
-    changes, and not what we may be writing there.
+    That is a file's size, or a folder's list of names and the size of its last file: not its place or date, which
+    copying changes, and not what we may be writing there.
     """
     try:
         if not path.is_dir():
@@ -144,12 +144,13 @@ def convert(
     slots: int = 0,
     resume: bool = True,
 ) -> Report:
-    """Converts every item of a reader into one clouds file; running again continues where a stopped or killed run ended.
+    """Converts every item of a reader into one clouds file; running again continues where a stopped or killed run
+    ended.
 
-    executor: where items are read, `slots` at a time, instead of processes on this machine; the file's bytes don't depend
-    on it. resume: off where nobody could run it again (a pipe); saves the journal's disk space. Raises UsageError when
-    `output` was made another way and `force` is off, DataError when no sample is good, and Stopped after a stop signal,
-    with what is done kept beside `output`.
+    executor: where items are read, `slots` at a time, instead of processes on this machine; the file's bytes don't
+    depend on it. resume: off where nobody could run it again (a pipe); saves the journal's disk space. Raises
+    UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
+    after a stop signal, with what is done kept beside `output`.
     """
     items = reader.items()
     for line in reader.summary(items):
@@ -214,7 +215,8 @@ class _Run:
         with Progress(self.conversion.task, total=len(self.items), unit="video") as bar:
             bar.skip(len(self.items) - len(self.todo))
             try:
-                for indexed, result in ordered_map(work, self.todo, min(jobs, len(self.todo)), executor):
+                jobs = min(jobs, len(self.todo))  # one item needs no process of its own
+                for indexed, result in ordered_map(work, self.todo, jobs, executor):
                     self.take(indexed, result, bar)
                     self.stop.check(self.kept())
             except KeyboardInterrupt:

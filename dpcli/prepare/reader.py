@@ -1,4 +1,4 @@
-"""What every raw-format reader offers: a cheap index of items, and one item read into a sample."""
+"""The interface of a reader of raw data: a cheap index of items, and one item read into a sample."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ class Sample:
 
 
 class Reader(Protocol):
-    """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker processes.
+    """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker
+    processes.
 
     What an option decides is a property, what is always the same a ClassVar.
     """

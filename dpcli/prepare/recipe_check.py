@@ -215,7 +215,8 @@ def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *,
 
     make_reader: anything with the `items` and `summary` of a Reader. file: `raw` may be a single file.
 
-    DataError, after the last line, when something is missing. Raises DataError at once when there is no recipe or no folder.
+    DataError, after the last line, when something is missing. Raises DataError at once when there is no recipe or no
+    folder.
     """
     recipe, rows = read_recipe(name)
     if raw is None:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from os.path import splitext
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,7 @@ class Series:
     @property
     def stems(self) -> frozenset[str]:
         """Returns the names without their suffixes."""
-        return frozenset(Path(name).stem for name in self.names)
+        return frozenset(splitext(name)[0] for name in self.names)
 
     def described(self) -> str:
         """Returns pattern and number of files, such as ``frame_*.png (30 files)``, or the one file's name."""
@@ -121,8 +122,8 @@ def is_hidden(name: str) -> bool:
 
 def is_beside(name: str) -> bool:
     """Returns whether a text's name says that it is about the frames (README, poses, times, labels, ...), not one."""
-    path = Path(name)
-    return path.suffix.lower() in TEXTS and _BESIDE.fullmatch(path.stem) is not None
+    stem, suffix = splitext(name)
+    return suffix.lower() in TEXTS and _BESIDE.fullmatch(stem) is not None
 
 
 def all_series(folder: Path, names: Sequence[str]) -> list[Series]:
@@ -238,9 +239,12 @@ def _mixed_formats(folder: Path, found: list[Series]) -> list[Series]:
         shapes.setdefault((own.casefold(), one.numbered), []).append(one)
     joined = []
     for same in shapes.values():
+        if len(same) == 1:
+            joined += same
+            continue
         stems = [stem for one in same for stem in one.stems]
         texts = {one.suffix in TEXTS for one in same}
-        if len(same) > 1 and same[0].numbered and len(set(stems)) == len(stems) and len(texts) == 1:
+        if same[0].numbered and len(set(stems)) == len(stems) and len(texts) == 1:
             joined.append(_made_of(folder, same))
         else:
             joined += same

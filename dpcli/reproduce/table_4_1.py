@@ -18,14 +18,14 @@ from pathlib import Path
 from dpcli.reproduce.runs import cut, dpc
 
 METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
-_PAST = ("--flow-decay", "1", "--consensus", "none", "--no-motion-head")
-_CURRENT = ("--flow-decay", "0", "--consensus", "none", "--no-motion-head")
-_BOTH = ("--consensus", "none", "--no-motion-head")
+_BOTH = ("--set", "consensus=none", "--set", "motion_head=false")
+_PAST = ("--set", "flow_decay=1", *_BOTH)
+_CURRENT = ("--set", "flow_decay=0", *_BOTH)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table: what is switched, and the thesis's AP, PQ, F1, Pre, Rec, mIoU, RI in percent."""
+    """Holds one line of the table: what is switched, and the thesis's AP, PQ, F1, Pre, Rec, mIoU, RI in percent."""
 
     name: str
     words: tuple[str, ...]
@@ -34,11 +34,11 @@ class Row:
 
 ROWS = {
     "plain": Row(
-        "no SE(3) features, past flow", ("--group", "trivial", *_PAST), (45.2, 44.2, 58.9, 53.8, 65.1, 60.9, 71.2)
+        "no SE(3) features, past flow", ("--set", "group=trivial", *_PAST), (45.2, 44.2, 58.9, 53.8, 65.1, 60.9, 71.2)
     ),
     "global": Row(
         "SE(3), pooled per cloud, past flow",
-        ("--pooling", "global", *_PAST),
+        ("--set", "pooling=global", *_PAST),
         (51.7, 50.0, 65.8, 64.7, 67.0, 61.6, 72.3),
     ),
     "past": Row("SE(3), pooled per point, past flow", _PAST, (55.3, 52.8, 68.3, 65.9, 70.0, 62.3, 72.7)),
@@ -50,9 +50,9 @@ _FIRST = "full"  # trained first: it estimates the first flows that the others t
 
 
 def run_row(key: str, train: Path, test: Path, folder: Path, budget: list[str], protocol: str, split: str) -> dict:
-    """Train, predict and judge one row, each only as far as it isn't done. The metrics as shares of 1, None for 0/0."""
+    """Trains, predicts and judges one row as far as it isn't done; returns metrics as shares of 1, None for 0/0."""
     model, parts = folder / key, folder / f"{key}.h5"
-    first = [] if key == _FIRST else ["--flows-of", folder / _FIRST]
+    first = [] if key == _FIRST else ["--set", f"flows_of={folder / _FIRST}"]
     dpc("segment", "train", train, "-o", model, *budget, *ROWS[key].words, *first)
     dpc("segment", "predict", test, "-o", parts, "--model", model, "--split", split)
     told = dpc("evaluate", "segmentation", parts, "--truth", test, "--split", split, "--protocol", protocol, "--json")
@@ -60,7 +60,7 @@ def run_row(key: str, train: Path, test: Path, folder: Path, budget: list[str], 
 
 
 def table(found: dict[str, dict], about: str) -> str:
-    """Markdown: thesis / ours in percent for every row, a dash where a row has not been run or a number is undefined."""
+    """Returns Markdown: thesis / ours in percent for every row, a dash where a row has not been run or is undefined."""
     lines = ["| |" + "|".join(f" {name.upper()} " for name in METRICS) + "|", "|---|" + "---|" * len(METRICS)]
     for key, row in ROWS.items():
         own = found.get(key, {})
@@ -73,6 +73,7 @@ def table(found: dict[str, dict], about: str) -> str:
 
 
 def main(argv: list[str] | None = None) -> None:
+    """Runs the rows that are asked for and writes the table after each."""
     own, budget = cut(argv)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("train", type=Path)

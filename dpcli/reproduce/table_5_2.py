@@ -106,6 +106,7 @@ def table(scores: dict[str, list[dict]], clips: int) -> str:
 
 
 def main() -> None:
+    """Fits and scores the rows that the command line asks for, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("meshes", type=Path)
     parser.add_argument("out", type=Path)

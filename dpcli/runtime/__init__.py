@@ -1,1 +1,1 @@
-"""How work runs: device, seeds, progress, signals, processes. Nothing here knows about point clouds."""
+"""This room holds how work runs: device, seeds, progress, signals, processes. Nothing here knows about point clouds."""

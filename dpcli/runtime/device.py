@@ -10,7 +10,7 @@ from dpcli.runtime.tuning import choose_products
 
 
 def cpu_count() -> int:
-    """CPUs this process may use: the affinity mask, narrowed by SLURM_CPUS_PER_TASK when a batch system sets it."""
+    """Counts the CPUs this process may use: the affinity mask, narrowed by SLURM_CPUS_PER_TASK when a batch system sets it."""
     try:
         cpus = len(os.sched_getaffinity(0))
     except AttributeError:  # not Linux
@@ -20,7 +20,7 @@ def cpu_count() -> int:
 
 
 def choose_device(name: str = "auto"):
-    """`auto | cpu | cuda | cuda:n` -> torch.device; UsageError for any other, and when a CUDA device is asked for and absent.
+    """Turns `auto | cpu | cuda | cuda:n` into a torch.device; UsageError for any other, and when a CUDA device is asked for and absent.
 
     For a CPU it also chooses the library that multiplies matrices (`tuning.choose_products`).
     """

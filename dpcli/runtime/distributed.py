@@ -26,14 +26,15 @@ class Processes:
 
     @property
     def first(self) -> bool:
+        """Tells whether this is the process that writes files and talks."""
         return self.rank == 0
 
     def place(self, device: torch.device) -> torch.device:
-        """The device of this process: each its own GPU."""
+        """Returns the device of this process: each has its own GPU."""
         return torch.device("cuda", self.local_rank) if device.type == "cuda" and self.count > 1 else device
 
     def sums(self, values: Sequence[float], device: torch.device) -> list[float]:
-        """Element-wise sums over all processes (collective: every process must call it)."""
+        """Returns element-wise sums over all processes (collective: every process must call it)."""
         if self.count == 1:
             return list(values)
         # gloo sums float64; so does nccl, on the GPU
@@ -42,13 +43,13 @@ class Processes:
         return totals.tolist()
 
     def wait(self) -> None:
-        """Until every process has come here."""
+        """Waits until every process has come here."""
         if self.count > 1:
             dist.barrier()
 
 
 def from_environment() -> Processes:
-    """What torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. UsageError when they are no numbers."""
+    """Returns what torchrun says in RANK, WORLD_SIZE and LOCAL_RANK. UsageError when they are no numbers."""
     try:
         return Processes(
             *(
@@ -62,7 +63,7 @@ def from_environment() -> Processes:
 
 @contextmanager
 def process_group(device: torch.device) -> Iterator[Processes]:
-    """Join the other processes for the length of a block: NCCL between GPUs, gloo between CPUs."""
+    """Joins the other processes for the length of a block: NCCL between GPUs, gloo between CPUs."""
     processes = from_environment()
     if processes.count == 1:
         yield processes

@@ -19,7 +19,7 @@ def reduced_products(device: torch.device, on: bool) -> AbstractContextManager:
 
 
 def is_reduced(tensor: Tensor) -> bool:
-    """Whether products of this tensor's device are made in bfloat16 here."""
+    """Returns whether products of this tensor's device are made in bfloat16 here."""
     return torch.is_autocast_enabled(tensor.device.type)
 
 
@@ -45,7 +45,7 @@ def _widened(value: Any) -> Any:
 
 
 def wanted(amp: bool | None, device: torch.device) -> bool:
-    """What --amp/--no-amp mean. Without either: mixed precision on a GPU that multiplies in bfloat16, none elsewhere.
+    """Returns what the setting `amp` means here; None: mixed precision on a GPU that multiplies in bfloat16, none elsewhere.
 
     A CPU would be slowed down by it, and so would GPUs before Ampere, where torch emulates bfloat16.
     """

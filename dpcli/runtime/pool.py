@@ -16,14 +16,14 @@ from typing import Any
 
 from dpcli.errors import DpcError
 from dpcli.runtime import shared_memory as handover
-from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.tuning import fast_transport, keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 
 _MOST = 1024  # processes; with far more, the counters of a pool's queue overflow
 
 
 def _start_worker() -> None:
-    """The parent decides when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
+    """Leaves it to the parent when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
     for number in (signal.SIGINT, *STOPPING):
         signal.signal(number, signal.SIG_IGN)
     os.environ.update({name: "1" for name in SINGLE_THREAD})
@@ -32,7 +32,7 @@ def _start_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """A killed parent can't tell its workers to end, and they would wait for work for ever."""
+    """Ends this worker when its parent was killed and can't tell it to; it would wait for work for ever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         wait([parent.sentinel])
@@ -54,7 +54,7 @@ def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
 def ordered_map(
     function: Callable[[Any], Any], items: Iterable[Any], jobs: int, executor: Executor | None = None
 ) -> Iterator[tuple[Any, Any]]:
-    """Yield `(item, function(item) or the exception it raised)` in input order.
+    """Yields `(item, function(item) or the exception it raised)` in input order.
 
     At most `2 * jobs` results exist at a time, so memory doesn't grow with the number of items. `jobs <= 1` without an
     executor runs in this process; else `executor`, or `jobs` processes started by `forkserver` (safe beside threads).
@@ -68,7 +68,7 @@ def ordered_map(
     strangers = set(multiprocessing.active_children())
     pool = executor or _new_pool(jobs)
     guarded = partial(_guarded, function)
-    work = partial(handover.packed, guarded) if own and handover.POSSIBLE else guarded
+    work = partial(handover.packed, guarded) if own and handover.POSSIBLE and fast_transport() else guarded
     waiting: deque = deque()
 
     def first() -> tuple[Any, Any]:

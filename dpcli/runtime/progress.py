@@ -24,18 +24,22 @@ class _Log:
         sys.stderr.flush()
 
     def detail(self, text: str) -> None:
+        """Writes what only -v shows."""
         if self.level >= 2:
             self._write(text)
 
     def info(self, text: str) -> None:
+        """Writes what -q hides."""
         if self.level >= 1:
             self._write(text)
 
     def warn(self, text: str) -> None:
+        """Writes a warning, which -q hides."""
         if self.level >= 1:
             self._write(f"warning: {text}")
 
     def error(self, text: str) -> None:
+        """Writes an error, always."""
         self._write(f"error: {text}")
 
 
@@ -43,7 +47,7 @@ log = _Log()
 
 
 def duration(seconds: float) -> str:
-    """`75.2` -> `1m15s`; used for the time left."""
+    """Returns seconds as text, such as `1m15s` for 75.2; used for the time left."""
     seconds = int(max(seconds, 0))
     hours, minutes, rest = seconds // 3600, seconds % 3600 // 60, seconds % 60
     return f"{hours}h{minutes:02d}m" if hours else f"{minutes}m{rest:02d}s" if minutes else f"{rest}s"
@@ -84,23 +88,23 @@ class Progress:
         self._bar.start()
 
     def skip(self, count: int) -> None:
-        """Items that were done before this run: they count as done but not for the speed."""
+        """Counts items that were done before this run: they count as done but not for the speed."""
         self.done += count
         self.first += count
 
     def advance(self, count: int = 1, **counters: float) -> None:
-        """`count` more items are done; `counters` are summed and shown per second."""
+        """Counts `count` more items as done; `counters` are summed and shown per second."""
         self.done += count
         for key, value in counters.items():
             self.counters[key] = self.counters.get(key, 0) + value
         self._show()
 
     def note(self, **values: object) -> None:
-        """Current values to show beside the bar, such as a loss."""
+        """Takes current values to show beside the bar, such as a loss."""
         self.values.update(values)
 
     def status(self) -> str:
-        """The line's text without the task's name."""
+        """Returns the line's text without the task's name."""
         elapsed = max(time.monotonic() - self.started, 1e-9)
         rate = (self.done - self.first) / elapsed
         parts = [f"{self.done}/{self.total} {100 * self.done // max(self.total, 1)}%" if self.total else f"{self.done}"]

@@ -1,4 +1,4 @@
-"""What a command records about itself in the file it writes."""
+"""Records what a command says about itself in the file it writes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FLAGS = {"-q", "--quiet", "-v", "--verbose", "--debug", "--force", "--json"}
 
 
 def command_line(argv: list[str] | None = None) -> str:
-    """The command as typed, without the options that don't change the result (`-o`, `--jobs`, `-q`, ...)."""
+    """Returns the command as typed, without the options that don't change the result (`-o`, `--jobs`, `-q`, ...)."""
     kept, skip = ["dpc"], False
     for word in sys.argv[1:] if argv is None else argv:
         if skip:
@@ -28,7 +28,7 @@ def command_line(argv: list[str] | None = None) -> str:
 
 
 def file_digest(path: str | Path) -> str:
-    """SHA-256 of a file's bytes, in hexadecimal."""
+    """Returns the SHA-256 of a file's bytes, in hexadecimal."""
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         while block := file.read(1 << 20):
@@ -37,7 +37,7 @@ def file_digest(path: str | Path) -> str:
 
 
 def record(config: dict, seed: int, inputs: dict[str, str | Path] | None = None) -> dict:
-    """One provenance entry: command, resolved options, seed, version, and the digest of every input file."""
+    """Returns one provenance entry: command, resolved options, seed, version, and the digest of every input file."""
     entry = {"command": command_line(), "config": config, "seed": int(seed), "version": __version__}
     if inputs:
         entry["inputs"] = {role: file_digest(path) for role, path in inputs.items()}

@@ -93,7 +93,7 @@ class RunFolder:
         os.close(self._lock)
 
     def _continues(self) -> bool:
-        """Whether an earlier run of this configuration is there, to go on with; UsageError when it is anything else."""
+        """Returns whether an earlier run of this configuration is there, to go on with; UsageError when it is anything else."""
         saved = self.path / "config.json"
         if self.force:
             return False
@@ -119,17 +119,18 @@ class RunFolder:
         return True
 
     def refuse_inside(self, option: str, file: Path) -> None:
-        """UsageError when `file`, named by an option to start from, is among those that the run replaces."""
+        """Raises UsageError when `file`, named by an option to start from, is among those that the run replaces."""
         if self.path.resolve() in (file.parent.resolve(), file.resolve().parent):
             raise UsageError(
                 f"{option} {file}: lies in the folder of -o, whose files this run replaces; use another -o"
             )
 
     def file(self, name: str) -> Path:
+        """Returns the path of a file of the run."""
         return self.path / name
 
     def load_state(self) -> dict | None:
-        """What an earlier, unfinished run saved; None for a fresh one."""
+        """Reads what an earlier, unfinished run saved; None for a fresh one."""
         path = self.path / "state.pt"
         if not path.exists():
             return None
@@ -143,17 +144,18 @@ class RunFolder:
         return state
 
     def tell_continuing(self, where: str | None) -> None:
-        """Say where an earlier run goes on; None: at its end."""
+        """Says where an earlier run goes on; None: at its end."""
         log.info(
             f"continuing {self.path} at {where}" if where else f"{self.path}: is finished already; --force starts over"
         )
 
     def save_state(self, state: dict) -> None:
+        """Writes what `load_state` reads again, whole or not at all."""
         with whole_file(self.path / "state.pt") as part, open(part, "wb") as file:  # given a name, torch says no reason
             torch.save({**state, "rows": self.rows}, file)
 
     def log(self, row: dict) -> None:
-        """Append one epoch and rewrite the small log files whole, so that a reader never sees half a line."""
+        """Appends one epoch and rewrite the small log files whole, so that a reader never sees half a line."""
         self.rows.append({key: row.get(key) for key in self.columns})
         _replace(self.path / "log.json", json.dumps(self.rows, indent=1))
         with whole_file(self.path / "log.csv") as part, open(part, "w", newline="") as file:
@@ -162,7 +164,7 @@ class RunFolder:
             writer.writerows(self.rows)
 
     def draw_curves(self) -> None:
-        """The learning curves so far, by the function given."""
+        """Draws the learning curves so far, by the function given."""
         if self.rows and self.curves is not None:
             self.curves(self.rows, self.path / "curves.png")
 

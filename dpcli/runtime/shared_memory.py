@@ -35,13 +35,13 @@ class Parcel:
 
 
 class _MemoryFile:
-    """One of this process's, and a view of it: copying into that takes a third of the time of writing to a file."""
+    """Holds a memory file of this process and a view of it: copying into that takes a third of the time of writing to a file."""
 
     def __init__(self) -> None:
         self.number, self._view = os.memfd_create("dpc result"), None
 
     def view(self, size: int) -> mmap.mmap:
-        """At least its first `size` bytes. OSError: no memory left."""
+        """Returns a view of at least its first `size` bytes. OSError: no memory left."""
         if self._view is None or len(self._view) < size:
             size = -(-size // mmap.PAGESIZE) * mmap.PAGESIZE
             os.posix_fallocate(self.number, 0, size)  # or the first touch without memory would kill the process
@@ -58,14 +58,14 @@ class _MemoryFile:
 
 
 class _MemoryFiles:
-    """Those of this process: taken for a result, free again when the parent says so."""
+    """Holds the memory files of this process: taken for a result, free again when the parent says so."""
 
     def __init__(self) -> None:
         self._files: list[_MemoryFile] = []
         self._process = 0
 
     def take(self) -> _MemoryFile | None:
-        """One that nobody reads; None when there are too many."""
+        """Returns one that nobody reads; None when there are too many."""
         if self._process != os.getpid():  # after a fork they are another's
             self._files, self._process = [], os.getpid()
         free = [file for file in self._files if not file.in_use()]
@@ -84,7 +84,7 @@ _files = _MemoryFiles()
 
 
 def packed(function: Callable[[Any], Any], item: Any) -> Any:
-    """`function(item)`, its large arrays in a Parcel. Runs in a worker process."""
+    """Returns `function(item)`, its large arrays in a Parcel. Runs in a worker process."""
     result = function(item)
     buffers: list[pickle.PickleBuffer] = []
     pickled = pickle.dumps(result, protocol=5, buffer_callback=buffers.append)
@@ -108,7 +108,7 @@ def packed(function: Callable[[Any], Any], item: Any) -> Any:
 
 
 def unpacked(parcel: Parcel) -> Any:
-    """The result in a Parcel; its arrays are views of the memory file. OSError when that can't be opened."""
+    """Returns the result in a Parcel; its arrays are views of the memory file. OSError when that can't be opened."""
     number = os.open(parcel.path, os.O_RDWR | os.O_CLOEXEC)
     try:
         # all of it will be read: its pages are found once, instead of one fault after the other

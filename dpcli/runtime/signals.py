@@ -22,14 +22,14 @@ class StopRequest:
     name: str = ""
 
     def check(self, what: str, again: str = "to continue") -> None:
-        """Raise Stopped when a stop was asked for; `what` says what is already safe, `again` what for to run once more."""
+        """Raises Stopped when a stop was asked for; `what` says what is already safe, `again` what for to run once more."""
         if self.requested:
             raise Stopped(f"stopped by {self.name}; {what}; run the same command again {again}")
 
 
 @contextmanager
 def stop_requested() -> Iterator[StopRequest]:
-    """Install the handlers for the length of a block. The first signal sets the flag, a second one exits at once (75)."""
+    """Installs the handlers for the length of a block. The first signal sets the flag, a second one exits at once (75)."""
     request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield request

@@ -10,7 +10,7 @@ from dpcli.errors import DataError, DpcError
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The content of a TOML file; DataError when it is none."""
+    """Returns the content of a TOML file; DataError when it is none."""
     if sys.version_info >= (3, 11):
         import tomllib
     else:

@@ -64,7 +64,7 @@ def find_weights(name: str | Path, shipped: Path | None, maker: str, option: str
 
 
 def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str, str]) -> None:
-    """Write beside the target, then rename. header: text by name; `format` tells readers what it is."""
+    """Writes weights whole or not at all. header: text by name; `format` tells readers what it is."""
     from safetensors.torch import save_file
 
     whole = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
@@ -77,7 +77,7 @@ def save_weights(path: Path, tensors: dict[str, torch.Tensor], header: dict[str,
 
 
 def _sort_header(path: Path) -> None:
-    """Equal weights and texts as equal bytes: the library writes the texts in another order each time. A file begins with
+    """Makes equal weights and texts equal bytes: the library writes the texts in another order each time. A file begins with
     the length of its header, 8 bytes, and the header in JSON, perhaps with spaces behind it."""
     with path.open("r+b") as file:
         length = int.from_bytes(file.read(8), "little")
@@ -90,7 +90,7 @@ def _sort_header(path: Path) -> None:
 
 
 def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Tensors and header. DataError when the file is not whole, of another format (made by `maker`), or holds NaN."""
+    """Returns tensors and header. DataError when the file is not whole, of another format (made by `maker`), or holds NaN."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -107,7 +107,7 @@ def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str
 
 
 def load_state(model: torch.nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """Put the tensors of a file into a model, in the model's precision. DataError when names or shapes differ."""
+    """Puts the tensors of a file into a model, in the model's precision. DataError when names or shapes differ."""
     try:
         model.load_state_dict(tensors)
     except RuntimeError as error:
@@ -115,7 +115,7 @@ def load_state(model: torch.nn.Module, tensors: dict[str, torch.Tensor], path: P
 
 
 def weights_summary(path: Path) -> dict[str, Any]:
-    """Format, version, bytes, how many numbers of which types, model card, and the rest of the header, as values for JSON.
+    """Returns format, version, bytes, how many numbers of which types, model card, and the rest of the header, as values for JSON.
 
     What is JSON in the header (configuration, class names, notes) is unpacked. DataError when the file is not whole.
     """
@@ -144,7 +144,7 @@ def weights_summary(path: Path) -> dict[str, Any]:
 
 
 def _plain(text: str) -> Any:
-    """What JSON says; text that is none, or has numbers that JSON can't write again, stays text."""
+    """Returns what JSON says; text that is none, or has numbers that JSON can't write again, stays text."""
     try:
         value = json.loads(text)
         json.dumps(value, allow_nan=False)

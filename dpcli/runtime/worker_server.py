@@ -13,9 +13,10 @@ STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") 
 
 
 def ensure_server() -> None:
-    """Start the server unless it runs. Stop signals and Ctrl-C never reach it.
+    """Starts the server unless it runs. Stop signals and Ctrl-C never reach it.
 
-    If one killed it, its workers would be left behind for ever; and what it was importing is nothing to tell a person.
+    A signal that ended the server would leave its workers running without a parent, and while it imports libraries it
+    would print a trace of them.
     """
     before = {name: os.environ.get(name) for name in SINGLE_THREAD}
     os.environ.update({name: "1" for name in SINGLE_THREAD})  # read by libraries as the server imports them

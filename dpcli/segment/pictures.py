@@ -182,7 +182,7 @@ def turntable(path: Path, sequence: CloudSequence, *, seconds: float = 6.0, look
 
 
 def there_and_back(frames: int, count: int) -> list[int]:
-    """Which of the frames each of `count` images shows: from the first to the last and back, resting at both ends."""
+    """Returns which of the frames each of `count` images shows: from the first to the last and back, resting at both ends."""
     phase = np.arange(count) / count
     swing = (1 - np.cos(2 * np.pi * phase)) / 2
     return np.minimum((swing.round(9) * frames).astype(int), frames - 1).tolist()

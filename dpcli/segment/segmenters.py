@@ -103,7 +103,3 @@ class ClassicalSegmenter(Segmenter):
             rng=generator(self.seed, SegmentStream.CLASSICAL),
         )
         return [torch.nn.functional.one_hot(torch.from_numpy(np.int64(own)), self.slots).float() for own in labels]
-
-    def record(self) -> dict[str, Any]:
-        """Returns the method's resolved settings."""
-        return {"classical": self.settings.used()}

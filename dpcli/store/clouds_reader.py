@@ -80,7 +80,7 @@ class CloudsReader:
         return file[name]
 
     def _read_shifts(self, file: h5py.File) -> np.ndarray:
-        """What was taken off the original coordinates of each sequence, f64 (S,3); zeros where nothing was."""
+        """Returns what was taken off the original coordinates of each sequence, f64 (S,3); zeros where nothing was."""
         if "shift" not in file:
             return np.zeros((len(self.names), 3))
         shifts = self._data(file, "shift", (3,))[:]
@@ -109,22 +109,22 @@ class CloudsReader:
 
     @property
     def frame_counts(self) -> np.ndarray:
-        """Frames of each sequence, i64 (S)."""
+        """Counts the frames of each sequence, i64 (S)."""
         return np.diff(self._sequence_offsets)
 
     @property
     def frame_sizes(self) -> np.ndarray:
-        """Points of each frame, i64 (F)."""
+        """Counts the points of each frame, i64 (F)."""
         return np.diff(self._frame_offsets)
 
     @property
     def point_counts(self) -> np.ndarray:
-        """Points of each sequence, i64 (S)."""
+        """Counts the points of each sequence, i64 (S)."""
         return np.diff(self._frame_offsets[self._sequence_offsets])
 
     @property
     def file(self) -> h5py.File:
-        """The open handle of this process."""
+        """Opens the file in this process unless it is open, and returns the handle."""
         if self._file is None or self._process != os.getpid() or not self._file.id.valid:
             self._sets = {}
             self._file, self._process = open_store(self.path, self.kinds), os.getpid()
@@ -184,6 +184,7 @@ class CloudsReader:
         )
 
     def close(self) -> None:
+        """Closes the handle of this process; the next read opens the file again."""
         if self._file is not None and self._process == os.getpid():
             self._file.close()
         self._file, self._sets = None, {}

@@ -15,7 +15,7 @@ from dpcli.store.schema import KEPT, fields_of
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
 from dpcli.store.writing.resumable_writer import ResumableWriter
-from dpcli.store.writing.whole_chunks import WholeChunks
+from dpcli.store.writing.whole_chunks import PlainChunks, chunk_writer
 
 COMPRESSIONS = ("none", "lzf", "gzip")
 POINTS_PER_CHUNK = 16384  # 192 KiB of xyz: inside HDF5's advice of 10 KiB to 1 MiB, few chunks per sequence
@@ -40,6 +40,14 @@ class CloudsWriter(ResumableWriter):
     `field_NAME`); a shift is written where a sample has one. Set before the
     block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
     kept in the file; a shard may be empty.
+
+    >>> from dpcli.store import CloudSequence, CloudsReader
+    >>> with CloudsWriter("two.h5", class_names=["wave"]) as writer:
+    ...     for name in ("a", "b"):
+    ...         writer.write(CloudSequence.from_frames(name, [np.zeros((5, 3)), np.ones((2, 3))], label=0))
+    >>> with CloudsReader("two.h5") as reader:
+    ...     reader.names, reader.frame_counts.tolist(), reader.read(1, frames=[1]).points.shape
+    (['a', 'b'], [2, 2], (2, 3))
     """
 
     kind = "clouds"
@@ -59,16 +67,6 @@ class CloudsWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
-        super().__init__(
-            path,
-            class_names=class_names,
-            length_unit=length_unit,
-            source=source,
-            seed=seed,
-            provenance=provenance,
-            force=force,
-            resume=resume,
-        )
         if compression not in COMPRESSIONS:
             raise UsageError(f"--compression {compression}: expected one of {', '.join(COMPRESSIONS)}")
         kept = sorted(name for name in set(fields) if name.startswith(KEPT))
@@ -83,13 +81,24 @@ class CloudsWriter(ResumableWriter):
         self._shifts: list[np.ndarray | None] = []
         self._index: dict[str, list] = {name: [] for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
-        self._chunks: WholeChunks | None = None
+        self._chunks: PlainChunks | None = None
         self._placed: Placed | None = None
-        self._open(force)
+        super().__init__(
+            path,
+            class_names=class_names,
+            length_unit=length_unit,
+            source=source,
+            seed=seed,
+            provenance=provenance,
+            force=force,
+            resume=resume,
+        )
 
     def _create(self) -> None:
         file = self._file
         self._create_floats("points", 3)
+        if self.compression == "none":
+            self._chunks = chunk_writer(file["points"])
         for name in ("frame_offsets", "sequence_offsets"):
             file.create_dataset(name, data=np.zeros(1, _FIELD[name].dtype), maxshape=(None,), chunks=(4096,), **PACKED)
         for name, dtype in _PER_SAMPLE.items():
@@ -100,7 +109,7 @@ class CloudsWriter(ResumableWriter):
             self._create_field(file, name)
 
     def _create_floats(self, name: str, width: int) -> None:
-        """A data set of f32 (rows, width), uncompressed unless --compression says otherwise."""
+        """Makes a data set of f32 (rows, width), uncompressed unless --compression says otherwise."""
         filters = {} if self.compression == "none" else {"compression": self.compression, "shuffle": True}
         rows = max(1, POINTS_PER_CHUNK * 3 // width)
         self._file.create_dataset(
@@ -117,13 +126,13 @@ class CloudsWriter(ResumableWriter):
         # pose is created with the first sample, which tells the number of parts
 
     def write(self, sequence: CloudSequence) -> None:
-        """Append one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
+        """Appends one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
         self._check(sequence)
         self._append_sequence(sequence)
         self._note(sequence)
 
     def _note(self, sequence: CloudSequence, *said: Any) -> None:
-        """From here on the sample counts as written; `said`: what else `write` was given."""
+        """Makes the sample count as written; `said`: what else `write` was given."""
         self._record([sequence, *said], self._placed)
         self._placed = None
         self._names.add(sequence.name)
@@ -167,19 +176,14 @@ class CloudsWriter(ResumableWriter):
             self._file.create_dataset(
                 name, (0, *shape), _FIELD[name].dtype, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
             )
-        if name == "points" and self.compression == "none":
-            self._append_whole_chunks(values)
+        if name == "points" and self._chunks:
+            self._placed = self._chunks.append(values)
         else:
             self._extend(name, values)
         self._unflushed += getattr(values, "nbytes", 0)
         if self._unflushed > _FLUSH_BYTES:
             self._atomic.flush()
             self._unflushed = 0
-
-    def _append_whole_chunks(self, points: np.ndarray) -> None:
-        self._chunks = self._chunks or WholeChunks(self._file["points"])
-        places = self._chunks.append(points)
-        self._placed = (points, places) if points.dtype == np.float32 else None
 
     def _extend(self, name: str, values: np.ndarray | list) -> None:
         if name not in self._data:  # kept open: closing would write its unfinished chunk, each time

@@ -19,7 +19,7 @@ _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 
 @dataclass
 class StreamEmbedding:
-    """features f32 (S,D); coordinates f32 (S,2), without unit; values: figures by name, such as neighbor_accuracy."""
+    """Holds features f32 (S,D); coordinates f32 (S,2), without unit; values: figures by name, such as neighbor_accuracy."""
 
     features: np.ndarray
     coordinates: np.ndarray
@@ -39,7 +39,7 @@ def write_embedding(
     provenance: Sequence[dict] = (),
     force: bool = False,
 ) -> None:
-    """Write the file whole or not at all. UsageError when it exists and `force` is off, DataError on malformed arrays."""
+    """Writes the file whole or not at all. UsageError when it exists and `force` is off, DataError on malformed arrays."""
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
     _check(str(path), names, labels, splits, streams)

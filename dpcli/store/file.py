@@ -1,4 +1,4 @@
-"""What every file of the contract has in common: the root attributes, safe opening, provenance."""
+"""Holds what every file of the contract has in common: the root attributes, safe opening, provenance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STRING = h5py.string_dtype("utf-8")
 
 
 def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
-    """Open a file of the contract for reading.
+    """Opens a file of the contract for reading.
 
     Raises DataError when it isn't HDF5, is truncated, is not ours, is of another schema or kind, or refers to data
     outside itself (external links, virtual data sets, external storage) or to Python objects.
@@ -71,7 +71,7 @@ def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:
 
 
 def _refuse_outside(file: h5py.File, path: Path) -> None:
-    """Hostile or broken files could name other files, or pickles; a file of the contract is self-contained."""
+    """Raises DataError for what lies outside the file, or is no number and no text: hostile files could name others, or pickles."""
 
     def visit(group: h5py.Group) -> None:
         for name in group:
@@ -120,18 +120,18 @@ def _is_numbers(item: h5py.Group | h5py.Dataset, kinds: str) -> bool:
 
 
 def file_kind(path: str | Path) -> str:
-    """The kind of a file of the contract, such as `clouds`; DataError as `open_store`."""
+    """Returns the kind of a file of the contract, such as `clouds`; DataError as `open_store`."""
     with open_store(path) as file:
         return str(file.attrs["dpc_kind"])
 
 
 def root_attributes(file: h5py.File) -> dict:
-    """Root attributes as plain Python values, without the long ones (`class_names`, `provenance` are data sets)."""
+    """Returns the root attributes as plain Python values, without the long ones (`class_names`, `provenance` are data sets)."""
     return {key: value.item() if isinstance(value, np.generic) else value for key, value in file.attrs.items()}
 
 
 def read_provenance(file: h5py.File) -> list[dict]:
-    """The commands that led to this file, oldest first."""
+    """Returns the commands that led to this file, oldest first."""
     if "provenance" not in file:
         return []
     try:
@@ -148,7 +148,7 @@ def read_provenance(file: h5py.File) -> list[dict]:
 
 
 def write_skipped(file: h5py.File, skipped: Sequence[tuple[str, str]]) -> None:
-    """Samples that were passed over, (name, reason): how many as an attribute, who and why as a data set (n,2).
+    """Writes the samples that were passed over, (name, reason): how many as an attribute, who and why as a data set (n,2).
 
     A data set, because an attribute ends at 64 KiB. Nothing is written when there are none.
     """
@@ -160,7 +160,7 @@ def write_skipped(file: h5py.File, skipped: Sequence[tuple[str, str]]) -> None:
 
 
 def read_skipped(file: h5py.File) -> list[tuple[str, str]]:
-    """(name, reason) of the samples that were passed over when the file was made; DataError on a wrong shape."""
+    """Returns (name, reason) of the samples that were passed over when the file was made; DataError on a wrong shape."""
     if "skipped" not in file:
         return []
     if file["skipped"].ndim != 2 or file["skipped"].shape[1] != 2:
@@ -169,7 +169,7 @@ def read_skipped(file: h5py.File) -> list[tuple[str, str]]:
 
 
 def write_positions(file: h5py.File, positions: tuple[Sequence[int], Sequence[int]] | None) -> None:
-    """Where a shard's samples belong: places in the list of all, of those written and of those skipped, i64 each.
+    """Writes the places that a shard's samples, those written and those skipped, have in the list of all, i64 each.
 
     `dpc prepare merge` needs them to restore the order. Nothing is written for None, a file that is no shard.
     """
@@ -179,14 +179,14 @@ def write_positions(file: h5py.File, positions: tuple[Sequence[int], Sequence[in
 
 
 def read_positions(file: h5py.File) -> tuple[list[int], list[int]] | None:
-    """What `write_positions` wrote; None when the file is no shard."""
+    """Returns the places that `write_positions` wrote; None when the file is no shard."""
     if "position" not in file or "skipped_position" not in file:
         return None
     return file["position"][:].tolist(), file["skipped_position"][:].tolist()
 
 
 def read_strings(file: h5py.File, name: str, *, optional: bool = False) -> list[str]:
-    """A string data set as a list; when it is absent, none where that is `optional`, else DataError."""
+    """Returns a string data set as a list; when it is absent, none where that is `optional`, else DataError."""
     if name not in file:
         if optional:
             return []
@@ -207,7 +207,7 @@ def write_root(
     class_names: Sequence[str],
     provenance: Sequence[dict],
 ) -> None:
-    """Root attributes, class names and provenance, as design.md section 3 lists them. No clock time, so bytes repeat."""
+    """Writes root attributes, class names and provenance (docs/format.md). No clock time, so bytes repeat."""
     last = provenance[-1] if provenance else {}
     file.attrs.update(
         {

@@ -61,37 +61,41 @@ class GaussianScene:
 
     @property
     def num_gaussians(self) -> int:
+        """Counts the Gaussians, N."""
         return len(self.mean)
 
     @property
     def num_frames(self) -> int:
+        """Counts the frames, T."""
         return len(self.time)
 
     @property
     def num_parts(self) -> int:
+        """Counts the rigid parts, S."""
         return self.part_probability.shape[1]
 
     @property
     def sh_degree(self) -> int:
+        """Returns the degree of the spherical harmonics, 0 to 3."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def opacity(self) -> np.ndarray:
-        """f32 (N), 0..1."""
+        """Returns the opacities, f32 (N), 0..1."""
         return opacity_of(self.opacity_logit)
 
     @property
     def scale(self) -> np.ndarray:
-        """Standard deviations, f32 (N,3)."""
+        """Returns the standard deviations, f32 (N,3)."""
         return np.exp(self.log_scale)
 
     @property
     def color(self) -> np.ndarray:
-        """The color that doesn't depend on the direction, u8 (N,3)."""
+        """Returns the color that doesn't depend on the direction, u8 (N,3)."""
         return color_of(self.sh)
 
     def between(self, time: float) -> tuple[int, int, float]:
-        """(a, b, w): the frames around `time` (seconds), and the weight 0..1 of the later one; clamped at the ends."""
+        """Returns (a, b, w): the frames around `time` (seconds), and the weight 0..1 of the later one; clamped at the ends."""
         if not np.isfinite(time):
             raise DataError(f"time {time}: expected seconds between {self.time[0]:g} and {self.time[-1]:g}")
         after = int(np.searchsorted(self.time, time, side="right"))
@@ -102,7 +106,7 @@ class GaussianScene:
         return after - 1, after, float((time - start) / (stop - start))
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Means f32 (N,3) and unit quaternions f32 (N,4) at `time` in seconds, clamped at the ends of the clip.
+        """Returns means f32 (N,3) and unit quaternions f32 (N,4) at `time` in seconds, clamped at the ends of the clip.
 
         Between frames means go straight and quaternions along the normalized shorter chord; at a frame's time the
         result is that frame, exactly.
@@ -119,7 +123,7 @@ class GaussianScene:
         )
 
     def validate(self, where: str = "scene") -> None:
-        """Raise DataError, starting with `where`, unless types, shapes and values are as the class says."""
+        """Raises DataError, starting with `where`, unless types, shapes and values are as the class says."""
         counts = {
             "N": len(self.mean),
             "T": len(self.time),
@@ -137,7 +141,7 @@ class GaussianScene:
             raise DataError(f"{where}: {problem}")
 
     def _problems(self) -> Iterator[str]:
-        """What is wrong with values, given that types and shapes are right."""
+        """Yields what is wrong with values, given that types and shapes are right."""
         if self.sh.shape[1] not in (1, 4, 9, 16):
             yield f"sh has {self.sh.shape[1]} terms, expected 1, 4, 9 or 16 (degree 0 to 3)"
         if np.any(np.diff(self.time) <= 0):
@@ -196,7 +200,7 @@ def _check_array(where: str, key: str, value: np.ndarray, dtype: type, shape: tu
 
 
 def _rigid(motion: np.ndarray) -> np.ndarray:
-    """Which of (...,4,4) are rigid motions, bool (...)."""
+    """Returns which of (...,4,4) are rigid motions, bool (...)."""
     rotation = motion[..., :3, :3].astype(np.float64)
     square = rotation @ rotation.swapaxes(-1, -2)
     good = (np.abs(square - np.eye(3)) < _TOLERANCE).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
@@ -213,7 +217,7 @@ def write_scene(
     length_unit: str = "",
     force: bool = False,
 ) -> None:
-    """Write one scene whole or not at all. UsageError when `path` exists and `force` is off; DataError as `validate`."""
+    """Writes one scene whole or not at all. UsageError when `path` exists and `force` is off; DataError as `validate`."""
     if Path(path).exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
     scene.validate(f"{path}")
@@ -235,7 +239,7 @@ def _write_arrays(file: h5py.File, scene: GaussianScene) -> None:
 
 
 def read_scene(path: str | Path) -> GaussianScene:
-    """The whole scene in memory, validated. DataError when the file isn't one, lacks a data set, or holds bad values."""
+    """Reads the whole scene into memory and validates it. DataError when the file isn't one, lacks a data set, or holds bad values."""
     with open_store(path, ["gaussians"]) as file:
         missing = [key for key in LAYOUT if key not in file] + [
             key for key in ("size", "reference", "metrics") if key not in file.attrs

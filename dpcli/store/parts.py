@@ -22,7 +22,7 @@ _FIELD = fields_of("parts")
 
 @dataclass
 class PartsSample:
-    """What is said of one sequence, beside the hard ids in its `part`.
+    """Holds what is said of one sequence, beside the hard ids in its `part`.
 
     probability f32 (P,K) of each part, 0..1; pairs i32 (Q,2) source and target frame; motion f32 (Q,K,4,4) with
     x_target = R x_source + t; flow: for each pair f32 (N_source,3), the displacement of the source frame's points.
@@ -34,7 +34,7 @@ class PartsSample:
     flow: list[np.ndarray]
 
     def validate(self, sequence: CloudSequence, num_parts: int) -> None:
-        """Raise DataError unless shapes, ids, frames and values fit the sequence and the K parts of the file."""
+        """Raises DataError unless shapes, ids, frames and values fit the sequence and the K parts of the file."""
         where = f"sample {sequence.name!r}"
         count, pairs = len(sequence.points), len(self.pairs)
         for key, value, shape in (
@@ -92,7 +92,7 @@ def _check_probability(probability: np.ndarray, where: str) -> None:
 
 
 def _check_motion(motion: np.ndarray, where: str) -> None:
-    """Rigid: the last row 0 0 0 1, the first three columns a rotation."""
+    """Raises DataError unless motions are rigid: the last row 0 0 0 1, the first three columns a rotation."""
     rotation = motion[..., :3, :3].astype(np.float64)
     rigid = np.isfinite(motion).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -144,7 +144,7 @@ class PartsWriter(CloudsWriter):
         motion: np.ndarray,  # f32 (Q,K,4,4)
         flow: Sequence[np.ndarray],  # Q times f32 (N_source,3)
     ) -> None:
-        """Append one sample, whose `part` are the hard ids. DataError as `CloudsWriter.write`, `PartsSample.validate`."""
+        """Appends one sample, whose `part` are the hard ids. DataError as `CloudsWriter.write`, `PartsSample.validate`."""
         self._check(sequence)
         said = PartsSample(
             np.asarray(probability, _FIELD["part_probability"].dtype),
@@ -202,11 +202,11 @@ class PartsReader(CloudsReader):
 
     @property
     def pair_counts(self) -> np.ndarray:
-        """Frame pairs of each sequence, i64 (S)."""
+        """Counts the frame pairs of each sequence, i64 (S)."""
         return np.diff(self._pair_offsets)
 
     def read_parts(self, index: int) -> PartsSample:
-        """What is said of sequence `index`; DataError when its values don't fit the sequence."""
+        """Reads what is said of sequence `index`; DataError when its values don't fit the sequence."""
         frames = self._frame_offsets[self._sequence_offsets[index] : self._sequence_offsets[index + 1] + 1]
         points = slice(int(frames[0]), int(frames[-1]))
         pairs = slice(*map(int, self._pair_offsets[index : index + 2]))

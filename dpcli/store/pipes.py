@@ -21,7 +21,7 @@ _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
 
 @contextmanager
 def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[Path]:
-    """A readable path for `argument`: itself, or for `-` a temporary copy of stdin (a redirected file is used directly).
+    """Yields a readable path for `argument`: itself, or for `-` a temporary copy of stdin (a redirected file is used directly).
 
     Raises UsageError when stdin is a terminal, DataError when it is empty or the path doesn't exist.
     """
@@ -51,14 +51,14 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
 
 
 def standard_input() -> BinaryIO:
-    """stdin; UsageError when it is closed."""
+    """Returns stdin; UsageError when it is closed."""
     if sys.stdin is None:
         raise UsageError("-: standard input is closed; pipe a command into this one or name a file")
     return sys.stdin.buffer
 
 
 def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
-    """Say before anything is opened that what is there must not be replaced, --force or not: UsageError.
+    """Raises UsageError, before anything is opened, where what is there must not be replaced, --force or not.
 
     An input under whatever name (links, `-` for a redirected file); what lies in an input folder (a model, raw data) and is
     no result of dpc's own; whatever is no regular file: renaming a file over a device would put an end to the device.
@@ -77,7 +77,7 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
 
 
 def refuse_repeats(names: Iterable[str | Path]) -> None:
-    """UsageError where two of the names, inputs and the output, are of one file."""
+    """Raises UsageError where two of the names, inputs and the output, are of one file."""
     seen: list[Path] = []
     for name in names:
         path = Path(name).resolve()
@@ -99,7 +99,7 @@ def _is_result(path: Path) -> bool:
 
 
 def _regular_file(stream: BinaryIO) -> Path | None:
-    """The path of a redirected regular file (`dpc ... - < a.h5`), else None."""
+    """Returns the path of a redirected regular file (`dpc ... - < a.h5`), else None."""
     try:
         number = stream.fileno()
         if stat.S_ISREG(os.fstat(number).st_mode) and stream.tell() == 0 and os.path.exists(f"/proc/self/fd/{number}"):
@@ -111,7 +111,7 @@ def _regular_file(stream: BinaryIO) -> Path | None:
 
 @contextmanager
 def output_file(argument: str | Path, stdout: BinaryIO | None = None) -> Iterator[Path]:
-    """A path to write to: `argument` itself, or for `-` a temporary file copied to stdout when the block succeeds.
+    """Yields a path to write to: `argument` itself, or for `-` a temporary file copied to stdout when the block succeeds.
 
     Raises UsageError when stdout is a terminal: binary data would only garble it.
     """

@@ -38,6 +38,8 @@ class ScoresWriter(ResumableWriter):
         force: bool = False,
         resume: bool = False,
     ) -> None:
+        self.streams = tuple(streams)
+        self._rows: list[tuple] = []
         super().__init__(
             path,
             class_names=class_names,
@@ -48,9 +50,6 @@ class ScoresWriter(ResumableWriter):
             force=force,
             resume=resume,
         )
-        self.streams = tuple(streams)
-        self._rows: list[tuple] = []
-        self._open(force)
 
     def write(
         self,
@@ -61,7 +60,7 @@ class ScoresWriter(ResumableWriter):
         split: str = "",
         streams: dict[str, np.ndarray] | None = None,
     ) -> None:
-        """One sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
+        """Adds one sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
         own = streams or {}
         for key, row in (("scores", scores), *own.items()):  # a stream may be called scores, too
             if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():

@@ -19,7 +19,7 @@ POINT_FIELDS = {
 
 @dataclass
 class CloudSequence:
-    """A point cloud video. Per-point arrays are flat, frame after frame; `frame_offsets` cuts them.
+    """Holds a point cloud video. Per-point arrays are flat, frame after frame; `frame_offsets` cuts them.
 
     points f32 (P,3) in the file's length unit; frame_offsets i64 (T+1), from 0 to P; label counts from 0, -1 = unknown;
     time f64 (T) seconds; color u8 (P,3); part i16 (P) rigid part; track i64 (P) identity of a point over frames;
@@ -46,7 +46,12 @@ class CloudSequence:
 
     @classmethod
     def from_frames(cls, name: str, frames: list[np.ndarray], **fields: Any) -> CloudSequence:
-        """From a list of (N_t,3) arrays; per-point fields are given as lists of per-frame arrays, too."""
+        """Makes a sequence from a list of (N_t,3) arrays; per-point fields are given as lists of per-frame arrays, too.
+
+        >>> waving = CloudSequence.from_frames("a", [np.zeros((2, 3)), np.ones((1, 3))], label=4)
+        >>> waving.num_frames, waving.frame_offsets.tolist(), waving.frame(1).tolist()
+        (2, [0, 2, 3], [[1.0, 1.0, 1.0]])
+        """
         offsets = np.concatenate([[0], np.cumsum([len(frame) for frame in frames])]).astype(np.int64)
         points = np.concatenate(frames).astype(np.float32, copy=False) if frames else np.zeros((0, 3), np.float32)
         for key in POINT_FIELDS.keys() & fields.keys():
@@ -56,10 +61,11 @@ class CloudSequence:
 
     @property
     def num_frames(self) -> int:
+        """Counts the frames, T."""
         return len(self.frame_offsets) - 1
 
     def frame(self, t: int) -> np.ndarray:
-        """Points of frame t, f32 (N_t,3), a view."""
+        """Returns the points of frame t, f32 (N_t,3), a view."""
         return self.points[self.frame_offsets[t] : self.frame_offsets[t + 1]]
 
     def original_frame(self, t: int) -> np.ndarray:
@@ -87,7 +93,7 @@ class CloudSequence:
         self.extra = {name: values.take(rows) for name, values in self.extra.items()}
 
     def validate(self, num_classes: int = 0) -> None:
-        """Raise DataError unless shapes, offsets, label and values are as the class says."""
+        """Raises DataError unless shapes, offsets, label and values are as the class says."""
         where = f"sample {self.name!r}"
         if not self.name:
             raise DataError("a sample has no name; every sample needs a unique one")

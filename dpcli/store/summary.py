@@ -1,4 +1,4 @@
-"""What a file of the contract holds, as data: kind, counts, lengths, classes, ranges, provenance."""
+"""Summarizes a file of the contract, as data: kind, counts, lengths, classes, ranges, provenance."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SPLITS = ("train", "validation", "val", "test")  # the order people expect
 
 
 def summary(path: str | Path) -> dict[str, Any]:
-    """Everything `dpc info` tells, as plain values for JSON. Raises DataError as the readers do."""
+    """Returns everything `dpc info` tells, as plain values for JSON. Raises DataError as the readers do."""
     path, kind = Path(path), file_kind(path)
     with open_store(path) as file:
         common = {
@@ -92,7 +92,7 @@ def _parts(path: Path) -> dict[str, Any]:
 
 
 def _part_counts(reader: CloudsReader) -> np.ndarray:
-    """Different parts that the points of each sequence are in, i64 (S); empty when the file has none."""
+    """Counts the different parts that the points of each sequence are in, i64 (S); empty when the file has none."""
     if "part" not in reader.fields:
         return np.zeros(0, np.int64)
     ends = np.concatenate([[0], np.cumsum(reader.point_counts)])
@@ -187,7 +187,7 @@ def _gaussians(path: Path) -> dict[str, Any]:
 
 
 def point_ranges(reader: CloudsReader) -> tuple[dict[str, list[float] | None], int]:
-    """Smallest and largest coordinate of each axis, and how many points are not finite (they don't count).
+    """Finds the smallest and largest coordinate of each axis, and how many points are not finite (they don't count).
 
     Reads a fixed number of points at a time, so memory doesn't grow with the file.
     """
@@ -208,7 +208,7 @@ def point_ranges(reader: CloudsReader) -> tuple[dict[str, list[float] | None], i
 
 
 def _column_ends(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Minimum and maximum (3) of the columns of f32 (N,3), N > 0; NaN where one occurs."""
+    """Returns minimum and maximum (3) of the columns of f32 (N,3), N > 0; NaN where one occurs."""
     whole = len(block) // _WIDE * _WIDE
     wide = block[:whole].reshape(-1, _WIDE * 3)  # NumPy reduces long rows many times as fast as rows of three
     ends = [wide.min(axis=0).reshape(-1, 3), wide.max(axis=0).reshape(-1, 3)] if whole else []
@@ -217,7 +217,7 @@ def _column_ends(block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _intervals(reader: CloudsReader) -> np.ndarray:
-    """Seconds from each frame to the next of the same sequence; empty without times."""
+    """Returns the seconds from each frame to the next of the same sequence; empty without times."""
     if "time" not in reader.fields:
         return np.zeros(0)
     steps = np.diff(reader.file["time"][:])
@@ -240,12 +240,12 @@ def _known(values: np.ndarray) -> np.ndarray:
 
 
 def _count(values: Iterable[Any]) -> dict[str, int]:
-    """How often each value occurs, in the order of the values; keys as text, as JSON wants them."""
+    """Counts how often each value occurs, in the order of the values; keys as text, as JSON wants them."""
     return {str(value): count for value, count in sorted(Counter(np.asarray(values).tolist()).items())}
 
 
 def _who(class_names: list[str], labels: np.ndarray, splits: list[str]) -> dict[str, Any]:
-    """Samples of each class, in all and by split; of each split; and how many have no label."""
+    """Counts the samples of each class, in all and by split; of each split; and how many have no label."""
     names = list(class_names) or [""] * (int(labels.max(initial=-1)) + 1)
     rows = []
     for label, name in enumerate(names):

@@ -23,7 +23,7 @@ _RIGID = 1e-5  # how far R R^T may be from the identity: room for matrices that 
 
 @dataclass
 class ViewsHeader:
-    """All of a views file but its pictures and ground truth; V views, T frames.
+    """Holds all of a views file but its pictures and ground truth; V views, T frames.
 
     name: str. intrinsics: f64 (V,3,3) pixels, pixel centers at +0.5. world_to_camera: f64 (V,4,4) rigid, OpenCV axes.
     time: f64 (T) seconds, rising. role: V of reference | train | test, with one reference. reference: its index.
@@ -41,18 +41,20 @@ class ViewsHeader:
 
     @property
     def num_views(self) -> int:
+        """Counts the views, V."""
         return len(self.role)
 
     @property
     def num_frames(self) -> int:
+        """Counts the frames, T."""
         return len(self.time)
 
     def camera_centers(self) -> np.ndarray:
-        """Where the cameras stand in the world, f64 (V,3)."""
+        """Returns where the cameras stand in the world, f64 (V,3)."""
         return -np.einsum("vji,vj->vi", self.world_to_camera[:, :3, :3], self.world_to_camera[:, :3, 3])
 
     def validate(self) -> None:
-        """DataError that names the field unless shapes agree, values are finite, poses rigid, times rising."""
+        """Raises DataError, which names the field, unless shapes agree, values are finite, poses rigid, times rising."""
         views, frames = self.num_views, self.num_frames
         if not views or not frames or min(self.size) < 1:
             raise DataError(f"{self.name!r}: {views} views, {frames} frames, size {tuple(self.size)}; none may be 0")
@@ -165,7 +167,7 @@ class ViewsWriter:
             file.create_dataset("part", data=part)
 
     def add(self, view: int, frame: int, rgba: np.ndarray) -> None:
-        """One picture: u8 (H,W,4), straight (not premultiplied) alpha. DataError on another shape, or a second one."""
+        """Writes one picture: u8 (H,W,4), straight (not premultiplied) alpha. DataError on another shape, or a second one."""
         views, frames = self._written.shape
         if not (0 <= view < views and 0 <= frame < frames):
             raise DataError(
@@ -248,15 +250,17 @@ class ViewsReader:
 
     @property
     def num_views(self) -> int:
+        """Counts the views, V."""
         return self.header.num_views
 
     @property
     def num_frames(self) -> int:
+        """Counts the frames, T."""
         return self.header.num_frames
 
     @property
     def file(self) -> h5py.File:
-        """The open handle of this process."""
+        """Opens the file in this process unless it is open, and returns the handle."""
         if self._file is None or not self._file.id.valid:
             self._file = open_store(self.path, ["views"])
             self._pictures = self._file["rgba"]  # looking a data set up costs as much as decoding a picture
@@ -268,7 +272,7 @@ class ViewsReader:
         return self._pictures
 
     def rgba(self, view: int, frame: int) -> np.ndarray:
-        """The picture u8 (H,W,4) of a view at a frame, straight alpha. One chunk is read."""
+        """Reads the picture u8 (H,W,4) of a view at a frame, straight alpha. One chunk is read."""
         if not (0 <= view < self.num_views and 0 <= frame < self.num_frames):
             raise DataError(
                 f"{self.path}: view {view}, frame {frame}; the file has {self.num_views} views, {self.num_frames} frames"
@@ -280,10 +284,12 @@ class ViewsReader:
 
     @property
     def track(self) -> np.ndarray | None:
+        """Reads the true positions of surface points, f32 (T,M,3), once; None where the file has none."""
         return self._load_truth()[0]
 
     @property
     def part(self) -> np.ndarray | None:
+        """Reads the parts of these points, i16 (M), once; None where the file has none."""
         return self._load_truth()[1]
 
     def _load_truth(self) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -297,6 +303,7 @@ class ViewsReader:
         return self._truth
 
     def close(self) -> None:
+        """Closes the handle of this process; the next read opens the file again."""
         if self._file is not None:
             self._file.close()
             self._file = None

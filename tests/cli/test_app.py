@@ -132,16 +132,13 @@ def test_no_option_takes_what_is_no_number():
 
 
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):
-    for room, number, below in (
-        ("classify", "nan", ""),
-        ("classify", "1e+300", " below 1e+30"),
-        ("segment", "1e+300", " below 1e+30"),
+    for room, number, expected in (
+        ("classify", "nan", "a number above 0"),
+        ("classify", "1e+300", "a finite number below 1e+30"),
+        ("segment", "1e+300", "a finite number below 1e+30"),
     ):
         done = dpc_here(room, "train", "clouds.h5", "-o", "runs", "--lr", number)
-        assert (
-            done.returncode == 2
-            and done.stderr.decode() == f"dpc: error: --lr {number}: expected a finite number{below}\n"
-        )
+        assert done.returncode == 2 and done.stderr.decode() == f"dpc: error: lr = {number}: expected {expected}\n"
 
 
 @pytest.mark.parametrize(

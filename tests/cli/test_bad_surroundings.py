@@ -107,8 +107,8 @@ WRITES = """
 import resource, signal, sys
 from pathlib import Path
 import numpy as np
-from dpcli.classify.explain_commands import write_clouds
-from dpcli.classify.explain_pac import ActivationCloud
+from dpcli.classify.commands.explain_pac import write_clouds
+from dpcli.classify.explain.point_activation_cloud import ActivationCloud
 from dpcli.errors import DpcError
 from dpcli.store import CloudSequence, ScoresWriter
 from dpcli.store.embedding import StreamEmbedding, write_embedding

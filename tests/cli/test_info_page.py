@@ -202,9 +202,10 @@ def test_where_a_page_may_be_written(tmp_path, dpc_here, monkeypatch):
     source = write_balls(tmp_path / "balls.html")  # an input with a page's name
     before = source.read_bytes()
     for page, code, sentence in (
-        (source, 2, b"is an input, too"), (tmp_path / "page.txt", 2, b"expected .html, .htm"),
+        (source, 2, b"is an input, too"),
+        (tmp_path / "page.txt", 2, b"expected .html, .htm"),
         (tmp_path / "none" / "page.html", 3, b"does not exist; create it first"),
-    ):  # fmt: skip
+    ):
         refused = dpc_here("info", source, "--page", page)
         assert refused.returncode == code and sentence in refused.stderr
     assert source.read_bytes() == before and [one.name for one in tmp_path.iterdir()] == ["balls.html"]
@@ -282,9 +283,15 @@ def test_keys(balls, tmp_path):
     });"""
     shown = show(balls, tmp_path, "play=0&frame=0&theme=light", script, wanted="told")
     assert shown.attribute("told").split() == [
-        "1,false,part,0,false,false", "0,false,part,0,false,false", "0,true,part,0,false,false", "0,false,part,0,false,false",
-        "0,false,height,0,false,false", "0,false,height,1,false,false", "0,false,height,1,true,false", "0,false,height,1,false,true",
-    ]  # fmt: skip
+        "1,false,part,0,false,false",
+        "0,false,part,0,false,false",
+        "0,true,part,0,false,false",
+        "0,false,part,0,false,false",
+        "0,false,height,0,false,false",
+        "0,false,height,1,false,false",
+        "0,false,height,1,true,false",
+        "0,false,height,1,false,true",
+    ]
     assert shown.attribute("zoom") == "true"
 
 
@@ -404,10 +411,12 @@ def test_the_film_shows_one_frame_of_all_cameras(tmp_path, dpc_here):
     colors = write_views(tmp_path / "v.h5")
     assert dpc_here("info", tmp_path / "v.h5", "--page", tmp_path / "v.html").returncode == 0
     script = """
-    const middle = (canvas) => [...canvas.getContext("2d").getImageData(9, 9, 1, 1).data].join();
+    const seen = () => [...document.querySelectorAll("canvas")]
+      .map((canvas) => [...canvas.getContext("2d").getImageData(9, 9, 1, 1).data].join()).join(";");
     whenReady(() => {
+      const before = seen();
       document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowRight", bubbles: true }));
-      setTimeout(() => { root.dataset.seen = [...document.querySelectorAll("canvas")].map(middle).join(";"); }, 300);
+      setInterval(() => { if (seen() !== before) root.dataset.seen = seen(); }, 100);
     });"""
     shown = show(tmp_path / "v.html", tmp_path, "frame=1", script, wanted="seen")
     seen = [[int(value) for value in own.split(",")] for own in shown.attribute("seen").split(";")]

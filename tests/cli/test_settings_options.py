@@ -94,8 +94,30 @@ def said(capsys, *words: str) -> str:
 def test_a_command_gets_what_was_given(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text("dropout = 0.5\n")
-    run("train", "x.h5", "-o", "out", "--frames", "8", "--centroids", "4,2", "--decay", "constant", "--no-amp", "--drop-short",
-        "--workers", "none", "--config", str(path), "--set", "lr=1", "--seed", "3", "--preset", "tiny")  # fmt: skip
+    run(
+        "train",
+        "x.h5",
+        "-o",
+        "out",
+        "--frames",
+        "8",
+        "--centroids",
+        "4,2",
+        "--decay",
+        "constant",
+        "--no-amp",
+        "--drop-short",
+        "--workers",
+        "none",
+        "--config",
+        str(path),
+        "--set",
+        "lr=1",
+        "--seed",
+        "3",
+        "--preset",
+        "tiny",
+    )
     flags = {"frames": 8, "centroids": (4, 2), "decay": "constant", "amp": False, "drop_short": True}
     data, given, output, seed = received
     assert (data, output, seed) == ("x.h5", "out", 3)

@@ -64,7 +64,7 @@ classify fuse scores.h5 -o out/f.h5
 classify profile --preset tiny
 classify explain pac gestures.h5 --model model -o out/pac.h5
 classify explain tsne gestures.h5 --model model -o out/tsne.h5 --clips-per-video 1
-segment train objects.h5 -o out/parts --flow nearest --points 48 --batch 2 --epochs 1 --pairs-per-epoch 2
+segment train objects.h5 -o out/parts --flow nearest --points 48 --batch 2 --epochs 1 --set pairs_per_epoch=2
 segment predict objects.h5 -o out/parts.h5 --flow nearest
 segment flow objects.h5 -o out/flow --steps 1 --batch 1
 segment estimate-flow objects.h5 -o out/ef.h5 --flow nearest

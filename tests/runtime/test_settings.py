@@ -83,13 +83,38 @@ def config(tmp_path):
 
 
 def test_set_reads_every_type():
-    words = ["frames=8", "normalize=unit", "centroids=256,128", "widths=1,2/3/4,5", "coarse=", "head=none", "stride=4",
-             "static-radius=none", "decay=constant", "lr=1", "amp=false", "augment=true", "initial=a=b", "note= x "]  # fmt: skip
+    words = [
+        "frames=8",
+        "normalize=unit",
+        "centroids=256,128",
+        "widths=1,2/3/4,5",
+        "coarse=",
+        "head=none",
+        "stride=4",
+        "static-radius=none",
+        "decay=constant",
+        "lr=1",
+        "amp=false",
+        "augment=true",
+        "initial=a=b",
+        "note= x ",
+    ]
     assert CATALOG.parse_set(words) == {
-        "frames": 8, "normalize": "unit", "centroids": (256, 128), "widths": ((1, 2), (3,), (4, 5)), "coarse": (),
-        "head": None, "stride": 4, "static_radius": None, "decay": "constant", "lr": 1.0, "amp": False, "augment": True,
-        "initial": "a=b", "note": " x ",
-    }  # fmt: skip
+        "frames": 8,
+        "normalize": "unit",
+        "centroids": (256, 128),
+        "widths": ((1, 2), (3,), (4, 5)),
+        "coarse": (),
+        "head": None,
+        "stride": 4,
+        "static_radius": None,
+        "decay": "constant",
+        "lr": 1.0,
+        "amp": False,
+        "augment": True,
+        "initial": "a=b",
+        "note": " x ",
+    }
     assert type(CATALOG.parse_set(["lr=1"])["lr"]) is float
 
 
@@ -100,7 +125,10 @@ def test_set_reads_every_type():
         ("batch=1.5", "batch = 1.5: expected a whole number"),
         ("batch=", "batch = '': expected a whole number"),
         ("batch=true", "batch = true: expected a whole number"),
-        ("batch=99999999999999999999", "batch = 99999999999999999999: expected a whole number up to 9223372036854775807"),
+        (
+            "batch=99999999999999999999",
+            "batch = 99999999999999999999: expected a whole number up to 9223372036854775807",
+        ),
         ("lr=0", "lr = 0: expected a number above 0"),
         ("lr=nan", "lr = nan: expected a number above 0"),
         ("lr=inf", "lr = inf: expected a finite number below 1e+30"),
@@ -115,8 +143,10 @@ def test_set_reads_every_type():
         ("augment=none", "augment = none: expected true or false"),
         ("stride=3", "stride = 3: expected one of 1, 2, 4"),
         ("static_radius=x", "static_radius = x: expected a whole number or none"),
-        ("centroids=256",
-         "centroids = 256: expected 2 whole numbers, as 1024,512 on the command line or [1024, 512] in TOML"),
+        (
+            "centroids=256",
+            "centroids = 256: expected 2 whole numbers, as 1024,512 on the command line or [1024, 512] in TOML",
+        ),
         ("centroids=256,0", "centroids = 256,0: expected numbers, each at least 1"),
         ("coarse=1,x/2,3", "coarse = 1,x/2,3: expected groups, each of a number and a whole number, as 0.1,4/0.2,2"),
         ("head=1,2,3", "head = 1,2,3: expected 2 whole numbers or none"),
@@ -128,7 +158,7 @@ def test_set_reads_every_type():
         ("=3", "--set =3: expected NAME=VALUE, such as --set frames=16"),
         ("note=\udce9", "note = '\\udce9': expected text"),
     ],
-)  # fmt: skip
+)
 def test_a_bad_set_is_told_in_a_sentence(word, sentence):
     assert set_refusal(word).startswith(sentence)
 
@@ -213,12 +243,21 @@ def test_a_check_of_several_settings_comes_through():
 @pytest.mark.parametrize(
     ("cls", "changes"),
     [
-        (Schedule, {"batch": 0}), (Schedule, {"batch": True}), (Schedule, {"batch": 2.0}), (Schedule, {"decay": "x"}),
-        (Schedule, {"learning_rate": float("nan")}), (Schedule, {"learning_rate": False}), (Schedule, {"amp": 1}),
-        (Schedule, {"initial": "none"}), (Network, {"centroids": [2, 1]}), (Network, {"centroids": (2, 1, 1)}),
-        (Network, {"widths": ((1,), 2)}), (Network, {"head": (0, 1)}), (Network, {"normalize": None}),
+        (Schedule, {"batch": 0}),
+        (Schedule, {"batch": True}),
+        (Schedule, {"batch": 2.0}),
+        (Schedule, {"decay": "x"}),
+        (Schedule, {"learning_rate": float("nan")}),
+        (Schedule, {"learning_rate": False}),
+        (Schedule, {"amp": 1}),
+        (Schedule, {"initial": "none"}),
+        (Network, {"centroids": [2, 1]}),
+        (Network, {"centroids": (2, 1, 1)}),
+        (Network, {"widths": ((1,), 2)}),
+        (Network, {"head": (0, 1)}),
+        (Network, {"normalize": None}),
     ],
-)  # fmt: skip
+)
 def test_an_instance_checks_itself(cls, changes):
     refusal(lambda: cls(**changes))
 

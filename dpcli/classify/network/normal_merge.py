@@ -86,6 +86,6 @@ def build_merge(
         return ResidualMerge(channels, tap_widths, config.merge_norm)
     if [len(stage) for stage in tap_widths] != [2, 2]:
         raise UsageError(
-            f"--variant release with --backbone {config.backbone}: its merge pairs two stages of two layers; use --variant thesis"
+            f"merge = cross with backbone = {config.backbone}: it pairs two stages of two layers; leave it out"
         )
     return CrossMerge(channels)

@@ -197,12 +197,15 @@ class _Case:
             *self.sizes,
         )
 
-    def mend(self, moment: np.ndarray, to_plane: np.ndarray, to_matrix: np.ndarray, moved: np.ndarray) -> None:
+    def mend(
+        self, moment: np.ndarray, plane: np.ndarray, to_plane: np.ndarray, to_matrix: np.ndarray, moved: np.ndarray
+    ) -> None:
         """Sets the gradients of the fits of a piece whose determinant the guard moved."""
         groups, size = self.layout.groups, self.layout.size + 1
         mend_guarded_gradients(
             moment.reshape(-1, self.layout.entries, groups),
             self.layout.places,
+            plane.reshape(-1, size, groups),
             (self.rule[3], GUARDS[self.rule[4]]),
             to_plane.reshape(-1, size, groups),
             to_matrix.reshape(-1, size, size, groups),
@@ -276,7 +279,7 @@ class _SurfaceFit(torch.autograd.Function):
                 if len(away):
                     case.row_kernels.deviation_back(some, away, to_plane, *case.sizes)
                 case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right, moved)
-                case.mend(moment, to_plane, to_matrix, moved)
+                case.mend(moment, _flat(planes)[plane], to_plane, to_matrix, moved)
                 to_features = room.features[: rows.stop - rows.start]
                 case.row_kernels.fit_back(
                     some,

@@ -10,12 +10,17 @@ import typer
 
 from dpcli.classify.explain.pac_settings import PAC
 from dpcli.cli.classify.options import Data, Model, Split, Stream
+from dpcli.cli.help_groups import SectionedGroup
 from dpcli.cli.options import Device, Force, Json, Output, Seed, TrustedBackbone
 from dpcli.cli.settings_options import options_of
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 
-app = typer.Typer(no_args_is_help=True, help="Look into a model: activations of points (pac), maps of videos (tsne).")
+app = typer.Typer(
+    cls=SectionedGroup,
+    no_args_is_help=True,
+    help="Look into a model: activations of points (pac), maps of videos (tsne).",
+)
 
 
 @app.command()

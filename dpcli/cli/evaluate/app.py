@@ -1,4 +1,4 @@
-"""`dpc evaluate`: gathers the commands, each of a module of its own."""
+"""`dpc evaluate`: metrics of predictions against the truth. This module only gathers the commands."""
 
 from __future__ import annotations
 
@@ -12,8 +12,15 @@ from dpcli.cli.evaluate.runs import runs
 from dpcli.cli.evaluate.segmentation import segmentation
 from dpcli.cli.evaluate.video import video
 from dpcli.cli.evaluate.weights import app as weights
+from dpcli.cli.help_groups import SectionedGroup
 
-app = typer.Typer(no_args_is_help=True)
-for _command in (classification, segmentation, motion, video, compare, runs, report):
-    app.command()(_command)
-app.add_typer(weights, name="weights")
+SECTIONS = {
+    "One prediction against the truth": (classification, segmentation, motion, video),
+    "Several predictions or results": (compare, runs, report),
+}  # heading in `dpc evaluate --help` -> its commands
+
+app = typer.Typer(no_args_is_help=True, cls=SectionedGroup)
+for _heading, _commands in SECTIONS.items():
+    for _command in _commands:
+        app.command(rich_help_panel=_heading)(_command)
+app.add_typer(weights, name="weights", rich_help_panel="Networks of the learned metrics")

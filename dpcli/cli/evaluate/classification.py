@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import Intersect, IntervalOptions, PictureOptions, Split
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
 
 
 @with_option_groups
@@ -25,7 +25,7 @@ def classification(
     intervals: IntervalOptions,
     output: PictureOptions,
 ) -> None:
-    """Accuracy with its interval, per class and per stream, and the confusion matrix of a scores file."""
+    """Evaluate a scores file: accuracy with its interval, per class and per stream, and the confusion matrix."""
     from dpcli.evaluate.commands.classification import run_classification
 
     result = run_classification(

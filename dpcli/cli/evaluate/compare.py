@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from dpcli.cli.evaluate.comparison_options import ComparisonOptions
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import Intersect, IntervalOptions, PictureOptions
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
 
 
 @with_option_groups
@@ -24,7 +24,7 @@ def compare(
     intervals: IntervalOptions,
     output: PictureOptions,
 ) -> None:
-    """Two predictions of the same samples: differences with paired intervals and p values, and what changed most."""
+    """Compare two predictions of the same samples: differences with paired intervals, p values, and what changed most."""
     from dpcli.evaluate.commands.compare import run_compare
 
     options = comparison.options(intersect=intersect)

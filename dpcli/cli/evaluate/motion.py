@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import (
     Intersect,
     IntervalOptions,
@@ -13,6 +12,7 @@ from dpcli.cli.evaluate.options import (
     Split,
 )
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
 
 
 @with_option_groups
@@ -26,7 +26,7 @@ def motion(
     intervals: IntervalOptions,
     output: PictureOptions,
 ) -> None:
-    """End-point error (EPE3D), AccS, AccR and Outlier of a parts file's flow, and the errors of its part motions."""
+    """Evaluate the motion in a parts file: end-point error (EPE3D), AccS, AccR, Outlier, and the errors of part motions."""
     from dpcli.evaluate.commands.motion import run_motion
 
     result = run_motion(

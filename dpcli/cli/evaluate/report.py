@@ -51,7 +51,7 @@ def report(
     as_latex: Annotated[bool, typer.Option("--latex", help="Print LaTeX tables (booktabs) instead of a page.")] = False,
     force: Force = False,
 ) -> None:
-    """One self-contained page of many results: tables, confusion matrices, error clouds, video strips, provenance."""
+    """Write one self-contained page of many results: tables, confusion matrices, error clouds, video strips, provenance."""
     form = _form(output, as_markdown, as_latex)
     _check_output(output, force)
     from dpcli.evaluate.commands.report import run_report

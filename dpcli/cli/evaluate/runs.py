@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 
 from dpcli.cli.evaluate.comparison_options import ComparisonOptions
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import Confidence, FormOptions
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
 from dpcli.errors import UsageError
 
 
@@ -27,7 +27,7 @@ def runs(
     confidence: Confidence = 0.95,
     output: FormOptions,
 ) -> None:
-    """The same evaluation of several runs (seeds): one row each, mean, standard deviation, t interval of the mean."""
+    """Evaluate several runs (seeds) in the same way: a row each, mean, standard deviation, t interval of the mean."""
     if not 0 < confidence < 1:
         raise UsageError(f"--confidence {confidence:g}: expected a share between 0 and 1, such as 0.95")
     from dpcli.evaluate.commands.runs import run_runs

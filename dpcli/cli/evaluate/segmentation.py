@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import (
     IgnoreBelow,
     Intersect,
@@ -14,6 +13,7 @@ from dpcli.cli.evaluate.options import (
     Split,
 )
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
 
 
 @with_option_groups
@@ -28,7 +28,7 @@ def segmentation(
     intervals: IntervalOptions,
     output: PictureOptions,
 ) -> None:
-    """Average precision, PQ, F1, precision and recall at IoU 0.5, mIoU and Rand index of a parts file."""
+    """Evaluate the parts of a parts file: average precision, PQ, F1, precision and recall at IoU 0.5, mIoU, Rand index."""
     from dpcli.evaluate.commands.segmentation import run_segmentation
 
     result = run_segmentation(

@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from dpcli.cli.evaluate.option_groups import with_option_groups
 from dpcli.cli.evaluate.options import Intersect, IntervalOptions, PictureOptions, word_option
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device
 from dpcli.evaluate.choices import (
     BACKGROUNDS,
@@ -77,7 +77,7 @@ def video(
     intervals: IntervalOptions,
     output: PictureOptions,
 ) -> None:
-    """PSNR, SSIM, LPIPS, CLIP, FVD and warping error of a video or a 4D scene, and a scene's parts and tracks."""
+    """Evaluate a video or a 4D scene: PSNR, SSIM, LPIPS, CLIP, FVD, warping error, and a scene's parts and tracks."""
     from dpcli.evaluate.commands.video import run_video
     from dpcli.evaluate.video.protocol import video_protocol
 

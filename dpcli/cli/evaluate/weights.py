@@ -9,9 +9,14 @@ import typer
 
 from dpcli.cli.evaluate.options import FormOptions
 from dpcli.cli.evaluate.output import print_result
+from dpcli.cli.help_groups import SectionedGroup
 from dpcli.cli.options import Json
 
-app = typer.Typer(no_args_is_help=True, help="Weights of the learned metrics: which are needed, fetched and whole.")
+app = typer.Typer(
+    cls=SectionedGroup,
+    no_args_is_help=True,
+    help="List, check and fetch the weights of the networks that learned metrics need.",
+)
 
 Folder = Annotated[
     Path | None,

@@ -48,6 +48,6 @@ for command in MADE:
 app.add_typer(
     synthetic,
     name="synthetic",
-    help="Make data out of nothing, with ground truth: gestures, articulated objects, an animal.",
+    help="Makes data out of nothing, with ground truth: gestures, articulated objects, an animal.",
     rich_help_panel="Synthetic data",
 )

@@ -30,7 +30,7 @@ class ConversionOptions:
     shard: Annotated[
         str,
         typer.Option(
-            "--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins"
+            "--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them."
         ),
     ] = ""
     dask: Annotated[
@@ -52,7 +52,7 @@ class PublishedConversion(ConversionOptions):
 def run_conversion(
     name: str, make_reader: Callable[[], Any], options: ConversionOptions, raw: Path | None = None
 ) -> None:
-    """Converts what the reader reads and print what was written, or print what is missing with `--check`.
+    """Converts what the reader reads and prints what was written, or prints what is missing with `--check`.
 
     name: the command's, which is also its recipe's. raw: the folder that `--check` compares with the recipe.
     """

@@ -27,6 +27,9 @@ Pattern = Annotated[
         help="Which files of a folder are its frames, such as '*.depth.png'. Default: found by their names.",
     ),
 ]
+Topic = Annotated[
+    str, typer.Option("--topic", help="Topic of a recording (.bag, .mcap, .db3). Default: the only one that fits.")
+]
 LabelTable = Annotated[
     Path | None, typer.Option("--labels", help="CSV file of labels; its columns: name,label[,subject][,split].")
 ]

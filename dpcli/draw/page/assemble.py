@@ -61,11 +61,15 @@ def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], da
     return filled(
         source_text(_TEMPLATE),
         {
-            "TITLE": html.escape(str(header["title"])), "STYLE": source_text(STYLE) + source_text(_DATA_STYLE), "BODY": name,
-            "MAIN": source_text(f"web/{name}.html"), "HEADER": as_json(header), "DATA": data,
+            "TITLE": html.escape(str(header["title"])),
+            "STYLE": source_text(STYLE) + source_text(_DATA_STYLE),
+            "BODY": name,
+            "MAIN": source_text(f"web/{name}.html"),
+            "HEADER": as_json(header),
+            "DATA": data,
             "SCRIPT": script_text([*SHARED, *(f"web/{one}.js" for one in script)]),
         },
-    )  # fmt: skip
+    )
 
 
 def write_page(page: str, path: Path) -> int:

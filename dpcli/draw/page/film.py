@@ -36,8 +36,12 @@ def film_page(
         pictures = "".join(f'<img alt="" src="{_webp(picture, side)}">' for picture in view.pictures)
         strips.append(f'<div id="view{at}" hidden>{pictures}</div>')
     header = facts.header() | {
-        "views": titles, "frames": list(frames), "frame_count": frame_count, "time": time.tolist(), "rate": frame_rate(time),
-    }  # fmt: skip
+        "views": titles,
+        "frames": list(frames),
+        "frame_count": frame_count,
+        "time": time.tolist(),
+        "rate": frame_rate(time),
+    }
     return data_page(header, "film", script=("film",), data="\n".join(strips))
 
 

@@ -42,7 +42,7 @@ class PageSequence:
 
 @dataclass
 class PageFacts:
-    """What a page says of its file: title, a line below it, notes on what is left out, rows of facts, commands that made it."""
+    """Holds what a page says of its file: title, a line below it, notes on what is left out, rows of facts, commands that made it."""
 
     title: str
     subtitle: str
@@ -85,9 +85,12 @@ def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np
     Positions are rounded to 1/65535 of the box around their sequence. Equal input gives an equal page.
     """
     header = facts.header() | {
-        "axes": axes.tolist(), "unit": unit, "looks": _looks(sequences), "ramp": _ramp(),
+        "axes": axes.tolist(),
+        "unit": unit,
+        "looks": _looks(sequences),
+        "ramp": _ramp(),
         "sequences": [_described(sequence) for sequence in sequences],
-    }  # fmt: skip
+    }
     blocks = [_packed(sequence) for sequence in sequences]
     for about, block in zip(header["sequences"], blocks):
         about["bytes"] = len(block)
@@ -116,12 +119,19 @@ def _described(sequence: PageSequence) -> dict[str, Any]:
     low, step = _steps(points)
     time = sequence.time
     return {
-        "title": sequence.title, "frames": sequence.frames, "frame_count": sequence.frame_count,
-        "counts": [len(frame) for frame in sequence.points], "time": None if time is None else time.tolist(), "rate": frame_rate(time),
-        "low": low.tolist(), "step": step.tolist(), "parts": _part_list(sequence), "colored": sequence.color is not None,
+        "title": sequence.title,
+        "frames": sequence.frames,
+        "frame_count": sequence.frame_count,
+        "counts": [len(frame) for frame in sequence.points],
+        "time": None if time is None else time.tolist(),
+        "rate": frame_rate(time),
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "parts": _part_list(sequence),
+        "colored": sequence.color is not None,
         "class": sequence.class_name or (f"label {sequence.label}" if sequence.label >= 0 else ""),
         "label_color": part_colors(np.array([sequence.label]))[0].tolist(),
-    }  # fmt: skip
+    }
 
 
 def _steps(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,8 +164,10 @@ def _part_list(sequence: PageSequence) -> list[dict[str, Any]]:
         return []
     ids, counts = _ids(sequence)
     total = max(sum(len(frame) for frame in sequence.part), 1)
-    told = [{"id": int(one), "share": _percent(count / total), "color": part_colors(np.array([one]))[0].tolist()}
-            for one, count in zip(ids, counts)]  # fmt: skip
+    told = [
+        {"id": int(one), "share": _percent(count / total), "color": part_colors(np.array([one]))[0].tolist()}
+        for one, count in zip(ids, counts)
+    ]
     if counts.sum() < total and -1 not in ids:  # some ids were cut: their points count as none
         told.append({"id": -1, "share": _percent(1 - counts.sum() / total), "color": list(UNKNOWN)})
     return told

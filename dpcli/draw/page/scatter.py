@@ -14,22 +14,36 @@ MOST_DOTS = 20_000
 
 
 def scatter_page(
-    facts: PageFacts, names: Sequence[str], class_names: Sequence[str], labels: np.ndarray,
+    facts: PageFacts,
+    names: Sequence[str],
+    class_names: Sequence[str],
+    labels: np.ndarray,
     planes: Mapping[str, tuple[np.ndarray, Mapping[str, float]]],
-) -> str:  # fmt: skip
+) -> str:
     """Return the page. labels: i (S), -1 = unknown. planes: by stream, places f (S,2) without unit, and figures by name."""
     kept = spread(len(names), MOST_DOTS)
     if len(kept) < len(names):
         facts.notes.append(f"Showing {len(kept):,} of {len(names):,} samples, evenly spread.")
     used = sorted(set(labels[kept].tolist()))
     classes = [
-        {"label": label, "color": part_colors(np.array([label]))[0].tolist(),
-         "name": "unknown" if label < 0 else class_names[label] if label < len(class_names) and class_names[label] else f"label {label}"}
+        {
+            "label": label,
+            "color": part_colors(np.array([label]))[0].tolist(),
+            "name": "unknown"
+            if label < 0
+            else class_names[label]
+            if label < len(class_names) and class_names[label]
+            else f"label {label}",
+        }
         for label in used
-    ]  # fmt: skip
+    ]
     header = facts.header() | {
-        "names": [names[row] for row in kept], "labels": labels[kept].tolist(), "classes": classes,
-        "planes": [{"title": title, "places": np.round(places[kept].astype(np.float64), 4).tolist(), "figures": dict(figures)}
-                   for title, (places, figures) in planes.items()],
-    }  # fmt: skip
+        "names": [names[row] for row in kept],
+        "labels": labels[kept].tolist(),
+        "classes": classes,
+        "planes": [
+            {"title": title, "places": np.round(places[kept].astype(np.float64), 4).tolist(), "figures": dict(figures)}
+            for title, (places, figures) in planes.items()
+        ],
+    }
     return data_page(header, "scatter", script=("scatter",))

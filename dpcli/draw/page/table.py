@@ -1,4 +1,4 @@
-"""What a classifier says as a page: a table of samples that can be sorted, searched and narrowed to the mistakes."""
+"""Shows a classifier's scores as a page: a table of samples that can be sorted, searched and narrowed to the mistakes."""
 
 from __future__ import annotations
 
@@ -19,9 +19,15 @@ _BEST, _DIGITS, _ONE = (
 
 
 def scores_page(
-    facts: PageFacts, names: Sequence[str], class_names: Sequence[str], labels: np.ndarray, scores: np.ndarray, *,
-    splits: Sequence[str], streams: Mapping[str, np.ndarray],
-) -> str:  # fmt: skip
+    facts: PageFacts,
+    names: Sequence[str],
+    class_names: Sequence[str],
+    labels: np.ndarray,
+    scores: np.ndarray,
+    *,
+    splits: Sequence[str],
+    streams: Mapping[str, np.ndarray],
+) -> str:
     """Return the page. labels: i (S), -1 = unknown. scores: f (S,C). streams: further scores (S,C) by name, such as static.
 
     The first 5,000 samples become rows; the counts of right ones are of all samples. Scores that are no probabilities (each row
@@ -31,10 +37,12 @@ def scores_page(
     if shown < len(names):
         facts.notes.append(f"Showing the first {shown:,} of {len(names):,} samples; the counts are of all.")
     header = facts.header() | {
-        "classes": [name or f"class {at}" for at, name in enumerate(class_names)], "probabilities": _are_probabilities(scores),
-        "streams": list(streams), "tally": {name: _tally(own, labels) for name, own in {"": scores, **streams}.items()},
+        "classes": [name or f"class {at}" for at, name in enumerate(class_names)],
+        "probabilities": _are_probabilities(scores),
+        "streams": list(streams),
+        "tally": {name: _tally(own, labels) for name, own in {"": scores, **streams}.items()},
         "rows": [_row(at, names, labels, scores, splits, streams) for at in range(shown)],
-    }  # fmt: skip
+    }
     return data_page(header, "table", script=("table",))
 
 
@@ -58,7 +66,9 @@ def _row(
 ) -> dict[str, Any]:
     best = np.argsort(-scores[at], kind="stable")[:_BEST]
     return {
-        "name": names[at], "split": splits[at], "label": int(labels[at]),
+        "name": names[at],
+        "split": splits[at],
+        "label": int(labels[at]),
         "best": [[int(one), round(float(scores[at, one]), _DIGITS)] for one in best],
         "streams": [[int(own[at].argmax()), round(float(own[at].max()), _DIGITS)] for own in streams.values()],
-    }  # fmt: skip
+    }

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
-from dpcli.evaluate.report.thesis_tables import chosen_tables
+from dpcli.evaluate.report.thesis_tables import choose_tables
 
 WRITERS = {"html": report_html, "markdown": report_markdown, "latex": report_latex}
 
@@ -35,7 +35,7 @@ def run_report(
 
     Errors are those of `collect` and `arrange`.
     """
-    chosen_tables(beside, [])  # a wrong name is said before the work
+    choose_tables(beside, [])  # a wrong name is said before the work
     collected = collect(results, truth, split=split, pictures=pictures and form == "html")
     made = arrange(collected, title=title, beside=beside)
     return ReportText(WRITERS[form](made), len(made.sections), collected.duplicates)

@@ -10,9 +10,9 @@ from dpcli import __version__
 from dpcli.errors import DataError
 from dpcli.evaluate.report.blocks import Cell, Report, Section, Table, table
 from dpcli.evaluate.report.classification_section import SHOWN_HERE, classification_blocks
-from dpcli.evaluate.report.collect import Collected, Result
+from dpcli.evaluate.report.collect import Collected, CollectedResult
 from dpcli.evaluate.report.metric_tables import denominator, detail_lists, headline, metric_blocks
-from dpcli.evaluate.report.thesis_tables import beside_table, chosen_tables
+from dpcli.evaluate.report.thesis_tables import beside_table, choose_tables
 
 
 def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[str] = ()) -> Report:
@@ -21,8 +21,8 @@ def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[st
     DataError when a result's numbers have no shape that can be shown; UsageError for a table there isn't.
     """
     objects = [result.found for result in collected.results]
-    tables = chosen_tables(beside, objects)
-    titles = _titles(collected.results)
+    tables = choose_tables(beside, objects)
+    titles = _distinct_titles(collected.results)
     sections = [_section(number, own, title) for number, (own, title) in enumerate(zip(collected.results, titles), 1)]
     named = list(zip(titles, objects, strict=True))
     return Report(
@@ -35,9 +35,9 @@ def arrange(collected: Collected, *, title: str = "Results", beside: Sequence[st
     )
 
 
-def _titles(results: Sequence[Result]) -> list[str]:
+def _distinct_titles(results: Sequence[CollectedResult]) -> list[str]:
     """Returns the input's file name, or the whole path where names repeat within a task, or a number after it."""
-    full = [_input(result) for result in results]
+    full = [_input_name(result) for result in results]
     short = [PurePath(text).name or text for text in full]
     seen = Counter((own.found["task"], name) for own, name in zip(results, short))
     made = [name if seen[result.found["task"], name] == 1 else text for result, name, text in zip(results, short, full)]
@@ -50,14 +50,14 @@ def _titles(results: Sequence[Result]) -> list[str]:
     return out
 
 
-def _input(result: Result) -> str:
-    said = result.found.get("input", "")
-    if isinstance(said, (list, tuple)):
-        said = ", ".join(PurePath(str(own)).name for own in said)
-    return result.source if said in ("", "-", None) else str(said)
+def _input_name(result: CollectedResult) -> str:
+    name = result.found.get("input", "")
+    if isinstance(name, (list, tuple)):
+        name = ", ".join(PurePath(str(own)).name for own in name)
+    return result.source if name in ("", "-", None) else str(name)
 
 
-def _section(number: int, result: Result, title: str) -> Section:
+def _section(number: int, result: CollectedResult, title: str) -> Section:
     found = result.found
     classified = found["task"] == "classification"
     try:
@@ -69,8 +69,8 @@ def _section(number: int, result: Result, title: str) -> Section:
     truth = PurePath(str(protocol.get("truth", "")))
     if truth.suffix or len(truth.parts) > 1:  # a path, not words
         data = f"{data} of {truth.name}" if data else truth.name
-    said = [str(note) for note in found.get("notes", []) if isinstance(note, str)]
-    left = [
+    remarks = [str(note) for note in found.get("notes", []) if isinstance(note, str)]
+    left_out = [
         f"Left out, {own.get('reason', 'unknown')}: {own.get('count', len(own.get('names', [])))}."
         for own in found.get("left_out", [])
     ]
@@ -82,7 +82,7 @@ def _section(number: int, result: Result, title: str) -> Section:
         data,
         headline(found),
         [*special, *blocks, *result.extras],
-        [*said, *left, *result.notes, *notes],
+        [*remarks, *left_out, *result.notes, *notes],
         detail_lists(found),
         commands,
     )

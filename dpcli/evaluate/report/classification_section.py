@@ -18,22 +18,25 @@ _MOST_PAIRS = 12
 
 
 def classification_blocks(found: Mapping[str, Any]) -> list[Table | Figure]:
-    """Returns tables and the matrix of a classification object; those whose numbers it lacks are left out. DataError: `_matrix`."""
+    """Returns tables and the matrix of a classification object; those whose numbers it lacks are left out.
+
+    Raises DataError for a confusion matrix that is not square, or not of all classes.
+    """
     metrics = found.get("metrics", {})
     classes = [row for row in metrics.get("per_class", []) if isinstance(row, Mapping)]
     blocks: list[Table | Figure] = []
     if isinstance(metrics.get("streams"), Mapping):
-        blocks.append(_streams(metrics["streams"], found.get("denominators", {})))
+        blocks.append(_stream_table(metrics["streams"], found.get("denominators", {})))
     if classes:
-        blocks.append(_classes(classes))
-    confusion = _matrix(metrics.get("confusion"), len(classes))
+        blocks.append(_class_table(classes))
+    confusion = _confusion_matrix(metrics.get("confusion"), len(classes))
     if confusion is not None:
         names = [str(row.get("name", "")) for row in classes] or [""] * len(confusion)
-        blocks += _confusions(confusion, names)
+        blocks += _confusion_blocks(confusion, names)
     return blocks
 
 
-def _streams(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Table:
+def _stream_table(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Table:
     names = list(dict.fromkeys(key for own in streams.values() for key in own if not key.endswith("_interval")))
     samples, correct = counts.get("samples"), counts.get("correct", {})
     rows = []
@@ -48,7 +51,7 @@ def _streams(streams: Mapping[str, Any], counts: Mapping[str, Any]) -> Table:
     )
 
 
-def _classes(classes: list[Mapping[str, Any]]) -> Table:
+def _class_table(classes: list[Mapping[str, Any]]) -> Table:
     rows = [
         [
             Cell(f"{row.get('label', number)} {row.get('name', '')}".strip(), float(number)),
@@ -65,7 +68,7 @@ def _classes(classes: list[Mapping[str, Any]]) -> Table:
     )
 
 
-def _matrix(found: Any, classes: int) -> np.ndarray | None:
+def _confusion_matrix(found: Any, classes: int) -> np.ndarray | None:
     """Returns the confusion matrix, i64 (C,C); None without one. DataError unless it is square, of counts, of all classes."""
     if found is None:
         return None
@@ -86,16 +89,16 @@ def _matrix(found: Any, classes: int) -> np.ndarray | None:
     return matrix
 
 
-def _confusions(confusion: np.ndarray, names: list[str]) -> list[Table | Figure]:
+def _confusion_blocks(confusion: np.ndarray, names: list[str]) -> list[Table | Figure]:
     note = "Rows: truth, columns: prediction; color: share of the row's truth, number: samples."
     if len(confusion) > _MOST_CLASSES:
         grid = []
     else:
         grid = [Figure("Confusion matrix", confusion_grid(confusion, names), note)]
-    return [*grid, *_confused(confusion, names)]
+    return [*grid, *_most_confused(confusion, names)]
 
 
-def _confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
+def _most_confused(confusion: np.ndarray, names: list[str]) -> list[Table]:
     """Returns the pairs that are mixed up most often, most samples first, then by label."""
     wrong = confusion * (1 - np.eye(len(confusion), dtype=np.int64))
     cells = [tuple(own) for own in np.argwhere(wrong > 0).tolist()]

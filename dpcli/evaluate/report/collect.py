@@ -25,7 +25,7 @@ _VIDEO = ("views", "gaussians")
 
 
 @dataclass
-class Result:
+class CollectedResult:
     """Holds a result object and where it is from; `extras`: figures that only the files behind it could give."""
 
     found: dict[str, Any]
@@ -38,7 +38,7 @@ class Result:
 class Collected:
     """Holds all results in the order given, and what was given twice."""
 
-    results: list[Result]
+    results: list[CollectedResult]
     duplicates: list[str]
 
 
@@ -60,31 +60,31 @@ def collect(
         raise UsageError("no results to report; " + _EXPECTED)
     if list(arguments).count("-") > 1:
         raise UsageError("- names the pipe, which can be read only once")
-    results = [result for argument in arguments for result in _results(argument, truth, split, pictures, stdin)]
-    return _once(results)
+    results = [result for argument in arguments for result in _results_of(argument, truth, split, pictures, stdin)]
+    return _drop_repeats(results)
 
 
-def _results(
+def _results_of(
     argument: str, truth: Path | None, split: str | None, pictures: bool, stdin: BinaryIO | None
-) -> list[Result]:
+) -> list[CollectedResult]:
     if argument == "-":
-        return _objects((stdin or standard_input()).read(), "stdin", pictures)
-    path, own = _named(argument)
-    if path.is_file() and not _is_store(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
-        return _objects(path.read_bytes(), str(path), pictures)
-    kind = file_kind(path) if path.is_file() and _is_store(path) else "video"
+        return _parse_objects((stdin or standard_input()).read(), "stdin", pictures)
+    path, own = _split_pair(argument)
+    if path.is_file() and not _is_hdf5(path) and own is None and path.suffix.lower() not in (".npy", ".mp4", ".gif"):
+        return _parse_objects(path.read_bytes(), str(path), pictures)
+    kind = file_kind(path) if path.is_file() and _is_hdf5(path) else "video"
     if kind == "scores":
-        return [_scores(path, own, split)]
+        return [_scores_result(path, own, split)]
     if kind == "parts":
-        return _parts(path, own or truth, split, pictures)
+        return _parts_results(path, own or truth, split, pictures)
     if kind in _VIDEO or (own and kind == "video"):
-        return [_video(path, own, pictures)]
+        return [_video_result(path, own, pictures)]
     if kind == "video" and not path.exists():
         raise DataError(f"{path}: no such file; {_EXPECTED}")
     raise DataError(f"{path}: holds {kind!r}, which has no result in it; {_EXPECTED}")
 
 
-def _named(argument: str) -> tuple[Path, Path | None]:
+def _split_pair(argument: str) -> tuple[Path, Path | None]:
     """Returns both paths of `PRED=TRUTH`; a file that has an equals sign in its name stays one."""
     if "=" not in argument or Path(argument).exists():
         return Path(argument), None
@@ -93,12 +93,12 @@ def _named(argument: str) -> tuple[Path, Path | None]:
     return Path(argument[:cut]), Path(argument[cut + 1 :])
 
 
-def _is_store(path: Path) -> bool:
+def _is_hdf5(path: Path) -> bool:
     with open(path, "rb") as file:
         return file.read(len(_HDF5)) == _HDF5
 
 
-def _objects(data: bytes, source: str, pictures: bool) -> list[Result]:
+def _parse_objects(data: bytes, source: str, pictures: bool) -> list[CollectedResult]:
     """Returns result objects from text: one object, a list of them, or one on each line."""
     if data.startswith(_HDF5):
         raise DataError(f"{source}: an HDF5 file; save it and name it (the report reads it more than once)")
@@ -108,16 +108,16 @@ def _objects(data: bytes, source: str, pictures: bool) -> list[Result]:
         raise DataError(f"{source}: neither text nor HDF5 (it begins with {data[:8]!r}); {_EXPECTED}") from None
     if not text.strip():
         raise DataError(f"{source}: empty; {_EXPECTED}")
-    results = [Result(_checked(own, where), source) for own, where in _parsed(text, source)]
+    results = [CollectedResult(_check_result(own, where), source) for own, where in _objects_in_text(text, source)]
     for result in results:
         if pictures and result.found.get("task") == "video":
             _add_strips(result)
     return results
 
 
-def _parsed(text: str, source: str) -> list[tuple[Any, str]]:
+def _objects_in_text(text: str, source: str) -> list[tuple[Any, str]]:
     try:
-        whole = _json(text)
+        whole = _strict_json(text)
         found = whole if isinstance(whole, list) else [whole]
         return [(own, f"{source}: object {i}" if len(found) > 1 else source) for i, own in enumerate(found, 1)]
     except ValueError:
@@ -127,7 +127,7 @@ def _parsed(text: str, source: str) -> list[tuple[Any, str]]:
         if not line.strip():
             continue
         try:
-            made.append((_json(line), f"{source}: line {number}"))
+            made.append((_strict_json(line), f"{source}: line {number}"))
         except ValueError as error:
             shown = line.strip()[:40]
             raise DataError(
@@ -136,7 +136,7 @@ def _parsed(text: str, source: str) -> list[tuple[Any, str]]:
     return made
 
 
-def _json(text: str) -> Any:
+def _strict_json(text: str) -> Any:
     """Returns what JSON says. ValueError for NaN and Infinity, which no result has."""
 
     def refuse(name: str) -> None:
@@ -148,7 +148,7 @@ def _json(text: str) -> Any:
         raise ValueError("nested too deeply") from None
 
 
-def _checked(found: Any, where: str) -> dict[str, Any]:
+def _check_result(found: Any, where: str) -> dict[str, Any]:
     """Returns the object, if it has the shape of a result; a task that nobody knows is fine. DataError."""
     if not isinstance(found, dict) or not isinstance(found.get("task"), str):
         shown = (
@@ -160,9 +160,9 @@ def _checked(found: Any, where: str) -> dict[str, Any]:
     for key in _MAPPINGS:
         if not isinstance(found.get(key, {}), dict):
             raise DataError(f"{where}: {key} is a {type(found[key]).__name__}; expected an object of names and values")
-    said = found.get("provenance", [])
-    if isinstance(said, list):  # of a comparison: one list for each side
-        flat = [entry for own in said for entry in (own if isinstance(own, list) else [own])]
+    history = found.get("provenance", [])
+    if isinstance(history, list):  # of a comparison: one list for each side
+        flat = [entry for own in history for entry in (own if isinstance(own, list) else [own])]
         found = found | {"provenance": [entry for row, entry in enumerate(flat) if entry not in flat[:row]]}
     for key in _LISTS:
         entries = found.get(key, [])
@@ -171,16 +171,18 @@ def _checked(found: Any, where: str) -> dict[str, Any]:
     return found
 
 
-def _scores(path: Path, truth: Path | None, split: str | None) -> Result:
+def _scores_result(path: Path, truth: Path | None, split: str | None) -> CollectedResult:
     from dpcli.evaluate.bootstrap import Resampling
     from dpcli.evaluate.classification.protocol import evaluate_classification
     from dpcli.evaluate.classification.result_json import classification_json
 
     report = evaluate_classification(path, truth, split, resampling=Resampling())
-    return Result(_plain(classification_json(report, str(path), ScoresReader(path).provenance)), str(path))
+    return CollectedResult(
+        _through_json(classification_json(report, str(path), ScoresReader(path).provenance)), str(path)
+    )
 
 
-def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[Result]:
+def _parts_results(path: Path, truth: Path | None, split: str | None, pictures: bool) -> list[CollectedResult]:
     """Returns segmentation, and motion where the truth has poses and the prediction frame pairs."""
     from dpcli.evaluate.bootstrap import Resampling
     from dpcli.evaluate.segmentation.motion_protocol import evaluate_motion
@@ -189,59 +191,64 @@ def _parts(path: Path, truth: Path | None, split: str | None, pictures: bool) ->
 
     if truth is None:
         raise UsageError(f"{path}: a parts file is compared with a truth; add --truth CLOUDS, or name it {path}=CLOUDS")
-    with CloudsReader(truth) as clouds, PartsReader(path) as said:
-        motion, provenance = "pose" in clouds.fields and bool((said.pair_counts > 0).any()), said.provenance
+    with CloudsReader(truth) as clouds, PartsReader(path) as predicted:
+        motion, provenance = "pose" in clouds.fields and bool((predicted.pair_counts > 0).any()), predicted.provenance
     options = {"split": split, "resampling": Resampling()}
     made = [
-        Result(
-            _plain(segmentation_json(evaluate_segmentation(path, truth, **options), str(path), provenance)), str(path)
+        CollectedResult(
+            _through_json(segmentation_json(evaluate_segmentation(path, truth, **options), str(path), provenance)),
+            str(path),
         )
     ]
     if motion:
         made.append(
-            Result(_plain(motion_json(evaluate_motion(path, truth, **options), str(path), provenance)), str(path))
+            CollectedResult(
+                _through_json(motion_json(evaluate_motion(path, truth, **options), str(path), provenance)), str(path)
+            )
         )
     if pictures:
         made[0].extras = part_blocks(path, truth, split=split, motion=motion)
     return made
 
 
-def _video(path: Path, truth: Path | None, pictures: bool) -> Result:
+def _video_result(path: Path, truth: Path | None, pictures: bool) -> CollectedResult:
     from dpcli.evaluate.video.comparison import evaluate_video
     from dpcli.evaluate.video.result_json import video_json
 
     if truth is None:
         raise UsageError(f"{path}: a video is compared with a truth; name both as {path}=TRUTH")
-    result = Result(_plain(video_json(evaluate_video(path, truth), str(path))), str(path))
+    result = CollectedResult(_through_json(video_json(evaluate_video(path, truth), str(path))), str(path))
     if pictures:
         _add_strips(result)
     return result
 
 
-def _add_strips(result: Result) -> None:
+def _add_strips(result: CollectedResult) -> None:
     """Adds pictures of the files that the object names, if they are still there; else a note that says why not."""
     protocol = result.found.get("protocol", {})
-    said, real = result.found.get("input"), protocol.get("truth")
-    if not (isinstance(said, str) and isinstance(real, str) and Path(said).exists() and Path(real).exists()):
+    predicted, truth = result.found.get("input"), protocol.get("truth")
+    if not (
+        isinstance(predicted, str) and isinstance(truth, str) and Path(predicted).exists() and Path(truth).exists()
+    ):
         result.notes.append("No pictures: the files that were compared are not where the object says.")
         return
     try:
         background = protocol.get("background")
         result.extras.append(
-            strip_figure(Path(said), Path(real), protocol=str(protocol.get("name", "dpc")), background=background)
+            strip_figure(Path(predicted), Path(truth), protocol=str(protocol.get("name", "dpc")), background=background)
         )
         result.notes.append("The pictures are of the files as they are now.")
     except (DataError, UsageError) as error:
         result.notes.append(f"No pictures: {error}.")
 
 
-def _plain(found: dict[str, Any]) -> dict[str, Any]:
+def _through_json(found: dict[str, Any]) -> dict[str, Any]:
     """Returns the object as its JSON text would be read, so that files and objects make the same page."""
     return json.loads(json.dumps(found, allow_nan=False))
 
 
-def _once(results: list[Result]) -> Collected:
-    kept: dict[str, Result] = {}
+def _drop_repeats(results: list[CollectedResult]) -> Collected:
+    kept: dict[str, CollectedResult] = {}
     duplicates = []
     for result in results:
         key = json.dumps(result.found, sort_keys=True)

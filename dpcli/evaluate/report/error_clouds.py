@@ -59,18 +59,22 @@ def part_blocks(
     with PairedSequences(path, truth, split=split, intersect=intersect, fields=fields) as paired:
         errors = [_sequence_error(row, pair, motion) for row, pair in zip(paired.rows, paired, strict=True)]
         known = [own for own in errors if not np.isnan(own.mean)]
-        shown = _chosen(known)
+        shown = _choose_sequences(known)
         unit = paired.truth.length_unit
         clouds = [
-            (title, own, frame, _cloud(paired, own, frame, unit if motion else "")) for title, own, frame in shown
+            (title, own, frame, _read_cloud(paired, own, frame, unit if motion else "")) for title, own, frame in shown
         ]
-    return [*_spreads(known, unit), _sequence_table(known, unit), *([_figure(clouds)] if clouds else [])]
+    return [
+        *_error_histograms(known, unit),
+        _sequence_table(known, unit),
+        *([_clouds_figure(clouds)] if clouds else []),
+    ]
 
 
 def _sequence_error(row: tuple[int, int], pair: SequencePair, motion: bool) -> SequenceError:
-    offsets, truth, said = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
+    offsets, truth, predicted = pair.truth.frame_offsets, pair.truth.part, pair.predicted.part
     spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
-    ious = [mean_iou(truth[span], said[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
+    ious = [mean_iou(truth[span], predicted[span]) if (truth[span] >= 0).any() else np.nan for span in spans]
     errors = []
     if motion:
         for (source, target), flow in zip(pair.parts.pairs.tolist(), pair.parts.flow, strict=True):
@@ -87,7 +91,7 @@ def _flow_error(pair: SequencePair, source: int, target: int, flow: np.ndarray) 
     return np.where(part >= 0, np.linalg.norm(flow - real, axis=1), np.nan)
 
 
-def _chosen(errors: Sequence[SequenceError]) -> list[tuple[str, SequenceError, int]]:
+def _choose_sequences(errors: Sequence[SequenceError]) -> list[tuple[str, SequenceError, int]]:
     """Returns the worst sequences by mIoU and those in the middle, each with the frame nearest to its mean."""
     order = sorted(errors, key=lambda own: (own.mean, own.name))
     middle = max((len(order) - _MEDIAN) // 2, _WORST)
@@ -95,14 +99,14 @@ def _chosen(errors: Sequence[SequenceError]) -> list[tuple[str, SequenceError, i
     return [(title, own, int(np.nanargmin(np.abs(own.iou - own.mean)))) for title, own in picked]
 
 
-def _cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -> Cloud:
+def _read_cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -> Cloud:
     """Returns a frame of a sequence, predicted parts renamed to the true ones they cover best; thinned evenly."""
     ours, theirs = own.row
     truth = paired.truth.read(theirs, fields=paired.fields)
     predicted = paired.predicted.read(ours, fields=("part",))
     pair = SequencePair(truth, predicted, paired.predicted.read_parts(ours))
     span = slice(int(truth.frame_offsets[frame]), int(truth.frame_offsets[frame + 1]))
-    part = _renamed(truth.part[span], predicted.part[span])
+    part = _rename_parts(truth.part[span], predicted.part[span])
     error = np.where(truth.part[span] >= 0, (part != truth.part[span]).astype(np.float64), np.nan)
     if unit or "pose" in paired.fields:
         from_frame = [row for row, source in enumerate(pair.parts.pairs[:, 0].tolist()) if source == frame]
@@ -115,7 +119,7 @@ def _cloud(paired: PairedSequences, own: SequenceError, frame: int, unit: str) -
     return Cloud(truth.points[span][keep], truth.part[span][keep], part[keep], error[keep], unit)
 
 
-def _renamed(truth: np.ndarray, part: np.ndarray) -> np.ndarray:
+def _rename_parts(truth: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Returns predicted ids i (N) as the true ids that overlap them most, one to one; the others come after all true ids."""
     found = overlap(truth, part)
     rows, columns = hungarian_matching(found.shared / found.union)
@@ -125,7 +129,7 @@ def _renamed(truth: np.ndarray, part: np.ndarray) -> np.ndarray:
     return np.where(found.columns >= 0, names[np.maximum(found.columns, 0)] if len(names) else -1, -1)
 
 
-def _spreads(errors: Sequence[SequenceError], unit: str) -> list[Figure]:
+def _error_histograms(errors: Sequence[SequenceError], unit: str) -> list[Figure]:
     if not errors:
         return []
     made = [Figure("mIoU of the sequences", histogram([own.mean for own in errors], "fraction"))]
@@ -163,7 +167,7 @@ def _sequence_table(errors: Sequence[SequenceError], unit: str) -> Table:
     return table("By sequence", header, rows, note, key="per_sequence")
 
 
-def _figure(clouds: list[tuple[str, SequenceError, int, Cloud]]) -> Figure:
+def _clouds_figure(clouds: list[tuple[str, SequenceError, int, Cloud]]) -> Figure:
     html = "".join(_markup(*own) for own in clouds)
     note = (
         "Truth, prediction and error of the worst sequences by mIoU and of those in the middle, each at the frame nearest to its "
@@ -175,16 +179,16 @@ def _figure(clouds: list[tuple[str, SequenceError, int, Cloud]]) -> Figure:
 def _markup(title: str, own: SequenceError, frame: int, cloud: Cloud) -> str:
     top = float(np.nanmax(cloud.error)) if np.isfinite(cloud.error).any() else 0.0
     words = f"red: end-point error up to {text_of(top)} {cloud.unit}".rstrip() if cloud.unit else "red: wrong part"
-    said = f"{title}: {own.name}, frame {frame}, mIoU {text_of(float(own.iou[frame]), 'fraction')}"
-    data = base64.b64encode(packed(cloud)).decode("ascii")
+    caption = f"{title}: {own.name}, frame {frame}, mIoU {text_of(float(own.iou[frame]), 'fraction')}"
+    data = base64.b64encode(pack_cloud(cloud)).decode("ascii")
     return (
         f'<figure class="cloud" data-points="{len(cloud.points)}" data-cloud="{data}">'
-        f"<figcaption>{escape(said)} <span class=faint>{len(cloud.points)} points shown; {escape(words)}</span></figcaption>"
-        f'<canvas tabindex="0" role="img" aria-label="{escape(said)}: truth, prediction, error"></canvas></figure>'
+        f"<figcaption>{escape(caption)} <span class=faint>{len(cloud.points)} points shown; {escape(words)}</span></figcaption>"
+        f'<canvas tabindex="0" role="img" aria-label="{escape(caption)}: truth, prediction, error"></canvas></figure>'
     )
 
 
-def packed(cloud: Cloud) -> bytes:
+def pack_cloud(cloud: Cloud) -> bytes:
     """Returns a cloud as bytes for the page, little endian.
 
     u16 x, y, z (3N) in a cube around the points, then u8 truth + 1, part + 1 (2N, 0 = none), u8 error (N, share of the

@@ -37,14 +37,17 @@ _MARKDOWN = "\\`*_[]<>|#"
 def report_markdown(report: Report) -> str:
     """Returns the summary, the thesis's rows beside ours, and each result's tables and notes."""
     lines = [
-        f"# {_plain(report.title)}",
+        f"# {_escape_markdown(report.title)}",
         _markdown_table(report.summary),
-        *(_plain(text) + "." for text in report.left_out),
+        *(_escape_markdown(text) + "." for text in report.left_out),
     ]
     for own in report.beside:
-        lines += [f"## {_plain(own.title)}", _markdown_table(own), _plain(own.note)]
+        lines += [f"## {_escape_markdown(own.title)}", _markdown_table(own), _escape_markdown(own.note)]
     for section in report.sections:
-        lines += [f"## {_plain(section.task)}: {_plain(section.title)}", *_markdown_section(section)]
+        lines += [
+            f"## {_escape_markdown(section.task)}: {_escape_markdown(section.title)}",
+            *_markdown_section(section),
+        ]
     return "\n\n".join(line for line in lines if line) + "\n"
 
 
@@ -52,18 +55,18 @@ def _markdown_section(section: Section) -> list[str]:
     lines = []
     for own in section.blocks:
         if isinstance(own, Table):
-            lines += [f"**{_plain(own.title)}**", _markdown_table(own), _plain(own.note)]
-    lines.append("\n".join(f"- {_plain(note)}" for note in section.notes))
+            lines += [f"**{_escape_markdown(own.title)}**", _markdown_table(own), _escape_markdown(own.note)]
+    lines.append("\n".join(f"- {_escape_markdown(note)}" for note in section.notes))
     protocol = next((terms for title, terms in section.details if title == "Protocol"), [])
-    lines.append("; ".join(f"{_plain(term)}: {_plain(words)}" for term, words in protocol))
-    return [*lines, *(f"Command: {_code(command)}" for command in section.commands)]
+    lines.append("; ".join(f"{_escape_markdown(term)}: {_escape_markdown(words)}" for term, words in protocol))
+    return [*lines, *(f"Command: {_markdown_code(command)}" for command in section.commands)]
 
 
 def _markdown_table(table: Table) -> str:
     aligned = ["---", *("---:" if _numeric(table, place) else "---" for place in range(1, len(table.header)))]
-    rows = [[_plain(own.text) for own in row] for row in table.rows]
+    rows = [[_escape_markdown(own.text) for own in row] for row in table.rows]
     return "\n".join(
-        f"| {' | '.join(row)} |" for row in [[_plain(name) or " " for name in table.header], aligned, *rows]
+        f"| {' | '.join(row)} |" for row in [[_escape_markdown(name) or " " for name in table.header], aligned, *rows]
     )
 
 
@@ -71,20 +74,20 @@ def _numeric(table: Table, place: int) -> bool:
     return all(row[place].sort is not None or row[place].text == "-" for row in table.rows)
 
 
-def _plain(text: str) -> str:
+def _escape_markdown(text: str) -> str:
     """Returns text that means nothing to markdown: on one line, its marks escaped."""
     flat = " ".join(text.split())
     return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in flat)
 
 
-def _code(text: str) -> str:
+def _markdown_code(text: str) -> str:
     """Returns text between so many backticks that none in it ends it."""
-    fence = "`" * (1 + max((len(run) for run in _runs(text)), default=0))
+    fence = "`" * (1 + max((len(run) for run in _backtick_runs(text)), default=0))
     pad = " " if fence != "`" else ""
     return f"{fence}{pad}{' '.join(text.split())}{pad}{fence}"
 
 
-def _runs(text: str) -> list[str]:
+def _backtick_runs(text: str) -> list[str]:
     return [run for run in "".join(c if c == "`" else " " for c in text).split(" ") if run]
 
 
@@ -111,8 +114,14 @@ def _latex_table(table: Table, caption: str, note: str = "") -> str:
             rows.append(r"\midrule")
         ours = row[0].mark != "thesis"
         rows.append(_latex_row(row))
-    words = latex(caption) + (f". {latex(note)}" if note else "")
-    inside = [r"\toprule", _joined([latex(name) for name in table.header]), r"\midrule", *rows, r"\bottomrule"]
+    words = escape_latex(caption) + (f". {escape_latex(note)}" if note else "")
+    inside = [
+        r"\toprule",
+        _join_cells([escape_latex(name) for name in table.header]),
+        r"\midrule",
+        *rows,
+        r"\bottomrule",
+    ]
     return "\n".join(
         [
             r"\begin{table}[htbp]",
@@ -127,15 +136,15 @@ def _latex_table(table: Table, caption: str, note: str = "") -> str:
 
 
 def _latex_row(row: Sequence[Cell]) -> str:
-    return _joined([latex(own.text) for own in row])
+    return _join_cells([escape_latex(own.text) for own in row])
 
 
-def _joined(cells: Sequence[str]) -> str:
+def _join_cells(cells: Sequence[str]) -> str:
     # braces: a first cell that begins with [ would be read as an argument of the row before
     first = f"{{{cells[0]}}}" if cells[0].startswith(("[", "*")) else cells[0]
     return " & ".join([first, *cells[1:]]) + r" \\"
 
 
-def latex(text: str) -> str:
+def escape_latex(text: str) -> str:
     """Returns text as LaTeX prints it: what it would take as a command is escaped."""
     return "".join(_LATEX.get(letter, letter) for letter in text)

@@ -34,13 +34,13 @@ def headline(found: Mapping[str, Any]) -> Headline:
     plain = {key: value for key, value in metrics.items() if is_number(value)}
     for key in (*_HEADLINES, *plain):
         if key in plain:
-            unit = _unit(units, key)
+            unit = _unit_of(units, key)
             ends = metrics.get(f"{key}_interval") or intervals_of(found).get(key)
             return Headline(_with_unit(key, unit), cell(plain[key], unit), interval_text(ends, unit), of)
     for key, record in metrics.items():
         for name in ("difference", "mean"):
             if isinstance(record, Mapping) and is_number(record.get(name)):
-                unit = _unit(units, key)
+                unit = _unit_of(units, key)
                 return Headline(
                     f"{name} of {_with_unit(key, unit)}",
                     cell(record[name], unit),
@@ -67,7 +67,7 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
     """Returns tables and curves of all `metrics` but those to skip, and notes on what could not be shown."""
     metrics, units = found.get("metrics", {}), found.get("units", {})
     intervals = intervals_of(found)
-    grouped = _grouped(metrics)
+    grouped = _grouped_metrics(metrics)
     scalars: list[tuple[str, Any, str]] = []
     blocks: list[Table | Figure] = []
     notes: list[str] = []
@@ -80,10 +80,10 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
             isinstance(value, Mapping) and value and all(_is_scalar(own) or interval_of(own) for own in value.values())
         ):
             scalars += [(f"{key} {name}", own, name) for name, own in value.items()]
-        elif (records := _records(value)) is not None:
+        elif (records := _named_records(value)) is not None:
             blocks.append(_records_table(key, records, units))
-            blocks += _spreads(key, records, units)
-        elif isinstance(value, (list, Mapping)) and (series := _series(key, value)):
+            blocks += _histograms_and_curves(key, records, units)
+        elif isinstance(value, (list, Mapping)) and (series := _named_series(key, value)):
             blocks.append(Figure(title_of(key), "".join(curve(name, ys) for name, ys in series.items())))
         else:
             notes.append(f"{title_of(key)}: in the object, not shown here.")
@@ -91,7 +91,7 @@ def metric_blocks(found: Mapping[str, Any], skip: Sequence[str] = ()) -> tuple[l
     columns = ["metric", "value", "interval", "unit"]
     if all(row[2] == "-" for row in rows):
         columns, rows = [columns[k] for k in (0, 1, 3)], [[row[k] for k in (0, 1, 3)] for row in rows]
-    head = [table("Metrics", columns, rows, _how(found), key="metrics")] if rows else []
+    head = [table("Metrics", columns, rows, _interval_note(found), key="metrics")] if rows else []
     return [*head, *_grouped_tables(found, grouped, units), *blocks], notes
 
 
@@ -101,17 +101,17 @@ def intervals_of(found: Mapping[str, Any]) -> Mapping[str, Any]:
     return own["metrics"] if isinstance(own.get("metrics"), Mapping) else own
 
 
-def _how(found: Mapping[str, Any]) -> str:
+def _interval_note(found: Mapping[str, Any]) -> str:
     """Returns how the intervals were found, in a sentence; "" without any."""
     own = found.get("intervals", {})
     if not own.get("resamples") or not is_number(own.get("confidence")):
         return ""
     of = f"{own.get('number', '')} {own.get('resampled', '')}".strip()
-    said = f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
-    return f"Intervals: {said}." + (" Of accuracy: Wilson." if "accuracy_interval" in found.get("metrics", {}) else "")
+    how = f"{100 * own['confidence']:g} %, {own.get('method', '')}, {own['resamples']} resamples of {of}"
+    return f"Intervals: {how}." + (" Of accuracy: Wilson." if "accuracy_interval" in found.get("metrics", {}) else "")
 
 
-def _grouped(metrics: Mapping[str, Any]) -> dict[str, Mapping]:
+def _grouped_metrics(metrics: Mapping[str, Any]) -> dict[str, Mapping]:
     """Returns the metrics that are records: differences of a comparison, means over runs."""
     return {key: own for key, own in metrics.items() if isinstance(own, Mapping) and {"difference", "mean"} & set(own)}
 
@@ -120,7 +120,7 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
     """Returns a row for each metric of a comparison or of runs; then the single runs, a test, and the samples that differ most."""
     if not grouped:
         return []
-    records = _records(grouped)
+    records = _named_records(grouped)
     made = [_records_table("metric", records, units)] if records else []
     names = found.get("runs", [])
     if isinstance(names, list) and all(isinstance(own.get("values"), list) for own in grouped.values()):
@@ -129,11 +129,11 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
             for row, name in enumerate(names)
         ]
         made += [_records_table("run", runs, units)] if any(name or own for name, own in runs) else []
-    if (records := _records([found.get("mcnemar")])) is not None:
+    if (records := _named_records([found.get("mcnemar")])) is not None:
         made.append(_records_table("McNemar's exact test", records, {}))
     changed = found.get("most_changed", {})
     for key, rows in changed.items() if isinstance(changed, Mapping) else ():
-        if (records := _records(rows)) is not None:
+        if (records := _named_records(rows)) is not None:
             made.append(_records_table(f"samples that differ most, by {title_of(key)}", records, {}))
     return made
 
@@ -141,7 +141,7 @@ def _grouped_tables(found: Mapping[str, Any], grouped: Mapping[str, Mapping], un
 def _scalar_row(
     name: str, value: Any, key: str, units: Mapping, intervals: Mapping, metrics: Mapping
 ) -> list[Cell | str]:
-    unit = _unit(units, key)
+    unit = _unit_of(units, key)
     own = interval_text(metrics.get(f"{key}_interval") or intervals.get(key), unit) or "-"
     words = {"fraction": "share", "1": "", "": ""}.get(unit, unit)
     if not _is_scalar(value):
@@ -153,18 +153,18 @@ def _is_scalar(value: Any) -> bool:
     return value is None or isinstance(value, (str, bool, int, float))
 
 
-def _records(value: Any) -> list[tuple[str, Mapping]] | None:
+def _named_records(value: Any) -> list[tuple[str, Mapping]] | None:
     """Returns (row name, record) of a list of records or of records by name; None for anything else, or without a column."""
     records: list[tuple[str, Mapping]] = []
     if isinstance(value, list) and all(isinstance(own, Mapping) for own in value):
         records = [("", own) for own in value]
     if isinstance(value, Mapping) and all(isinstance(own, Mapping) for own in value.values()):
         records = [(str(name), own) for name, own in value.items()]
-    return records if any(name or _flat(own) for name, own in records) else None
+    return records if any(name or _flatten_record(own) for name, own in records) else None
 
 
 def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> Table:
-    flat = [(name, _flat(record)) for name, record in records]
+    flat = [(name, _flatten_record(record)) for name, record in records]
     columns = list(dict.fromkeys(column for _, record in flat for column in record))
     named = any(name for name, _ in flat)
     rows = []
@@ -173,7 +173,7 @@ def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping)
         rows.append([*head, *(_record_cell(name, column, record, units) for column in columns)])
     header = [
         *([title_of(key.removeprefix("per_"))] if named else []),
-        *(_with_unit(column, _unit(units, column)) for column in columns),
+        *(_with_unit(column, _unit_of(units, column)) for column in columns),
     ]
     title = title_of(key.removeprefix("per_"))
     return table(
@@ -183,14 +183,14 @@ def _records_table(key: str, records: list[tuple[str, Mapping]], units: Mapping)
 
 def _record_cell(name: str, column: str, record: Mapping, units: Mapping) -> Cell:
     value = record.get(column)
-    unit = "" if column in _UNITLESS or isinstance(value, int) else _unit(units, column) or _unit(units, name)
+    unit = "" if column in _UNITLESS or isinstance(value, int) else _unit_of(units, column) or _unit_of(units, name)
     if interval_of(value):
         text = interval_text(value, unit)
         return Cell(text, sort_key(text))
     return cell(value, unit)
 
 
-def _flat(record: Mapping) -> dict[str, Any]:
+def _flatten_record(record: Mapping) -> dict[str, Any]:
     """Returns scalars and intervals of a record, those of records in it under both names; longer lists are left out."""
     made: dict[str, Any] = {}
     for key, value in record.items():
@@ -201,23 +201,23 @@ def _flat(record: Mapping) -> dict[str, Any]:
     return made
 
 
-def _spreads(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> list[Figure]:
+def _histograms_and_curves(key: str, records: list[tuple[str, Mapping]], units: Mapping) -> list[Figure]:
     """Returns how the metrics of single sequences or frames are spread, and curves of records that hold values by frame."""
     made = []
     if key in _SPREAD_OF:
         for column in [name for name in records[0][1] if name in units]:
             values = [own[column] for _, own in records if is_number(own.get(column))]
             if len(values) > 3:
-                made.append(Figure(f"{title_of(column)} {title_of(key)}", histogram(values, _unit(units, column))))
+                made.append(Figure(f"{title_of(column)} {title_of(key)}", histogram(values, _unit_of(units, column))))
     for number, (name, record) in enumerate(records):
-        series = _series("", record.get("per_frame", {}))
+        series = _named_series("", record.get("per_frame", {}))
         title = name or str(record.get("view", record.get("name", number)))
         if series:
             made.append(Figure(f"{title}, by frame", "".join(curve(own, ys) for own, ys in series.items())))
     return made
 
 
-def _series(key: str, value: Any) -> dict[str, list[float | None]]:
+def _named_series(key: str, value: Any) -> dict[str, list[float | None]]:
     """Returns values by name, for lists of numbers; {} for anything else."""
     named = value if isinstance(value, Mapping) else {title_of(key): value}
     good = {
@@ -231,7 +231,7 @@ def _series(key: str, value: Any) -> dict[str, list[float | None]]:
     return good if len(good) == len(named) else {}
 
 
-def _unit(units: Mapping, key: str) -> str:
+def _unit_of(units: Mapping, key: str) -> str:
     found = units.get(key, "")
     return found if isinstance(found, str) else ""
 
@@ -243,24 +243,24 @@ def _with_unit(key: str, unit: str) -> str:
 def detail_lists(found: Mapping[str, Any]) -> list[tuple[str, list[tuple[str, str]]]]:
     """Returns protocol, units, denominators, notes, what was left out, and provenance, in words."""
     made = [
-        (title, [(title_of(key), _words(value)) for key, value in found.get(name, {}).items()])
+        (title, [(title_of(key), _in_words(value)) for key, value in found.get(name, {}).items()])
         for title, name in (("Protocol", "protocol"), ("Units", "units"), ("Denominators", "denominators"))
     ]
-    made.append(("Left out", [_left_out(entry) for entry in found.get("left_out", [])] or [("nothing", "")]))
+    made.append(("Left out", [_left_out_in_words(entry) for entry in found.get("left_out", [])] or [("nothing", "")]))
     how = {key: value for key, value in found.get("intervals", {}).items() if _is_scalar(value)}
-    made.append(("Intervals", [(title_of(key), _words(value)) for key, value in how.items()]))
+    made.append(("Intervals", [(title_of(key), _in_words(value)) for key, value in how.items()]))
     for number, entry in enumerate(found.get("provenance", []), 1):
-        terms = [(key, _words(value)) for key, value in entry.items()]
+        terms = [(key, _in_words(value)) for key, value in entry.items()]
         made.append((f"Provenance {number}", terms))
     return [(title, terms) for title, terms in made if terms]
 
 
-def _left_out(entry: Mapping[str, Any]) -> tuple[str, str]:
+def _left_out_in_words(entry: Mapping[str, Any]) -> tuple[str, str]:
     names = [str(name) for name in entry.get("names", [])]
     return str(entry.get("reason", "")), f"{entry.get('count', len(names))}: " + ", ".join(names[:200])
 
 
-def _words(value: Any) -> str:
+def _in_words(value: Any) -> str:
     if isinstance(value, list) and all(isinstance(own, str) for own in value):
         return "; ".join(value) or "none"
     return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, sort_keys=True)

@@ -66,8 +66,8 @@ class ThesisTable:
         """Returns whether a result is of this table's task and data: by a command of its provenance, or by its class names."""
         if found.get("task") != self.task:
             return False
-        said = [str(entry.get("command", "")) for entry in found.get("provenance", [])]
-        if any(f"{words} " in f"{command} " for words in self.commands for command in said):
+        ran = [str(entry.get("command", "")) for entry in found.get("provenance", [])]
+        if any(f"{words} " in f"{command} " for words in self.commands for command in ran):
             return True
         per_class = found.get("metrics", {}).get("per_class", [])
         names = {str(row.get("name", "")).lower() for row in per_class if isinstance(row, Mapping)}
@@ -89,7 +89,7 @@ def thesis_tables() -> tuple[ThesisTable, ...]:
     return tuple(made)
 
 
-def chosen_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -> list[ThesisTable]:
+def choose_tables(beside: Sequence[str], objects: Sequence[Mapping[str, Any]]) -> list[ThesisTable]:
     """Returns the tables asked for by id (`table-3.4`; `none` = no table), else those that know one of the results.
 
     Ablations only stand beside a result when they are asked for. UsageError for ids there aren't.
@@ -113,7 +113,7 @@ def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, 
     ours = [
         (title, found) for title, found in objects if thesis.knows(found) or asked and found.get("task") == thesis.task
     ]
-    rows = [row for title, found in ours for row in _own_rows(thesis, title, found)]
+    rows = [row for title, found in ours for row in _rows_of_ours(thesis, title, found)]
     rows += [_thesis_row(thesis, own) for own in sorted(thesis.rows, key=lambda row: not row.get("own"))]
     header = (
         "method",
@@ -121,18 +121,21 @@ def beside_table(thesis: ThesisTable, objects: Sequence[tuple[str, Mapping[str, 
         "setting",
         *(_header(metric, unit) for metric, unit in zip(thesis.metrics, thesis.units)),
     )
-    said = (
-        "; ".join(dict.fromkeys(f"{title}: {_protocol(found)}" for title, found in ours))
+    protocols = (
+        "; ".join(dict.fromkeys(f"{title}: {_protocol_in_words(found)}" for title, found in ours))
         or "no result of ours is of this task"
     )
     note = (
-        f"Thesis: {thesis.protocol}. Ours: {said}. Rows marked thesis are copied from its {_where(thesis)}, not measured here; "
+        f"Thesis: {thesis.protocol}. Ours: {protocols}. Rows marked thesis are copied from its {_place_in_thesis(thesis)}, "
+        "not measured here; "
         "protocol, split and length unit may differ from ours."
     )
-    return table(f"{thesis.title}: ours beside the thesis's {_where(thesis)}", header, rows, note, key=thesis.id)
+    return table(
+        f"{thesis.title}: ours beside the thesis's {_place_in_thesis(thesis)}", header, rows, note, key=thesis.id
+    )
 
 
-def _where(thesis: ThesisTable) -> str:
+def _place_in_thesis(thesis: ThesisTable) -> str:
     return f"figure {thesis.number}" if "figure" in thesis.title else f"Table {thesis.number}"
 
 
@@ -141,7 +144,7 @@ def _header(metric: str, unit: str) -> str:
     return title_of(metric) + (f" ({words})" if words else "")
 
 
-def _own_rows(thesis: ThesisTable, title: str, found: Mapping[str, Any]) -> list[list[Cell | str]]:
+def _rows_of_ours(thesis: ThesisTable, title: str, found: Mapping[str, Any]) -> list[list[Cell | str]]:
     metrics, split = found.get("metrics", {}), found.get("protocol", {}).get("split", "")
     setting = f"split {split}" if split else ""
     if thesis.tau is not None:
@@ -157,7 +160,7 @@ def _own_rows(thesis: ThesisTable, title: str, found: Mapping[str, Any]) -> list
         for place, (metric, unit) in enumerate(zip(thesis.metrics, thesis.units, strict=True))
     ]
     return [
-        [Cell(name, mark="ours"), "ours", setting, *(_converted(own.get(metric), *rest) for metric, *rest in columns)]
+        [Cell(name, mark="ours"), "ours", setting, *(_convert(own.get(metric), *rest) for metric, *rest in columns)]
         for name, own in named
     ]
 
@@ -176,7 +179,7 @@ def _digits(thesis: ThesisTable, place: int) -> int:
     )
 
 
-def _converted(value: Any, ours: str, theirs: str, digits: int) -> Cell:
+def _convert(value: Any, ours: str, theirs: str, digits: int) -> Cell:
     if not is_number(value):
         return Cell("-")
     factor = _FACTOR.get((ours, theirs), 100.0 if theirs.startswith("1/100") else 1.0)
@@ -184,7 +187,7 @@ def _converted(value: Any, ours: str, theirs: str, digits: int) -> Cell:
 
 
 def _thesis_row(thesis: ThesisTable, row: dict[str, Any]) -> list[Cell | str]:
-    source = f"thesis, {_where(thesis)}" + ("" if row.get("own") else " (cited)")
+    source = f"thesis, {_place_in_thesis(thesis)}" + ("" if row.get("own") else " (cited)")
     cells = [
         Cell(f"{value:.{_digits(thesis, place)}f}", float(value)) if is_number(value) else Cell("-")
         for place, value in enumerate(row["values"])
@@ -192,7 +195,7 @@ def _thesis_row(thesis: ThesisTable, row: dict[str, Any]) -> list[Cell | str]:
     return [Cell(row["method"], mark="thesis"), source, row["setting"], *cells]
 
 
-def _protocol(found: Mapping[str, Any]) -> str:
+def _protocol_in_words(found: Mapping[str, Any]) -> str:
     protocol = found.get("protocol", {})
     words = {key: protocol[key] for key in ("name", "split", "views") if key in protocol}
     counts = found.get("denominators", {})

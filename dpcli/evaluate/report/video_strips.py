@@ -26,13 +26,14 @@ def strip_figure(predicted: Path, truth: Path, *, protocol: str = "dpc", backgro
 
     chosen = video_protocol(protocol, background)
     strip = DifferenceStrip(BACKGROUNDS[chosen.background])
-    with closing(open_source(truth)) as real, closing(open_source(predicted, truth=real)) as said:
-        pairs = match_views(said, real, chosen, True, [])
+    with closing(open_source(truth)) as true_source, closing(open_source(predicted, truth=true_source)) as source:
+        pairs = match_views(source, true_source, chosen, True, [])
         for ours, theirs in pairs[:_MOST_VIEWS]:
-            count = min(source.frames[view] for source, view in ((said, ours), (real, theirs)) if source.frames)
+            count = min(one.frames[view] for one, view in ((source, ours), (true_source, theirs)) if one.frames)
             shown = np.unique(np.linspace(0, count - 1, _INSTANTS).round().astype(int)).tolist()
-            for frame, own, other in zip(shown, said.pictures(ours, shown), real.pictures(theirs, shown), strict=True):
-                strip(real.views[theirs], frame, count, own, other)
+            pictures = zip(shown, source.pictures(ours, shown), true_source.pictures(theirs, shown), strict=True)
+            for frame, predicted_picture, true_picture in pictures:
+                strip(true_source.views[theirs], frame, count, predicted_picture, true_picture)
     html = "".join(_markup(title, cells) for title, cells in strip.rows.items())
     note = f"{min(len(pairs), _MOST_VIEWS)} of {len(pairs)} views, {_INSTANTS} instants at most, made smaller."
     return Figure("Pictures side by side", html, note)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from dpcli.draw.bars import Bars, Histogram, draw_panels
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import SegmentationReport
-from dpcli.evaluate.segmentation.tables import TITLES, class_rows
+from dpcli.evaluate.segmentation.tables import class_rows
 
 _SHOWN = ("ap", "pq", "f1", "miou", "ri")
 
@@ -15,7 +16,7 @@ _SHOWN = ("ap", "pq", "f1", "miou", "ri")
 def draw_segmentation_bars(report: SegmentationReport, path: Path) -> None:
     """Draws the scores of each class and of all sequences, and how the mIoU of the sequences is spread."""
     rows = class_rows(report.main, report.classes, report.class_names)
-    values = {TITLES[key]: [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
+    values = {title_of(key): [100 * getattr(own, key) for _, own in rows] for key in _SHOWN}
     bars = Bars([f"{title} ({own.objects})" for title, own in rows], values, "%", 100)
     spread = Histogram(100 * report.objects.object_iou, "mIoU of a sequence, %", "sequences")
     draw_panels([bars, spread], len(rows), f"Parts, protocol {report.protocol}, split {report.split}", path)

@@ -13,7 +13,7 @@ from dpcli.evaluate.segmentation.tables import class_rows, interval_tables
 from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
 
 SHARE_TITLES = {"accs": "AccS", "accr": "AccR", "outlier": "Outlier"}
-_DISPLACEMENT = "Displacement: how far apart true and predicted motion put a true part's centroid."
+_DISPLACEMENT = "Displacement error: how far apart true and predicted motion put a true part's centroid."
 _NO_POSES = (
     "True flow: scene_flow, from each frame to the next. No poses in the truth: motions of parts aren't compared."
 )
@@ -24,8 +24,8 @@ def motion_tables(report: MotionReport) -> list[TextTable]:
     rows = class_rows(report.main, report.classes, report.class_names)
     unit = f" ({report.length_unit})" if report.length_unit else ""
     shares = [f"{name} {tau:g}" for tau in TAUS for name in SHARE_TITLES.values()]
-    header = ["sequences of", "pairs", "points", f"EPE3D{unit}", "no motion", *shares]
-    parts = ["sequences of", "true parts", "matched", "rotation (deg)", f"displacement{unit}"]
+    header = ["class", "pairs", "points", f"EPE3D{unit}", f"no motion{unit}", *shares]
+    parts = ["class", "true parts", "matched parts", "rotation error (deg)", f"displacement error{unit}"]
     return [
         TextTable("Flow", header, [_flow_row(*row) for row in rows]),
         *([TextTable("Motions of matched parts", parts, list(starmap(_part_row, rows)))] if report.from_poses else []),
@@ -37,8 +37,8 @@ def _interval_rows(report: MotionReport, unit: str) -> list[list[str]]:
     main, found = report.main, report.intervals
     lengths = (
         ("epe3d", f"EPE3D{unit}", main.epe3d),
-        ("part_rotation", "rotation (deg)", np.degrees(main.rotation)),
-        ("part_displacement", f"displacement{unit}", main.displacement),
+        ("part_rotation", "rotation error (deg)", np.degrees(main.rotation)),
+        ("part_displacement", f"displacement error{unit}", main.displacement),
     )
     lengths = lengths if report.from_poses else lengths[:1]
     rows = [[title, four_digits(value), four_digit_ends(found.get(key))] for key, title, value in lengths]

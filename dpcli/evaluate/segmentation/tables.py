@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.segmentation.metrics import SegmentationMetrics
 from dpcli.evaluate.segmentation.motion_protocol import MotionReport
 from dpcli.evaluate.segmentation.protocol import FIXES, SegmentationReport
 from dpcli.evaluate.segmentation.result_json import segmentation_scores
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
-
-TITLES = {"ap": "AP", "pq": "PQ", "f1": "F1", "pre": "Pre", "rec": "Rec", "miou": "mIoU", "ri": "RI"}
 
 
 def class_rows(main: Any, classes: Mapping[int, Any], names: list[str]) -> list[tuple[str, Any]]:
@@ -29,15 +28,15 @@ def interval_tables(report: SegmentationReport | MotionReport, rows: list[list[s
 
 def segmentation_tables(report: SegmentationReport) -> list[TextTable]:
     """Returns one row for each class and for all, in percent, and a table of the intervals."""
-    header = ["sequences of", "number", "frames", "true parts", "predicted", "found", *TITLES.values()]
-    rows = [_segmentation_row(*row) for row in class_rows(report.main, report.classes, report.class_names)]
-    main = TextTable("Parts (AP, PQ, F1, Pre, Rec at IoU 0.5)", header, rows)
     values = segmentation_scores(report.main)
+    header = ["class", "sequences", "frames", "true parts", "predicted", "found"]
+    rows = [_segmentation_row(*row) for row in class_rows(report.main, report.classes, report.class_names)]
+    main = TextTable("Parts (AP, PQ, F1, precision, recall at IoU 0.5)", [*header, *map(title_of, values)], rows)
     return [
         main,
         *interval_tables(
             report,
-            [[title, percent(values[key]), percent_ends(report.intervals.get(key))] for key, title in TITLES.items()],
+            [[title_of(key), percent(value), percent_ends(report.intervals.get(key))] for key, value in values.items()],
         ),
     ]
 
@@ -51,9 +50,9 @@ def segmentation_notes(report: SegmentationReport) -> list[str]:
     """Returns sentences on what was counted and how, and what was left out."""
     main = report.main
     lines = [
-        f"Split {report.split!r}, truth: {report.truth}. AP, PQ, F1, Pre, Rec: {main.true_positives} found of "
+        f"Split {report.split!r}, truth: {report.truth}. AP, PQ, F1, precision, recall: {main.true_positives} found of "
         f"{main.truth_parts} true parts, {main.predictions} predictions, pooled over {main.frames} frames; "
-        f"mIoU, RI: mean over the frames of each of {main.objects} sequences, then over these.",
+        f"mIoU, Rand index: mean over the frames of each of {main.objects} sequences, then over these.",
         *resampling_note(report.resampling, "sequences", len(report.names)),
         *_protocol_notes(report.protocol),
     ]

@@ -106,7 +106,7 @@ def _part_table(score: PartScore) -> TextTable:
 
 
 def _track_table(score: TrackScore, unit: str) -> TextTable:
-    header = ["tracks of", f"EPE{f' ({unit})' if unit else ''}", "of the diameter", "points", "frames"]
+    header = ["tracks of", f"EPE{f' ({unit})' if unit else ''}", "EPE / diameter", "points", "frames"]
     rows = [
         [name, four_digits(error), _percent(error, score.diameter), str(score.points), str(score.frames)]
         for name, error in (("the scene", score.epe), ("no motion", score.static))
@@ -146,16 +146,20 @@ def video_notes(report: VideoReport) -> list[str]:
 
 
 def _picture_notes(report: VideoReport) -> list[str]:
-    said, (width, height) = describe_protocol(report.protocol), report.size
+    choices, (width, height) = describe_protocol(report.protocol), report.size
     counts = f"{len(report.views)} view{'s' if len(report.views) > 1 else ''}, {_frames(report.views)} frames"
     lines = [
-        f"{counts} of {width}x{height} pixels over {said['background']}, {said['colors']}, size: {said['size']}; "
-        f"data range {said['data_range']}; means {said['mean']}.",
-        *(f"{TITLES[name].removesuffix(' (dB)')}: {said[name]}." for name in report.names if name in PICTURE_METRICS),
+        f"{counts} of {width}x{height} pixels over {choices['background']}, {choices['colors']}, size: {choices['size']}; "
+        f"data range {choices['data_range']}; means {choices['mean']}.",
+        *(
+            f"{TITLES[name].removesuffix(' (dB)')}: {choices[name]}."
+            for name in report.names
+            if name in PICTURE_METRICS
+        ),
     ]
     exact, empty = (sum(getattr(view.metrics, key) for view in report.views) for key in ("exact", "without_object"))
     if "psnr_foreground" in report.names:
-        lines.append(f"A wide {said['background']} background raises PSNR and SSIM, but not PSNR on object.")
+        lines.append(f"A wide {choices['background']} background raises PSNR and SSIM, but not PSNR on object.")
     if exact:
         lines.append(f"{exact} frames are equal and count as {PSNR_CAP:g} dB.")
     if empty and "psnr_foreground" in report.names:

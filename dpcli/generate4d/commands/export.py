@@ -1,11 +1,19 @@
-"""What `dpc generate4d export` does; the options are in `cli/generate4d/export.py`."""
+"""Does the work of `dpc generate4d export`; the options are in `cli/generate4d/export.py`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from dpcli.errors import UsageError
-from dpcli.generate4d.out.export import as_sequence, export_file, export_sequence, keep_opaque, write_clouds, write_json
+from dpcli.generate4d.out.export import (
+    as_sequence,
+    export_file,
+    export_sequence,
+    keep_opaque,
+    tables_beside,
+    write_clouds,
+    write_json,
+)
 from dpcli.generate4d.out.formats import Axes, Format
 from dpcli.generate4d.out.splat_files import camera_list
 from dpcli.runtime import provenance
@@ -88,4 +96,5 @@ def _export_files(
         export_file(scene, output, kind, time=time, axes=axes)
     else:
         paths = export_sequence(scene, output, kind, axes=axes, force=force)
-        log.info(f"{output}: {paths[0].name} to {paths[-1].name}, cameras.json, metrics.json")
+        beside = ", ".join(path.name for path in tables_beside(output))
+        log.info(f"{output}: {paths[0].name} to {paths[-1].name}; beside it {beside}")

@@ -1,4 +1,4 @@
-"""What `dpc generate4d fit` does; the options are in `cli/generate4d/fit.py`."""
+"""Does the work of `dpc generate4d fit`; the options are in `cli/generate4d/fit.py`."""
 
 from __future__ import annotations
 

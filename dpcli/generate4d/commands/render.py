@@ -1,4 +1,4 @@
-"""What `dpc generate4d render` does; the options are in `cli/generate4d/render.py`."""
+"""Does the work of `dpc generate4d render`; the options are in `cli/generate4d/render.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `dpc generate4d view` does; the options are in `cli/generate4d/view.py`."""
+"""Does the work of `dpc generate4d view`; the options are in `cli/generate4d/view.py`."""
 
 from __future__ import annotations
 

@@ -57,13 +57,16 @@ def export_sequence(
     times: Sequence[float] | None = None,
     force: bool = False,
 ) -> list[Path]:
-    """Writes frame0001.ply (or .splat), ... into `folder`, with cameras.json and metrics.json; returns the frames' paths.
+    """Writes frame0001.ply (or .splat), ... into `folder`, cameras and metrics as .json beside it; returns the frames' paths.
 
-    Players show files of such names as a clip. The folder appears whole. Raises UsageError when it exists and `force` is
-    off, which would replace it.
+    Players show a folder as a clip when it holds nothing but files of such names: see `tables_beside`. The folder appears
+    whole. Raises UsageError when it exists and `force` is off, which would replace it.
     """
     if folder.exists() and not force:
         raise UsageError(f"{folder}: exists already; --force replaces it")
+    taken = [path for path in tables_beside(folder) if path.exists()]
+    if taken and not force:
+        raise UsageError(f"{taken[0]}: exists already; --force replaces it")
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
     check_replaced(folder, ("frame*.ply", "frame*.splat", "cameras.json", "metrics.json"))
@@ -75,11 +78,21 @@ def export_sequence(
             _make_folder(part, folder)
             for name, time in zip(names, times, strict=True):
                 export_file(scene, part / name, form, time=time, axes=axes)
-            write_json(part / "cameras.json", camera_list(scene, axes))
-            write_json(part / "metrics.json", scene.metrics)
+        cameras, metrics = tables_beside(folder)
+        write_json(cameras, camera_list(scene, axes))
+        write_json(metrics, scene.metrics)
     except OSError as error:
         raise DpcError(f"{folder}: cannot be written ({error.strerror})") from None
     return [folder / name for name in names]
+
+
+def tables_beside(folder: Path) -> tuple[Path, Path]:
+    """Returns where the cameras and metrics of a folder of frames are written: `frames_cameras.json` beside `frames`.
+
+    >>> tables_beside(Path("frames"))[0].name
+    'frames_cameras.json'
+    """
+    return folder.with_name(f"{folder.name}_cameras.json"), folder.with_name(f"{folder.name}_metrics.json")
 
 
 def _make_folder(part: Path, folder: Path) -> None:

@@ -170,7 +170,9 @@ def blend_motions(
 
     The thesis writes R x + t, a position, in place of the displacement. Quaternions must lie in one hemisphere.
     """
-    return weight * rigid + (1 - weight) * rest, normalize_quaternion(weight * rigid_turn + (1 - weight) * turn)
+    # the turn first: gradients of a shared term are summed in the order of its uses, and the sums are kept to the bit
+    both = normalize_quaternion(weight * rigid_turn + (1 - weight) * turn)
+    return weight * rigid + (1 - weight) * rest, both
 
 
 def add_motions(rigid: Tensor, rigid_turn: Tensor, rest: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:

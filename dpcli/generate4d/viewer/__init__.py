@@ -37,10 +37,13 @@ def write_page(
     page = filled(
         source_text("page.html", __package__),
         {
-            "TITLE": html.escape(title), "STYLE": source_text(STYLE), "HEADER": as_json(header), "DATA": as_base64(blob),
+            "TITLE": html.escape(title),
+            "STYLE": source_text(STYLE),
+            "HEADER": as_json(header),
+            "DATA": as_base64(blob),
             "SCRIPT": f"{script_text(SHARED)}\n{script_text(SCRIPTS, __package__)}",
         },
-    )  # fmt: skip
+    )
     return assemble.write_page(page, path)
 
 
@@ -51,7 +54,7 @@ def _box(scene: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def packed(scene: GaussianScene) -> dict[str, np.ndarray]:
-    """What the page reads, in its order. Moving things are differences to the frame before, which compress better;
+    """Packs what the page reads, in its order. Moving things are differences to the frame before, which compress better;
     bytes of 16-bit numbers lie apart, low bytes first: position u8 (2,T,3,N), turn u8 (T,4,N), weight u8 (T,N), scale
     f32 (3,N), color u8 (4,N) with opacity, part u8 (N) = id + 1."""
     low, extent = _box(scene)

@@ -267,7 +267,7 @@ def back_xyz(hidden, dense, constant, order, values, starts, weight, grad_weight
 def back_table(
     hidden, dense, constant, order, values, starts, weight, grad_weight, idx, first, to_table, to_offset, nodes
 ):
-    """As `back_xyz`, through the ReLU of `hidden_table`: to_table[idx[r]] += g and to_offset[i] = sum of g.
+    """Does as `back_xyz`, through the ReLU of `hidden_table`: to_table[idx[r]] += g and to_offset[i] = sum of g.
 
     to_table (blocks*B*N*2*WIDTH), in blocks of channels (rows of all channels would fall on few sets of the cache),
     to_offset (B*M*C1), nodes = N.

@@ -24,7 +24,7 @@ _ARITHMETIC = {"contract", "nsz", "arcp", "reassoc"}
 
 
 def kernel(function: Callable) -> Callable:
-    """For searches, whose indices and distances must equal the reference's; compiled on first call.
+    """Compiles a search, whose indices and distances must equal the reference's, on its first call.
 
     Serial by design: callers spread work over plain threads (`backend.run_in_threads`), which unlike numba's parallel
     mode survives a fork. Where no cache folder is writable the kernel is compiled anew in each process. Helpers belong
@@ -34,12 +34,12 @@ def kernel(function: Callable) -> Callable:
 
 
 def inlined(function: Callable) -> Callable:
-    """A helper of a `kernel` whose text goes into the caller: for what is called once a microsecond."""
+    """Compiles a helper of a `kernel` whose text goes into the caller: for what is called once a microsecond."""
     return _compiled(function, nogil=True, fastmath=_FLAGS, error_model="numpy", inline="always")
 
 
 def arithmetic_kernel(function: Callable) -> Callable:
-    """As `kernel`, but infinities and NaN pass through as IEEE 754 has them: for work on values nobody has checked."""
+    """Compiles as `kernel`, but infinities and NaN pass through as IEEE 754 has them: for work on values nobody has checked."""
     return _compiled(function, nogil=True, error_model="numpy")
 
 
@@ -54,7 +54,7 @@ def _compiled(function: Callable, **options: object) -> Callable:
 
 
 def parallel_kernel(function: Callable) -> Callable:
-    """For floating-point work on numba's own threads: contraction and reordering allowed, results to rounding only.
+    """Compiles floating-point work for numba's own threads: contraction and reordering allowed, results to rounding only.
 
     Must not run in a process that forks afterwards; `parallel.parallel_kernels` loads modules that use it.
     """
@@ -62,5 +62,5 @@ def parallel_kernel(function: Callable) -> Callable:
 
 
 def piece_kernel(function: Callable) -> Callable:
-    """As `parallel_kernel`, but serial and without the GIL: for work that plain threads share among them."""
+    """Compiles as `parallel_kernel`, but serial and without the GIL: for work that plain threads share among them."""
     return _compiled(function, nogil=True, fastmath=_ARITHMETIC, error_model="numpy")

@@ -192,7 +192,7 @@ def ball_query_kernel(xyz, times, centroids, centroid_times, limits, nearest, in
 
 @kernel
 def _frame_hits(x, y, z, low, high, cx, cy, cz, limit, block, row):
-    """As `_first_hits` among points low..high-1 of one frame, whose limit is the same for all."""
+    """Does as `_first_hits` among points low..high-1 of one frame, whose limit is the same for all."""
     filled = 0
     for first in range(low, high, _BLOCK):
         size = min(_BLOCK, high - first)
@@ -256,7 +256,7 @@ def _balanced_clip(points, times, centroids, centroid_times, limits, shares, low
 
 @kernel
 def balanced_query_kernel(points, times, centroids, centroid_times, limits, shares, index, count, first, last):
-    """As `ball_query_kernel`, but slots are shared among frames: shares (2R-1,) i64. points (B,N,3) f32."""
+    """Does as `ball_query_kernel`, but slots are shared among frames: shares (2R-1,) i64. points (B,N,3) f32."""
     rows = centroids.shape[1]
     while first < last:
         b = first // rows

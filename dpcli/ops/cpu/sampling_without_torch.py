@@ -14,6 +14,9 @@ def fps_numpy(points: np.ndarray, num_samples: int, *, start: int = 0) -> np.nda
     One thread; ties to the lowest index; num_samples beyond N repeats the sequence from its beginning.
     DPC_BACKEND=torch, or numba missing, selects the plain numpy loop. Raises ValueError on a wrong shape, an empty
     cloud, non-finite coordinates, or start out of range.
+
+    >>> fps_numpy(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]]), 3).tolist()
+    [0, 3, 2]
     """
     points = np.ascontiguousarray(points, np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:

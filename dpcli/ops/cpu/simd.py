@@ -64,6 +64,8 @@ def _is_vector(array) -> bool:
 
 @intrinsic
 def lanes(typingctx, scalar):
+    """Repeats a scalar in eight lanes."""
+
     def codegen(context, builder, signature, args):
         return _vector(builder, args[0])
 
@@ -72,6 +74,8 @@ def lanes(typingctx, scalar):
 
 @intrinsic
 def ramp(typingctx):
+    """Returns the lanes 0..7."""
+
     def codegen(context, builder, signature, args):
         return ir.Constant(_FLOATS, [float(lane) for lane in range(WIDTH)])
 
@@ -80,6 +84,8 @@ def ramp(typingctx):
 
 @intrinsic
 def load(typingctx, array, index):
+    """Reads eight values of a C-contiguous float32 vector from element `index` on."""
+
     if not _is_vector(array):
         return None
 
@@ -91,6 +97,8 @@ def load(typingctx, array, index):
 
 @intrinsic
 def store(typingctx, array, index, value):
+    """Writes eight values into a C-contiguous float32 vector from element `index` on."""
+
     if not _is_vector(array):
         return None
 
@@ -141,6 +149,8 @@ for _symbol, _method in ((operator.add, "fadd"), (operator.sub, "fsub"), (operat
 
 @intrinsic
 def where_lower(typingctx, a, b, x, y):
+    """Takes x in the lanes where a < b, y in the others."""
+
     def codegen(context, builder, signature, args):
         return builder.select(builder.fcmp_ordered("<", args[0], args[1]), args[2], args[3])
 
@@ -149,6 +159,8 @@ def where_lower(typingctx, a, b, x, y):
 
 @intrinsic
 def reciprocal(typingctx, value):
+    """Computes 1 / v in each lane."""
+
     def codegen(context, builder, signature, args):
         return builder.fdiv(_constant(1.0), args[0])
 
@@ -186,6 +198,8 @@ def power_of_two(typingctx, value):
 
 @intrinsic
 def total(typingctx, value):
+    """Sums the lanes, always in the same order."""
+
     def codegen(context, builder, signature, args):
         v = args[0]
         for step in (4, 2, 1):
@@ -198,6 +212,8 @@ def total(typingctx, value):
 
 @intrinsic
 def any_lower(typingctx, a, b):
+    """Tells whether a < b in any lane."""
+
     def codegen(context, builder, signature, args):
         bits = builder.bitcast(builder.fcmp_ordered("<", *args), ir.IntType(WIDTH))
         return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(WIDTH), 0))
@@ -207,6 +223,8 @@ def any_lower(typingctx, a, b):
 
 @intrinsic
 def claim(typingctx, counter):
+    """Counts element 0 of an int64 vector up, once for each thread that asks, and returns what it was."""
+
     if not (isinstance(counter, types.Array) and counter.ndim == 1 and counter.dtype == types.int64):
         return None
 

@@ -1,6 +1,6 @@
 """Batched small inverses in numba: `TILE` matrices side by side, entry by entry, so that the arithmetic vectorizes.
 
-Mirrors `linalg._inverse` for n <= 8: one block partition at most, whose blocks have the closed form.
+Mirrors `ops.small_inverses._inverse` for n <= 8: one block partition at most, whose blocks have the closed form.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import numpy as np
 from dpcli.ops.cpu.jit import arithmetic_kernel
 
 TILE = 64  # matrices per tile: an 8x8 tile of float32 is 16 kB
-_SIGNED, _NONE = 0, 2  # positions in linalg.GUARDS
+_SIGNED, _NONE = 0, 2  # positions in ops.small_inverses.GUARDS
 
 
 @arithmetic_kernel
@@ -265,7 +265,7 @@ def _eliminate(m, sides):
 
 @arithmetic_kernel
 def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
-    """Coefficients of fits from their moments (centroids*entries*groups), flat, in `kernels_surface`'s order: planes
+    """Coefficients of fits from their moments (centroids*entries*groups), flat, in the order of `surface_fit`: planes
     (centroids*n*groups) solve the normal equations, n <= 8; with a ridge by elimination, else by the guarded inverse."""
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2

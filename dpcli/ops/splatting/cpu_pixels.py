@@ -1,9 +1,9 @@
-"""CPU kernels of `splatting`: the pixels of tiles, forward and backward, from the lists of `kernels_splat_lists`.
+"""CPU kernels of `splatting`: the pixels of tiles, forward and backward, from the lists of `cpu_tile_lists`.
 
 Within a tile a Gaussian visits only the rows of its box. Workers take tiles off a `counter` (1 i64, zero), longest
 lists first. No two workers write to one place and every sum has a fixed order: results repeat exactly on any number of
 threads. Arrays are C-contiguous float32 unless said otherwise, `flat` ones seen as a vector; letters, `packed`, `box`,
-`pair_start` and the lists as in `kernels_splat_lists`, D channels. Opacities (1 or C,N) and colors (1 or C,N,D) may
+`pair_start` and the lists as in `cpu_tile_lists`, D channels. Opacities (1 or C,N) and colors (1 or C,N,D) may
 serve all cameras. Indices are unsigned where it matters: numba then leaves out its test for negative ones.
 """
 

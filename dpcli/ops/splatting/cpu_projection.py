@@ -1,4 +1,4 @@
-"""CPU kernels of `splatting`: projecting Gaussians, forward and backward. The steps are `splatting_torch.project_torch`'s.
+"""CPU kernels of `splatting`: projecting Gaussians, forward and backward. The steps are `torch_reference.project_torch`'s.
 
 Arithmetic is float64 in registers, arrays are C-contiguous float32. What serves all cameras has 1 in place of C. With
 U = J W R (2,3) the 2D covariance is U S S U^T + eps2d I; the backward pass recomputes U from the inputs.

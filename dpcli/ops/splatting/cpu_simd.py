@@ -1,4 +1,4 @@
-"""Two more operations on `kernels_simd`'s lanes, for `kernels_splat`: eight sums at once, and 2^v with fewer steps.
+"""Two more operations on the lanes of `ops.cpu.simd`, for `cpu_pixels`: eight sums at once, and 2^v with fewer steps.
 
 What the inner loops compare and multiply with comes from memory, as an argument of the kernel: numba's code would
 otherwise build each constant anew for every row of pixels, about a third of its instructions.
@@ -25,7 +25,7 @@ OWN = 3 + len(_EXP2)  # constants before `more`
 
 @intrinsic
 def power(typingctx, table, value):
-    """2^v as `kernels_simd.power_of_two`, with its numbers from `constants`; v below -126 counts as that, above 127 not."""
+    """Returns 2^v as `simd.power_of_two`, with its numbers from `constants`; v below -126 counts as that, above 127 not."""
     if not _is_vector(table):
         return None
 

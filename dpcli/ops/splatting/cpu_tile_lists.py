@@ -1,6 +1,6 @@
 """CPU kernel of `splatting`: which Gaussians each tile holds, nearest first.
 
-A tile is one column of 8 lanes (`kernels_simd`) and TALL rows. Gaussians reach a tile in order of (depth, index): a
+A tile is one column of 8 lanes (`ops.cpu.simd`) and TALL rows. Gaussians reach a tile in order of (depth, index): a
 radix sort per camera, then blocks of the order are counted and listed side by side; how many blocks never shows.
 Arrays are C-contiguous float32 unless said otherwise; C cameras, N Gaussians, T tiles (all cameras'), P pairs of a tile
 and a Gaussian. Opacities (1 or C,N) may serve all cameras.
@@ -114,7 +114,7 @@ def _sort(depths, radii, order):
 
 @arithmetic_kernel
 def _count(listed, box, across, cursor):
-    """How many of the listed Gaussians touch each tile: cursor (tiles); return how many pairs they are."""
+    """Counts the listed Gaussians that touch each tile into cursor (tiles), and returns the number of pairs."""
     cursor[:] = 0
     pairs = 0
     for n in listed:

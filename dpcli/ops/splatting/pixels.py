@@ -1,4 +1,4 @@
-"""From projected Gaussians to pixels on a CPU: the autograd function around the kernels of `kernels_splat`."""
+"""Turns projected Gaussians into pixels on a CPU: the autograd function around the kernels of `cpu_pixels`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def pixels_numba(
     width: int,
     height: int,
 ) -> tuple[Tensor, Tensor]:  # [C, H, W, D], [C, H, W, 1]
-    """Composited colors (no background) and alphas, float32; as `splatting_torch.pixels_torch`, with gradients."""
+    """Returns composited colors (no background) and alphas, float32; as `torch_reference.pixels_torch`, with gradients."""
     tensors = [t.contiguous() for t in (means2d, conics, colors, opacities)]
     out, alphas = _Pixels.apply(*tensors, radii.contiguous(), depths.detach().contiguous(), width, height)
     return out, alphas[..., None]
@@ -29,7 +29,7 @@ def pixels_numba(
 
 @dataclass
 class _Lists:
-    """Which Gaussians each tile holds, nearest first; the arrays of `kernels_splat_lists`."""
+    """Lists the Gaussians that each tile holds, nearest first, in the arrays of `cpu_tile_lists`."""
 
     tasks: np.ndarray
     tile_start: np.ndarray

@@ -1,4 +1,4 @@
-"""Projecting Gaussians on a CPU: the autograd function around the kernels of `kernels_splat_project`."""
+"""Projecting Gaussians on a CPU: the autograd function around the kernels of `cpu_projection`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def project_numba(
     radius_clip: float,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # [C, N, 2], [C, N, 3], [C, N], [C, N, 2] i32
-    """As `splatting_torch.project_torch`, with gradients of means, quats and scales; those of unseen Gaussians are zero."""
+    """Projects as `torch_reference.project_torch`, with gradients of means, quats and scales; those of unseen Gaussians are zero."""
     tensors = [t.contiguous() for t in (means, quats, scales)]
     limits = tuple(float(value) for value in (near_plane, far_plane, radius_clip, eps2d))
     return _Projection.apply(*tensors, opacities.detach().contiguous(), viewmats, Ks, width, height, limits)

@@ -1,6 +1,6 @@
 """Differentiable rendering of 3D Gaussians, called as gsplat's `rasterization` and with the constants of its 1.5.3.
 
-Projection (`splatting_torch`, `splatting_projection`) and compositing (`splatting_torch`, `splatting_pixels`) each have
+Projection (`torch_reference`, `projection`) and compositing (`torch_reference`, `pixels`) each have
 a torch reference and a fast CPU form; on CUDA compositing is gsplat's own kernel where that package imports.
 """
 
@@ -40,7 +40,7 @@ def rasterization(
     backgrounds: Tensor | None = None,  # [C, D]
     render_mode: str = "RGB",
 ) -> tuple[Tensor, Tensor, dict]:  # [C, H, W, D], [C, H, W, 1], notes
-    """Colors, alphas and notes of C pinhole pictures of N Gaussians (Kerbl et al. 2023), with gradients.
+    """Renders colors, alphas and notes of C pinhole pictures of N Gaussians (Kerbl et al. 2023), with gradients.
 
     quats w x y z of any length; scales linear (standard deviations, the unit of means); opacities 0..1; viewmats world to
     camera, OpenCV axes; Ks without skew; pixel centers at +0.5. A leading C means that each camera sees its own (say,
@@ -53,6 +53,13 @@ def rasterization(
     radii (C,N,2) i32, 0 where unseen, opacities, width, height, n_cameras.
     Gradients reach all tensors but Ks; float32 is fast, float64 always takes the reference. Raises ValueError on wrong
     shapes, values that aren't finite, an unknown render_mode.
+
+    >>> mean, size = torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 0.2)
+    >>> lens = torch.tensor([[[8.0, 0.0, 4.5], [0.0, 8.0, 4.5], [0.0, 0.0, 1.0]]])
+    >>> red, turn = torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    >>> colors, alphas, _ = rasterization(mean, turn, size, torch.tensor([0.5]), red, torch.eye(4)[None], lens, 9, 9)
+    >>> colors.shape, round(alphas[0, 4, 4].item(), 3), alphas[0, 0, 0].item()  # the middle, and a corner it doesn't reach
+    (torch.Size([1, 9, 9, 3]), 0.5, 0.0)
     """
     return _render(
         False,
@@ -144,7 +151,7 @@ def _render(
 
 
 def _finished(out: Tensor, alphas: Tensor, backgrounds: Tensor | None, render_mode: str) -> Tensor:
-    """Depth divided by alpha where it is to be the expected one, and the background behind the colors."""
+    """Returns depth divided by alpha where it is to be the expected one, and the background behind the colors."""
     if render_mode.endswith("ED"):
         out = torch.cat([out[..., :-1], out[..., -1:] / alphas.clamp(min=1e-10)], -1)
     if backgrounds is None or render_mode in ("D", "ED"):
@@ -156,7 +163,7 @@ def _finished(out: Tensor, alphas: Tensor, backgrounds: Tensor | None, render_mo
 def _features(
     colors: Tensor, means: Tensor, depths: Tensor, viewmats: Tensor, sh_degree: int | None, mode: str
 ) -> Tensor:
-    """What is composited: colors, SH evaluated, with or instead of them depth; (1 or C,N,D)."""
+    """Returns what is composited: colors, SH evaluated, with or instead of them depth; (1 or C,N,D)."""
     if mode in ("D", "ED"):
         return depths[..., None]
     if sh_degree is not None:
@@ -191,7 +198,7 @@ def _pixels(reference: bool, means: Tensor, tile_size: int) -> Callable:
 
 @functools.cache
 def gsplat_available() -> bool:
-    """Whether gsplat and its compiled kernels import; says so once on stderr if the package is there but they don't."""
+    """Returns whether gsplat and its compiled kernels import; says so once on stderr if the package is there but they don't."""
     try:
         from gsplat.cuda._backend import _C
     except ImportError:

@@ -12,14 +12,18 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
-from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, has_images, read_depth_video
+from dpcli.prepare.actions.depth_units import require_plausible, usual_scale, without_marks
+from dpcli.prepare.decode.calibration import Calibration
+from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, DepthVideo, frame_series, read_depth_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
+from dpcli.prepare.recordings.depth import read_recorded_depth
+from dpcli.prepare.recordings.recording import find_recordings, is_recording
+from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
-DEFAULT_FPS = 30.0
 BACKGROUNDS = ("none", "median", "first")
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
 
@@ -58,8 +62,10 @@ class DepthVideos:
     stride: int = 1
     labels: Path | None = None
     label_from_folder: bool = False
+    calibration: Calibration | None = None
+    pattern: str = ""
+    topic: str = ""
     length_unit: ClassVar[str] = "m"
-    fields: ClassVar[tuple[str, ...]] = ("time",)
 
     def __post_init__(self) -> None:
         if self.background not in BACKGROUNDS:
@@ -70,7 +76,7 @@ class DepthVideos:
             raise UsageError(f"--depth-scale {self.depth_scale:g}: expected raw units per meter, more than 0")
         if self.fps is not None and not self.fps > 0:
             raise UsageError(f"--fps {self.fps:g}: expected more than 0")
-        if self.intrinsics and self.fov is not None:
+        if (self.intrinsics or self.calibration) and self.fov is not None:
             raise UsageError("--fov and intrinsics were both given; use one")
         if self.labels and self.label_from_folder:
             raise UsageError("--labels and --label-from-folder were both given; use one")
@@ -83,9 +89,22 @@ class DepthVideos:
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""
-        values = {k: v for k, v in asdict(self).items() if k not in ("inputs", "labels", "label_from_folder", "far")}
-        folders = {"label_from_folder": True} if self.label_from_folder else {}
-        return {**values, "far": self.far if np.isfinite(self.far) else None, **folders}
+        apart = ("inputs", "labels", "label_from_folder", "far", "calibration", "pattern", "topic")
+        values = {k: v for k, v in asdict(self).items() if k not in apart}
+        given = {"label_from_folder": self.label_from_folder, "pattern": self.pattern, "topic": self.topic}
+        if self.calibration:
+            given["calibration"] = {k: v for k, v in asdict(self.calibration).items() if k != "source"}
+        return {**values, "far": self.far if np.isfinite(self.far) else None, **{k: v for k, v in given.items() if v}}
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Returns ``time`` when the seconds of every frame are known."""
+        return ("time",) if self._timed else ()
+
+    @cached_property
+    def _timed(self) -> bool:
+        """Returns whether the time of every frame is known: by ``fps``, by time stamps, or because all names are times."""
+        return self.fps is not None or all(_tells_time(item) for item in self._found)
 
     @cached_property
     def _table(self) -> LabelTable | None:
@@ -95,13 +114,13 @@ class DepthVideos:
 
     @cached_property
     def _found(self) -> list[Item]:
-        paths = [(found, given) for given in self.inputs for found in find_videos(given)]
+        paths = [(*found, given) for given in self.inputs for found in find_videos(given, self.pattern)]
         items: dict[str, Item] = {}
-        for path, given in paths:
+        for path, series, given in paths:
             name = as_utf8(path.relative_to(given).as_posix() if path != given else path.name)
             if name in items:
                 raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
-            items[name] = Item(name, path)
+            items[name] = Item(name, path, extra={"series": series, "recording": is_recording(path)})
         return list(items.values())
 
     def items(self) -> list[Item]:
@@ -110,66 +129,128 @@ class DepthVideos:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        video = read_depth_video(item.path, self.stride)
-        depth, unit = self._raw(video.frames, item.path)
+        video, recorded = self._video(item)
+        camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
+        scale = self._scale(video.frames.dtype)
+        depth, notes = without_marks(video.frames)
+        depth, unit = self._inverted(depth, item.path), 1 / scale
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
             still = background_depth(depth, self.background)
             depth[(still > 0) & (depth > still - np.float32(self.margin))] = 0
-        points, counts = back_project(depth, self._camera(*depth.shape[1:]), unit=unit, near=self.near, far=self.far)
-        kept, notes = drop_empty_frames(str(item.path), counts)
-        rate = (self.fps or video.fps or DEFAULT_FPS) / self.stride
-        return Sample(
-            CloudSequence(item.name, points, offsets(counts[kept]), time=kept / rate, **describe(item)), notes
+        points, counts = back_project(depth, camera, unit=unit, near=self.near, far=self.far)
+        require_plausible(str(item.path), points[:, 2], scale, asked=self._declared_scale is not None)
+        kept, dropped = drop_empty_frames(str(item.path), counts)
+        sequence = CloudSequence(
+            item.name, points, offsets(counts[kept]), time=self._times(item, video, kept), **describe(item)
         )
+        if item.extra["recording"] and not (recorded or self.calibration or self.intrinsics or self.fov):
+            notes[f"recordings without camera_info, taken for {DEFAULT_FOV:g} degrees wide (--fov)"] = 1
+        return Sample(sequence, {**notes, **dropped})
 
-    def _raw(self, frames: np.ndarray, path: Path) -> tuple[np.ndarray, float]:
-        """Returns depth (T,H,W) as the sensor counts it, 0 = nothing seen, and how many meters one count is."""
+    def _video(self, item: Item) -> tuple[DepthVideo, Calibration | None]:
+        """Returns the frames of an item, and the camera that a recording describes."""
+        if not item.extra["recording"]:
+            return read_depth_video(item.path, self.stride, item.extra["series"]), None
+        frames, time, camera = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(frames, time), camera
+
+    def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
+        if not self._timed:
+            return None
+        series: Series | None = item.extra["series"]
+        if self.fps and series:
+            return series.frame_times(self.fps)[:: self.stride][kept]
+        if self.fps:
+            return kept * self.stride / self.fps
+        if video.time is None:
+            raise DataError(f"{item.path}: its frames have no time stamps that rise; give their rate with --fps")
+        return video.time[kept]
+
+    @property
+    def _declared_scale(self) -> float | None:
+        """Returns raw units per meter as the user or the calibration says them."""
+        return self.depth_scale or (self.calibration.depth_scale if self.calibration else None)
+
+    def _scale(self, kind: np.dtype) -> float:
+        """Returns raw units per meter: the user's, the calibration's, or what is usual for the type of number."""
+        if self.calibration and not self.depth_scale and kind.kind != "f":
+            self.calibration.require_clear_scale()
+        return self._declared_scale or usual_scale(kind)
+
+    def _inverted(self, frames: np.ndarray, path: Path) -> np.ndarray:
+        """Returns depth (T,H,W) as the sensor counts it, 0 = nothing seen."""
         kind = frames.dtype
-        if kind.kind == "f" and not np.isfinite(frames).all():
-            frames = np.nan_to_num(frames, nan=0, posinf=0, neginf=0)  # the usual marks for "no return"
-        usual = 1.0 if kind.kind == "f" else 100.0 if kind.itemsize == 1 else 1000.0  # raw units per meter
-        scale = self.depth_scale or usual
-        if self.invert:
-            if kind.kind != "u":
-                raise DataError(
-                    f"{path}: depths of type {kind}; --invert needs unsigned integers, whose range is known"
-                )
-            frames = np.where(frames > 0, np.iinfo(kind).max - frames, 0)
-        return frames, 1 / scale
+        if not self.invert:
+            return frames
+        if kind.kind != "u":
+            raise DataError(f"{path}: depths of type {kind}; --invert needs unsigned integers, whose range is known")
+        return np.where(frames > 0, np.iinfo(kind).max - frames, 0)
 
-    def _camera(self, height: int, width: int) -> Intrinsics:
-        if self.intrinsics:
-            return self.intrinsics
-        return Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
+    def _camera(self, width: int, height: int, recorded: Calibration | None) -> Intrinsics:
+        """Returns the user's camera, or the one that a recording describes, or one of a usual field of view."""
+        calibration = self.calibration or (None if self.intrinsics or self.fov else recorded)
+        if calibration:
+            return calibration.of_pictures(width, height)
+        return self.intrinsics or Intrinsics.from_field_of_view(self.fov or DEFAULT_FOV, width, height)
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
-        if not self.intrinsics and self.fov is None:
+        unknown = not (self.intrinsics or self.calibration or self.fov)
+        if unknown and not all(item.extra["recording"] for item in items):
             lines.append(
                 f"no intrinsics given: assuming a horizontal field of view of {DEFAULT_FOV:g} degrees (--fov, --fx ...)"
             )
+        if self.calibration:
+            lines += self.calibration.notes()
+        if not self._timed:
+            silent = [item.name for item in items if not _tells_time(item)]
+            lines.append(
+                f"no times are written: {', '.join(silent[:3])} {'say' if silent[1:] else 'says'} none (--fps)"
+            )
+        lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
         unlabeled = [item.name for item in items if item.label < 0]
         if self._table and unlabeled:
             lines.append(f"{len(unlabeled)} without a label in {self.labels}: {', '.join(unlabeled[:5])}")
         return lines
 
 
-def find_videos(path: Path) -> list[Path]:
-    """Returns the depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of images)."""
+def _tells_time(item: Item) -> bool:
+    """Returns whether an item says when its frames were taken: by time stamps inside, or by the names of its frames."""
+    series: Series | None = item.extra["series"]
+    stamped = item.extra["recording"] or item.path.suffix.lower() in VIDEO_SUFFIXES
+    return series.times() is not None if series else stamped
+
+
+def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None]]:
+    """Returns the depth videos that an input names: itself, or what a folder holds (videos, arrays, folders of frames).
+
+    Beside each folder stands the series of its frames. pattern: which files of a folder are its frames.
+    """
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
-    if not path.is_dir() or has_images(path):
-        return [path]
-    found, suffixes = [], (*VIDEO_SUFFIXES, ".npy")
+    if not path.is_dir() or is_recording(path):
+        return [(path, None)]
+    if own := frame_series(path, pattern):
+        return [(path, own)]
+    found: list[tuple[Path, Series | None]] = []
+    suffixes = (*VIDEO_SUFFIXES, ".npy")
+    found += [(recording, None) for recording in find_recordings(path)]
     for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
-        found += [below for name in folders if has_images(below := Path(folder, name))]
-        named = (Path(folder, name) for name in files if name.lower().endswith(suffixes))
-        found += [file for file in named if file.is_file()]
-    found.sort(key=lambda p: natural_key(p.relative_to(path).as_posix()))
+        folders[:] = [name for name in folders if not is_hidden(name)]
+        clips = [(Path(folder, name), frame_series(Path(folder, name), pattern)) for name in folders]
+        found += [(clip, series) for clip, series in clips if series]
+        if any(clip == Path(folder) for clip, _ in found):
+            files = [name for name in files if not name.lower().endswith(".npy")]  # its frames, or twins of these
+        named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))
+        found += [(file, None) for file in named if file.is_file()]
+    found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
+        asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         raise DataError(
-            f"{path}: no depth video in it; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)}"
+            f"{path}: no depth video in it{asked}; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)},"
+            " or recordings (.bag, .mcap, .db3)"
         )
     return found

@@ -14,6 +14,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode import zip_folders
+from dpcli.prepare.decode.calibration import read_calibration
 from dpcli.prepare.decode.folder_listing import folder_files, leads_out
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.decode.png import decode_depth_png
@@ -103,7 +104,7 @@ def named_intrinsics(text: str) -> Intrinsics:
         return INTRINSICS[text]
     if not Path(text).suffix:
         raise UsageError(f"--intrinsics {text}: expected {', '.join(INTRINSICS)} or a .json with fx fy cx cy")
-    return Intrinsics.from_json(Path(text))
+    return read_calibration(Path(text)).of_pictures(WIDTH, HEIGHT)
 
 
 def cross_subject_split(subject: int) -> str:

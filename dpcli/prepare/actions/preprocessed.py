@@ -37,7 +37,8 @@ def open_preprocessed(
     """Returns the reader for what is in a folder. form: which of the forms, or ``auto`` to tell it by the first file
     found.
 
-    Raises UsageError when an option is given that the form doesn't have. Raises DataError when the folder holds none of them.
+    Raises UsageError when an option is given that the form doesn't have. Raises DataError when the folder holds none
+    of them.
     """
     if form not in _FORMS:
         raise UsageError(f"--form {form}: expected one of {', '.join(_FORMS)}")

@@ -46,7 +46,9 @@ def read_regions(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def largest_component(mask: np.ndarray) -> np.ndarray:
-    """Returns the largest 4-connected component of a mask u8 (H,W) of 0 and 1; of equal ones the first in raster order."""
+    """Returns the largest 4-connected component of a mask u8 (H,W) of 0 and 1; of equal ones the first in raster
+    order.
+    """
     cv2 = load_cv2()
     _, labels = cv2.connectedComponents(mask, connectivity=4)
     areas = np.bincount(labels.reshape(-1)[np.flatnonzero(mask)], minlength=1)

@@ -72,7 +72,9 @@ class ArticulatedObject:
         return corners[:, :3], corners[:, 3].astype(np.int64)
 
     def poses(self, values: np.ndarray) -> np.ndarray:
-        """Returns body-to-root f64 (F,bodies,4,4) for joint values f64 (F,joints): forward kinematics, after ``follow``."""
+        """Returns body-to-root f64 (F,bodies,4,4) for joint values f64 (F,joints): forward kinematics, after
+        ``follow``.
+        """
         poses = np.tile(np.eye(4), (len(values), self.num_bodies, 1, 1))
         for joint, value in zip(self.joints, values.T, strict=True):
             poses[:, joint.child] = poses[:, joint.parent] @ joint.origin @ joint_motion(joint, value)

@@ -1,4 +1,4 @@
-"""Which objects train, validate and test: by category, or a share of the objects."""
+"""Splits of objects: each trains, validates or tests by its category, or by a draw with given shares."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import path_inside
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
 
@@ -106,6 +107,17 @@ def read_lists(raw: Path) -> tuple[tuple[str, str], ...]:
     return tuple(rooms)
 
 
+def _misplaced(data: Path, name: str) -> str:
+    """Returns what is wrong with a listed name that is not a folder's beside the list, "" when nothing is."""
+    if Path(name).name != name or name in (".", ".."):
+        return f"{data}: a list names {name!r}; expected the name of a folder beside it"
+    try:
+        path_inside(data, data, name)
+    except DataError as error:
+        return f"{data}: a list names a folder that is no room: {error}"
+    return ""
+
+
 @lru_cache(maxsize=4)
 def most_parts(raw: Path) -> int:
     """Returns how many parts every pose is padded to: the most objects of a room, one more if its first frame has
@@ -114,6 +126,8 @@ def most_parts(raw: Path) -> int:
     most = 1
     for name, _ in read_lists(raw):
         folder = raw / "data" / name
+        if _misplaced(raw / "data", name):
+            continue
         try:
             objects = np.load(folder / "pose_00.npy", mmap_mode="r", allow_pickle=False).shape[0]
             most = max(most, int(read_segmentation(folder / "segm_00.npy", objects).max()) + 1, objects)
@@ -142,9 +156,9 @@ class OgcRooms:
         items = []
         for name, split in rooms:
             folder = self.raw / "data" / name
-            problem = "" if folder.is_dir() else f"{folder}: in the list of the {split} split, but no such folder"
-            if Path(name).name != name or name in (".", ".."):
-                problem = f"{self.raw / 'data'}: a list names {name!r}; expected the name of a folder beside it"
+            problem = _misplaced(self.raw / "data", name)
+            if not problem and not folder.is_dir():
+                problem = f"{folder}: in the list of the {split} split, but no such folder"
             items.append(Item(name, folder, split=split, extra={"parts": parts}, problem=problem))
         return items
 

@@ -1,4 +1,4 @@
-"""Where the objects of a generated room stand and how they move: the recipe of OGC-DR (Song and Yang 2022)."""
+"""The layout of a generated room: objects stand on its floor and move, by the recipe of OGC-DR (Song and Yang 2022)."""
 
 from __future__ import annotations
 

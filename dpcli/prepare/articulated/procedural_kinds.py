@@ -1,4 +1,7 @@
-"""Kinds of procedural objects: furniture, appliances, tools. Each takes a Builder and a generator; z is up, -y the front."""
+"""Kinds of procedural objects: furniture, appliances, tools.
+
+Each takes a Builder and a generator; z is up, -y the front.
+"""
 
 from __future__ import annotations
 

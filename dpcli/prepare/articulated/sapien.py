@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
 from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
@@ -34,8 +35,8 @@ class FoundObject:
 def find_objects(raw: Path) -> tuple[FoundObject, ...]:
     """Returns every object below ``raw``, in natural order. A folder's mobility.urdf hides other URDF files beside it.
 
-    The category is the folder that holds the object's folder (Category/ID/mobility.urdf); without such a folder,
-    ``model_cat`` of the object's meta.json, as the original distribution has it.
+    The category is ``model_cat`` of the object's meta.json, as the original distribution has it; without that, the
+    folder that holds the object's folder (Category/ID/mobility.urdf). Objects may lie in the folders of others.
     """
     if not raw.exists():
         raise DataError(f"{raw}: does not exist; expected {_EXPECTED}")
@@ -43,56 +44,74 @@ def find_objects(raw: Path) -> tuple[FoundObject, ...]:
     if not files or files[0].suffix.lower() != ".urdf":
         raise DataError(f"{raw}: no URDF found; expected {_EXPECTED}")
     found = [_describe(raw, path) for path in files]
-    twice = [name for name, count in Counter(f.name for f in found).items() if count > 1]
-    if twice:
-        raise DataError(f"{raw}: {len(twice)} objects have the same category and name, such as {twice[0]}; rename one")
+    counts = Counter(f.name for f in found)
+    found = [f if counts[f.name] == 1 else replace(f, name=_long_name(raw, f)) for f in found]
     return tuple(sorted(found, key=lambda f: (f.category, natural_key(f.name))))
 
 
 def _urdf_files(raw: Path) -> list[Path]:
     files = []
     for folder, below, names in os.walk(raw):
-        urdf = sorted(name for name in names if name.lower().endswith(".urdf"))
+        urdf = sorted(name for name in names if name.lower().endswith(".urdf") and not name.startswith("."))
         files += [Path(folder, name) for name in (["mobility.urdf"] if "mobility.urdf" in urdf else urdf)]
-        below[:] = sorted(below) if not urdf else []  # meshes lie below an object, other objects don't
+        below[:] = sorted(name for name in below if not name.startswith("."))
     return files
 
 
 def _describe(raw: Path, path: Path) -> FoundObject:
-    name = path.resolve().parent.name if path.name == "mobility.urdf" else path.stem
+    name = path.absolute().parent.name if path.name == "mobility.urdf" else path.stem
     above = () if raw.is_file() else path.relative_to(raw).parts[:-1]
-    category = above[-2] if len(above) >= 2 else _model_category(path.parent / "meta.json")
+    category = _model_category(path.parent / "meta.json") or (above[-2] if len(above) >= 2 else "")
     return FoundObject(path, category, f"{category}_{name}" if category else name)
+
+
+def _long_name(raw: Path, found: FoundObject) -> str:
+    """Returns a name that tells objects of one category and name apart: the folders on the way to it."""
+    place = found.path.relative_to(raw)
+    place = place.parent if place.name == "mobility.urdf" else place.with_suffix("")
+    return "_".join([found.category, *place.parts] if found.category else place.parts)
 
 
 def _model_category(meta: Path) -> str:
     try:
-        return str(json.loads(meta.read_text())["model_cat"])
-    except (OSError, ValueError, KeyError, TypeError):
+        category = json.loads(meta.read_text())["model_cat"]
+        return category.strip() if isinstance(category, str) else ""
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return ""
 
 
 @lru_cache(maxsize=3)
-def _studied(path: Path, options: Articulation) -> Study:
+def _studied(path: Path, root: Path | None, options: Articulation) -> Study:
     """Studies an object; its meshes are read once for all its sequences, and a process keeps the last few objects."""
-    return study(load_object(read_skeleton(path)), options)
+    return study(load_object(read_skeleton(path, root)), options)
 
 
 @dataclass(frozen=True)
 class Sapien:
-    """Reads URDF objects. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how."""
+    """Reads URDF objects. ``pairs_per_object``: sequences drawn of every object; ``articulation``: how.
+
+    ``allow_outside``: meshes may lie outside the raw folder, or a raw file's folder; links and ``..`` may lead there.
+    """
 
     raw: Path
     pairs_per_object: int = 8
     articulation: Articulation = Articulation()
     split: SplitRule = SplitRule()
     seed: int = 0
+    allow_outside: bool = False
     length_unit: ClassVar[str] = "object diameter"
     fields: ClassVar[tuple[str, ...]] = ("part", "pose")
 
     def __post_init__(self) -> None:
         if self.pairs_per_object < 1:
             raise UsageError(f"--pairs-per-object {self.pairs_per_object}: expected 1 or more")
+
+    @property
+    def root(self) -> Path | None:
+        """Returns the folder that all files must lie in; None when they may lie anywhere."""
+        if self.allow_outside:
+            return None
+        return self.raw.parent if self.raw.is_file() else self.raw
 
     @property
     def class_names(self) -> list[str]:
@@ -109,7 +128,7 @@ class Sapien:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
         found = find_objects(self.raw)
         splits = self.split.assign([f.category for f in found], self.seed)
-        problems, joints = zip(*(_inspect(f.path) for f in found))
+        problems, joints = zip(*(_inspect(f.path, self.root, self.raw) for f in found))
         pad = min(self.articulation.max_parts, 1 + max(joints))
         names = self.class_names
         return [
@@ -127,7 +146,7 @@ class Sapien:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        studied = _studied(item.path, self.articulation)
+        studied = _studied(item.path, self.root, self.articulation)
         return draw_sequence(item.name, studied, self.articulation, item.extra["parts"], rng, **describe(item))
 
     def summary(self, items: list[Item]) -> list[str]:
@@ -139,13 +158,18 @@ class Sapien:
         return [f"{len(good)} objects{names} ({shares}), {self.pairs_per_object} sequences of each"]
 
 
-def _inspect(path: Path) -> tuple[str, int]:
-    """Returns (problem that shows without the meshes' content, number of joints)."""
+def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
+    """Returns (problem that shows without the meshes' content, number of joints). given: what the user named."""
     try:
-        skeleton = read_skeleton(path)
+        if path != given:
+            path_inside(root, path.parent, path.name)
+    except DataError as error:
+        return f"{path}: {error} (--allow-outside opens others)", 0
+    try:
+        skeleton = read_skeleton(path, root)
+        missing = missing_meshes(skeleton)
     except DataError as error:
         return str(error), 0
-    missing = missing_meshes(skeleton)
     if missing:
         more = f" and {len(missing) - 1} others" if len(missing) > 1 else ""
         return f"{path}: its mesh {missing[0]}{more} is missing", 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter, deque
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,25 +22,31 @@ _UNSUPPORTED = ("floating", "planar")
 
 @dataclass
 class Skeleton:
-    """Holds a URDF without its meshes. shapes: (body, 4x4 shape-to-body, geometry of yourdfpy) of every visual."""
+    """Holds a URDF without its meshes. shapes: (body, 4x4 shape-to-body, geometry of yourdfpy) of every visual.
+
+    root: the folder that its meshes must lie in, None for any.
+    """
 
     path: Path
     joints: list[Joint]
     shapes: list[tuple[int, np.ndarray, Any]]
     notes: Counter
+    root: Path | None = None
 
 
-def read_skeleton(path: Path) -> Skeleton:
+def read_skeleton(path: Path, root: Path | None = None) -> Skeleton:
     """Parse a URDF and merge links joined by fixed joints. Raises DataError when it isn't a tree of links.
 
-    Limits: a continuous joint gets +-180 degrees, so does a revolute joint without limits; inverted ones are swapped;
-    a slide without limits has infinite ones here. Floating and planar joints are taken as fixed. All are noted.
+    Limits: a continuous joint gets +-180 degrees, so does a revolute joint without limits; where one of two limits is
+    given the other is 0, as the format has it; inverted ones are swapped; a slide without limits has infinite ones
+    here. Floating and planar joints are taken as fixed. All are noted. root: its meshes must lie in it.
     """
     robot = _parse(path)
+    _check_names(path, robot)
     notes: Counter = Counter()
     order, place = _walk_tree(path, robot)
     joints, sources = _movable(path, order, place, notes)
-    return Skeleton(path, _followers(path, robot, joints, sources), _shapes(robot, place, notes), notes)
+    return Skeleton(path, _followers(path, robot, joints, sources), _shapes(robot, place, notes), notes, root)
 
 
 def load_object(skeleton: Skeleton) -> ArticulatedObject:
@@ -50,7 +57,7 @@ def load_object(skeleton: Skeleton) -> ArticulatedObject:
     notes = Counter(skeleton.notes)
     triangles, bodies = [np.zeros((0, 3, 3))], [np.zeros(0, np.int64)]
     for body, placement, geometry in skeleton.shapes:
-        corners = geometry_triangles(skeleton.path, geometry)
+        corners = geometry_triangles(skeleton.path, geometry, skeleton.root, notes)
         if not len(corners):
             notes["mesh files without faces"] += 1
         triangles.append(corners @ placement[:3, :3].T + placement[:3, 3])
@@ -60,9 +67,12 @@ def load_object(skeleton: Skeleton) -> ArticulatedObject:
 
 
 def missing_meshes(skeleton: Skeleton) -> list[str]:
-    """Returns file names of visual meshes that don't exist, as the URDF spells them."""
+    """Returns file names of visual meshes that don't exist, as the URDF spells them.
+
+    Raises DataError when one lies outside the skeleton's root.
+    """
     names = [geometry.mesh.filename for _, _, geometry in skeleton.shapes if geometry.mesh is not None]
-    return [name for name in dict.fromkeys(names) if not resolve(skeleton.path, name).is_file()]
+    return [name for name in dict.fromkeys(names) if not resolve(skeleton.path, name, skeleton.root).is_file()]
 
 
 def _parse(path: Path) -> Any:
@@ -70,16 +80,44 @@ def _parse(path: Path) -> Any:
     from yourdfpy import URDF
 
     logging.getLogger("yourdfpy.urdf").setLevel(logging.CRITICAL)
-    name = utf8_path(path, "yourdfpy")
+    utf8_path(path, "yourdfpy")
     try:
-        root = etree.parse(name).getroot()
-        if root.tag != "robot":
-            raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
-        return URDF.load(name, build_scene_graph=False, load_meshes=False).robot
-    except etree.XMLSyntaxError as error:
-        raise DataError(f"{path}: not well-formed XML ({error.msg}); expected a URDF") from None
-    except (AttributeError, KeyError, TypeError, ValueError) as error:  # an element or attribute that is absent or odd
+        text = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        tree = etree.parse(BytesIO(text), etree.XMLParser(resolve_entities=False, no_network=True))
+        if tree.docinfo.internalDTD is not None:
+            raise DataError(f"{path}: it has a DOCTYPE, whose entities are not read; expected a plain URDF")
+        if tree.getroot().tag != "robot":
+            found = tree.getroot().tag
+            raise DataError(f"{path}: its root element is <{found}>; expected <robot>, this is not a URDF")
+        return URDF.load(BytesIO(text), build_scene_graph=False, load_meshes=False).robot
+    except DataError:
+        raise
+    except (etree.LxmlError, OSError, LookupError) as error:  # such as bytes that are not of its encoding
+        if isinstance(error, KeyError | IndexError):
+            raise DataError(f"{path}: not a valid URDF: {type(error).__name__} {error}") from None
+        problem = getattr(error, "msg", None) or error
+        hint = "; save it as UTF-8, or name its encoding in its first line" if "ncoding" in str(problem) else ""
+        raise DataError(f"{path}: not well-formed XML ({problem}); expected a URDF{hint}") from None
+    except Exception as error:  # an element or attribute that is absent or odd: one bad file must not end the others
         raise DataError(f"{path}: not a valid URDF: {type(error).__name__} {error}") from None
+
+
+def _check_names(path: Path, robot: Any) -> None:
+    """Raises DataError when two links or two joints share a name, or when a joint mimics one that is not there."""
+    for kind, entries in (("links", robot.links), ("joints", robot.joints)):
+        twice = [name for name, count in Counter(entry.name for entry in entries).items() if count > 1]
+        if twice:
+            raise DataError(f"{path}: two {kind} have the name {twice[0]!r}; each needs its own, rename one")
+    names = {joint.name for joint in robot.joints}
+    for joint in robot.joints:
+        if joint.mimic is not None and joint.mimic.joint not in names:
+            raise DataError(
+                f"{path}: joint {joint.name!r} mimics {joint.mimic.joint!r}; there is no joint of that name, "
+                "correct it or remove the <mimic>"
+            )
 
 
 def _walk_tree(path: Path, robot: Any) -> tuple[list[Any], dict[str, tuple[int, np.ndarray]]]:
@@ -131,6 +169,9 @@ def _check_numbers(path: Path, joint: Any) -> None:
 def _limits(joint: Any) -> tuple[float, float, str]:
     """Returns (lower, upper, what was odd)."""
     low, high = (joint.limit.lower, joint.limit.upper) if joint.limit is not None else (None, None)
+    alone = (low is None) != (high is None)
+    if alone:
+        low, high = low or 0.0, high or 0.0
     given = low is not None and high is not None and np.isfinite(low + high)
     if joint.type == "continuous":
         return -np.pi, np.pi, ""
@@ -138,7 +179,8 @@ def _limits(joint: Any) -> tuple[float, float, str]:
         return -np.inf, np.inf, ""
     if not given:
         return -np.pi, np.pi, "hinges without limits (+-180 degrees taken)"
-    odd = "joints with inverted limits (swapped)" if low > high else ""
+    odd = "joints with one limit (the other is 0)" if alone else ""
+    odd = "joints with inverted limits (swapped)" if low > high else odd
     low, high = min(low, high), max(low, high)
     return low, (min(high, low + 2 * np.pi) if joint.type == "revolute" else high), odd
 

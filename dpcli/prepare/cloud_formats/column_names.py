@@ -1,4 +1,4 @@
-"""What the names of columns mean: which hold x, y and z and in which unit, which a color, which number frames."""
+"""Says what the names of columns mean: which hold x, y and z and in which unit, which a color, which number frames."""
 
 from __future__ import annotations
 

@@ -2,100 +2,24 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import short_names
+from dpcli.prepare.commands.copy_samples import Copy, copy_samples
+from dpcli.prepare.commands.sources import OpenFiles, Source, read_source
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Report, count_samples
-from dpcli.prepare.shards import Shard, shard_of
-from dpcli.runtime.progress import Progress, log
+from dpcli.prepare.shards import shard_of
+from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
-from dpcli.runtime.signals import stop_requested
-from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
-from dpcli.store.file import file_kind, read_positions
+from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.pipes import refuse_repeats
 from dpcli.store.writing.already_made import already_made
 
 _OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
-
-
-@dataclass(kw_only=True)
-class Source:
-    """Holds what the index of one file says; its points stay on the disk.
-
-    made_by: the reader's name. positions: the places in the whole index of the samples written and of those skipped, where
-    the file is a shard. prefix: what goes before its samples' names in the joined file.
-    """
-
-    path: Path
-    class_names: list[str]
-    length_unit: str
-    seed: int = 0
-    made_by: str = ""
-    names: list[str] = field(default_factory=list)
-    labels: list[int] = field(default_factory=list)
-    fields: tuple[str, ...] = ()
-    provenance: list[dict[str, Any]] = field(default_factory=list)
-    skipped: list[tuple[str, str]] = field(default_factory=list)
-    positions: tuple[list[int], list[int]] | None = None
-    shard: Shard | None = None
-    prefix: str = ""
-
-    def sample_name(self, index: int) -> str:
-        """Returns the sample's name in the joined file."""
-        return self.prefix + self.names[index]
-
-
-def read_source(path: Path) -> Source:
-    """Returns the index of a clouds file. Raises DataError when it is none."""
-    if file_kind(path) != "clouds":
-        raise DataError(
-            f"{path}: holds {file_kind(path)}; merge and split take clouds files, as dpc prepare makes them"
-        )
-    with CloudsReader(path) as reader:
-        root = reader.attributes
-        found = shard_of(reader.provenance[-1]) if reader.provenance else None
-        return Source(
-            path=path,
-            class_names=reader.class_names,
-            length_unit=reader.length_unit,
-            seed=int(root.get("seed", 0)),
-            made_by=str(root.get("source", "")),
-            names=list(reader.names),
-            labels=reader.labels.tolist(),
-            fields=reader.fields,
-            provenance=reader.provenance,
-            skipped=reader.skipped,
-            positions=read_positions(reader.file),
-            shard=found[0] if found else None,
-        )
-
-
-class OpenFiles:
-    """Keeps readers by path, only the latest used of them open."""
-
-    def __init__(self) -> None:
-        self._readers: OrderedDict[Path, CloudsReader] = OrderedDict()
-
-    def read(self, path: Path, index: int) -> CloudSequence:
-        """Returns one sequence of a file, which is opened when it isn't."""
-        if path not in self._readers:
-            self._readers[path] = CloudsReader(path)
-        self._readers.move_to_end(path)
-        sequence = self._readers[path].read(index)
-        while len(self._readers) > _OPEN:
-            self._readers.popitem(last=False)[1].close()
-        return sequence
-
-    def close(self) -> None:
-        """Closes all files."""
-        for reader in self._readers.values():
-            reader.close()
 
 
 def merge(
@@ -150,7 +74,18 @@ def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool
     first = next(source for source in sources if source.names)
     samples = [(*places[place], None) for place in sorted(places)]
     skipped, compression = [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none"))
-    return _copy_samples(output, entry, first, samples, skipped, compression=compression, force=force, resume=resume)
+    copy = Copy(
+        output=output,
+        pattern=first,
+        names=[source.sample_name(index) for source, index, _ in samples],
+        provenance=entry,
+        task="prepare merge",
+        skipped=skipped,
+        compression=compression,
+        force=force,
+        resume=resume,
+    )
+    return _write_samples(copy, samples)
 
 
 def _whole_entry(sources: list[Source]) -> dict[str, Any]:
@@ -218,7 +153,18 @@ def _merge_unlike(
     entry = record(config, 0, {f"{k}": source.path for k, source in enumerate(sources)})
     unit = sources[0].length_unit
     pattern = Source(path=output, class_names=class_names, length_unit=unit, made_by="merge", fields=fields)
-    return _copy_samples(output, entry, pattern, chosen, skipped, compression=compression, force=force, resume=resume)
+    copy = Copy(
+        output=output,
+        pattern=pattern,
+        names=[source.sample_name(index) for source, index, _ in chosen],
+        provenance=entry,
+        task="prepare merge",
+        skipped=skipped,
+        compression=compression,
+        force=force,
+        resume=resume,
+    )
+    return _write_samples(copy, chosen)
 
 
 def _refuse_equal_names(sources: list[Source]) -> None:
@@ -234,69 +180,24 @@ def _refuse_equal_names(sources: list[Source]) -> None:
             seen[own] = source.path
 
 
-def _copy_samples(
-    output: Path,
-    entry: dict[str, Any],
-    pattern: Source,
-    samples: list[tuple[Source, int, int | None]],
-    skipped: list[tuple[str, str]],
-    *,
-    compression: str,
-    force: bool,
-    resume: bool,
-) -> Report:
-    """Copies (file, index, new label or None for its own) to `output`, which has the look of `pattern`."""
-    report = Report(skipped=skipped)
-    if not force and already_made(output, entry, CloudsReader):
-        log.info(f"{output}: already complete, made of the same files (--force makes it again)")
+def _write_samples(copy: Copy, samples: list[tuple[Source, int, int | None]]) -> Report:
+    """Copies (file, index, new label or None for its own), or leaves a file as it is that was made of the same."""
+    report = Report(skipped=copy.skipped)
+    if not copy.force and already_made(copy.output, copy.provenance, CloudsReader):
+        log.info(f"{copy.output}: already complete, made of the same files (--force makes it again)")
         report.was_complete = True
-        return count_samples(report, output)
+        return count_samples(report, copy.output)
     files = OpenFiles()
+
+    def read(place: int) -> CloudSequence:
+        source, index, label = samples[place]
+        return _relabel(files.read(source.path, index), source, copy.pattern, label)
+
     try:
-        with (
-            stop_requested() as stop,
-            CloudsWriter(
-                output,
-                class_names=pattern.class_names,
-                length_unit=pattern.length_unit,
-                source=pattern.made_by,
-                seed=pattern.seed,
-                fields=pattern.fields,
-                compression=compression,
-                provenance=entry,
-                force=force,
-                resume=resume,
-            ) as writer,
-            Progress("prepare merge", total=len(samples), unit="video") as bar,
-        ):
-            done = copied_before(writer, [source.sample_name(index) for source, index, _ in samples])
-            bar.skip(done)
-            for source, index, label in samples[done:]:
-                sequence = _relabel(files.read(source.path, index), source, pattern, label)
-                writer.write(sequence)
-                bar.advance(1, frames=sequence.num_frames)
-                stop.check(f"{len(writer)} of {len(samples)} samples are kept")
-            writer.skipped = skipped
+        copy_samples(copy, read)
     finally:
         files.close()
-    return count_samples(report, output)
-
-
-def copied_before(writer: CloudsWriter, names: list[str]) -> int:
-    """Returns how many samples, from the first on, a stopped run left.
-
-    Raises UsageError when it left others, which stay.
-    """
-    done = len(writer.written_names)
-    if writer.written_names != names[:done]:
-        writer.keep = True
-        raise UsageError(
-            f"{writer.path}: a stopped run left {done} other samples for it; go on with that run, write to "
-            "another file, or --force to start over"
-        )
-    if done:
-        log.info(f"continuing: {done} of {len(names)} were copied before")
-    return done
+    return count_samples(report, copy.output)
 
 
 def _relabel(sequence: CloudSequence, source: Source, pattern: Source, label: int | None) -> CloudSequence:

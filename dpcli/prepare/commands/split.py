@@ -5,19 +5,20 @@ from __future__ import annotations
 import csv
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.commands.merge import Source, copied_before, read_source
+from dpcli.prepare.commands.copy_samples import Copy, copy_samples
+from dpcli.prepare.commands.sources import Source, read_source
 from dpcli.prepare.reader import SPLITS
-from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
-from dpcli.runtime.signals import stop_requested
-from dpcli.store import CloudsReader, CloudsWriter
+from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.pipes import check_output
 from dpcli.store.writing.already_made import already_made
 
@@ -138,8 +139,8 @@ def split(
 ) -> dict[str, int]:
     """Writes `output/SPLIT.h5` for each split, or, when `output` ends in .h5, one file whose samples have new splits.
 
-    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams; stopped
-    or killed, it goes on from the last sample when run again.
+    -> samples of each split; "" counts those in none, which are named in the file when `output` is one. Streams;
+    stopped or killed, it goes on from the last sample when run again.
     """
     source = read_source(path)
     with CloudsReader(path) as reader:
@@ -149,13 +150,15 @@ def split(
         inputs = {"clouds": path, **({"list": choice.listed} if choice.listed else {})}
         entry = record({"split": said, "compression": compression}, choice.seed, inputs)
         if output.suffix in (".h5", ".hdf5"):
-            _copy(reader, source, splits, output, [name for name in counts if name], entry, compression, force)
+            wanted = [name for name in counts if name]
+            _write_split(reader, splits, wanted, _plan_copy(source, output, entry, compression, force))
             return counts
         output.mkdir(parents=True, exist_ok=True)
         for name in counts:
             if name:
-                one = {**entry, "config": {**entry["config"], "part": name}}
-                _copy(reader, source, splits, output / f"{_file_name(name)}.h5", [name], one, compression, force)
+                part = {**entry, "config": {**entry["config"], "part": name}}
+                copy = _plan_copy(source, output / f"{_file_name(name)}.h5", part, compression, force)
+                _write_split(reader, splits, [name], copy)
     return counts
 
 
@@ -165,44 +168,31 @@ def _file_name(split_name: str) -> str:
     return split_name
 
 
-def _copy(
-    reader: CloudsReader,
-    source: Source,
-    splits: list[str],
-    output: Path,
-    wanted: list[str],
-    entry: dict,
-    compression: str,
-    force: bool,
-) -> None:
-    check_output(output, "-o", [source.path])
-    history = [*source.provenance, entry]
-    if not force and already_made(output, entry, CloudsReader):
-        log.info(f"{output}: already complete (--force makes it again)")
+def _plan_copy(source: Source, output: Path, entry: dict[str, Any], compression: str, force: bool) -> Copy:
+    return Copy(
+        output=output,
+        pattern=source,
+        names=[],
+        provenance=[*source.provenance, entry],
+        task=f"prepare split {output.stem}",
+        skipped=source.skipped,
+        compression=compression,
+        force=force,
+        where=f" of {output}",
+    )
+
+
+def _write_split(reader: CloudsReader, splits: list[str], wanted: list[str], copy: Copy) -> None:
+    """Copies the samples of the wanted splits, or leaves a file as it is that was made the same way."""
+    check_output(copy.output, "-o", [copy.pattern.path])
+    if not copy.force and already_made(copy.output, copy.provenance[-1], CloudsReader):
+        log.info(f"{copy.output}: already complete (--force makes it again)")
         return
     chosen = [index for index, name in enumerate(splits) if name in wanted]
-    with (
-        stop_requested() as stop,
-        CloudsWriter(
-            output,
-            class_names=source.class_names,
-            length_unit=source.length_unit,
-            source=source.made_by,
-            seed=source.seed,
-            fields=source.fields,
-            compression=compression,
-            provenance=history,
-            force=force,
-            resume=True,
-        ) as writer,
-        Progress(f"prepare split {output.stem}", total=len(chosen), unit="video") as bar,
-    ):
-        done = copied_before(writer, [reader.names[index] for index in chosen])
-        bar.skip(done)
-        for index in chosen[done:]:
-            sequence = reader.read(index)
-            sequence.split = splits[index]
-            writer.write(sequence)
-            bar.advance(1, frames=sequence.num_frames)
-            stop.check(f"{len(writer)} of {len(chosen)} samples of {output} are kept")
-        writer.skipped = source.skipped
+
+    def read(place: int) -> CloudSequence:
+        sequence = reader.read(chosen[place])
+        sequence.split = splits[chosen[place]]
+        return sequence
+
+    copy_samples(replace(copy, names=[reader.names[index] for index in chosen]), read)

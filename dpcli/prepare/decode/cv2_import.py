@@ -6,7 +6,7 @@ import os
 
 
 def load_cv2():  # -> module
-    """Imports OpenCV and return it, with one thread and without its own lines on stderr about damaged files.
+    """Imports OpenCV and returns it, with one thread and without its own lines on stderr about damaged files.
 
     Our messages name the file and say what to do.
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,28 +12,44 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.deep_video import deep_frames
+from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import decode_gray_png
-from dpcli.prepare.reader import natural_key
+from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
+from dpcli.prepare.series import Series, choose_series, is_hidden
 
-VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov")
-IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm")
+VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
+IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".jp2", ".pfm", ".exr")
+FRAME_SUFFIXES = (*IMAGE_SUFFIXES, ".npy")  # of two files of one frame the earlier is preferred
+# names that say depth, and not a picture of it or what lies beside it
+_DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
 _GRAY_NOISE, _COLORED_SHARE = (
     24,
     0.02,
 )  # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
+_EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
+_TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
 
 @dataclass
 class DepthVideo:
-    """Holds raw frames (T,H,W) u8, u16, or float, and the frame rate its file declares (None = says nothing)."""
+    """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known."""
 
     frames: np.ndarray
-    fps: float | None = None
+    time: np.ndarray | None = None
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture
     """Opens an OpenCV capture that yields 16-bit gray frames unharmed and 8-bit ones expanded to the full range."""
+    capture = _opened(path)
+    if not capture.isOpened():
+        raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
+    return capture
+
+
+def _opened(path: Path):  # -> cv2.VideoCapture
+    """Returns the capture of `open_video`, also one that could not be opened. Raises DataError when there is no file."""
     if not path.is_file():
         raise DataError(f"{path}: no such video")
     cv2, name = load_cv2(), utf8_path(path, "OpenCV")
@@ -44,8 +60,6 @@ def open_video(path: Path):  # -> cv2.VideoCapture
     if capture.isOpened() and int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _GRAY16:
         if not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0):  # an OpenCV that takes it at the opening only
             capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, [*single, cv2.CAP_PROP_CONVERT_RGB, 0])
-    if not capture.isOpened():
-        raise DataError(f"{path}: not a readable video (empty, truncated, or of an unknown codec)")
     return capture
 
 
@@ -65,21 +79,78 @@ def read_video(
     path: Path, start: int = 0, stop: int | None = None, stride: int = 1
 ) -> tuple[list[np.ndarray], float | None]:
     """Returns what `video_frames` yields, and the frames per second that the file declares (None = says nothing)."""
-    import cv2
-
     capture = open_video(path)
     try:
-        rate = float(capture.get(cv2.CAP_PROP_FPS))
-        frames = list(_decoded(capture, path, start, stop, stride))
+        return list(_decoded(capture, path, start, stop, stride)), _declared_rate(capture)
     finally:
         capture.release()
-    return frames, rate if np.isfinite(rate) and 0 < rate < 10_000 else None
 
 
-def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> Iterator[np.ndarray]:
-    index = 0
+def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.ndarray | None]:
+    """Returns every ``stride``-th frame of a depth video, (H,W) u8, u16 or f32 as stored, and their seconds since the first,
+    f64 (T), None where the file has no time stamps that rise.
+
+    Of several streams the one of depth is taken. Raises DataError where gray of more than 8 bits would be cut.
+    """
+    capture = _opened(path)
+    try:
+        tag, rate = int(capture.get(load_cv2().CAP_PROP_CODEC_PIXEL_FORMAT)), _declared_rate(capture)
+        one_stream = (
+            path.suffix.lower() == ".avi"
+        )  # in others depth often lies beside color; asking takes a tenth of a second
+        stream = None if one_stream and tag in (_GRAY16, *_EIGHT_BITS) else depth_stream(path)
+        if stream is None or (stream.place == 0 and _is_plain(stream)):
+            stamps: list[float | None] = []
+            frames = list(_decoded(capture, path, 0, None, stride, stamps))
+            return frames, rising_times(stamps, rate, stride)
+    finally:
+        capture.release()
+    if stream.is_eight_bits:
+        raise DataError(
+            f"{path}: its depth is stream {stream.place} ({stream.described()}) of several; copy it to a file of its own:"
+            f" ffmpeg -i {path.name} -map 0:v:{stream.place} -c copy depth{path.suffix}"
+        )
+    kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
+    return [frame for frame, _ in kept], rising_times([seconds for _, seconds in kept], rate, stride)
+
+
+def _is_plain(stream: VideoStream) -> bool:
+    """Returns whether OpenCV gives a stream's pixels unharmed."""
+    return stream.is_eight_bits or (stream.pixel_format == "gray16le" and not stream.written_bits)
+
+
+def rising_times(stamps: Sequence[float | None], rate: float | None, stride: int = 1) -> np.ndarray | None:
+    """Returns seconds since the first of ``stamps``, those of every ``stride``-th frame; None when they are not known.
+
+    Where they are those of a constant rate (frames per second) but for the milliseconds of the container, the rate counts.
+
+    >>> rising_times([0.0, 0.033, 0.067], 30.0).round(4).tolist()
+    [0.0, 0.0333, 0.0667]
+    """
+    even = np.arange(len(stamps)) * stride / rate if rate else None
+    if any(stamp is None for stamp in stamps):
+        return None
+    seconds = np.array(stamps, np.float64)
+    if len(seconds) > 1 and not (np.diff(seconds) > 0).all():
+        return None
+    since = seconds - seconds[:1]
+    return even if even is not None and np.abs(since - even).max(initial=0) <= _TICK else since
+
+
+def _declared_rate(capture) -> float | None:
+    rate = float(capture.get(load_cv2().CAP_PROP_FPS))
+    return rate if np.isfinite(rate) and 0 < rate < 10_000 else None
+
+
+def _decoded(
+    capture, path: Path, start: int, stop: int | None, stride: int, stamps: list[float | None] | None = None
+) -> Iterator[np.ndarray]:
+    """Yields the wanted frames (H,W), and appends the seconds of their time stamps to ``stamps``."""
+    cv2, index = load_cv2(), 0
     while (stop is None or index < stop) and capture.grab():
         if index >= start and (index - start) % stride == 0:
+            if stamps is not None:
+                stamps.append(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
             ok, frame = capture.retrieve()
             if not ok:
                 raise DataError(f"{path}: frame {index} cannot be decoded")
@@ -92,8 +163,8 @@ def _decoded(capture, path: Path, start: int, stop: int | None, stride: int) -> 
 
 
 def _colored(frame: np.ndarray) -> bool:
-    """Returns whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of its
-    pixels.
+    """Returns whether a decoded frame (H,W,3) u8 has colors, beyond what lossy codecs make of gray; looks at some of
+    its pixels.
     """
     some = frame[::8, ::8].astype(np.int16)
     return bool((np.ptp(some, axis=2) > _GRAY_NOISE).mean() > _COLORED_SHARE)
@@ -101,6 +172,8 @@ def _colored(frame: np.ndarray) -> bool:
 
 def read_image(path: Path) -> np.ndarray:
     """Reads one gray depth image (H,W) u8, u16 or f32. Raises DataError when unreadable or colored."""
+    if path.suffix.lower() == ".exr":
+        return read_exr(path)
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is not None:
@@ -121,16 +194,24 @@ def read_image(path: Path) -> np.ndarray:
     return image
 
 
-def read_image_folder(folder: Path, stride: int = 1) -> np.ndarray:
-    """Reads the images of a folder in natural order as (T,H,W). Raises DataError when sizes or types differ."""
-    paths = image_paths(folder)[::stride]
-    if not paths:
-        raise DataError(f"{folder}: no depth images ({', '.join(IMAGE_SUFFIXES)})")
-    first = read_image(paths[0])
+def read_frame(path: Path) -> np.ndarray:
+    """Reads one frame (H,W) of a folder: an image, or an array in ``.npy``."""
+    if path.suffix.lower() != ".npy":
+        return read_image(path)
+    array = read_array(path)
+    if len(array) != 1:
+        raise DataError(f"{path}: holds {len(array)} frames; expected one (height, width), as its neighbors have")
+    return array[0]
+
+
+def read_frames(series: Series, stride: int = 1) -> np.ndarray:
+    """Reads every ``stride``-th frame of a series as (T,H,W). Raises DataError when sizes or types differ."""
+    paths = series.paths[::stride]
+    first = read_frame(paths[0])
     frames = np.empty((len(paths), *first.shape), first.dtype)
     frames[0] = first
     for index, path in enumerate(paths[1:], start=1):
-        frame = read_image(path)
+        frame = read_frame(path)
         if (frame.shape, frame.dtype) != (first.shape, first.dtype):
             size = f"{first.shape[1]}x{first.shape[0]} {first.dtype}"
             raise DataError(f"{path}: {frame.shape[1]}x{frame.shape[0]} {frame.dtype}; the first image is {size}")
@@ -138,15 +219,37 @@ def read_image_folder(folder: Path, stride: int = 1) -> np.ndarray:
     return frames
 
 
-def has_images(folder: Path) -> bool:
-    """Returns whether `image_paths` finds any, without asking for all."""
+def frame_series(folder: Path, pattern: str = "") -> Series | None:
+    """Returns the frames of depth directly in a folder, in order; None when it holds none.
+
+    Of several series, the one whose name says depth is taken, or else the only one that holds gray images. Several arrays
+    of more than one frame each are videos of their own, not a series.
+    """
     with os.scandir(folder) as entries:
-        return any(entry.name.lower().endswith(IMAGE_SUFFIXES) for entry in entries)
+        names = [entry.name for entry in entries if entry.name.lower().endswith(FRAME_SUFFIXES)]
+    if not any(name.lower().endswith(IMAGE_SUFFIXES) for name in names):
+        arrays = sorted(name for name in names if not is_hidden(name))
+        if len(arrays) < 2 or not _is_frame(folder / arrays[0]):
+            return None
+    return choose_series(
+        folder, names, pattern=pattern, suffixes=FRAME_SUFFIXES, wanted=_DEPTH_NAME, judge=_holds_depth
+    )
 
 
-def image_paths(folder: Path) -> list[Path]:
-    """Returns image files directly in a folder, in natural order."""
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
+def _is_frame(path: Path) -> bool:
+    """Returns whether an array file holds one frame (H,W), by its header."""
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False).ndim == 2
+    except (ValueError, OSError, EOFError):
+        return False
+
+
+def _holds_depth(path: Path) -> bool:
+    """Returns whether a file can be a frame of depth: gray of more than 8 bits."""
+    try:
+        return read_frame(path).dtype != np.uint8
+    except DataError:
+        return False
 
 
 def read_array(path: Path, stride: int = 1) -> np.ndarray:
@@ -164,18 +267,25 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
     return np.ascontiguousarray(array[::stride])
 
 
-def read_depth_video(path: Path, stride: int = 1) -> DepthVideo:
-    """Reads any depth video: a video file, an ``.npy``, or a folder of images. ``stride`` keeps every n-th frame."""
+def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
+    """Reads any depth video: a video file, an ``.npy``, or a folder of frames, of which ``series`` says which.
+
+    ``stride`` keeps every n-th frame. Raises DataError when it can't be read, or holds no frame.
+    """
     suffix = path.suffix.lower()
     if path.is_dir():
-        video = DepthVideo(read_image_folder(path, stride))
+        series = series or frame_series(path)
+        if series is None:
+            raise DataError(f"{path}: no depth images ({', '.join(FRAME_SUFFIXES)})")
+        times = series.times()
+        video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride])
     elif suffix == ".npy":
         video = DepthVideo(read_array(path, stride))
     elif suffix in VIDEO_SUFFIXES:
-        frames, rate = read_video(path, stride=stride)
+        frames, time = read_timed_video(path, stride)
         if not frames:
             raise DataError(f"{path}: an empty video: no frame can be decoded")
-        video = DepthVideo(np.stack(frames), rate)
+        video = DepthVideo(np.stack(frames), time)
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:

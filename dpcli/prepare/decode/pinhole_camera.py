@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import UsageError
+from dpcli.prepare.decode.cv2_import import load_cv2
 
 
 @dataclass(frozen=True)
@@ -38,22 +37,12 @@ class Intrinsics:
         focal = width / 2 / math.tan(math.radians(degrees) / 2)
         return cls(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
-    @classmethod
-    def from_json(cls, path: Path) -> Intrinsics:
-        """Reads ``{"fx":..,"fy":..,"cx":..,"cy":..}``, or Open3D's ``{"intrinsic_matrix": [9 numbers, column-major]}``."""
-        try:
-            data = json.loads(path.read_text())
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-        except ValueError as error:
-            raise DataError(f"{path}: is not JSON ({error})") from None
-        try:
-            if "intrinsic_matrix" in data:
-                m = [float(v) for v in data["intrinsic_matrix"]]
-                return cls(m[0], m[4], m[6], m[7])
-            return cls(*(float(data[key]) for key in ("fx", "fy", "cx", "cy")))
-        except (KeyError, IndexError, TypeError, ValueError):
-            raise DataError(f'{path}: expected {{"fx": .., "fy": .., "cx": .., "cy": ..}} in pixels') from None
+
+@dataclass(frozen=True)
+class LensIntrinsics(Intrinsics):
+    """Holds intrinsics of a lens that bends lines: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6 s1 .. s4 tx ty, or the first of them."""
+
+    distortion: tuple[float, ...] = ()
 
 
 @lru_cache(maxsize=8)
@@ -62,10 +51,26 @@ def pixel_rays(height: int, width: int, intrinsics: Intrinsics) -> np.ndarray:
     x = (np.arange(width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(height) - intrinsics.cy) / intrinsics.fy
     rays = np.ones((height, width, 3), np.float32)
+    if isinstance(intrinsics, LensIntrinsics):
+        rays[..., :2] = _straightened(x, y, intrinsics.distortion)
+        rays.setflags(write=False)
+        return rays.reshape(-1, 3)
     rays[..., 0] = x
     rays[..., 1] = y[:, None]
     rays.setflags(write=False)
     return rays.reshape(-1, 3)
+
+
+def _straightened(x: np.ndarray, y: np.ndarray, distortion: tuple[float, ...]) -> np.ndarray:
+    """Returns where a lens sends rays from, f64 (H,W,2), that arrive at x (W) and y (H): the distortion undone."""
+    bent = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 1, 2)
+    cv2 = load_cv2()
+    precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    if hasattr(cv2, "undistortPointsIter"):  # what OpenCV 4 calls it
+        found = cv2.undistortPointsIter(bent, np.eye(3), np.array(distortion), None, None, precise)
+    else:
+        found = cv2.undistortPoints(bent, np.eye(3), np.array(distortion), criteria=precise)
+    return found.reshape(len(y), len(x), 2)
 
 
 @lru_cache(maxsize=8)

@@ -1,4 +1,6 @@
-"""PNG files of 8 or 16 bits: gray ones by kornia-rs in a third of OpenCV's time, all with their damage found and named."""
+"""PNG files of 8 or 16 bits: gray ones by kornia-rs in a third of OpenCV's time, all with their damage found and
+named.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ _MOST_DEFLATED = 1032  # bytes that one byte of a deflate stream can stand for
 
 @dataclass(frozen=True)
 class PngHeader:
-    """Holds the first chunk of a PNG: size in pixels, bits per channel, color type (0 is gray) and the chunk's checksum."""
+    """Holds the first chunk of a PNG: size in pixels, bits per channel, color type (0 is gray) and the chunk's
+    checksum.
+    """
 
     width: int
     height: int
@@ -63,8 +67,8 @@ def _decoders() -> dict[int, Callable]:
 def decode_gray_png(data: bytes) -> np.ndarray | None:
     """Decodes the bytes of a whole gray PNG to u8 or u16 (H,W).
 
-    Returns None for all else (another kind of file, a damaged one, no kornia-rs): OpenCV decodes that, or the caller says
-    what is wrong with it.
+    Returns None for all else (another kind of file, a damaged one, no kornia-rs): OpenCV decodes that, or the caller
+    says what is wrong with it.
     """
     header = read_header(data)
     if header is None or not data.endswith(_END) or header.color != 0 or header.bits not in _decoders():
@@ -83,7 +87,8 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
 
 
 def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple[int, ...] = (16,)) -> np.ndarray:
-    """Decodes the bytes of a gray PNG to depth u8 or u16 (H,W). size: (width, height) expected; bits: allowed per pixel.
+    """Decodes the bytes of a gray PNG to depth u8 or u16 (H,W). size: (width, height) expected; bits: allowed per
+    pixel.
 
     Everything is checked before libpng sees it, because it fills in what a damaged file lacks, or complains on stderr
     without a name. Raises DataError that says what was found at ``where``.

@@ -21,13 +21,18 @@ class Texture:
 
 @dataclass(frozen=True)
 class Material:
-    """Holds color, a linear RGBA factor; blend: opaque | mask | blend, with `cutoff` for mask; unlit: no shading."""
+    """Holds color, a linear RGBA factor; blend: opaque | mask | blend, with `cutoff` for mask; unlit: no shading.
+
+    emission: linear RGB that is added to what the light shows, times `emission_texture`.
+    """
 
     color: tuple[float, float, float, float] = (1.0, 1.0, 1.0, 1.0)
     texture: Texture | None = None
     blend: str = "opaque"
     cutoff: float = 0.5
     unlit: bool = False
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    emission_texture: Texture | None = None
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ class AnimatedMesh:
     time: f64 (T) seconds. positions, normals: f32 (T,V,3). triangles: i64 (F,3). material: i64 (F) into `materials`.
     color: linear RGBA f32 (V,4). uv: f32 (V,2), v downwards. bones i64 and weights f32 (V,J): skinning, sums 1.
     bone_pose: f64 (T,B,4,4) bone to world. bone_parent: i64 (B), -1 for roots; parents may come after children.
+    emission_uv: f32 (V,2) where the emission's textures are looked up, None: at uv. one_sided: bool (F) triangles that
+    are not seen from behind, None: all are seen from both sides.
     """
 
     name: str
@@ -53,6 +60,8 @@ class AnimatedMesh:
     bone_pose: np.ndarray
     bone_parent: np.ndarray
     bone_name: tuple[str, ...] = field(default=())
+    emission_uv: np.ndarray | None = None
+    one_sided: np.ndarray | None = None
 
     @property
     def num_frames(self) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +13,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.filming import Filming, film
 from dpcli.prepare.meshes.gltf import read_gltf
+from dpcli.prepare.meshes.gltf_extensions import name_unread, refuse_required
 from dpcli.prepare.meshes.gltf_mesh import bake
 from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
 from dpcli.prepare.views.views_pipeline import Clip
@@ -38,10 +41,29 @@ def list_clips(path: Path) -> list[tuple[str, float]]:
     return [(clip.name, clip.end - clip.start) for clip in clips]
 
 
+def clip_outputs(path: Path, output: str) -> list[tuple[str, str]]:
+    """Returns (clip, file) for every clip of a model: OUT.h5 becomes OUT_Walk.h5, OUT_Run.h5, ...
+
+    Characters that a file's name should not have become _; names that are the same then get their clip's number.
+    """
+    with _well_formed(path):
+        choose_clip(file := read_gltf(path), None)
+        names = clip_names(file)
+    short = [re.sub(r"[^\w.-]+", "_", name.split("|")[-1]).strip("_.")[:80] or "clip" for name in names]
+    many = [key for key, count in Counter(name.lower() for name in short).items() if count > 1]
+    short = [f"{name}_{index}" if name.lower() in many else name for index, name in enumerate(short)]
+    place = Path(output)
+    return [(name, str(place.with_name(f"{place.stem}_{end}{place.suffix}"))) for name, end in zip(names, short)]
+
+
 def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
-    """Reads a clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own units."""
+    """Reads a clip (None: the file's first) of a .glb or .gltf at `frames` evenly spaced times, in the file's own
+    units.
+    """
     with _well_formed(path):
         file = read_gltf(path)
+        refuse_required(file)
+        name_unread(file)
         chosen, names = choose_clip(file, clip), clip_names(file)
         if clip is None and len(names) > 1:
             log.info(f"{path}: clip {names[0]!r}, the first of {len(names)}; --list names them, --clip chooses")

@@ -4,15 +4,35 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf_nodes import parents_first
 from dpcli.prepare.meshes.surface_points import SurfacePoints, choose_on_surface
 
+_SHRUNK = 0.01  # of the largest reach or area in the clip: what is smaller shows nothing
+
 
 def choose_points(mesh: AnimatedMesh, count: int, rng: np.random.Generator) -> SurfacePoints:
-    """Draws ``count`` points, uniform over the surface of the first frame."""
-    a, b, c = (mesh.positions[0][mesh.triangles[:, k]].astype(np.float64) for k in range(3))
-    return choose_on_surface(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, count, rng)
+    """Draws ``count`` points, uniform over the surface of the first frame and of what is hidden there.
+
+    A triangle that is shrunk then, below a hundredth of what it becomes, counts with its largest area in the clip.
+    """
+    areas = [_areas(mesh, frame) for frame in range(mesh.num_frames)]
+    largest = np.max(areas, axis=0)
+    if not largest.any():
+        raise DataError(f"{mesh.name}: no triangle has an area in any frame; expected a surface")
+    return choose_on_surface(np.where(areas[0] < _SHRUNK * largest, largest, areas[0]), count, rng)
+
+
+def ever_hidden(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
+    """Returns bool (M): whose triangles are shrunk to nothing in some frame, below 1/10,000 of their largest area."""
+    areas = np.stack([_areas(mesh, frame)[points.triangle] for frame in range(mesh.num_frames)])
+    return (areas < _SHRUNK**2 * areas.max(0)).any(0)
+
+
+def _areas(mesh: AnimatedMesh, frame: int) -> np.ndarray:
+    a, b, c = (mesh.positions[frame][mesh.triangles[:, k]].astype(np.float64) for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def track_points(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
@@ -35,23 +55,25 @@ def rigid_parts(
     pose: np.ndarray,  # f64 (T,B,4,4) bone to world
     parent: np.ndarray,  # i64 (B), -1 for roots
     bone: np.ndarray,  # i64 (M) the bone of each point
-    first: np.ndarray,  # (M,3) the points at frame 0
+    track: np.ndarray,  # (T,M,3) the points
     tolerance: float,  # in units of length
     smallest: int,  # points
 ) -> np.ndarray:
     """Returns the rigid part i16 (M) of each point: 0, 1, ... in the order of their first bones.
 
     Bones are one part when, over the whole clip, the part carries a bone's points (root mean square) to within
-    ``tolerance`` of where the bone carries them: its ancestors' part if it does, else the one that does it best; a part
-    moves as its first bone. Then parts of fewer than ``smallest`` points, the smallest first, join the part that carries
-    their points best. Bones without points don't count.
+    ``tolerance`` of where the bone carries them: its ancestors' part if it does, else the one that does it best; a
+    part moves as its first bone. A bone's motion counts from frame 0, or, where its points are shrunk to a point then,
+    from where they reach farthest. Then parts of fewer than ``smallest`` points, the smallest first, join the part that
+    carries their points best. Bones without points don't count.
     """
-    motion = pose @ np.linalg.pinv(pose[:1])  # frame 0 -> frame t
+    starts = _starts(track, bone, len(parent))
+    motions = {start: pose @ np.linalg.pinv(pose[start]) for start in set(starts.tolist())}  # start -> frame t
     group = np.full(len(parent), -1)
     found: list[int] = []  # the first bones of the parts
     for index in parents_first(parent):
         above = group[parent[index]] if parent[index] >= 0 else -1
-        points = first[bone == index]
+        motion, points = motions[starts[index]], track[starts[index], bone == index].astype(np.float64)
         if not len(points):
             group[index] = above
             continue
@@ -65,13 +87,25 @@ def rigid_parts(
         if len(ids) < 2 or counts.min() >= smallest:
             return np.searchsorted(ids, part).astype(np.int16)
         least = ids[counts.argmin()]
-        points, rest = first[part == least], [other for other in ids if other != least]
+        motion, points = motions[starts[least]], track[starts[least], part == least].astype(np.float64)
+        rest = [other for other in ids if other != least]
         gaps = [motion_distance(motion[:, least], motion[:, other], points) for other in rest]
         part[part == least] = rest[int(np.argmin(gaps))]
 
 
+def _starts(track: np.ndarray, bone: np.ndarray, bones: int) -> np.ndarray:
+    """Returns the frame i64 (B) that each bone's motion counts from."""
+    starts = np.zeros(bones, np.int64)
+    for index in np.unique(bone):
+        reach = np.linalg.norm(np.ptp(track[:, bone == index], axis=1), axis=1)
+        starts[index] = reach.argmax() if reach[0] < _SHRUNK * reach.max() else 0
+    return starts
+
+
 def motion_distance(one: np.ndarray, other: np.ndarray, points: np.ndarray) -> float:
-    """Returns how far apart two motions (T,4,4) carry points (N,3): root mean square over the points, largest over time."""
+    """Returns how far apart two motions (T,4,4) carry points (N,3): root mean square over the points, largest over
+    time.
+    """
     difference = one - other
     apart = points @ difference[:, :3, :3].transpose(0, 2, 1) + difference[:, None, :3, 3]
     return float(np.sqrt((apart**2).sum(-1).mean(1)).max())

@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
-from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, rigid_parts, track_points
+from dpcli.prepare.meshes.bone_parts import choose_points, ever_hidden, heaviest_bones, rigid_parts, track_points
 from dpcli.prepare.meshes.raycast import FrameCaster
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
@@ -29,8 +29,8 @@ _STILL = 1e-3  # of the object's radius: what moves less than this is no motion
 class Filming:
     """Says how an animated mesh is filmed. Angles in degrees; the reference camera stands at azimuth 0.
 
-    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points of
-    ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
+    yaw turns the object about the upright first. size: picture side, samples: rays per pixel and axis. tracks: points
+    of ground truth. part_tolerance, min_part: see `rigid_parts`, as shares of the object's radius and of the points.
     """
 
     size: int = 512
@@ -103,9 +103,14 @@ def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | Non
         return None, None
     points = choose_points(mesh, filming.tracks, generator(filming.seed))
     track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
+    hidden = int(ever_hidden(mesh, points).sum())
+    if hidden:
+        log.warn(
+            f"{mesh.name}: {hidden} of {filming.tracks} tracks are hidden in some frames, a point of no extent there"
+        )
     smallest = int(np.ceil(filming.min_part * filming.tracks))
     tolerance = filming.part_tolerance * OBJECT_RADIUS
-    part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track[0].astype(np.float64), tolerance, smallest)
+    part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track, tolerance, smallest)
     log.info(f"{mesh.name}: {int(part.max()) + 1} rigid parts of {len(np.unique(bone))} bones")
     return track, part
 

@@ -1,4 +1,5 @@
-"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and 4).
+"""The container of glTF 2.0: .glb and .gltf files into checked numpy arrays (Khronos specification, sections 3.6 and
+4).
 
 The container is JSON beside a block of bytes, so the standard library reads it; `gltf_nodes` and
 `gltf_mesh` say what it means.
@@ -10,39 +11,52 @@ import base64
 import binascii
 import io
 import json
+import re
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
+from posixpath import normpath
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import path_inside
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MOST = 1 << 27  # entries: a damaged count must not fill the memory
-_UNDERSTOOD = (
-    "KHR_materials_",
-    "KHR_texture_transform",
-    "KHR_mesh_quantization",
-    "KHR_lights_punctual",
-    "EXT_texture_webp",
-)
+_SCHEME = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*:")
+_FOREIGN = {  # how files of other formats begin
+    b"Kaydara FBX Binary": "FBX",
+    b"; FBX": "FBX",
+    b"PXR-USDC": "USD",
+    b"#usda": "USD",
+    b"BLENDER": "a Blender file",
+    b"PK\x03\x04": "a zip archive (or USDZ)",
+    b"\x1f\x8b": "a gzip archive (or a compressed Blender file)",
+    b"\x28\xb5\x2f\xfd": "a zstd archive (or a compressed Blender file)",
+    b"7z\xbc\xaf\x27\x1c": "a 7z archive",
+    b"Rar!": "a rar archive",
+    b"<?xml": "XML (COLLADA, perhaps)",
+    b"<COLLADA": "COLLADA",
+}
 
 
 @dataclass
 class Gltf:
     """Holds a glTF file: its JSON and, read when asked for, its buffers.
 
-    `accessor` decodes numbers, `image` gives a texture's encoded bytes. All errors are DataErrors that name the file.
+    `accessor` decodes numbers, `image` gives a texture's encoded bytes; decoded: what accessors (by index) hold that a
+    compressed block gave, (count, components). All errors are DataErrors that name the file.
     """
 
     path: Path
     tree: dict[str, Any]
     binary: bytes | None = None
+    decoded: dict[int, np.ndarray] = field(default_factory=dict)
     _buffers: dict[int, bytes] = field(default_factory=dict)
 
     def fail(self, problem: str) -> DataError:
@@ -77,11 +91,13 @@ class Gltf:
             raise self.fail(f"{what}: accessor {index} has no valid type or count; export the file again")
         if width is not None and columns != width:
             raise self.fail(f"{what}: accessor {index} is {entry['type']}, expected {width} components")
-        if "bufferView" in entry:
+        if index in self.decoded:
+            values = self._of_block(self.decoded[index], columns, dtype, what)
+        elif "bufferView" in entry:
             values = self._elements(entry["bufferView"], entry.get("byteOffset", 0), count, columns, dtype, what)
         else:
             values = np.zeros((count, columns), dtype)
-        if "sparse" in entry:
+        if "sparse" in entry and index not in self.decoded:
             values = self._replaced(values, entry["sparse"], what)
         if dtype is not np.float32 and entry.get("normalized"):
             values = np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1)
@@ -89,6 +105,15 @@ class Gltf:
             row = int(np.argmax(~np.isfinite(values).all(1)))
             raise self.fail(f"{what}: NaN or infinite at entry {row} of {count}; repair the model, export it again")
         return values[:, 0] if columns == 1 else values
+
+    def _of_block(self, values: np.ndarray, columns: int, dtype: type, what: str) -> np.ndarray:
+        if values.shape[1] != columns or not len(values):
+            raise self.fail(f"{what}: its Draco block has {values.shape[1]} components, expected {columns}")
+        return values.astype(dtype)
+
+    def view_bytes(self, index: Any) -> bytes:
+        """Returns the bytes of a buffer view."""
+        return self._view(index)[0]
 
     def _elements(self, view: Any, offset: int, count: int, columns: int, dtype: type, what: str) -> np.ndarray:
         data, stride = self._view(view)
@@ -144,23 +169,37 @@ class Gltf:
     def _resource(self, uri: str) -> bytes:
         """Returns the bytes of a data: URI or of a file below the folder; anything else is refused, a file may be
         hostile.
+
+        Names are read as browsers do: \\ is /, white space at the ends and line breaks don't count.
         """
-        if uri.startswith("data:"):
-            head, _, body = uri.partition(",")
-            try:
-                return base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode()
-            except (binascii.Error, ValueError):
-                raise self.fail("a data: URI is not valid base64; export the file again") from None
-        folder = self.path.parent.resolve()
-        target = (folder / unquote(uri)).resolve()
-        if "://" in uri or not target.is_relative_to(folder):
+        uri = re.sub(r"[\t\n\r]", "", uri.strip())
+        if uri[:5].lower() == "data:":
+            return self._embedded(uri)
+        folder = self.path.parent
+        if _SCHEME.match(uri):
             raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it")
+        names = [unquote(uri), unquote(re.split("[?#]", uri)[0]), uri]
+        try:
+            places = [path_inside(folder, folder, normpath(name.replace("\\", "/"))) for name in names]
+        except DataError:
+            raise self.fail(f"refers to {uri[:80]!r} outside its folder; keep its files beside it") from None
+        target = next((place for place in places if place.is_file()), places[0])
         try:
             return target.read_bytes()
         except OSError as error:
             raise self.fail(
                 f"its file {uri[:80]!r} cannot be read ({error.strerror}); keep it beside the .gltf"
             ) from None
+
+    def _embedded(self, uri: str) -> bytes:
+        head, _, body = uri.partition(",")
+        if not head.lower().endswith(";base64"):
+            return unquote_to_bytes(body)
+        text = re.sub(r"\s", "", unquote(body)).rstrip("=")
+        try:
+            return base64.b64decode(text + "=" * (-len(text) % 4), validate=True)
+        except (binascii.Error, ValueError):
+            raise self.fail("a data: URI is not valid base64; export the file again") from None
 
     def image(self, index: Any) -> np.ndarray:
         """Returns pixels of images[index], u8 (H,W,4), decoded by Pillow."""
@@ -178,7 +217,7 @@ class Gltf:
 
 
 def read_gltf(path: Path) -> Gltf:
-    """Open a .glb or .gltf file. Raises DataError unless it is whole, version 2 and free of extensions we can't follow."""
+    """Opens a .glb or .gltf file. Raises DataError unless it is whole and of version 2."""
     try:
         data = Path(path).read_bytes()
     except IsADirectoryError:
@@ -187,6 +226,13 @@ def read_gltf(path: Path) -> Gltf:
         raise DataError(f"{path}: a folder; {some}") from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    foreign = next(
+        (what for start, what in _FOREIGN.items() if data.lstrip(b"\xef\xbb\xbf \n\r\t").startswith(start)), ""
+    )
+    if foreign:
+        raise DataError(
+            f"{path}: not a glTF file but {foreign}; unpack it, or open it in Blender and use File > Export > glTF 2.0"
+        )
     text, binary = _split_glb(path, data) if data[:4] == b"glTF" else (data, None)
     try:
         tree = json.loads(text)
@@ -195,9 +241,6 @@ def read_gltf(path: Path) -> Gltf:
         raise DataError(f"{path}: not a glTF file (no JSON with an asset version); expected .glb or .gltf") from None
     if not version.startswith("2"):
         raise DataError(f"{path}: glTF version {version}; version 2 is read, convert the file")
-    foreign = [name for name in tree.get("extensionsRequired", []) if not str(name).startswith(_UNDERSTOOD)]
-    if foreign:
-        raise DataError(f"{path}: needs the extension {foreign[0]}, which is not read; export it without compression")
     return Gltf(Path(path), tree, binary)
 
 

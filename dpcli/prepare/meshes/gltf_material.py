@@ -1,8 +1,7 @@
-"""Materials of a glTF file: base color, its texture and transparency; reflections are left out."""
+"""Materials of a glTF file: base color, emission, their textures and transparency; reflections are left out."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,31 +26,72 @@ def to_srgb(color: np.ndarray) -> np.ndarray:
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * np.maximum(color, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def read_material(file: Gltf, index: int, header_only: bool = False) -> Any:
-    """Reads the Material of this index (-1: white); with header_only returns the number of the texture coordinates it
-    uses.
-    """
+def texture_sets(file: Gltf, index: int) -> tuple[int, int]:
+    """Returns the numbers of the texture coordinates that the base color and the emission of a material use."""
+    base, _, emission = _references(file, index)
+    first = _texture_set(base)
+    return first, _texture_set(emission) if emission else first
+
+
+def read_material(file: Gltf, index: int) -> Material:
+    """Reads the Material of this index (-1: white, seen from its front)."""
     entry = file.item("materials", index) if index != -1 else {}
     extensions = entry.get("extensions", {})
+    texture, color, emission = _references(file, index)
+    unlit = "KHR_materials_unlit" in extensions
+    strength = float(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
+    if not 0 <= strength < np.inf:
+        raise file.fail(f"material {index}: its emission has the strength {strength}; export the file again")
+    glow = tuple(strength * value for value in _numbers(file, index, entry.get("emissiveFactor"), (0, 0, 0)))
+    shines = any(glow) and not unlit
+    return Material(
+        _numbers(file, index, color, (1, 1, 1, 1)),
+        _texture(file, texture) if texture else None,
+        str(entry.get("alphaMode", "OPAQUE")).lower(),
+        float(entry.get("alphaCutoff", 0.5)),
+        unlit,
+        emission=glow if shines else (0.0, 0.0, 0.0),
+        emission_texture=_texture(file, emission) if emission and shines else None,
+    )
+
+
+def is_double_sided(file: Gltf, index: int) -> bool:
+    """Returns whether a material is seen from behind, too."""
+    return index != -1 and bool(file.item("materials", index).get("doubleSided", False))
+
+
+def _references(file: Gltf, index: int) -> tuple[dict[str, Any] | None, Any, dict[str, Any] | None]:
+    """Returns the base color's texture and factor, and the emission's texture, as the file has them."""
+    entry = file.item("materials", index) if index != -1 else {}
     metal = entry.get("pbrMetallicRoughness", {})
     color, texture = metal.get("baseColorFactor"), metal.get("baseColorTexture")
-    if "KHR_materials_pbrSpecularGlossiness" in extensions:  # older exports keep their colors there
-        old = extensions["KHR_materials_pbrSpecularGlossiness"]
+    old = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    if old is not None:  # older exports keep their colors there
         color, texture = old.get("diffuseFactor", color), old.get("diffuseTexture", texture)
-    change = (texture or {}).get("extensions", {}).get("KHR_texture_transform", {})
-    if header_only:
-        return change.get("texCoord", (texture or {}).get("texCoord", 0))
+    return texture, color, entry.get("emissiveTexture")
+
+
+def _texture_set(reference: dict[str, Any] | None) -> int:
+    reference = reference or {}
+    return _change(reference).get("texCoord", reference.get("texCoord", 0))
+
+
+def _change(reference: dict[str, Any]) -> dict[str, Any]:
+    return reference.get("extensions", {}).get("KHR_texture_transform", {})
+
+
+def _numbers(file: Gltf, index: int, values: Any, rest: tuple[int, ...]) -> tuple[float, ...]:
     try:
-        factor = tuple(float(np.clip(value, 0, 1)) for value in (color or (1, 1, 1, 1)))
-        assert len(factor) == 4 and np.isfinite(factor).all()
+        found = tuple(float(np.clip(value, 0, 1)) for value in (values or rest))
+        assert len(found) == len(rest) and np.isfinite(found).all()
     except (TypeError, ValueError, AssertionError):
-        raise file.fail(f"material {index}: its color is not four numbers; export the file again") from None
-    blend = str(entry.get("alphaMode", "OPAQUE")).lower()
-    material = Material(factor, None, blend, float(entry.get("alphaCutoff", 0.5)), "KHR_materials_unlit" in extensions)
-    return replace(material, texture=_texture(file, texture["index"], change)) if texture else material
+        count = {3: "three", 4: "four"}[len(rest)]
+        raise file.fail(f"material {index}: its color is not {count} numbers; export the file again") from None
+    return found
 
 
-def _texture(file: Gltf, index: Any, change: dict[str, Any]) -> Texture:
+def _texture(file: Gltf, reference: dict[str, Any]) -> Texture:
+    index, change = reference["index"], _change(reference)
     entry = file.item("textures", index)
     webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
     source = webp.get("source", entry.get("source"))

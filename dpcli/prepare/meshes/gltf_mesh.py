@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.gltf import Gltf
-from dpcli.prepare.meshes.gltf_material import read_material
-from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, read_clip
+from dpcli.prepare.meshes.gltf_draco import decompress
+from dpcli.prepare.meshes.gltf_extensions import instances
+from dpcli.prepare.meshes.gltf_material import is_double_sided, read_material, texture_sets
+from dpcli.prepare.meshes.gltf_nodes import Clip, node_name, node_parents, node_poses, node_visibility, read_clip
 from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.runtime.progress import log
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
+_MOST_VERTICES = 20_000_000  # of all instances of a node
 
 
 @dataclass
@@ -34,21 +37,28 @@ class _Piece:
     material: int
     targets: np.ndarray | None
     normal_targets: np.ndarray | None
+    emission_uv: np.ndarray
 
 
 def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
     """Bakes the scene's triangles at `frames` times of a clip; time counts from 0. Bones are the file's nodes.
 
-    What has no skin hangs on its node. Points and lines are passed over. Raises DataError when the file is broken.
+    What has no skin hangs on its node. Points and lines are passed over. What is hidden at a time is a point then.
+    Raises DataError when the file is broken.
     """
     parent, curves = node_parents(file), read_clip(file, clip)
     time = curves.sample_times(frames)
-    poses = node_poses(file, parent, curves, time)
-    pieces = [piece for node in _scene_nodes(file) for piece in _read_node(file, node)]
+    poses, shown = node_poses(file, parent, curves, time), node_visibility(file, parent, curves, time)
+    visible = [node for node in _scene_nodes(file) if shown[:, node].any()]
+    pieces = [piece for node in visible for piece in _read_node(file, node)]
+    pieces = [_turned_out(piece, poses) for piece in pieces if len(piece.triangles)]
     if not pieces:
         raise file.fail("has no triangles in its scene; expected a mesh with an animation")
     used = sorted({piece.material for piece in pieces})
     moved = [_move(file, piece, curves, time, poses) for piece in pieces]
+    for piece, (positions, _) in zip(pieces, moved):
+        hidden = ~shown[:, piece.node]
+        positions[hidden] = positions[hidden, :1]
     starts = np.cumsum([0] + [len(piece.uv) for piece in pieces])
     joints = max(piece.bones.shape[1] for piece in pieces)
 
@@ -59,7 +69,7 @@ def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
         return np.concatenate(arrays)
 
     seconds = time - time[0] if frames > 1 and time[-1] > time[0] else np.arange(frames, dtype=float)
-    return AnimatedMesh(
+    mesh = AnimatedMesh(
         name=f"{file.path.stem} {curves.name}",
         time=seconds,
         positions=np.concatenate([x for x, _ in moved], axis=1),
@@ -74,7 +84,28 @@ def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
         bone_pose=poses,
         bone_parent=parent,
         bone_name=tuple(node_name(file, index) for index in range(len(parent))),
+        emission_uv=joined("emission_uv"),
     )
+    culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]
+    return replace(mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None)
+
+
+def _turned_out(piece: _Piece, poses: np.ndarray) -> _Piece:
+    """Returns the piece with its triangles wound the other way when its node, or first bone, mirrors it."""
+    bone = int(piece.bones[0, piece.weights[0].argmax()])
+    size = np.linalg.det((poses[:, bone] @ piece.inverse_bind[bone])[:, :3, :3])
+    if size[np.abs(size).argmax()] < 0:
+        return replace(piece, triangles=piece.triangles[:, ::-1])
+    return piece
+
+
+def _has_twin(mesh: AnimatedMesh) -> np.ndarray:
+    """Returns bool (F): which triangles lie on another one, as exporters write a leaf that is seen from both sides."""
+    corners = mesh.positions[0][mesh.triangles].astype(np.float64)
+    grid = max(float(np.ptp(corners)), 1e-30) * 1e-6
+    middles = np.rint(np.concatenate([corners.mean(1), corners.min(1), corners.max(1)], axis=1) / grid)
+    _, inverse, counts = np.unique(middles, axis=0, return_inverse=True, return_counts=True)
+    return counts[inverse.reshape(-1)] > 1
 
 
 def _scene_nodes(file: Gltf) -> list[int]:
@@ -96,7 +127,29 @@ def _read_node(file: Gltf, index: int) -> list[_Piece]:
     if len(kept) < len(primitives):
         log.detail(f"{file.path}: {len(primitives) - len(kept)} sets of points or lines are left out")
     skins = _read_skin(file, node["skin"]) if "skin" in node else None
-    return [_read_primitive(file, index, primitive, skins) for primitive in kept]
+    pieces = [_read_primitive(file, index, primitive, skins) for primitive in kept]
+    transforms = instances(file, index)
+    if transforms is None:
+        return pieces
+    if len(transforms) * sum(len(piece.positions) for piece in pieces) > _MOST_VERTICES:
+        raise file.fail(f"{len(transforms)} instances of {node_name(file, index)!r} are too many to draw")
+    return [copy for piece in pieces for copy in _copies(piece, transforms)]
+
+
+def _copies(piece: _Piece, transforms: np.ndarray) -> list[_Piece]:
+    """Returns one piece for each instance, placed by its transform (N,4,4) below the node."""
+    bones, weights = np.zeros((len(piece.positions), 1), int), np.ones((len(piece.positions), 1))
+    placed, turned = skin(piece.positions, piece.normals, bones, weights, transforms[:, None])
+    made = []
+    for transform, positions, normals in zip(transforms, placed, turned):
+        mirrored = np.linalg.det(transform[:3, :3]) < 0
+        triangles = piece.triangles[:, ::-1] if mirrored else piece.triangles
+        copy = replace(piece, positions=positions, normals=normals, triangles=triangles)
+        if piece.targets is not None:
+            copy.targets = piece.targets @ transform[:3, :3].T
+            copy.normal_targets = piece.normal_targets @ transform[:3, :3].T
+        made.append(copy)
+    return made
 
 
 def _read_skin(file: Gltf, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -120,30 +173,32 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
     attributes = entry.get("attributes", {})
     if "POSITION" not in attributes:
         raise file.fail(f"{where} has no positions; export the file again")
+    decompress(file, entry, where)
     positions = _floats(file, attributes, "POSITION", where, 3)
     count = len(positions)
 
-    def read(key: str, width: int | None, default: np.ndarray) -> np.ndarray:
+    def read(key: str, width: int | None, default: np.ndarray, finite: bool = True) -> np.ndarray:
         if key not in attributes:
             return default
-        values = _floats(file, attributes, key, where, width)
+        values = _floats(file, attributes, key, where, width, finite)
         if len(values) != count:
             raise file.fail(f"{where}: {len(values)} {key} for {count} vertices; export the file again")
         return values
 
     triangles = _triangles(file, entry, count, where)
+    computed = vertex_normals(positions, triangles)
     material = entry.get("material", -1)
-    uv_set = read_material(file, material, header_only=True)
+    uv_set, emission_set = texture_sets(file, material)
     color = read("COLOR_0", None, np.ones((count, 4), np.float32))
     color = np.concatenate([color, np.ones((count, 4 - color.shape[1]), np.float32)], axis=1)
     bones, weights, inverse_bind = _binding(file, node, attributes, positions, skins, where)
-    targets = entry.get("targets") or None
+    targets, nowhere = entry.get("targets") or None, np.zeros((count, 2), np.float32)
     return _Piece(
         node,
         positions,
-        read("NORMAL", 3, vertex_normals(positions, triangles)),
+        _whole_normals(file, read("NORMAL", 3, computed, finite=False), computed, where),
         triangles,
-        read(f"TEXCOORD_{uv_set}", 2, np.zeros((count, 2), np.float32)),
+        read(f"TEXCOORD_{uv_set}", 2, nowhere),
         color,
         bones,
         weights,
@@ -151,7 +206,17 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
         material,
         targets and _deltas(file, targets, "POSITION", count, where),
         targets and _deltas(file, targets, "NORMAL", count, where),
+        read(f"TEXCOORD_{emission_set}", 2, nowhere),
     )
+
+
+def _whole_normals(file: Gltf, normals: np.ndarray, computed: np.ndarray, where: str) -> np.ndarray:
+    """Returns normals f32 (V,3), those that are not finite computed from the triangles, with a warning."""
+    lost = ~np.isfinite(normals).all(1)
+    if lost.any():
+        log.warn(f"{file.path}: {where}: {lost.sum()} normals are NaN or infinite; computed from the triangles")
+        normals = np.where(lost[:, None], computed, normals)
+    return normals
 
 
 def _floats(file: Gltf, attributes: dict, key: str, where: str, width: int | None, finite: bool = True) -> np.ndarray:
@@ -161,7 +226,9 @@ def _floats(file: Gltf, attributes: dict, key: str, where: str, width: int | Non
 
 def _deltas(file: Gltf, targets: list[dict], key: str, count: int, where: str) -> np.ndarray:
     zero = np.zeros((count, 3), np.float32)
-    found = [_floats(file, target, key, f"target of {where}", 3) if key in target else zero for target in targets]
+    what = f"target of {where}"
+    found = [_floats(file, target, key, what, 3, key != "NORMAL") if key in target else zero for target in targets]
+    found = [np.where(np.isfinite(delta), delta, 0) for delta in found]
     if any(len(delta) != count for delta in found):
         raise file.fail(f"{where}: a morph target has another number of vertices; export the file again")
     return np.stack(found)
@@ -174,6 +241,8 @@ def _triangles(file: Gltf, entry: dict[str, Any], count: int, where: str) -> np.
     if len(corners) and (corners.max() >= count or corners.min() < 0):
         raise file.fail(f"{where}: a triangle uses vertex {corners.max()} of {count}; the file is damaged")
     mode = entry.get("mode", _TRIANGLES)
+    if len(corners) < 3:
+        return np.zeros((0, 3), np.int64)
     if mode == _STRIP:
         return np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
     if mode == _FAN:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +13,9 @@ from dpcli.prepare.meshes.gltf import Gltf
 from dpcli.prepare.meshes.skinning import Curve, matrices
 
 _REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
+_POINTER = re.compile(
+    r"/nodes/(\d+)/(?:extensions/KHR_node_visibility/(?=visible$))?(visible|translation|rotation|scale|weights)"
+)
 
 
 @dataclass(frozen=True)
@@ -30,12 +35,27 @@ class Clip:
 
 
 def clip_names(file: Gltf) -> list[str]:
-    """Names of the animations in the file's order; clip N when unnamed."""
-    return [str(entry.get("name") or f"clip {index}") for index, entry in enumerate(file.items("animations"))]
+    """Names of the animations in the file's order, each once: clip N when unnamed, NAME (2) for a second of a name.
+
+    What would move a terminal's cursor is spelled out, such as \\x1b.
+    """
+    found: list[str] = []
+    for index, entry in enumerate(file.items("animations")):
+        plain = str(entry.get("name") or f"clip {index}")
+        plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in plain)
+        name, number = plain, 1
+        while name in found:
+            number += 1
+            name = f"{plain} ({number})"
+        found.append(name)
+    return found
 
 
 def choose_clip(file: Gltf, wanted: str | None) -> int:
-    """Returns the index of a clip by name, or by what follows the last | of it, in any case; None: the first."""
+    """Returns the index of a clip by name, by what follows the last | of it, in any case, or by its number from 0.
+
+    None: the first.
+    """
     names = clip_names(file)
     if not names:
         raise file.fail("has no animation: nothing moves in it. Export the model with its clips (see --list)")
@@ -43,10 +63,15 @@ def choose_clip(file: Gltf, wanted: str | None) -> int:
         return 0
     if wanted in names:
         return names.index(wanted)
-    short = [index for index, name in enumerate(names) if name.split("|")[-1].lower() == wanted.lower()]
-    if len(short) != 1:
-        raise UsageError(f"--clip {wanted}: {file.path} has {', '.join(names)}")
-    return short[0]
+    for spell in (str.lower, lambda name: name.split("|")[-1].lower()):
+        same = [index for index, name in enumerate(names) if spell(name) == wanted.lower()]
+        if len(same) == 1:
+            return same[0]
+    if wanted.isdecimal() and int(wanted) < len(names):
+        return int(wanted)
+    raise UsageError(
+        f"--clip {wanted}: {file.path} has {', '.join(names)}; name one, or its number 0 .. {len(names) - 1}"
+    )
 
 
 def read_clip(file: Gltf, index: int) -> Clip:
@@ -54,9 +79,8 @@ def read_clip(file: Gltf, index: int) -> Clip:
     entry, name = file.item("animations", index), clip_names(file)[index]
     curves = {}
     for channel in entry.get("channels", []):
-        target = channel.get("target", {})
-        node, path = target.get("node"), target.get("path")
-        if node is None or path not in (*_REST, "weights"):
+        node, path = _target(channel.get("target", {}))
+        if node is None or path not in (*_REST, "weights", "visible"):
             continue  # what an extension moves; the specification says to pass it over
         what = f"clip {name!r}, {path} of {node_name(file, node)!r}"
         try:
@@ -64,7 +88,8 @@ def read_clip(file: Gltf, index: int) -> Clip:
             keys = (sampler["input"], sampler["output"], sampler.get("interpolation", "LINEAR"))
         except (KeyError, IndexError, TypeError):
             raise file.fail(f"{what}: its sampler is missing; export the file again") from None
-        curves[node, path] = _read_curve(file, what, path, *keys)
+        interpolation = "STEP" if path == "visible" else keys[2]
+        curves[node, path] = _read_curve(file, what, path, *keys[:2], interpolation)
     if not curves:
         raise file.fail(f"clip {name!r} moves nothing; choose another with --clip (see --list)")
     return Clip(
@@ -72,9 +97,18 @@ def read_clip(file: Gltf, index: int) -> Clip:
     )
 
 
+def _target(target: dict[str, Any]) -> tuple[int | None, str | None]:
+    """Returns node and property of a channel, where KHR_animation_pointer points at those of a node, too."""
+    if target.get("path") != "pointer":
+        return target.get("node"), target.get("path")
+    pointer = target.get("extensions", {}).get("KHR_animation_pointer", {}).get("pointer", "")
+    found = _POINTER.fullmatch(str(pointer))
+    return (int(found[1]), found[2]) if found else (None, None)
+
+
 def _read_curve(file: Gltf, what: str, path: str, times: int, values: int, interpolation: str) -> Curve:
     times = file.accessor(times, what, 1).astype(np.float64)
-    if (np.diff(times) <= 0).any():
+    if (np.diff(times) < 0).any():
         raise file.fail(f"{what}: its times do not rise; export the file again")
     values = file.accessor(values, what).astype(np.float64)
     groups = (3,) if interpolation == "CUBICSPLINE" else ()
@@ -131,6 +165,19 @@ def node_poses(file: Gltf, parent: np.ndarray, clip: Clip, time: np.ndarray) -> 
         bad = int(np.argmax(~np.isfinite(world).all((0, 2, 3))))
         raise file.fail(f"node {node_name(file, bad)!r} has a transform that is not finite; repair the model")
     return world
+
+
+def node_visibility(file: Gltf, parent: np.ndarray, clip: Clip, time: np.ndarray) -> np.ndarray:
+    """Returns bool (T,N): whether a node and all above it are visible at `time` (KHR_node_visibility)."""
+    shown = np.ones((len(time), len(parent)), bool)
+    for index in parents_first(parent):
+        extension = file.item("nodes", index).get("extensions", {}).get("KHR_node_visibility", {})
+        shown[:, index] = extension.get("visible", True)
+        if (index, "visible") in clip.curves:
+            shown[:, index] = clip.curves[index, "visible"].at(time)[:, 0] > 0.5
+        if parent[index] >= 0:
+            shown[:, index] &= shown[:, parent[index]]
+    return shown
 
 
 def _local(file: Gltf, index: int, clip: Clip, time: np.ndarray) -> np.ndarray:

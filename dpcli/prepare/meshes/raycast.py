@@ -12,19 +12,21 @@ _LIGHT = np.array(
     [0.37, 0.74, 0.56], np.float32
 )  # unit, where the light comes from: above, in front, a little to the right
 _DECODED = to_linear(np.arange(256) / 255).astype(np.float32)
-_LAYERS = 8  # most surfaces that one ray passes through
+_LAYERS = 16  # most surfaces that one ray passes through
 _NUDGE = 1e-4  # a ray goes on this far behind a transparent surface
 
 
 class FrameCaster:
     """Draws one frame of an AnimatedMesh from any camera.
 
-    shading: 0 shows plain colors, 1 full light and shade. All surfaces are seen from both sides.
+    shading: 0 shows plain colors, 1 full light and shade. Triangles that are `one_sided` are not seen from behind.
     """
 
     def __init__(self, mesh: AnimatedMesh, frame: int, shading: float = 0.5) -> None:
         self.mesh, self.shading = mesh, shading
         self.positions, self.normals = mesh.positions[frame], mesh.normals[frame]
+        a, b, c = (self.positions[mesh.triangles[:, k]] for k in range(3))
+        self._across = None if mesh.one_sided is None else np.cross(b - a, c - a)
         open3d = load_open3d()
         self._tensor = open3d.core.Tensor
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
@@ -100,6 +102,11 @@ class FrameCaster:
         color = surface_color(mesh, mesh.material[triangle], corners, weights)
         if self.shading and not all(m.unlit for m in mesh.materials):
             color[:, :3] *= self._light(triangle, corners, weights, direction)[:, None]
+        if any(any(m.emission) for m in mesh.materials):
+            color[:, :3] += emitted(mesh, mesh.material[triangle], corners, weights)
+        if self._across is not None:
+            behind = np.einsum("na,na->n", self._across[triangle], direction) > 0
+            color[behind & mesh.one_sided[triangle], 3] = 0
         color[:, :3] = to_srgb(np.clip(color[:, :3], 0, 1))
         return color
 
@@ -148,6 +155,18 @@ def surface_color(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray,
         color[here, 3] = _alpha(entry, color[here, 3])
     color[np.array([m.blend == "opaque" for m in mesh.materials])[material], 3] = 1
     return color
+
+
+def emitted(mesh: AnimatedMesh, material: np.ndarray, corners: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Returns the linear RGB f32 (N,3) that points give off by themselves; arguments as for `surface_color`."""
+    light = np.array([m.emission for m in mesh.materials], np.float32)[material]
+    uv = mesh.uv if mesh.emission_uv is None else mesh.emission_uv
+    for index, entry in enumerate(mesh.materials):
+        if entry.emission_texture is not None:
+            here = material == index
+            place = np.einsum("nk,nka->na", weights[here], uv[corners[here]])
+            light[here] *= sample_texture(entry.emission_texture, place)[:, :3]
+    return light
 
 
 def _alpha(material: Material, alpha: np.ndarray) -> np.ndarray:

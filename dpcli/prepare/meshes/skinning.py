@@ -11,8 +11,10 @@ from dpcli.ops.rotations import motion_matrix, quaternion_to_matrix
 
 @dataclass(frozen=True)
 class Curve:
-    """Holds a property over time. times: f64 (K) seconds, rising. values: f64 (K,D), CUBICSPLINE (K,3,D): in-tangent,
-    value, out-tangent. interpolation: LINEAR | STEP | CUBICSPLINE. rotation: values are quaternions x y z w.
+    """Holds a property over time. times: f64 (K) seconds, rising; at equal ones the value jumps to the last.
+
+    values: f64 (K,D), CUBICSPLINE (K,3,D): in-tangent, value, out-tangent. interpolation: LINEAR | STEP |
+    CUBICSPLINE. rotation: values are quaternions x y z w.
     """
 
     times: np.ndarray
@@ -29,7 +31,7 @@ class Curve:
             return normalize(found) if self.rotation else found
         k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
         step = self.times[k + 1] - self.times[k]
-        s = ((time - self.times[k]) / step)[:, None]
+        s = np.where(step > 0, (time - self.times[k]) / np.where(step > 0, step, 1), 1)[:, None]
         if cubic:
             found = _hermite(self.values[k], self.values[k + 1], step[:, None], s)
             return normalize(found) if self.rotation else found

@@ -1,4 +1,4 @@
-"""From the clouds of one sequence, as they lie in their files, to a sample: cleaned, in one unit, near the origin."""
+"""Makes a sample of the clouds of one sequence, as they lie in their files: cleaned, in one unit, near the origin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which files of a tree of folders are the frames of point cloud sequences: one sequence at most in each folder."""
+"""Finds the frames of point cloud sequences in a tree of folders: one sequence at most in each folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which rows of a table make which frame of which sequence: by a column of frames, one of sequences, and gaps."""
+"""Sorts the rows of a table into frames of sequences: by a column of frames, one of sequences, and gaps."""
 
 from __future__ import annotations
 

@@ -56,7 +56,10 @@ class Box:
 
 
 def read_boxes(path: Path) -> list[Box]:
-    """Reads the boxes of a label file, in its order, without DontCare regions. DataError names the line that is not one."""
+    """Reads the boxes of a label file, in its order, without DontCare regions.
+
+    DataError names the line that is not one.
+    """
     boxes = []
     for number, line in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
         words = line.split()

@@ -174,7 +174,9 @@ def _item(name: str, path: Path, split: str, row: int, label: int) -> Item:
 
 
 def _listed(path: Path) -> set[str] | None:
-    """Returns file names of a list such as ``data/modelnet40_ply_hdf5_2048/ply_data_train0.h5``; None without the list."""
+    """Returns file names of a list such as ``data/modelnet40_ply_hdf5_2048/ply_data_train0.h5``; None without the
+    list.
+    """
     if not path.is_file():
         return None
     lines = path.read_text(errors="replace").split("\n")

@@ -182,7 +182,9 @@ class SemanticKitti:
         return points, label[index], len(scan) - len(index)
 
     def _alignment(self, item: Item) -> np.ndarray:
-        """Returns f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities without."""
+        """Returns f64 (frames,4,4): what moves each scan's camera points to the camera of the first; identities
+        without.
+        """
         numbers = [int(name) for name in item.extra["scans"]]
         if not self.align:
             return np.tile(np.eye(4), (len(numbers), 1, 1))

@@ -1,4 +1,7 @@
-"""Made-up animals at rest: bones, the round shapes around them, and how big everything is. They look along +z, y is up."""
+"""Made-up animals at rest: bones, the round shapes around them, and how big everything is.
+
+They look along +z, y is up.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,9 @@ class Shape:
 
 @dataclass
 class Creature:
-    """Holds bones, parents before children; shapes; eyes: (bone, center of the head, direction, radius), on the surface."""
+    """Holds bones, parents before children; shapes; eyes: (bone, center of the head, direction, radius), on the
+    surface.
+    """
 
     kind: str
     bones: list[Bone] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""How made-up animals move: every bone's turn over time, as sums of few sines, so that a clip loops."""
+"""The gaits of made-up animals: every bone turns over time by a sum of few sines, so that a clip loops."""
 
 from __future__ import annotations
 

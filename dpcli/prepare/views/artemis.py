@@ -38,7 +38,10 @@ _INSIDE = 0.7  # of the true tracks have to fall on the object; else cameras and
 
 @dataclass(frozen=True, kw_only=True)
 class ArtemisOptions:
-    """Says what is taken of an animal. Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number."""
+    """Says what is taken of an animal.
+
+    Empty `cameras`: the nearest to TEST_AZIMUTHS; reference None: the lowest number.
+    """
 
     motion: str
     frames: int = 32
@@ -169,7 +172,10 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 
 def _choose(motion: Motion, frame: int, poses: np.ndarray, reference: int, options: ArtemisOptions) -> list[int]:
-    """Returns the test cameras; the log says which and where they stand. Raises UsageError on cameras that aren't there."""
+    """Returns the test cameras; the log says which and where they stand.
+
+    Raises UsageError on cameras that aren't there.
+    """
     present = [camera for camera in _present(motion, frame, len(poses)) if camera != reference]
     azimuth = {camera: np.rad2deg(orbit_of(poses[camera])[0]) for camera in (*present, reference)}
     for option, wanted in (("--cameras", options.cameras), ("--train-cameras", options.train_cameras)):
@@ -282,7 +288,9 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
 
 
 def _check_tracks(motion: Motion, frame: int, view: int, rig: _Rig, points: np.ndarray) -> None:
-    """Warn when the skinned voxels do not project into the silhouette: then cameras or bones are of another convention."""
+    """Warn when the skinned voxels do not project into the silhouette: then cameras or bones are of another
+    convention.
+    """
     alpha = _alpha(motion, frame, view)[..., 3]
     seen = points @ rig.poses[view][:3, :3].T + rig.poses[view][:3, 3]
     pixel = seen @ rig.intrinsics[view].T

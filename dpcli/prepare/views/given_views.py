@@ -37,7 +37,9 @@ def six_views(radius: float = DEFAULT_RADIUS, fovy: float = DEFAULT_FOVY) -> lis
 
 
 def read_cameras(path: Path, radius: float = DEFAULT_RADIUS, fovy: float = DEFAULT_FOVY) -> list[OrbitCamera]:
-    """Reads cameras of a JSON list of objects, angles in degrees; radius and fovy (radians) fill in what an entry lacks."""
+    """Reads cameras of a JSON list of objects, angles in degrees; radius and fovy (radians) fill in what an entry
+    lacks.
+    """
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -1,4 +1,6 @@
-"""From a capture's own world into ours: y up, the object at the origin in a sphere of known radius, azimuth 0 in front."""
+"""Maps a capture's own world into ours: y up, the object at the origin in a sphere of known radius, azimuth 0 in
+front.
+"""
 
 from __future__ import annotations
 

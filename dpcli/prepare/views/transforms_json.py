@@ -28,6 +28,8 @@ FILES = {
     "transforms_val.json": "test",
     "transforms_test.json": "test",
 }
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3", "s4")
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
 _UP = np.array([0.0, 0.0, 1.0])  # Blender's world
 
@@ -38,6 +40,7 @@ class _View:
     role: str
     focal: dict[str, float]
     paths: dict[float, Path] = field(default_factory=dict)  # by time
+    masks: dict[float, Path] = field(default_factory=dict)  # by time, where the file names them
 
 
 def is_transforms(path: Path) -> bool:
@@ -50,7 +53,9 @@ def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     _check(options)
     views, times = _grid(path)
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
-    return {**config, "input_digest": digest_of(view.paths[time] for view in views for time in times)}
+    config["input_digest"] = digest_of(view.paths[time] for view in views for time in times)
+    masks = [view.masks[time] for view in views for time in times if time in view.masks]
+    return {**config, "mask_digest": digest_of(masks)} if masks else config
 
 
 def _check(options: VideoOptions) -> None:
@@ -90,7 +95,7 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
         for number, view in enumerate(views):
             for row, time in enumerate(times):
-                yield number, row, crops[number].apply(_cut(view.paths[time], options), options.size)
+                yield number, row, crops[number].apply(_cut(view, time, options), options.size)
 
     return Clip(header, pictures)
 
@@ -133,10 +138,28 @@ def _collect(path: Path, role: str, views: dict[bytes, _View], times: set[float]
         except KeyError as error:
             hint = " (a still scene? 4D needs the time of every frame)" if error.args == ("time",) else ""
             raise DataError(f"{where}: no {error.args[0]!r}{hint}") from None
+        _check_lens(where, {**found, **frame})
         own = focal | {key: frame[key] for key in ("camera_angle_x", "fl_x", "fl_y", "cx", "cy") if key in frame}
         key = np.round(pose, 5).tobytes() + role.encode()
-        views.setdefault(key, _View(pose, role, own)).paths[time] = image
+        view = views.setdefault(key, _View(pose, role, own))
+        view.paths[time] = image
+        if frame.get("mask_path"):
+            view.masks[time] = _image(path.parent, str(frame["mask_path"]))
         times.add(time)
+
+
+def _check_lens(where: str, camera: dict[str, Any]) -> None:
+    """Raises DataError at a lens that no pinhole camera describes: a fisheye or panorama, or distortion that isn't 0."""
+    model = str(camera.get("camera_model") or "PINHOLE").upper()
+    bent = [f"{key} {camera[key]}" for key in _DISTORTION if camera.get(key)]
+    if camera.get("is_fisheye"):
+        model = "fisheye"
+    if model not in _PINHOLES or bent:
+        found = f"camera_model {model}" if model not in _PINHOLES else ", ".join(bent)
+        raise DataError(
+            f"{where}: {found}; expected pictures without lens distortion\n"
+            "Undistort them first (colmap image_undistorter, or cv2.undistort), and write the cameras of the result"
+        )
 
 
 def _pose(where: str, matrix: Any) -> np.ndarray:
@@ -188,7 +211,10 @@ def _intrinsics(view: _View, width: int, height: int) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
-def _cut(path: Path, options: VideoOptions) -> np.ndarray:
+def _cut(view: _View, time: float, options: VideoOptions) -> np.ndarray:
+    path = view.paths[time]
+    if time in view.masks:
+        return matting.with_mask(read_rgba(path), view.masks[time], path.name)
     return matting.cut_alone(read_rgba(path), str(path), options.background, options.tolerance, options.holes)
 
 
@@ -197,7 +223,7 @@ def _look(view: _View, times: list[float], options: VideoOptions) -> tuple[Box, 
     boxes: list[Box] = []
     sizes: dict[tuple[int, int], Path] = defaultdict()
     for time in times:
-        rgba = _cut(view.paths[time], options)
+        rgba = _cut(view, time, options)
         sizes.setdefault((rgba.shape[1], rgba.shape[0]), view.paths[time])
         if len(sizes) > 1:
             (a, first), (b, second) = sizes.items()

@@ -1,4 +1,6 @@
-"""What `--check` looks for in a clip or an ARTEMIS animal beyond its recipe: an index that opens no picture wholly."""
+"""Indices of a clip or an ARTEMIS animal for `--check`: they find beyond the recipe what lacks, and open no picture
+wholly.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,10 @@ class ArtemisIndex:
     motion: str = ""
 
     def items(self) -> list[Item]:
-        """Returns one item a motion that is there or in the file `sequences`. Raises DataError when cameras are unknown."""
+        """Returns one item a motion that is there or in the file `sequences`.
+
+        Raises DataError when cameras are unknown.
+        """
         poses, cameras = read_poses(self.animal / "CamPose.inf"), read_intrinsics(self.animal / "Intrinsic.inf")
         if len(poses) != len(cameras):
             raise DataError(f"{self.animal}: CamPose.inf has {len(poses)} cameras, Intrinsic.inf {len(cameras)}")
@@ -56,7 +61,9 @@ class ArtemisIndex:
         return "; ".join(faults)
 
     def _lacking_bones(self, motion: Motion) -> Iterator[str]:
-        """Returns which bones lack: without bones/ an animal has no true tracks, which is allowed; some of them is not."""
+        """Returns which bones lack: without bones/ an animal has no true tracks, which is allowed; some of them is
+        not.
+        """
         if (self.animal / "bones").is_dir():
             for frame in motion.folders:
                 name = f"bones/{motion.name}/Bones_{frame:04d}.inf"
@@ -89,7 +96,10 @@ class ClipIndex:
     options: VideoOptions
 
     def items(self) -> list[Item]:
-        """Returns one item a frame; of pictures only the head is read. Raises DataError when masks or views lack frames."""
+        """Returns one item a frame; of pictures only the head is read.
+
+        Raises DataError when masks or views lack frames.
+        """
         if is_transforms(self.clip):
             transforms_config(self.clip, self.options)  # finds every picture that the lists name
             return [Item(clip_name(self.clip), self.clip)]

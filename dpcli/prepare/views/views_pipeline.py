@@ -1,4 +1,4 @@
-"""From a clip to a `views` file: pictures are made and written one after the other."""
+"""Leads from a clip to a `views` file: pictures are made and written one after the other."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def convert_clip(
 ) -> ViewsHeader:
     """Writes a clip to `output` and return its header; a finished file of the same configuration is left as it is.
 
-    config: everything that decides the content, digests of the inputs among them. Raises UsageError when `output` was made
-    another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
+    config: everything that decides the content, digests of the inputs among them. Raises UsageError when `output` was
+    made another way and `force` is off; Stopped after a stop signal (a clip is short, so a part of one isn't kept).
     """
     provenance = record(json.loads(json.dumps({"reader": source, **config})), seed)
     if not force and already_made(output, provenance, ViewsReader):

@@ -20,7 +20,7 @@ from dpcli.runtime.toml_file import read_toml
 
 @dataclass(frozen=True)
 class Given:
-    """What a user said about a command's settings: the preset's name, and values by public name from each source.
+    """Holds what a user said about a command's settings: the preset's name, and values by public name from each source.
 
     Raises UsageError when a setting has both a flag and a `--set`.
     """

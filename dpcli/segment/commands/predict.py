@@ -69,7 +69,10 @@ def predict_file(
         reader = CloudsReader(path)
         sequences = sequences_of_split(reader, settings.input.split, data)
         estimator = find_estimator(settings.input.flow)
-        config = {"input": asdict(settings.input), "refinement": asdict(refinement), **segmenter.record()}
+        said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
+        if settings.classical.method is not None:
+            said["classical"] = settings.classical.used()
+        config = {"settings": said, **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
         fields = [name for name in reader.fields if name not in ("part", "pose")]

@@ -2,9 +2,3 @@
 
 Nothing here knows of part networks but their slot matching.
 """
-
-from __future__ import annotations
-
-from dpcli.segment.flow.estimators import METHODS, estimate_flow
-
-__all__ = ["METHODS", "estimate_flow"]

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dpcli.ops.cpu.jit import kernel
+from dpcli.ops.cpu.jit import inlined, kernel
 
 _BLOCK = 128  # distances whose least is found at once; the compiler vectorizes that for 128, not for 64
 _WORST = np.int32(0x7FFFFFFF)
@@ -43,13 +43,15 @@ def nearest_point(x, y, z, cloud, squared, bits):
 
 
 @kernel
-def _look_up(points, cloud, around, near, grid, origin, cells_per_unit, work, bits, at, far):
+def _look_up(points, search, work, bits, at, far):
     """Finds the nearest of cloud (3,M) for points f32 (3,n) through a grid: columns and squared distances.
 
     They go into at i64 (n) and far f32 (n). Only the neighbors of the point nearest to the center of each one's cell
-    are tried. near f32 (M,3,16): the places of the neighbors `around` (M,k), far away beyond the k. Scratch: work f32,
-    of at least M and 16 n, and its bits. In three passes, because a search point by point waits for memory each time.
+    are tried. search: a prepared cloud, see `surface_icp.Surface`: cloud, normals f32 (3,M); the neighbors around (M,k)
+    and their places near f32 (M,3,16), far away beyond the k; the grid, its origin and scale. Scratch: work f32, of at
+    least M and 16 n, and its bits. In three passes, because a search point by point waits for memory each time.
     """
+    cloud, _, around, near, grid, origin, cells_per_unit = search
     count, lanes, top = np.uintp(points.shape[1]), np.uintp(near.shape[2]), np.int32(0)
     ends = np.int32(grid.shape[0] - 1), np.int32(grid.shape[1] - 1), np.int32(grid.shape[2] - 1)
     for n in range(count):
@@ -116,14 +118,70 @@ def _compose(motion, v, center):
                 motion[i, 3] += center[i] + v[3 + i]
 
 
-@kernel
-def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_unit, motion, steps, wide, narrow, share):
-    """Makes Gauss-Newton steps of robust ICP: motion (3,4) f64 in place, source (3,n) onto cloud (3,M).
+@inlined
+def _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector):
+    """Writes the lower triangle of a Gauss-Newton step's matrix (6,6) and its vector (6); returns the sum of weights.
 
-    Each point's residual is its distance to the nearest point's plane plus `share` times the distance to the point
-    itself (both squared), weighted by Geman and McClure's 1 / (1 + d^2/s^2)^2 with s falling from wide to narrow.
+    The sums are plain numbers: kept in arrays, they were stored again for every point.
     """
-    count = source.shape[1]
+    total = 1e-6
+    v0 = v1 = v2 = v3 = v4 = v5 = 0.0
+    m00 = m10 = m11 = m20 = m21 = m22 = 0.0
+    m30 = m31 = m32 = m40 = m41 = m42 = m50 = m51 = m52 = 0.0
+    m33 = m43 = m44 = m53 = m54 = m55 = 0.0
+    for i in range(moved.shape[1]):
+        x, y, z, j = moved[0, i], moved[1, i], moved[2, i], np.uintp(at[i])
+        w = 1 / (1 + far[i] / (scale * scale))
+        w *= w
+        total += w
+        rx, ry, rz = cloud[0, j] - x, cloud[1, j] - y, cloud[2, j] - z
+        nx, ny, nz = np.float64(normals[0, j]), np.float64(normals[1, j]), np.float64(normals[2, j])
+        x, y, z = x - center[0], y - center[1], z - center[2]
+        a, b, c = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+        gap = w * (nx * rx + ny * ry + nz * rz)
+        u = w * share
+        v0 += gap * a + u * (y * rz - z * ry)
+        v1 += gap * b + u * (z * rx - x * rz)
+        v2 += gap * c + u * (x * ry - y * rx)
+        v3, v4, v5 = v3 + (gap * nx + u * rx), v4 + (gap * ny + u * ry), v5 + (gap * nz + u * rz)
+        wa, wb, wc = w * a, w * b, w * c
+        m00 += wa * a + u * (y * y + z * z)
+        m10 += wb * a - u * x * y
+        m11 += wb * b + u * (x * x + z * z)
+        m20 += wc * a - u * x * z
+        m21 += wc * b - u * y * z
+        m22 += wc * c + u * (x * x + y * y)
+        m30 += wa * nx
+        m31 += wb * nx + u * z
+        m32 += wc * nx - u * y
+        m40 += wa * ny - u * z
+        m41 += wb * ny
+        m42 += wc * ny + u * x
+        m50 += wa * nz + u * y
+        m51 += wb * nz - u * x
+        m52 += wc * nz
+        wx, wy, wz = w * nx, w * ny, w * nz
+        m33, m43, m44 = m33 + (wx * nx + u), m43 + wx * ny, m44 + (wy * ny + u)
+        m53, m54, m55 = m53 + wx * nz, m54 + wy * nz, m55 + (wz * nz + u)
+    vector[0], vector[1], vector[2], vector[3], vector[4], vector[5] = v0, v1, v2, v3, v4, v5
+    matrix[0, 0], matrix[1, 0], matrix[1, 1] = m00, m10, m11
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = m20, m21, m22
+    matrix[3, 0], matrix[3, 1], matrix[3, 2], matrix[3, 3] = m30, m31, m32, m33
+    matrix[4, 0], matrix[4, 1], matrix[4, 2], matrix[4, 3], matrix[4, 4] = m40, m41, m42, m43, m44
+    matrix[5, 0], matrix[5, 1], matrix[5, 2] = m50, m51, m52
+    matrix[5, 3], matrix[5, 4], matrix[5, 5] = m53, m54, m55
+    return total
+
+
+@kernel
+def icp_kernel(source, search, motion, steps, wide, narrow, share):
+    """Makes Gauss-Newton steps of robust ICP: motion (3,4) f64 in place, source (3,n) onto the cloud of `search`.
+
+    search: as `_look_up` has it. Each point's residual is its distance to the nearest point's plane plus `share` times
+    the distance to the point itself (both squared), weighted by Geman and McClure's 1 / (1 + d^2/s^2)^2 with s falling
+    from wide to narrow.
+    """
+    cloud, normals, near, count = search[0], search[1], search[3], source.shape[1]
     matrix, vector, center = np.empty((6, 6)), np.empty(6), np.empty(3)
     moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
     at, far = np.empty(count, np.int64), np.empty(count, np.float32)
@@ -139,79 +197,8 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
                 rounded[k, i] = moved[k, i]
                 total += moved[k, i]
             center[k] = total / count
-        _look_up(rounded, cloud, around, near, grid, origin, cells_per_unit, work, bits, at, far)
-        # the normal equations' sums as plain numbers: kept in arrays, they were stored again for every point
-        total = 1e-6
-        v0 = v1 = v2 = v3 = v4 = v5 = 0.0
-        m00 = m10 = m11 = m20 = m21 = m22 = 0.0
-        m30 = m31 = m32 = m40 = m41 = m42 = m50 = m51 = m52 = 0.0
-        m33 = m43 = m44 = m53 = m54 = m55 = 0.0
-        for i in range(count):
-            x, y, z, j = moved[0, i], moved[1, i], moved[2, i], np.uintp(at[i])
-            w = 1 / (1 + far[i] / (scale * scale))
-            w *= w
-            total += w
-            rx, ry, rz = cloud[0, j] - x, cloud[1, j] - y, cloud[2, j] - z
-            nx, ny, nz = np.float64(normals[0, j]), np.float64(normals[1, j]), np.float64(normals[2, j])
-            x, y, z = x - center[0], y - center[1], z - center[2]
-            a, b, c = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-            gap = w * (nx * rx + ny * ry + nz * rz)
-            u = w * share
-            v0 += gap * a + u * (y * rz - z * ry)
-            v1 += gap * b + u * (z * rx - x * rz)
-            v2 += gap * c + u * (x * ry - y * rx)
-            v3 += gap * nx + u * rx
-            v4 += gap * ny + u * ry
-            v5 += gap * nz + u * rz
-            wa, wb, wc = w * a, w * b, w * c
-            m00 += wa * a + u * (y * y + z * z)
-            m10 += wb * a - u * x * y
-            m11 += wb * b + u * (x * x + z * z)
-            m20 += wc * a - u * x * z
-            m21 += wc * b - u * y * z
-            m22 += wc * c + u * (x * x + y * y)
-            m30 += wa * nx
-            m31 += wb * nx + u * z
-            m32 += wc * nx - u * y
-            m40 += wa * ny - u * z
-            m41 += wb * ny
-            m42 += wc * ny + u * x
-            m50 += wa * nz + u * y
-            m51 += wb * nz - u * x
-            m52 += wc * nz
-            wx, wy, wz = w * nx, w * ny, w * nz
-            m33 += wx * nx + u
-            m43 += wx * ny
-            m44 += wy * ny + u
-            m53 += wx * nz
-            m54 += wy * nz
-            m55 += wz * nz + u
-        vector[0], vector[1], vector[2], vector[3], vector[4], vector[5] = v0, v1, v2, v3, v4, v5
-        matrix[0, 0], matrix[1, 0], matrix[1, 1], matrix[2, 0], matrix[2, 1], matrix[2, 2] = (
-            m00,
-            m10,
-            m11,
-            m20,
-            m21,
-            m22,
-        )
-        matrix[3, 0], matrix[3, 1], matrix[3, 2], matrix[4, 0], matrix[4, 1], matrix[4, 2] = (
-            m30,
-            m31,
-            m32,
-            m40,
-            m41,
-            m42,
-        )
-        matrix[5, 0], matrix[5, 1], matrix[5, 2], matrix[3, 3], matrix[4, 3], matrix[4, 4] = (
-            m50,
-            m51,
-            m52,
-            m33,
-            m43,
-            m44,
-        )
-        matrix[5, 3], matrix[5, 4], matrix[5, 5] = m53, m54, m55
+        _look_up(rounded, search, work, bits, at, far)
+        total = _sum_normal_equations(moved, cloud, normals, at, far, center, scale, share, matrix, vector)
         for a in range(6):  # keeps a line or a single point from turning freely
             matrix[a, a] += 1e-6 * total * (0.05 if a < 3 else 1.0)
         _solve(matrix, vector)
@@ -219,12 +206,12 @@ def icp_kernel(source, cloud, normals, around, near, grid, origin, cells_per_uni
 
 
 @kernel
-def residual_kernel(source, cloud, normals, around, near, grid, origin, cells_per_unit, motion, share, out):
+def residual_kernel(source, search, motion, share, out):
     """Computes squared residuals (n) of source (3,n) moved by motion, as f64 into `out`.
 
     A residual is (1 - share) plane distance^2 + share point distance^2.
     """
-    count = source.shape[1]
+    cloud, normals, near, count = search[0], search[1], search[3], source.shape[1]
     moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
     at, far = np.empty(count, np.int64), np.empty(count, np.float32)
     work = np.empty(max(cloud.shape[1], near.shape[2] * count), np.float32)
@@ -233,7 +220,7 @@ def residual_kernel(source, cloud, normals, around, near, grid, origin, cells_pe
             s = motion[k, 0] * source[0, i] + motion[k, 1] * source[1, i] + motion[k, 2] * source[2, i]
             moved[k, i] = s + motion[k, 3]
             rounded[k, i] = moved[k, i]
-    _look_up(rounded, cloud, around, near, grid, origin, cells_per_unit, work, work.view(np.int32), at, far)
+    _look_up(rounded, search, work, work.view(np.int32), at, far)
     for i in range(count):
         x, y, z, j = moved[0, i], moved[1, i], moved[2, i], np.uintp(at[i])
         gap = (cloud[0, j] - x) * normals[0, j] + (cloud[1, j] - y) * normals[1, j] + (cloud[2, j] - z) * normals[2, j]
@@ -241,36 +228,15 @@ def residual_kernel(source, cloud, normals, around, near, grid, origin, cells_pe
 
 
 @kernel
-def hypotheses_kernel(
-    source,
-    cloud,
-    normals,
-    around,
-    near,
-    grid,
-    origin,
-    cells_per_unit,
-    motions,
-    steps,
-    wide,
-    narrow,
-    share,
-    share_out,
-    scale,
-    out,
-):
+def hypotheses_kernel(source, search, motions, steps, wide, narrow, share, share_out, scale, out):
     """Runs ICP from every one of motions (H,3,4), in place.
 
     out (H): the mean of d^2 / (d^2 + scale^2) afterwards, d^2 as in `residual_kernel` with `share_out`.
     """
     squared = np.empty(source.shape[1])
     for h in range(len(motions)):
-        icp_kernel(
-            source, cloud, normals, around, near, grid, origin, cells_per_unit, motions[h], steps, wide, narrow, share
-        )
-        residual_kernel(
-            source, cloud, normals, around, near, grid, origin, cells_per_unit, motions[h], share_out, squared
-        )
+        icp_kernel(source, search, motions[h], steps, wide, narrow, share)
+        residual_kernel(source, search, motions[h], share_out, squared)
         out[h] = 0.0
         for i in range(len(squared)):
             out[h] += squared[i] / (squared[i] + scale * scale)
@@ -299,13 +265,14 @@ def _gap(m, px, py, pz, x, y, z):
 
 
 @kernel
-def energy_kernel(points, normals, label, motion, cost, neighbors, target, share, scale, tear, border, distance):
+def energy_kernel(points, normals, label, motion, cost, neighbors, target, weights):
     """Returns what bodies cost: both clouds' mean saturated residuals, the borders, and the way from body 0.
 
     points (N,3), their normals (N,3), label (N), motion (K,3,4), cost (K,N) saturated residuals, neighbors (N,k),
     target f32 (3,M). A border point costs more, from 1 - tear to 1, the farther apart (0.15 is far) its two motions
     take it. The weights are those of `rigid_bodies.BodySearch`.
     """
+    share, scale, tear, border, distance = weights
     count, near = neighbors.shape
     moved, turned = np.empty((3, count), np.float32), np.empty((3, count), np.float32)
     own, torn, away = 0.0, 0.0, 0.0

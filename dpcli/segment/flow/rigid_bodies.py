@@ -168,19 +168,10 @@ class _BodyFinder:
         It sums both clouds' mean saturated residuals, the borders, and the way from the first body.
         """
         options = self.options
+        weights = (options.share, self.scale, options.tear, options.border, options.far)
+        source, target = self.source, self.target
         energy = energy_kernel(
-            self.points,
-            self.source.normals,
-            label,
-            motion,
-            cost,
-            self.source.neighbors,
-            self.target.columns,
-            options.share,
-            self.scale,
-            options.tear,
-            options.border,
-            options.far,
+            self.points, source.normals, label, motion, cost, source.neighbors, target.columns, weights
         )
         return Bodies(label, motion, energy, cost)
 

@@ -31,10 +31,10 @@ def rigid_groups(
     a tolerance: three times the median residual of the small neighborhoods' own fits, kept within the bounds
     (diameters).
 
-    The left 60 points of a line stand still, the right 40 rise:
+    The left 60 points of a block stand still, the right 40 rise:
 
-    >>> points = torch.linspace(0, 1, 100)[None, :, None] * torch.tensor([1.0, 0.0, 0.0])
-    >>> flow = (points[..., :1] > 0.6) * torch.tensor([0.0, 0.0, 0.3])
+    >>> points = torch.cartesian_prod(torch.arange(5.0), torch.arange(4.0), torch.arange(5.0))[None] / 8
+    >>> flow = (points[..., :1] > 0.3) * torch.tensor([0.0, 0.0, 0.3])
     >>> rigid_groups(points, flow)[0].bincount().tolist()
     [60, 40]
     """

@@ -54,7 +54,7 @@ class Surface:
         The ICP is robust and point to plane.
         """
         motion = motion.copy()
-        icp_kernel(source, *self._search, motion, steps, wide, narrow, SHARE)
+        icp_kernel(source, self._search, motion, steps, wide, narrow, SHARE)
         return motion
 
     def icp_many(
@@ -74,16 +74,16 @@ class Surface:
         motions, score = motions.copy(), np.empty(len(motions))
         settings = (SHARE, share, scale)
         half, middle = steps // 3, (wide * wide * narrow) ** (1 / 3)
-        hypotheses_kernel(source, *self._search, motions, half, wide, middle, *settings, score)
+        hypotheses_kernel(source, self._search, motions, half, wide, middle, *settings, score)
         best = np.argsort(score, kind="stable")[: max(len(motions) // 2, 4)]
         motions, score = motions[best], score[best]
-        hypotheses_kernel(source, *self._search, motions, steps - half, middle, narrow, *settings, score)
+        hypotheses_kernel(source, self._search, motions, steps - half, middle, narrow, *settings, score)
         return motions, score
 
     def residuals(self, source: np.ndarray, motion: np.ndarray, share: float) -> np.ndarray:
         """Returns squared residuals (n) of source (3,n) f32, moved: point to plane, and `share` of point to point."""
         out = np.empty(source.shape[1])
-        residual_kernel(source, *self._search, motion, share, out)
+        residual_kernel(source, self._search, motion, share, out)
         return out
 
     def covered_by(self, moved: np.ndarray, normals: np.ndarray, share: float) -> np.ndarray:

@@ -81,14 +81,14 @@ class FlowTrainer:
         self.folder.draw_curves()
         return self.model.eval()
 
-    def _rate(self) -> float:
+    def _learning_rate(self) -> float:
         """Returns the learning rate of the step."""
         return max(1e-3 * 0.5 ** (self.step * self.batch // 400_000), 1e-5)
 
     def _one_step(self) -> None:
         """Learns from one batch of pairs, drawn and changed at random."""
         for group in self.optimizer.param_groups:
-            group["lr"] = self._rate()
+            group["lr"] = self._learning_rate()
         rng = generator(self.seed, SegmentStream.FLOW_TRAINING, 1, self.step)
         pairs = []
         for number in rng.integers(len(self.source.pairs), size=self.batch):
@@ -114,7 +114,7 @@ class FlowTrainer:
             "chamfer": chamfer_sum / count,
             "validation_loss": value,
             "validation_epe": error,
-            "learning_rate": self._rate(),
+            "learning_rate": self._learning_rate(),
             "seconds": round(seconds, 2),
         }
         log.detail(f"{row}")

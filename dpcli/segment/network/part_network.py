@@ -29,7 +29,7 @@ class PartNetwork(nn.Module):
     def __init__(self, config: PartConfig) -> None:
         super().__init__()
         self.config = config
-        self.mixed = False  # products in bfloat16: see `precision`
+        self.mixed = False  # products in bfloat16: see `runtime.mixed_precision`
         self.encoder = Encoder(config)
         self.segmentation = SegmentationHead(config)
         self.motion = MotionHead(config) if config.motion_width else None

@@ -49,7 +49,7 @@ class Schedule:
     def __post_init__(self) -> None:
         check(self)
 
-    def rate(self, step: int, steps: int) -> float:
+    def learning_rate_at(self, step: int, steps: int) -> float:
         """Returns the learning rate of one step (from 0) of `steps`."""
         warm = max(1, min(100, steps // 10))
         if step < warm:

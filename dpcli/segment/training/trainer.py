@@ -135,7 +135,7 @@ class Trainer:
             rng = torch.Generator().manual_seed(torch_seed(self.seed, SegmentStream.TURN, step))
             batch.points, rotation = turn_randomly(batch.points, rng)
             batch.flow = batch.flow @ rotation.mT
-        rate = self.schedule.rate(step, steps)
+        rate = self.schedule.learning_rate_at(step, steps)
         outcome = pair_loss(self.model, batch, self.objective, step / max(steps, 1))
         self._optimize(outcome.loss, rate)
         if outcome.flow is not None:

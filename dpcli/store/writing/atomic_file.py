@@ -71,7 +71,7 @@ class AtomicFile:
         return disk_full(self.target, error, "nothing was left under that name. Free space, then run again")
 
     def flush(self) -> None:
-        """Hand everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
+        """Hands everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
         self.file.flush()
         if hasattr(os, "posix_fadvise"):
             size = os.fstat(self.handle).st_size
@@ -81,7 +81,7 @@ class AtomicFile:
             self._written_out = size
 
     def commit(self) -> None:
-        """Close, flush to the disk, rename."""
+        """Closes the file, brings it to the disk and renames it; DpcError when that fails."""
         try:
             self.file.flush()
             self.file.close()
@@ -94,6 +94,7 @@ class AtomicFile:
             raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
 
     def discard(self) -> None:
+        """Closes and removes the unfinished file."""
         self._close()
         self.part.unlink(missing_ok=True)
 
@@ -110,7 +111,7 @@ class AtomicFile:
         trace: TracebackType | None,
         keep: bool = False,
     ) -> None:
-        """Discard after an exception, or `keep` the part unfinished; re-raise a failed write in words."""
+        """Discards after an exception, or `keep` the part unfinished; re-raise a failed write in words."""
         worded = self.problem(error) if error is not None else None
         if worded is not None:
             self._let_go()
@@ -122,7 +123,7 @@ class AtomicFile:
             raise worded from None
 
     def _let_go(self) -> None:
-        """After a failed write: what HDF5 still holds goes to the null device instead of to the full disk.
+        """Sends what HDF5 still holds after a failed write to the null device instead of to the full disk.
 
         It would try again on every close, complain each time, and crash as the process ends.
         """

@@ -1,4 +1,4 @@
-"""What a writer has been given so far, in a file that survives a kill at any moment.
+"""The record of what a writer has been given so far, in a file that survives a kill at any moment.
 
 HDF5 can't be read again when its writer is killed in the middle. So each sample, before it counts as written, leaves a
 record at the end of a plain file: length, checksum, content. Bytes that are in the unfinished HDF5 file at a known
@@ -35,7 +35,7 @@ _DATA_SUFFIXES = (".new", ".alt")  # of one length, as it is said in the journal
 
 
 class Journal:
-    """The samples given to one writer, in the file `path`, which this process alone may hold.
+    """Keeps the samples given to one writer, in the file `path`, which this process alone may hold.
 
     `about` describes the writer: what another one left is not continued. `data_name` is the HDF5 file beside it that
     what an earlier run left points into, "" when there is nothing of this very work; `other` is the `about` of samples
@@ -67,7 +67,7 @@ class Journal:
         return ""
 
     def samples(self) -> Iterator[list[Any]]:
-        """What was appended before, in order, up to what is not whole or not as it was written; once."""
+        """Yields what was appended before, in order, up to what is not whole or not as it was written; once."""
         if not self.data_name:
             return
         size = os.fstat(self._file).st_size
@@ -83,7 +83,7 @@ class Journal:
                 os.close(data)
 
     def begin(self, data: Path, number: int) -> None:
-        """Empty, but for what describes the writer. data: its HDF5 file, `number` its open handle."""
+        """Empties the file, but for what describes the writer. data: its HDF5 file, `number` its open handle."""
         os.ftruncate(self._file, 0)
         os.lseek(self._file, 0, os.SEEK_SET)
         self.data_name, self._data = data.name, os.dup(number)  # to sync it even after HDF5 has closed it
@@ -91,7 +91,7 @@ class Journal:
         self.append([self.about, self.data_name])
 
     def append(self, values: list[Any], placed: Placed | None = None) -> None:
-        """One sample: what its writer was given (sequences, arrays, lists of arrays, plain values). OSError: full disk.
+        """Appends one sample: what its writer was given (sequences, arrays, lists of arrays, plain values). OSError: full disk.
 
         placed: one of the arrays, whose first bytes are in the HDF5 file already, and where.
         """
@@ -114,7 +114,7 @@ class Journal:
         self._synced = time.monotonic()
 
     def replace(self, old: Journal) -> None:
-        """Take the place of `old`, all of whose samples are here; the HDF5 file it points into goes."""
+        """Takes the place of `old`, all of whose samples are here; the HDF5 file it points into goes."""
         self._sync()
         os.replace(self.path, old.path)
         self.path = old.path
@@ -122,49 +122,49 @@ class Journal:
         old.close()
 
     def keep(self) -> None:
-        """Close, for a later run; the HDF5 file must stay, too."""
+        """Closes the file, for a later run; the HDF5 file must stay, too."""
         if self._file >= 0:
             self._sync()
             self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Lets go of the file."""
         for number in (self._file, self._data):
             if number >= 0:
                 os.close(number)
         self._file = self._data = -1
 
     def discard(self) -> None:
-        """Remove, as its work is done or has failed, with what else killed runs left."""
+        """Removes the file, as its work is done or has failed, with what else killed runs left."""
         if self._file >= 0:
             self.remove_others("")
             self.path.unlink(missing_ok=True)
             self.close()
 
     def remove_others(self, used: str) -> None:
-        """Remove what killed runs left beside it, except `used`."""
+        """Removes what killed runs left beside it, except `used`."""
         for path in _beside(self.path):
             if path.name != used:
                 path.unlink(missing_ok=True)
 
 
 def journal_path(target: Path) -> Path:
-    """The journal of the writer of `target`."""
+    """Returns the path of the journal of the writer of `target`."""
     return target.with_name(f".{target.name}.part")
 
 
 def data_suffix(left: str) -> str:
-    """Of a new unfinished HDF5 file, beside one that an earlier run `left` and that is still needed."""
+    """Returns the suffix of a new unfinished HDF5 file, beside one that an earlier run `left` and that is still needed."""
     return _DATA_SUFFIXES[left.endswith(_DATA_SUFFIXES[0])]
 
 
 def second_path(path: Path) -> Path:
-    """Of the journal that is to take the place of the one at `path`."""
+    """Returns the path of the journal that is to take the place of the one at `path`."""
     return path.with_name(f"{path.name}.new")
 
 
 def _beside(path: Path) -> list[Path]:
-    """What the writer with the journal `path` may have left."""
+    """Lists what the writer with the journal `path` may have left."""
     return [second_path(path), *(path.with_suffix(suffix) for suffix in _DATA_SUFFIXES)]
 
 
@@ -175,7 +175,7 @@ def _write_all(number: int, data: bytes | memoryview) -> None:
 
 
 def _read_record(number: int, size: int, data: int) -> list[Any] | None:
-    """The next record; None at the end, and where what follows is cut short or is not what was written."""
+    """Reads the next record; None at the end, and where what follows is cut short or is not what was written."""
     head = os.read(number, _LENGTHS.size + _CHECK.size)
     if len(head) < _LENGTHS.size + _CHECK.size:
         return None
@@ -201,11 +201,11 @@ def _read_record(number: int, size: int, data: int) -> list[Any] | None:
 
 
 class _Changed(Exception):
-    """What a record points to is not there, or not as it was."""
+    """A record points to bytes that are not there, or not as they were."""
 
 
 def _checksum(array: np.ndarray) -> int:
-    """Of a contiguous array: the sum of each page in 64-bit words, and the CRC-32 of these and of what is left.
+    """Returns a checksum of a contiguous array: the sum of each page in 64-bit words, and the CRC-32 of these and of what is left.
 
     Several times as fast as a CRC-32 of all, and finds what is looked for: blocks that a power cut kept from the disk.
     """
@@ -216,7 +216,7 @@ def _checksum(array: np.ndarray) -> int:
 
 
 def _packed(value: Any, arrays: list[np.ndarray], placed: Placed | None = None) -> Any:
-    """`value` for JSON; the arrays in it go to `arrays` and leave their type and shape."""
+    """Returns `value` for JSON; the arrays in it go to `arrays` and leave their type and shape."""
     if isinstance(value, CloudSequence):
         return {"sequence": {f.name: _packed(getattr(value, f.name), arrays, placed) for f in fields(value)}}
     if isinstance(value, np.ndarray):
@@ -258,7 +258,7 @@ def _unpacked(value: Any, arrays: memoryview, taken: list[int], data: int) -> An
 
 
 def _read_pieces(pieces: list[tuple[int, int]], check: int, data: int) -> bytes:
-    """The bytes of the file `data` at (offset, length), joined; _Changed when they are not what they were."""
+    """Reads the bytes of the file `data` at (offset, length), joined; _Changed when they are not what they were."""
     found = b"".join(os.pread(data, length, offset) for offset, length in pieces) if data >= 0 else b""
     if len(found) != sum(length for _, length in pieces) or _checksum(np.frombuffer(found, np.uint8)) != check:
         raise _Changed
@@ -266,7 +266,7 @@ def _read_pieces(pieces: list[tuple[int, int]], check: int, data: int) -> bytes:
 
 
 def sweep(target: Path) -> None:
-    """Remove what a run killed just after it renamed its file to `target` left beside it; not what another one holds."""
+    """Removes what a run killed just after it renamed its file to `target` left beside it; not what another one holds."""
     path = journal_path(target)
     if path.exists():
         try:

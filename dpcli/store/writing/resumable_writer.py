@@ -29,8 +29,8 @@ class ResumableWriter(ABC):
     is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists, or what another provenance kept for
     it, and `force` is off.
 
-    A subclass calls `_open` at the end of its constructor and `_record` for each sample that is written, and says in
-    `_complete` what is left to write and in `_write_again` how a sample comes back from the journal.
+    A subclass has its own state ready before it calls this constructor, which opens the file and has `_create` and, to
+    continue, `_write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
     """
 
     kind = ""
@@ -54,26 +54,27 @@ class ResumableWriter(ABC):
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self.written_names: list[str] = []
         self._journal: Journal | None = None
+        self._open(force)
 
     def _about(self) -> dict[str, Any]:
-        """What decides whether a journal is of this very work: not the words of the command, which may be spelled otherwise."""
+        """Returns what decides whether a journal is of this very work: not the words of the command, which may be spelled otherwise."""
         work = [{key: value for key, value in entry.items() if key != "command"} for entry in self.provenance]
         return {"kind": self.kind, "provenance": work}
 
     def _create(self) -> None:  # noqa: B027 (not every subclass has any)
-        """The data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
+        """Makes the data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
 
     @abstractmethod
     def _write_again(self, given: list[Any]) -> str:
-        """Write a sample as `_record` was told of it; its name."""
+        """Writes a sample as `_record` was told of it, and returns its name."""
 
     @abstractmethod
     def _complete(self) -> None:
-        """Write into the HDF5 file what is still missing."""
+        """Writes into the HDF5 file what is still missing."""
 
     @abstractmethod
     def __len__(self) -> int:
-        """Samples written so far."""
+        """Counts the samples written so far."""
 
     def _open(self, force: bool) -> None:
         before = None
@@ -95,7 +96,7 @@ class ResumableWriter(ABC):
             raise
 
     def _kept_of(self, other: dict[str, Any], mine: dict[str, Any]) -> UsageError:
-        """What was kept is of other work; it stays."""
+        """Returns the error that says that what was kept is of other work; it stays."""
         old, new = ({**about, **(about.get("provenance") or [{}])[-1], "provenance": None} for about in (other, mine))
         some = [textwrap.shorten(one, 100, placeholder=" ...") for one in differences(old, new)[:3]]
         said = "; ".join(some) or "an earlier step of its files differs"
@@ -105,7 +106,7 @@ class ResumableWriter(ABC):
         )
 
     def _continue(self, before: Journal, force: bool) -> None:
-        """Write what an earlier run had written, if it was the same work."""
+        """Writes what an earlier run had written, if it was the same work."""
         if force or not before.data_name:
             self._journal = before
             before.begin(self._atomic.part, self._atomic.handle)
@@ -118,7 +119,7 @@ class ResumableWriter(ABC):
         self._journal.replace(before)
 
     def _give_up(self, before: Journal | None) -> None:
-        """Opening failed: nothing of the earlier run may be lost."""
+        """Leaves all of an earlier run as it was, since opening failed."""
         if self._journal not in (None, before):
             self._journal.path.unlink(missing_ok=True)
             self._journal.close()
@@ -129,7 +130,7 @@ class ResumableWriter(ABC):
             before.discard()
 
     def _record(self, given: list[Any], placed: Placed | None = None) -> None:
-        """From here on the sample counts as written. given, placed: as `Journal.append`."""
+        """Makes the sample count as written. given, placed: as `Journal.append`."""
         if self._journal:
             self._journal.append(given, placed)
 
@@ -144,7 +145,7 @@ class ResumableWriter(ABC):
     def _leave(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing stays but, after a stop, the journal."""
+        """Removes all but, after a stop, the journal and the file it points into."""
         stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
         kept = bool(self._journal and stopped and len(self))
         if hasattr(self, "_atomic"):

@@ -197,7 +197,9 @@ def test_guarded_solutions_and_gradients_against_autograd(size, least, guard):
     given = grad.transpose(1, 2).contiguous().numpy().reshape(-1)
     moved = np.empty((count, groups), np.bool_)
     solve_planes_back(flat, *rule, given, to_matrix.reshape(-1), to_right.reshape(-1), moved.reshape(-1))
-    mend_guarded_gradients(moments, layout.places, (least, guard), given.reshape(count, n, groups), to_matrix, moved)
+    mend_guarded_gradients(
+        moments, layout.places, planes, (least, guard), given.reshape(count, n, groups), to_matrix, moved
+    )
     wanted = torch.autograd.grad((expected * grad).sum(), leaves)
     wanted = wanted[0] + wanted[0].transpose(-1, -2), wanted[1]
     found = (

@@ -91,7 +91,7 @@ def test_a_backbone_that_groups_points_of_its_own_is_refused(tmp_path):
         cloud, times = clip_points(points)
         return [Grouping(cloud + 1, times, cloud, times, torch.zeros(len(cloud), cloud.shape[1], 2, dtype=torch.int64))]
 
-    with pytest.raises(UsageError, match="--draws: this backbone groups points"):
+    with pytest.raises(UsageError, match="draws: this backbone groups points"):
         NeighborCache(search, tmp_path, 1)(torch.randn(1, 2, 8, 3), torch.tensor([0]))
 
 
@@ -135,7 +135,7 @@ def test_a_training_with_kept_neighbors_is_the_one_that_searches_each_time(data,
     )
     fresh = last_weights(tmp_path / "fresh")
     assert not all(torch.equal(kept[key], fresh[key]) for key in kept)  # draws that come back are another training
-    assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] is None  # older runs go on
+    assert json.loads((tmp_path / "fresh" / "config.json").read_text())["schedule"]["draws"] == 0
 
 
 def test_a_stopped_run_with_draws_goes_on_to_the_same_weights(data, tmp_path, monkeypatch):
@@ -170,7 +170,7 @@ def test_no_room_for_neighbors_is_told_before_the_work(tmp_path):
 
 def test_draws_below_zero_are_refused(data, tmp_path, capfd):
     assert dpc("classify", "train", data, "-o", tmp_path / "run", *SMALL, "--set", "draws=-1") == 2
-    assert "--draws -1: expected 0" in capfd.readouterr().err
+    assert "draws = -1: expected at least 0" in capfd.readouterr().err
 
 
 def test_every_process_keeps_its_own(tmp_path):

@@ -135,7 +135,7 @@ def test_a_batch_in_parts_has_the_gradient_of_the_batch():
         found.append((total, model.static.stage2.linear2.weight.grad.clone()))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-5)
     torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=1e-7)
-    with pytest.raises(UsageError, match="--accumulate 3"):
+    with pytest.raises(UsageError, match="accumulate = 3"):
         Schedule(batch=4, accumulate=3).share(1)
     with pytest.raises(UsageError, match="3 processes"):
         Schedule(batch=4).share(3)
@@ -159,7 +159,7 @@ def test_label_smoothing_is_the_loss_against_a_share_of_every_class(alone):
     step = StageStep(model, 0, Schedule(1, 1, batch=4, label_smoothing=0.3), torch.device("cpu"), Processes())
     assert step(points, labels, 1e-3)[0] == pytest.approx(float(expected), rel=1e-5)
     for share in (-0.1, 1.0, float("nan")):
-        with pytest.raises(UsageError, match=f"--label-smoothing {share}"):
+        with pytest.raises(UsageError, match=f"label_smoothing = {share}"):
             Schedule(label_smoothing=share)
     assert json.loads((alone / "config.json").read_text())["schedule"]["label_smoothing"] == 0.05
 
@@ -292,7 +292,7 @@ def test_other_frames_start_from_trained_streams(data, alone, tmp_path, capfd):
 
 
 def test_pretraining_on_single_clouds_starts_a_static_stream(data, tmp_path, capfd):
-    """Shapes with labels, one frame each, as ModelNet40 is prepared; then `--static-from` with other classes."""
+    """Shapes with labels, one frame each, as ModelNet40 is prepared; then `static_from` with other classes."""
     rng = np.random.default_rng(0)
     with CloudsWriter(tmp_path / "shapes.h5", class_names=["ball", "rod", "disc"]) as writer:
         for i in range(9):

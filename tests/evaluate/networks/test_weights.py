@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 
 from dpcli.cli.evaluate import weights as evaluate_weights
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.evaluate.commands import weights as commands
 from dpcli.evaluate.networks import weights as module
 from dpcli.evaluate.networks.state_dicts import fill_module, load_tensors, load_weights
 from dpcli.evaluate.networks.weights import (
@@ -349,7 +350,8 @@ def test_fetch_without_a_network(tmp_path, monkeypatch):
 def run(monkeypatch, server):
     """Run `weights ...` of a toy app, with two toy entries; what it raises is raised."""
     lost = replace(server.entry, name="lost", file="lost.bin", url=server.entry.url.replace("toy", "lost"))
-    monkeypatch.setattr(module, "known_weights", lambda: {"toy": server.entry, "lost": lost})
+    for one in (module, commands):
+        monkeypatch.setattr(one, "known_weights", lambda: {"toy": server.entry, "lost": lost})
     app = typer.Typer()
     app.add_typer(evaluate_weights.app, name="weights")
     app.command("other")(lambda: None)

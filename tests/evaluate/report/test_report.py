@@ -9,7 +9,6 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,69 +21,12 @@ from dpcli.cli.evaluate.report import report as report_command
 from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.report import arrange, collect, report_html, report_latex, report_markdown
 from dpcli.evaluate.report.blocks import interval_text, sort_key, table, text_of
-from dpcli.evaluate.report.error_clouds import Cloud, _renamed, packed
-from dpcli.evaluate.report.markdown_and_latex import latex
-from dpcli.evaluate.report.thesis_tables import chosen_tables, thesis_tables
-from dpcli.store import CloudSequence, CloudsWriter, PartsWriter, ScoresWriter
+from dpcli.evaluate.report.error_clouds import Cloud, _rename_parts, pack_cloud
+from dpcli.evaluate.report.markdown_and_latex import escape_latex
 from tests.support.browser import needs_browser, open_page
+from tests.support.report_helpers import EVIL
 
 _FLAGS = "--disable-gpu --virtual-time-budget=3000 --window-size=700,600 --enable-logging=stderr".split()
-EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
-NAMES = ["wave", f"b {EVIL}", "50% & #1_{x}"]
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("report")
-
-
-@pytest.fixture(scope="module")
-def scores(folder) -> Path:
-    path, noise = folder / "scores.h5", np.random.default_rng(0)
-    history = {"command": f"dpc prepare msraction3d RAW {EVIL}", "seed": 3}
-    with ScoresWriter(path, class_names=NAMES, provenance=history, streams=("static", "dynamic")) as writer:
-        for index in range(30):
-            row = noise.normal(size=3) + 1.5 * np.eye(3)[index % 3]
-            writer.write(f"v{index}", row, label=index % 3, split="test", streams={"static": row, "dynamic": -row})
-    return path
-
-
-@pytest.fixture(scope="module")
-def truth(folder) -> Path:
-    """Two rigid bodies; `bad` is a sequence whose parts the prediction has all wrong."""
-    path = folder / "truth.h5"
-    with CloudsWriter(path, fields=("part", "pose"), length_unit="meter") as writer:
-        for name in ("bad", "good", "fine", "well"):
-            writer.write(_sequence(name))
-    return path
-
-
-@pytest.fixture(scope="module")
-def parts(folder, truth) -> Path:
-    path = folder / "parts.h5"
-    with PartsWriter(path, num_parts=2, length_unit="meter", provenance={"command": "dpc segment predict"}) as writer:
-        for name in ("bad", "good", "fine", "well"):
-            sequence = _sequence(name)
-            sequence.pose = None
-            if name == "bad":
-                sequence.part = np.tile([0, 1], len(sequence.part) // 2).astype(np.int16)
-            hard = np.eye(2, dtype=np.float32)[sequence.part]
-            writer.write(sequence, hard, np.array([[0, 1]]), np.tile(np.eye(4), (1, 2, 1, 1)), [np.zeros((40, 3))])
-    return path
-
-
-def _sequence(name: str) -> CloudSequence:
-    points = np.random.default_rng(len(name)).normal(size=(40, 3)).astype(np.float32)
-    part = np.repeat([0, 1], 20).astype(np.int16)
-    pose = np.tile(np.eye(4), (2, 2, 1, 1))
-    pose[1, 1, 0, 3] = 0.5  # body 1 moves by half a meter
-    moved = points + np.where(part == 1, 0.5, 0.0)[:, None].astype(np.float32) * np.array([1, 0, 0], np.float32)
-    return CloudSequence(name, np.concatenate([points, moved]), np.array([0, 40, 80]), part=np.tile(part, 2), pose=pose)
-
-
-@pytest.fixture(scope="module")
-def page(scores, parts, truth) -> str:
-    return report_html(arrange(collect([str(scores), str(parts)], truth), title=f"A {EVIL}"))
 
 
 class _Reader(HTMLParser):
@@ -159,39 +101,6 @@ def test_files_and_their_json_make_the_same_sections(scores, folder):
     assert piped.results[0].found == json.loads(json.dumps(found))
 
 
-def test_motion_beside_the_thesis_is_at_its_threshold():
-    """Ours at tau 0.05 must not stand beside the thesis's numbers at 0.01."""
-    found = {
-        "task": "motion",
-        "input": "m.h5",
-        "provenance": [{"command": "dpc prepare sapien X"}],
-        "metrics": {"epe3d": 0.02, "accs": 0.9, "thresholds": [{"tau": 0.01, "accs": 0.4}, {"tau": 0.05, "accs": 0.9}]},
-        "units": {"epe3d": "meter", "accs": "fraction"},
-    }
-    report = arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode())))
-    row = report.beside[0].rows[0]
-    assert report.beside[0].key == "table-B.3" and [own.text for own in row[3:5]] == ["2.00", "40.00"]
-    found["metrics"].pop("thresholds")
-    report = arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode())))
-    assert report.beside[0].rows[0][4].text == "-"
-
-
-def test_video_beside_the_thesis_is_of_the_reference_view():
-    """The thesis's PSNR is of the reference view; our mean over all views must not stand beside it."""
-    found = {
-        "task": "video",
-        "input": "v.h5",
-        "metrics": {"psnr": 20.0, "ssim": 0.9, "per_role": {"reference": {"psnr": 25.0}}},
-        "units": {"psnr": "dB", "ssim": "1"},
-    }
-    row = (
-        arrange(collect(["-"], stdin=BytesIO(json.dumps(found).encode()), pictures=False), beside=["table-5.1"])
-        .beside[0]
-        .rows[0]
-    )
-    assert [own.text for own in row[3:5]] == ["25.00", "-"] and "reference" in row[2].text
-
-
 def test_comparisons_and_runs_have_a_row_for_each_metric():
     pair = {
         "task": "compare",
@@ -220,56 +129,6 @@ def test_comparisons_and_runs_have_a_row_for_each_metric():
     assert (first.headline.value.text, first.headline.interval) == ("10.0 %", "2.0 to 20.0 %")
     assert [own.key for own in first.blocks[1:]] == ["McNemar's exact test", "samples that differ most, by accuracy"]
     assert [[own.text for own in row] for row in second.blocks[1].rows] == [["seed 0", "80.0 %"], ["seed 1", "90.0 %"]]
-
-
-def test_every_row_of_the_thesis_is_whole():
-    tables = thesis_tables()
-    assert len({own.number for own in tables}) == len(tables) == 15
-    for own in tables:
-        assert all(len(row["values"]) == len(own.metrics) == len(own.units) for row in own.rows)
-        for row in own.numbers():
-            assert row.table and row.method and row.metric and row.unit and np.isfinite(row.value)
-    value = {(row.table, row.method, row.setting, row.metric): row.value for own in tables for row in own.numbers()}
-    assert value["3.4", "Kinet", "Point Cloud, 24 frames", "accuracy"] == 93.27
-    assert (
-        value["4.2", "thesis", "unsupervised", "ap"] == 63.8 and value["4.2", "thesis", "supervised", "epe3d"] == 3.86
-    )
-    assert value["5.1", "MotionStruct4D", "", "psnr"] == 30.68
-
-
-def test_the_rows_of_the_thesis_equal_its_text(shared_data):
-    """Every value of the file stands in the thesis, digit for digit."""
-    text = shared_data.parent / "thesis.txt"
-    if not text.is_file():
-        pytest.skip("the thesis's text is not here")
-    printed = {float(number) for number in re.findall(r"\d+\.?\d*", text.read_text("utf-8"))}
-    wrong = [row for own in thesis_tables() for row in own.numbers() if row.value not in printed]
-    assert not wrong
-
-
-def test_tables_are_chosen_by_data_or_by_name(scores):
-    found = {"task": "classification", "provenance": [{"command": "dpc prepare msraction3d RAW"}]}
-    named = {
-        "task": "classification",
-        "metrics": {
-            "per_class": [
-                {"name": name.upper()} for name in ("high arm wave", "side boxing", "tennis serve", "golf swing")
-            ]
-        },
-    }
-    other = {"task": "classification", "provenance": [{"command": "dpc prepare synthetic gestures"}]}
-    assert (
-        [own.id for own in chosen_tables([], [found])]
-        == ["table-3.4"]
-        == [own.id for own in chosen_tables([], [named])]
-    )
-    assert chosen_tables([], [other]) == [] == chosen_tables(["none"], [found])
-    assert [own.id for own in chosen_tables(["table-3.1"], [other])] == ["table-3.1"]
-    with pytest.raises(UsageError, match="table-9.9.*expected none or some of table-3.1"):
-        chosen_tables(["table-9.9"], [])
-    rows = arrange(collect([str(scores)])).beside[0].rows
-    assert {own[0].mark for own in rows[:3]} == {"ours"} and {own[0].mark for own in rows[3:]} == {"thesis"}
-    assert all(own[1].text.startswith("thesis") for own in rows[3:])
 
 
 @pytest.mark.parametrize(
@@ -411,7 +270,7 @@ def test_markdown_escapes_and_lines_up(scores):
 
 
 def test_latex_escapes():
-    assert latex("a_b 50% & #1 {x} $ ~ ^ \\") == (
+    assert escape_latex("a_b 50% & #1 {x} $ ~ ^ \\") == (
         r"a\_b 50\% \& \#1 \{x\} \$ \textasciitilde{} \textasciicircum{} \textbackslash{}"
     )
 
@@ -446,7 +305,7 @@ def test_latex_compiles(scores, tmp_path):
 def test_a_cloud_is_packed_up_to_rounding():
     points = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
     truth, part = np.array([-1, 0, 1, 2, 0, 1, 300]), np.array([0, -1, 1, 2, 0, 1, 2])
-    data = packed(Cloud(points, truth, part, np.array([np.nan, 0, 1, 2, 4, 0.5, 3]), "m"))
+    data = pack_cloud(Cloud(points, truth, part, np.array([np.nan, 0, 1, 2, 4, 0.5, 3]), "m"))
     steps = np.frombuffer(data[:42], "<u2").reshape(3, 7).T / 65535
     side = np.ptp(points, axis=0).max()
     np.testing.assert_allclose((steps - steps[0]) * side, points - points[0], atol=side / 60000)
@@ -457,9 +316,9 @@ def test_a_cloud_is_packed_up_to_rounding():
 
 def test_predicted_parts_take_the_names_of_the_true_ones():
     truth, part = np.array([0, 0, 0, 1, 1, 5, -1]), np.array([7, 7, 3, 3, 3, 9, -1])
-    assert _renamed(truth, part).tolist() == [0, 0, 1, 1, 1, 5, -1]
-    assert _renamed(truth, np.array([2, 2, 2, 2, 2, 4, 6])).tolist() == [0, 0, 0, 0, 0, 5, 8]
-    assert _renamed(truth, np.full(7, -1)).tolist() == [-1] * 7
+    assert _rename_parts(truth, part).tolist() == [0, 0, 1, 1, 1, 5, -1]
+    assert _rename_parts(truth, np.array([2, 2, 2, 2, 2, 4, 6])).tolist() == [0, 0, 0, 0, 0, 5, 8]
+    assert _rename_parts(truth, np.full(7, -1)).tolist() == [-1] * 7
 
 
 def test_a_video_has_its_pictures_in_the_page(tmp_path):

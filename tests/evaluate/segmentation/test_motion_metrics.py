@@ -183,7 +183,7 @@ def test_table_says_of_what(tmp_path, truths) -> None:
     truth = write_truth(tmp_path / "t.h5", truths)
     text = run(parts, "--truth", truth).stdout
     assert "9 frame pairs of 3 sequences; means over all points" in text and "EPE3D (m)" in text
-    assert "AccS 0.01" in text and "Outlier 0.05" in text and "rotation (deg)" in text and "100.0 %" in text
+    assert "AccS 0.01" in text and "Outlier 0.05" in text and "rotation error (deg)" in text and "100.0 %" in text
     assert "| all | 9 |" in run(parts, "--truth", truth, "--markdown").stdout
     assert "6 pairs" in run(parts, "--truth", truth, "--protocol", "release").stdout
     assert run(parts, "--truth", truth, "--picture", tmp_path / "p.png").exit_code == 0

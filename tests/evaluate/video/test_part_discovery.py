@@ -6,12 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from sklearn.metrics import adjusted_rand_score
 
 from dpcli.errors import DataError
-from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index
 from dpcli.evaluate.video.part_discovery import (
     PART_NEIGHBORS,
     TRACK_NEIGHBORS,
@@ -37,27 +33,6 @@ def true_track(scene: GaussianScene, points: np.ndarray, part: np.ndarray) -> np
     """Points moved by their part's own motion, f64 (T,M,3); the first frame's motion is the identity."""
     motion = scene.part_motion[:, part].astype(np.float64)
     return np.einsum("tmij,mj->tmi", motion[..., :3, :3], points) + motion[..., :3, 3]
-
-
-@settings(max_examples=150, deadline=None)
-@given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), min_size=1, max_size=40))
-def test_adjusted_rand_index_is_scikit_learns(pairs: list[tuple[int, int]]) -> None:
-    truth, part = np.array(pairs).T
-    known = truth >= 0
-    found = adjusted_rand_index(truth, part)
-    if not known.any():
-        assert np.isnan(found)
-        return
-    assert found == pytest.approx(adjusted_rand_score(truth[known], part[known]), abs=1e-12)
-
-
-def test_adjusted_rand_index_by_hand() -> None:
-    # Hubert & Arabie: groups of 3 and 3 against 2 and 4; ordered pairs together 6+... of 30
-    truth, part = np.array([0, 0, 0, 1, 1, 1]), np.array([0, 0, 1, 1, 1, 1])
-    together, rows, columns, every = 2 + 0 + 6, 6 + 6, 2 + 12, 30
-    expected = rows * columns / every
-    assert adjusted_rand_index(truth, part) == pytest.approx((together - expected) / (13 - expected))
-    assert adjusted_rand_index(truth, 7 - part) == adjusted_rand_index(truth, part)  # names of parts don't matter
 
 
 def test_attach_takes_the_nearest_and_a_point_on_a_gaussian_has_it_alone() -> None:

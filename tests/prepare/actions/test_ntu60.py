@@ -193,7 +193,7 @@ def test_directory_bytes_that_lie_are_refused(tmp_path):
     whole = bytearray(write_zip(tmp_path / "a.zip", ntu_files(ONE, person(0))).read_bytes())
     directory = whole.index(b"PK\x01\x02")
     second = whole.index(b"PK\x01\x02", directory + 4)
-    for at, value, message in ((second, 0, "directory is damaged"), (second + 28, 0xFF, "the archive is damaged")):
+    for at, value, message in ((second, 0, "directory is damaged"), (directory + 28, 0xFF, "the archive is damaged")):
         broken = bytearray(whole)
         broken[at] = value
         (tmp_path / "a.zip").write_bytes(broken)

@@ -139,6 +139,15 @@ def test_a_list_cannot_lead_out_of_the_folder(tmp_path):
     assert ["expected the name of a folder" in item.problem for item in OgcRooms(raw).items()] == [True, False]
 
 
+@pytest.mark.parametrize("name", ["../../far", "link"])
+def test_nothing_outside_is_opened_to_count_parts(name, tmp_path):
+    write_room(tmp_path, "far", make_room(0, 7)[0])
+    raw = write_raw(tmp_path / "raw", {"near": make_room(0, 3)[0]}, train=["near", name])
+    (raw / "data" / "link").symlink_to(tmp_path / "far")
+    near, far = OgcRooms(raw).items()
+    assert far.problem and not near.problem and near.extra["parts"] < 7
+
+
 def write_box(path, sides):
     """A box of these sides as the text of an .obj file, four corners a face."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.articulated_sequence import Articulation, study
@@ -117,8 +121,8 @@ def test_mimic_joints_follow(tmp_path):
     ]
     with pytest.raises(DataError, match="joint 'k' mimics itself, through k, l"):
         load(two(tmp_path, *ring))
-    still = load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("nobody"))))
-    assert (still.joints[1].lower, still.joints[1].upper) == (0.1, 0.1)
+    with pytest.raises(DataError, match="joint 'k' mimics 'nobody'; there is no joint of that name"):
+        load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("nobody"))))
     fixed = load(two(tmp_path, link("c", box(1, 1, 1)), joint("k", "b", "c", more=mimic.format("j")), limits="0.5 0.5"))
     assert [(own.lower, own.upper) for own in fixed.joints] == [
         pytest.approx((-0.9, -0.9))
@@ -274,6 +278,177 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
         "Good",
     )
     assert again.returncode == 2 and "points 99 (now 98)" in again.stderr
+
+
+@pytest.mark.parametrize(
+    "limits, expected",
+    [('upper="1.5"', (0, 1.5)), ('lower="-0.5"', (-0.5, 0)), ('lower="0.25"', (0, 0.25)), ('upper="-1"', (-1, 0))],
+)
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_limit_that_is_left_out_is_zero(limits, expected, kind, tmp_path):
+    moving = joint("j", "a", "b", kind=kind, limits="", more=f'<limit {limits} effort="1" velocity="1"/>')
+    path = write_urdf(tmp_path / "r.urdf", link("a", box(1, 1, 1)), link("b", box(1, 1, 1)), moving)
+    assert (load(path).joints[0].lower, load(path).joints[0].upper) == expected
+
+
+@settings(max_examples=15, derandomize=True, deadline=None)
+@given(st.floats(1e-4, 1e3), st.sampled_from(["inch", "a b", "meter"]))
+def test_collada_is_read_in_meters_whatever_unit_it_declares(meter, name):
+    """pycollada writes; an own scale in the URDF counts besides, as robot viewers have it."""
+    import collada
+    import trimesh
+
+    with tempfile.TemporaryDirectory() as folder:
+        trimesh.creation.box(extents=np.array([1, 2, 3]) / meter).export(Path(folder, "b.dae"))
+        file = collada.Collada(str(Path(folder, "b.dae")))
+        file.assetInfo.unitmeter, file.assetInfo.unitname = meter, name
+        file.write(str(Path(folder, "b.dae")))
+        for scale, area in (("1 1 1", 22), ("2 2 2", 88)):
+            shape = f'<mesh filename="b.dae" scale="{scale}"/>'
+            path = write_urdf(Path(folder, "r.urdf"), link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b"))
+            assert load(path).body_areas == pytest.approx([area, 6], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        (b'<robot name="r"><!-- 90\xb0 --><link name="a"/></robot>', "save it as UTF-8, or name its encoding"),
+        (b'<?xml version="1.0" encoding="klingon"?><robot name="r"/>', "not well-formed XML"),
+        (b"", "not well-formed XML"),
+        (b"\0" * 99, "not well-formed XML"),
+        (b'<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/hostname">]><robot name="r">&x;</robot>', "it has a DOCTYPE"),
+        (b'<robot name="r"><link/></robot>', ""),
+        (b'<robot name="r"><link name="a"/><link name="a"/></robot>', "two links have the name 'a'"),
+    ],
+)
+def test_one_bad_urdf_never_ends_the_others(text, words, tmp_path):
+    cabinet(tmp_path / "good" / "mobility.urdf")
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "mobility.urdf").write_bytes(text)
+    bad, good = sorted(Sapien(tmp_path, pairs_per_object=1).items(), key=lambda item: not item.problem)
+    assert words in bad.problem and "bad/mobility.urdf: " in bad.problem and not good.problem
+
+
+@settings(max_examples=150, derandomize=True, deadline=None)
+@given(data=st.data())
+def test_damage_to_a_urdf_ends_in_a_sentence_or_not_at_all(data):
+    """Any cut, any changed byte: read, or refused with the file's name."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = cabinet(Path(folder, "r.urdf"))
+        whole = path.read_bytes()
+        place = data.draw(st.integers(0, len(whole) - 1))
+        if data.draw(st.booleans()):
+            path.write_bytes(whole[:place])
+        else:
+            value = data.draw(st.sampled_from(b'0 -.e"<>/nax\xb0\0'))
+            path.write_bytes(whole[:place] + bytes([value]) + whole[place + 1 :])
+        try:
+            assert load(path).num_bodies >= 1
+        except DataError as error:
+            assert "r.urdf" in str(error)
+
+
+@pytest.mark.parametrize(
+    "shape", ['<box size="1 2"/>', '<cylinder radius="1"/>', "<sphere/>", "<box/>", "<mesh/>", "<cone/>"]
+)
+def test_solids_without_a_size_are_refused(shape, tmp_path):
+    elements = [link("a", box(1, 1, 1)), link("b", shape), joint("j", "a", "b")]
+    path = write_urdf(tmp_path / "r.urdf", *elements)
+    with pytest.raises(DataError, match="r.urdf: "):
+        load(path)
+
+
+def test_names_written_on_windows(tmp_path):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "c.obj").write_text(CUBE_OBJ)
+    elements = [link("a", '<mesh filename="meshes\\c.obj"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
+    assert len(load(write_urdf(tmp_path / "r.urdf", *elements)).triangles) == 24
+
+
+def test_a_declared_encoding_is_read(tmp_path):
+    path = two(tmp_path)
+    path.write_bytes(b'<?xml version="1.0" encoding="iso-8859-1"?><!-- 90\xb0 -->' + path.read_bytes().split(b"?>")[-1])
+    assert len(load(path).joints) == 1
+
+
+def test_objects_within_objects_and_the_category_of_their_meta_file(tmp_path):
+    for where in ("x/bucket", "x/bucket/100454", "y/bucket", "y/.cache"):
+        cabinet(tmp_path / where / "mobility.urdf")
+        (tmp_path / where / "meta.json").write_text(json.dumps({"model_cat": "Bucket"}))
+    found = find_objects(tmp_path)
+    assert [(f.name, f.category) for f in found] == [
+        ("Bucket_100454", "Bucket"),
+        ("Bucket_x_bucket", "Bucket"),
+        ("Bucket_y_bucket", "Bucket"),
+    ]
+    (tmp_path / "x/bucket/meta.json").write_text('{"model_cat": 3}')
+    assert {f.category for f in find_objects(tmp_path / "x")} == {"Bucket", ""}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../../secret.obj",
+        "{outside}",
+        "file://{outside}",
+        "package://../../secret.obj",
+        "..\\..\\secret.obj",
+        "link.obj",
+        "a/\1.obj",
+    ],
+)
+def test_nothing_outside_the_folder_is_opened(name, tmp_path):
+    outside, raw = tmp_path / "secret.obj", tmp_path / "raw" / "1"
+    outside.write_text(CUBE_OBJ)
+    raw.mkdir(parents=True)
+    (raw / "link.obj").symlink_to(outside)
+    shape = f'<mesh filename="{name.format(outside=outside)}"/>'.replace("\1", "x" * 300)
+    write_urdf(raw / "mobility.urdf", link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b"))
+    problem = Sapien(tmp_path / "raw").items()[0].problem
+    assert "1/mobility.urdf: its mesh" in problem and ("lies outside" in problem or "cannot be a file's" in problem)
+    if "x" * 9 not in shape:
+        assert not Sapien(tmp_path / "raw", allow_outside=True).items()[0].problem
+
+
+def test_names_that_stay_in_the_folder_and_links_the_user_named(tmp_path):
+    (tmp_path / "robot" / "meshes").mkdir(parents=True)
+    (tmp_path / "robot" / "meshes" / "c.obj").write_text(CUBE_OBJ)
+    shapes = [f'<mesh filename="{name}"/>' for name in ("../meshes/c.obj", "package://robot/meshes/c.obj")]
+    elements = [link("a", shapes[0]), link("b", shapes[1]), joint("j", "a", "b")]
+    (tmp_path / "robot" / "urdf").mkdir()
+    write_urdf(tmp_path / "robot" / "urdf" / "r.urdf", *elements)
+    assert not Sapien(tmp_path).items()[0].problem
+    assert not Sapien(tmp_path / "robot").items()[0].problem
+    assert "'../meshes/c.obj' lies outside" in Sapien(tmp_path / "robot" / "urdf").items()[0].problem
+    (tmp_path / "named.urdf").symlink_to(two(tmp_path))
+    assert not Sapien(tmp_path / "named.urdf").items()[0].problem
+
+
+def test_meshes_open_no_files_outside_either(tmp_path):
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "secret.bin").write_bytes(np.zeros(9, "f4").tobytes())
+    tree = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"uri": "../secret.bin", "byteLength": 36}],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}],
+        "accessors": [{"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+    }
+    (tmp_path / "raw" / "m.gltf").write_text(json.dumps(tree))
+    elements = [link("a", '<mesh filename="m.gltf"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
+    path = write_urdf(tmp_path / "raw" / "r.urdf", *elements)
+    with pytest.raises(DataError, match="m.gltf cannot be read .*secret.bin' lies outside"):
+        load_object(read_skeleton(path, tmp_path / "raw"))
+    assert load_object(read_skeleton(path, None)).notes["triangles without area dropped"] == 1
+
+
+def test_vertices_of_two_numbers_are_refused(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    elements = [link("a", '<mesh filename="m.obj"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
+    with pytest.raises(DataError, match="m.obj cannot be read .* 2 coordinates, expected 3"):
+        load(write_urdf(tmp_path / "r.urdf", *elements))
 
 
 def test_real_objects(shared_data):

@@ -15,6 +15,7 @@ import pytest
 
 from dpcli.errors import DataError, Stopped, UsageError
 from dpcli.prepare.commands import merge as module
+from dpcli.prepare.commands import sources
 from dpcli.prepare.commands.merge import merge, read_source
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Conversion, convert
@@ -62,7 +63,7 @@ def test_files_of_equal_classes_follow_one_another(tmp_path):
 
 
 def test_many_files_are_not_all_open_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_OPEN", 2)
+    monkeypatch.setattr(sources, "_OPEN", 2)
     paths = [write(tmp_path / f"{k}.h5", [f"{k}x"], ["p"]) for k in range(5)]
     files = module.OpenFiles()
     for path in [*paths, *paths]:

@@ -14,11 +14,12 @@ from PIL import Image
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
-from dpcli.prepare.decode.color_frames import _frame_times, _lasts, frame_numbers, open_frames
+from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
 from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
+from dpcli.runtime.clips.video_frames import frame_times, lasts
 from dpcli.store import ViewsReader
 
 RED = (200, 40, 30)
@@ -105,13 +106,13 @@ def test_names_of_several_numbers_are_read_from_left_to_right(tmp_path, stems):
 
 def test_frame_times_follow_the_stamps_where_a_rate_cannot():
     steady = np.arange(12) / 29.97
-    np.testing.assert_array_equal(_frame_times(np.round(steady, 3), 29.97), steady)  # milliseconds only
-    np.testing.assert_array_equal(_frame_times(np.zeros(12), 29.97), steady)  # a container without stamps
-    assert _frame_times(np.zeros(12), None) is None
+    np.testing.assert_array_equal(frame_times(np.round(steady, 3), 29.97), steady)  # milliseconds only
+    np.testing.assert_array_equal(frame_times(np.zeros(12), 29.97), steady)  # a container without stamps
+    assert frame_times(np.zeros(12), None) is None
     uneven = np.array([0.5, 0.55, 0.6, 0.9, 1.2, 1.5])
-    np.testing.assert_allclose(_frame_times(uneven, 4.0), uneven - 0.5)
-    np.testing.assert_allclose(_frame_times(uneven, None), uneven - 0.5)
-    assert _lasts(uneven - 0.5, 1.3) and not _lasts(uneven - 0.5, 3.0) and not _lasts(np.zeros(1), 3.0)
+    np.testing.assert_allclose(frame_times(uneven, 4.0), uneven - 0.5)
+    np.testing.assert_allclose(frame_times(uneven, None), uneven - 0.5)
+    assert lasts(uneven - 0.5, 1.3) and not lasts(uneven - 0.5, 3.0) and not lasts(np.zeros(1), 3.0)
 
 
 def uneven_video(path: Path, kept: str = "lt(n,10)+not(mod(n,6))") -> Path:
@@ -311,9 +312,9 @@ def bad_clip(tmp_path: Path, kind: str) -> Path:
         ("nothing", "no frames"),
         ("corrupt png", "1.png: not a readable image"),
         ("corrupt mp4", "not a readable video|no frame can be decoded"),
-        ("corrupt gif", "not a readable animation"),
+        ("corrupt gif", "not a readable video"),  # the content tells what it is, not the name
         ("text", "unknown kind"),
-        ("image", "one image; expected its folder"),
+        ("image", "not a readable video"),
     ],
 )
 def test_bad_clips_are_told_what_to_do(tmp_path, kind, message):
@@ -524,6 +525,25 @@ def test_known_cameras_are_turned_into_our_world_exactly(tmp_path):
     assert (np.diff(heights) > 0.05).all()  # what rises in the scene rises along +y
 
 
+def test_masks_that_the_file_names_cut_the_object_out(tmp_path):
+    folder, _ = blender_folder(tmp_path / "scene")
+    whole = read(transforms_clip(folder, VideoOptions(size=64)))
+    data = json.loads((folder / "transforms_train.json").read_text())
+    (folder / "masks").mkdir()
+    for number, frame in enumerate(data["frames"]):
+        path = folder / f"{frame['file_path']}.png"
+        rgba = np.asarray(Image.open(path))
+        Image.fromarray(rgba[..., 3]).save(folder / "masks" / f"{number}.png")
+        Image.fromarray(np.dstack([rgba[..., :3], np.full(rgba.shape[:2], 255, np.uint8)])).save(path)
+        frame["mask_path"] = f"masks/{number}.png"
+    data.update(camera_model="OPENCV", k1=0.0, k2=0.0)  # no distortion is no lens
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    cut = read(transforms_clip(folder, VideoOptions(size=64)))
+    assert cut.keys() == whole.keys()
+    for key, picture in cut.items():
+        np.testing.assert_array_equal(picture, whole[key])
+
+
 def test_a_moving_camera_is_told_apart(tmp_path):
     folder, _ = blender_folder(tmp_path / "scene", cameras=1, moving_camera=True)
     with pytest.raises(DataError, match="the camera moves"):
@@ -541,6 +561,11 @@ def test_a_moving_camera_is_told_apart(tmp_path):
         (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4 x 4"),
         (lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "not a camera-to-world"),
         (lambda d: d.update(frames=[]), "no frames"),
+        (lambda d: d.update(k1=-0.1, camera_model="OPENCV"), "k1 -0.1; expected pictures without lens distortion"),
+        (lambda d: d["frames"][0].update(p2=0.01), "p2 0.01; expected"),
+        (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "camera_model OPENCV_FISHEYE"),
+        (lambda d: d.update(is_fisheye=True), "fisheye"),
+        (lambda d: d["frames"][0].update(mask_path="../m.png"), "outside the folder"),
     ],
 )
 def test_bad_transforms(tmp_path, change, message):
@@ -587,3 +612,20 @@ def test_real_clips(shared_data, name, frames):
     for rgba in read(clip).values():
         share = (rgba[..., 3] > 127).mean()
         assert 0.05 < share < 0.6 and rgba[0].max() == rgba[-1].max() == 0
+
+
+def test_images_and_animations_are_known_by_their_content(tmp_path):
+    """One image is no clip, half an animation is damaged, and an animation is read under any name."""
+    pictures = [on(picture) for picture in moving(4)]
+    Image.fromarray(pictures[0]).save(tmp_path / "one.png")
+    with pytest.raises(DataError, match="one image; expected its folder"):
+        open_frames(tmp_path / "one.png")
+    stills = [Image.fromarray(picture) for picture in pictures]
+    for form in ("gif", "png", "webp"):
+        path = tmp_path / f"moving-{form}"
+        stills[0].save(path, form, save_all=True, append_images=stills[1:], duration=100, lossless=True)
+        frames = open_frames(path)
+        assert len(frames) == 4 and frames.times == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    (tmp_path / "half").write_bytes((tmp_path / "moving-gif").read_bytes()[:200])
+    with pytest.raises(DataError, match="not a readable animation"):
+        open_frames(tmp_path / "half")

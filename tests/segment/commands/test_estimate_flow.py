@@ -17,7 +17,13 @@ import torch
 from dpcli.errors import DataError, Stopped, UsageError
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.segment.commands import estimate_flow as module
-from dpcli.segment.commands.estimate_flow import FlowOfSequence, draw_points, estimate_flow_of_file, flow_as_points
+from dpcli.segment.commands.estimate_flow import (
+    EstimatedFlow,
+    FlowOfSequence,
+    draw_points,
+    estimate_flow_of_file,
+    flow_as_points,
+)
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -56,7 +62,7 @@ def data(tmp_path_factory) -> Path:
     return path
 
 
-def estimate(data: object, output: object, **options) -> None:
+def estimate(data: object, output: object, **options) -> EstimatedFlow:
     given = {
         "flow": "nearest",
         "points": 20,
@@ -67,7 +73,7 @@ def estimate(data: object, output: object, **options) -> None:
         "jobs": 1,
         "force": False,
     }
-    estimate_flow_of_file(str(data), str(output), **{**given, **options})
+    return estimate_flow_of_file(str(data), str(output), **{**given, **options})
 
 
 def test_icp_finds_a_translation_and_the_last_frame_looks_back():
@@ -136,9 +142,8 @@ def test_flow_that_tells_nothing_gives_no_nan():
     assert not alone.points.any() and alone.num_frames == 1
 
 
-def test_what_is_known_of_a_sequence_stays(data, tmp_path, capsys):
-    estimate(data, tmp_path / "flow.h5")
-    assert capsys.readouterr().out == f"{tmp_path / 'flow.h5'}: flow of 5 sequences, 13 frames\n"
+def test_what_is_known_of_a_sequence_stays(data, tmp_path):
+    assert estimate(data, tmp_path / "flow.h5") == (5, 13)  # sequences, frames
     estimate(data, tmp_path / "points.h5", as_points=True)
     with (
         CloudsReader(data) as before,
@@ -197,8 +202,9 @@ def test_what_a_worker_process_gets_does_the_same(data):
 
 
 def test_a_trained_estimator_is_loaded_once_and_sees_the_drawn_points(data, tmp_path, monkeypatch):
-    from dpcli.segment.flow import estimate_flow, model_file
+    from dpcli.segment.flow import model_file
     from dpcli.segment.flow.config import FlowConfig
+    from dpcli.segment.flow.estimators import estimate_flow
     from dpcli.segment.flow.flowstep3d import FlowStep3D
 
     torch.manual_seed(0)

@@ -110,8 +110,10 @@ def test_resolved_settings_stand_in_the_file(dpc_here, data, tmp_path):
     done = dpc_here("segment", "predict", data, "-o", tmp_path / "p.h5", *words)
     assert done.returncode == 0, done.stderr
     with PartsReader(tmp_path / "p.h5") as reader:
-        config = reader.provenance[-1]["config"]
+        config = reader.provenance[-1]["config"]["settings"]
     assert config["input"] == {"flow": "nearest", "split": "test"}
     assert config["refinement"]["vote"] is False and config["refinement"]["split_bodies"] is False
     assert config["classical"]["motion"] == "residual" and config["classical"]["fewest"] == 1
     assert "eps" not in config["classical"]
+    told = dpc_here("info", tmp_path / "p.h5").stdout.decode()
+    assert "settings refinement  icp 20, normalize true, pairs adjacent, points 48" in told

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dpcli.errors import UsageError
-from dpcli.segment.flow import estimate_flow, motion_proposals
-from dpcli.segment.flow.estimators import estimate_body_flow, find_bodies_at_any_scale
+from dpcli.segment.flow import motion_proposals
+from dpcli.segment.flow.estimators import estimate_body_flow, estimate_flow, find_bodies_at_any_scale
 from dpcli.segment.flow.rigid_bodies import BodySearch, _BodyFinder
 from dpcli.segment.flow.surface_icp import Surface, columns
 

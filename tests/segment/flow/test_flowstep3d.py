@@ -13,8 +13,8 @@ from dpcli.errors import DataError, Stopped, UsageError
 from dpcli.ops import knn
 from dpcli.runtime.run_folder import RunFolder
 from dpcli.runtime.signals import StopRequest
-from dpcli.segment.flow import estimate_flow
 from dpcli.segment.flow.config import PRESETS, FlowConfig, FlowSchedule
+from dpcli.segment.flow.estimators import estimate_flow
 from dpcli.segment.flow.flowstep3d import FlowStep3D, SetConv
 from dpcli.segment.flow.losses import chamfer, flow_loss
 from dpcli.segment.flow.model_file import augment_pair, load_flow_model, save_flow_model

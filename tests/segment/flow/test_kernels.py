@@ -111,7 +111,7 @@ def test_look_up_takes_the_nearest_of_the_neighbors_tried() -> None:
     points = np.ascontiguousarray(sphere(80, 3).T * np.float32(1.05))
     at, far = np.empty(80, np.int64), np.empty(80, np.float32)
     work = np.empty(16 * 200, np.float32)
-    icp_kernels._look_up(points, search[0], *search[2:], work, work.view(np.int32), at, far)
+    icp_kernels._look_up(points, search, work, work.view(np.int32), at, far)
     grid, origin, rate = search[4:]
     cell = ((points.T - origin) * rate).astype(int)
     center = origin + (cell + 0.5) / rate

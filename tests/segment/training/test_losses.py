@@ -177,7 +177,7 @@ def test_supervised_gradient() -> None:
     assert torch.autograd.gradcheck(lambda m: supervised_loss(m, labels, dice_weight=0.3), (mask,))
 
 
-def test_assign_maximizes() -> None:
+def test_hungarian_assignment_maximizes() -> None:
     score = torch.tensor(np.random.default_rng(7).normal(size=(4, 4, 4)))
     for item, columns in zip(score, hungarian_assignment(score)):
         best = max(sum(float(item[s, order[s]]) for s in range(4)) for order in permutations(range(4)))
@@ -201,7 +201,7 @@ def test_match_slots_undoes_a_permutation() -> None:
     assert torch.equal(one_hot(carry_mask(first, flow, mask1, second)), mask2)
 
 
-def test_match_sequence_chains_any_number_of_frames() -> None:
+def test_match_slots_through_frames_chains_any_number_of_frames() -> None:
     first, second, flow, mask1, mask2 = two_bodies(9)
     back = torch.from_numpy(np.zeros(0))  # frames alternate between the two; the flow back is that of the nearest point
     nearest = torch.cdist(second, first + flow).argmin(-1)
@@ -216,7 +216,7 @@ def test_match_sequence_chains_any_number_of_frames() -> None:
     assert match_slots_through_frames(frames[:1], [], masks[:1]).tolist() == [[0, 1, 2]]
 
 
-def test_object_icp_finds_the_motion() -> None:
+def test_object_aware_icp_finds_the_motion() -> None:
     first, second, flow, mask1, mask2 = two_bodies(10)
     start = flow + 0.03 * torch.randn(flow.shape, generator=torch.Generator().manual_seed(0))
     before = (start - flow).norm(dim=-1).mean()
@@ -228,7 +228,7 @@ def test_object_icp_finds_the_motion() -> None:
     assert (wrong - flow).norm(dim=-1).mean() > before  # the slots do matter
 
 
-def test_object_icp_of_a_vanished_part() -> None:
+def test_object_aware_icp_of_a_vanished_part() -> None:
     """Hard masks, and slot 1 has no point in frame 2: its points keep their flow, nothing becomes NaN."""
     first, second, flow, mask1, _ = two_bodies(11)
     gone = torch.zeros_like(mask1)

@@ -268,12 +268,12 @@ def expect_widths(config: KinetConfig, published: tuple[tuple[int, ...], ...]) -
     widths = config.widths
     fits = len(widths) == len(published) and all(part and min(part) >= 1 for part in widths)
     if not fits or any(len(a) != len(b) for a, b in zip(widths[1:-1], published[1:-1])):
-        raise UsageError(f"--backbone {config.backbone}: widths = {widths}, expected numbers like {published}")
+        raise UsageError(f"backbone = {config.backbone}: widths = {widths}, expected numbers like {published}")
     return widths
 
 
 def xavier_init(module: nn.Module) -> None:
-    """Gives Xavier's uniform initialization to every linear layer, zero biases: that of both published networks."""
+    """Initializes every linear layer by Xavier's uniform rule with zero biases, as both published networks do."""
     for layer in module.modules():
         if isinstance(layer, nn.Linear):
             nn.init.xavier_uniform_(layer.weight)

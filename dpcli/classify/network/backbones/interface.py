@@ -81,18 +81,18 @@ def resolve_backbone(name: str) -> type[nn.Module]:
     place = BACKBONES.get(name, name)
     module, _, attribute = place.partition(":")
     if not attribute:
-        raise UsageError(f"--backbone {name}: expected {', '.join(BACKBONES)} or your own as module:Class")
+        raise UsageError(f"backbone = {name}: expected {', '.join(BACKBONES)} or your own as module:Class")
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise UsageError(f"--backbone {name}: {error}; is its folder on PYTHONPATH?") from None
+        raise UsageError(f"backbone = {name}: {error}; is its folder on PYTHONPATH?") from None
     left = getattr(found, "__abstractmethods__", ())  # named by Backbone and not written
     missing = [
         name for name in ("group", "taps", "forward") if name in left or not callable(getattr(found, name, None))
     ]
     if missing or not (isinstance(found, type) and issubclass(found, nn.Module)):
         lacks = f"lacks {', '.join(missing)}" if missing else "is no torch.nn.Module"
-        raise UsageError(f"--backbone {name}: {lacks}; docs/backbones.md shows the three methods")
+        raise UsageError(f"backbone = {name}: {lacks}; docs/backbones.md shows the three methods")
     return found
 
 
@@ -101,7 +101,7 @@ def build_backbone(config: KinetConfig) -> nn.Module:
     network = resolve_backbone(config.backbone)(config)
     widths = getattr(network, "tap_widths", None)
     if not widths or not all(isinstance(width, int) for stage in widths for width in stage):
-        raise UsageError(f"--backbone {config.backbone}: tap_widths = {widths!r}, expected integers, a tuple a stage")
+        raise UsageError(f"backbone = {config.backbone}: tap_widths = {widths!r}, expected integers, a tuple a stage")
     return network
 
 

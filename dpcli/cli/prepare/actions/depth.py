@@ -9,38 +9,41 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
-from dpcli.cli.prepare.options import LabelTable, Stride
+from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 from dpcli.errors import UsageError
 
 if TYPE_CHECKING:
-    from dpcli.prepare.decode.pinhole_camera import Intrinsics
+    from dpcli.prepare.decode.calibration import Calibration
 
 
 @dataclass(frozen=True)
 class DepthCamera:
     """Holds the options that say which camera filmed."""
 
-    intrinsics: Annotated[Path | None, typer.Option("--intrinsics", help="JSON file with fx fy cx cy, pixels.")] = None
+    intrinsics: Annotated[
+        Path | None, typer.Option("--intrinsics", help="File of RealSense, Open3D, ROS, COLMAP, or with fx fy cx cy.")
+    ] = None
     fx: Annotated[float | None, typer.Option("--fx", help="Focal length, pixels; needs --cx and --cy, too.")] = None
     fy: Annotated[float | None, typer.Option("--fy", help="Vertical focal length, pixels. Default: --fx.")] = None
     cx: Annotated[float | None, typer.Option("--cx", help="Principal point, pixels from the left.")] = None
     cy: Annotated[float | None, typer.Option("--cy", help="Principal point, pixels from the top.")] = None
     fov: Annotated[float | None, typer.Option("--fov", help="Horizontal field of view, degrees. Default: 60.")] = None
 
-    def read_intrinsics(self) -> Intrinsics | None:
-        """Returns the intrinsics that were given, None when they follow from `--fov`. Raises UsageError on a mixture."""
+    def read_calibration(self) -> Calibration | None:
+        """Returns the calibration that was given, None when it follows from `--fov`. Raises UsageError on a mixture."""
+        from dpcli.prepare.decode.calibration import Calibration, read_calibration
         from dpcli.prepare.decode.pinhole_camera import Intrinsics
 
         pixels = (self.fx, self.fx if self.fy is None else self.fy, self.cx, self.cy)
         if self.intrinsics and any(v is not None for v in pixels):
             raise UsageError("--intrinsics and --fx --fy --cx --cy were both given; use one")
         if self.intrinsics:
-            return Intrinsics.from_json(self.intrinsics)
+            return read_calibration(self.intrinsics)
         if all(v is None for v in pixels):
             return None
         if any(v is None for v in pixels):
             raise UsageError("--fx, --cx and --cy belong together (--fy defaults to --fx); or use --fov")
-        return Intrinsics(*(float(v) for v in pixels if v is not None))
+        return Calibration(Intrinsics(*(float(v) for v in pixels if v is not None)))
 
 
 @dataclass(frozen=True)
@@ -65,15 +68,18 @@ class DepthPixels:
 
 def depth(
     inputs: Annotated[
-        list[Path], typer.Argument(help="Videos (.avi .mp4 .mkv .mov), .npy, folders of images, or folders of these.")
+        list[Path],
+        typer.Argument(help="Videos (.avi .mp4 .mkv .mov), .npy, folders of images, recordings, or folders of these."),
     ],
     camera: DepthCamera,
     pixels: DepthPixels,
     *,
     fps: Annotated[
-        float | None, typer.Option("--fps", help="Frames per second. Default: the video's, else 30.")
+        float | None, typer.Option("--fps", help="Frames per second. Default: the time stamps of videos.")
     ] = None,
     stride: Stride = 1,
+    pattern: Pattern = "",
+    topic: Topic = "",
     label_from_folder: Annotated[
         bool,
         typer.Option(
@@ -84,24 +90,26 @@ def depth(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Returns any depth video, 8 or 16 bits, to points in meters.
+    """Turns any depth video, 8 or 16 bits, into points in meters.
 
     For example: dpc prepare depth my_videos --label-from-folder --fov 70 -o own.h5
     """
     from dpcli.prepare.actions.depth import DepthVideos
 
-    intrinsics = camera.read_intrinsics()
+    calibration = camera.read_calibration()
     run_conversion(
         "depth",
         lambda: DepthVideos(
             inputs=tuple(inputs),
-            intrinsics=intrinsics,
+            calibration=calibration,
             fov=camera.fov,
             **vars(pixels),
             fps=fps,
             stride=stride,
             labels=labels,
             label_from_folder=label_from_folder,
+            pattern=pattern,
+            topic=topic,
         ),
         conversion,
     )

@@ -20,9 +20,12 @@ def sapien(
     test_categories: TestCategories = "",
     validation_categories: ValidationCategories = "",
     fractions: CategoryFractions = "",
+    allow_outside: Annotated[
+        bool, typer.Option("--allow-outside", help="Meshes may lie outside RAW: through links, .. or absolute paths.")
+    ] = False,
     conversion: ArticulatedConversion,
 ) -> None:
-    """Returns articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
+    """Reads articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
 
     Lengths are diameters of the object in frame 0.
     """
@@ -37,6 +40,7 @@ def sapien(
             articulation=motion.articulation(conversion),
             split=rule,
             seed=conversion.seed,
+            allow_outside=allow_outside,
         ),
         conversion,
         raw,

@@ -26,7 +26,7 @@ def merge(
     compression: Compression = "none",
     force: Force = False,
 ) -> None:
-    """Joins files of clouds: the shards of one conversion in their order, or unlike sources with a label map.
+    """Join files of clouds: the shards of one conversion in their order, or unlike sources with a label map.
 
     Shards keep the compression that they were made with.
     """

@@ -65,7 +65,7 @@ def split(
     compression: Compression = "none",
     force: Force = False,
 ) -> None:
-    """Divide a file of clouds: by the splits it tells, a list, subjects or fractions.
+    """Divides a file of clouds: by the splits it tells, a list, subjects or fractions.
 
     For example: dpc prepare split own.h5 --fractions 0.8,0.1,0.1 -o own_split.h5
     """

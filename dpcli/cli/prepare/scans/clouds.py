@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
-from dpcli.cli.prepare.options import LabelTable, Pattern, Stride
+from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 
 if TYPE_CHECKING:
     from dpcli.prepare.scans.clouds import CloudFolders
+    from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TableSequences
 
 
@@ -57,7 +58,9 @@ class TableColumns:
 def clouds(
     raw: Annotated[
         Path,
-        typer.Argument(help="Folder of .ply .pcd .las .laz .npy .npz .bin .csv .xyz frames, or of such; or one table."),
+        typer.Argument(
+            help="Folder of .ply .pcd .las .laz .npy .npz .bin .csv .xyz frames, or of such; a table; or a recording."
+        ),
     ],
     units: CloudUnits,
     table: TableColumns,
@@ -67,6 +70,7 @@ def clouds(
     ] = None,
     stride: Stride = 1,
     pattern: Pattern = "",
+    topic: Topic = "",
     label_from_folder: Annotated[
         bool,
         typer.Option(
@@ -77,7 +81,8 @@ def clouds(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Returns point cloud files: a folder is a sequence, its files are the frames; or tables with a column of frames.
+    """Reads point cloud files: a folder is a sequence, its files are the frames; or tables with a column of frames,
+    or a topic of a robot's recording.
 
     For example: dpc prepare clouds scans --fps 10 -o own.h5
     """
@@ -90,16 +95,21 @@ def clouds(
         "label_from_folder": label_from_folder,
         "labels": labels,
     }
-    run_conversion("clouds", lambda: _make_reader(raw, units, table, pattern, shared), conversion, raw)
+    run_conversion("clouds", lambda: _make_reader(raw, units, table, pattern, topic, shared), conversion, raw)
 
 
 def _make_reader(
-    raw: Path, units: CloudUnits, table: TableColumns, pattern: str, shared: dict[str, Any]
-) -> CloudFolders | TableSequences:
-    """Returns the reader of a table, or of folders of tables where an option says so, else of folders of frames."""
+    raw: Path, units: CloudUnits, table: TableColumns, pattern: str, topic: str, shared: dict[str, Any]
+) -> CloudFolders | TableSequences | RecordedClouds:
+    """Returns the reader of recordings, of tables (those of a folder where an option says so), or of folders of frames."""
+    from dpcli.prepare.decode.cloud_files import SUFFIXES
+    from dpcli.prepare.recordings.recording import holds_only_recordings
     from dpcli.prepare.scans.clouds import CloudFolders
+    from dpcli.prepare.scans.recorded_clouds import RecordedClouds
     from dpcli.prepare.scans.tables import TABLES, TableSequences
 
+    if topic or holds_only_recordings(raw, SUFFIXES):
+        return RecordedClouds(raw, topic, **shared)
     if (raw.is_file() and raw.suffix.lower() in TABLES) or table != TableColumns():
         return TableSequences(raw, table.frame_column, table.sequence_column, table.gap, **shared)
     return CloudFolders(raw, bin_columns=units.bin_columns, pattern=pattern, **shared)

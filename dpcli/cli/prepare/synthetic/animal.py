@@ -16,7 +16,7 @@ def animal(
     options: FilmingOptions,
     motion: Annotated[
         Literal["walk", "trot", "wag", "fly", "swim"],
-        typer.Option("--motion", help="What it does: walk, trot or wag (four legs), fly (bird), swim (fish)."),
+        typer.Option("--motion", help="Its motion: walk, trot or wag (four legs), fly (bird), swim (fish)."),
     ] = "walk",
     cycles: Annotated[
         float, typer.Option("--cycles", help="Steps, wing beats or tail strokes in the clip; 0: the motion's own.")
@@ -25,7 +25,7 @@ def animal(
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
-    """Returns a made-up animal that moves, filmed: shape, coat and gait by --seed, exact tracks and rigid parts.
+    """Makes and films a made-up animal that moves: shape, coat and gait by --seed, exact tracks and rigid parts.
 
     Needs no data.
     """

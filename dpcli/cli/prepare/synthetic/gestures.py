@@ -18,7 +18,7 @@ def gestures(
     noise: Annotated[float, typer.Option("--noise", min=0.0, help="Sensor noise; 1 is like a Kinect's.")] = 1.0,
     conversion: ConversionOptions,
 ) -> None:
-    """Returns arm gestures whose pairs differ only in the direction of time, seen by a virtual depth camera."""
+    """Makes arm gestures whose pairs differ only in the direction of time, seen by a virtual depth camera."""
     from dpcli.prepare.synthetic.gestures import SyntheticGestures
 
     run_conversion(

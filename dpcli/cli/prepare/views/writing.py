@@ -10,7 +10,7 @@ from dpcli.cli.prepare.conversion import require_output
 
 
 def write_views(make_clip: Any, output: str, *, source: str, **options: Any) -> None:
-    """Converts one clip into `output` (a path, or - for a pipe) and print what it holds."""
+    """Converts one clip into `output` (a path, or - for a pipe) and prints what it holds."""
     require_output(output)
     from dpcli.prepare.views.views_pipeline import convert_clip
     from dpcli.store.pipes import output_file

@@ -60,15 +60,23 @@ function followTheme(changed) {
   return () => { chosen = root.hasAttribute("data-dark") ? "light" : "dark"; show(); };
 }
 
-// Keys do what `table` says, but not while a field is filled in, and a space on a button presses it.
+// Keys do what `table` says whatever has the focus; only fields of text keep theirs, sliders and menus their arrows, boxes their space.
 function listenToKeys(table) {
   window.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    const { tagName, type } = event.target, typed = ["INPUT", "SELECT"].includes(tagName) && !["range", "checkbox"].includes(type);
-    if (typed || type === "range" && event.key.startsWith("Arrow") || tagName === "BUTTON" && event.key === " ") return;
+    if (keepsKey(event.target, event.key)) return;
     const does = table()[event.key];
     if (does) { event.preventDefault(); does(); }
   });
+  window.addEventListener("keyup", (event) => {  // Firefox presses a button when its space is let go
+    if (event.key === " " && event.target.tagName === "BUTTON" && table()[" "]) event.preventDefault();
+  });
+}
+
+function keepsKey({ tagName, type, isContentEditable }, key) {
+  if (type === "range" || tagName === "SELECT") return key.startsWith("Arrow");
+  if (type === "checkbox") return key === " ";
+  return ["INPUT", "TEXTAREA"].includes(tagName) || isContentEditable;
 }
 
 function tableOf(rows) {

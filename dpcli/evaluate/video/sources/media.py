@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,10 +10,9 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View
-from dpcli.path_names import utf8_path
-
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
-VIDEO_SUFFIXES = (".mp4", ".gif", ".webm", ".avi", ".mov", ".mkv")
+from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, one_series, upright
+from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
 
 class FolderSource(Source):
@@ -24,10 +22,11 @@ class FolderSource(Source):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        folders = {path: _images_in(path)} if _images_in(path) else {}
+        own = _images_in(path)
+        folders = {path: own} if own else {}
         for child in sorted((p for p in path.iterdir() if p.is_dir()), key=_numbers_in_name) if not folders else ():
-            if _images_in(child):
-                folders[child] = _images_in(child)
+            if inside := _images_in(child):
+                folders[child] = inside
         if not folders:
             raise DataError(f"{path}: no images in it or in its folders ({', '.join(IMAGE_SUFFIXES)})")
         self.files = list(folders.values())
@@ -42,7 +41,8 @@ class FolderSource(Source):
 
 
 def _images_in(folder: Path) -> list[Path]:
-    return sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES), key=_numbers_in_name)
+    found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return one_series(folder, sorted(found, key=_numbers_in_name))
 
 
 def _numbers_in_name(path: Path) -> tuple:
@@ -69,7 +69,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, bool]:
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = "A" in image.getbands() or "transparency" in image.info
-            return np.asarray(image.convert("RGBA")), has_alpha
+            return np.asarray(upright(image).convert("RGBA")), has_alpha
     except (OSError, SyntaxError, ValueError) as error:
         raise DataError(f"{path}: not a readable image ({error}); make it again") from None
 
@@ -119,36 +119,21 @@ class ArraySource(Source):
 
 
 class VideoSource(Source):
-    """Reads a video file: one opaque view, decoded as it is read."""
+    """Reads a video file or an animated image: one view, decoded as it is read, with the alpha that it has."""
 
-    kind, has_alpha = "video file", False
+    kind = "video file"
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        capture = self._open()
-        count = 0
-        while capture.grab():  # what a container declares is often wrong
-            count += 1
-        capture.release()
-        if not count:
-            raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown codec)")
+        self.path, self.animated = path, is_image_file(path)
+        if self.animated:
+            count = len(animation_times(path))
+            self.has_alpha = any((frame[..., 3] < 255).any() for frame in animation_frames(path, range(count)))
+        else:
+            look = look_at_video(path)
+            count, self.has_alpha = look.count, look.has_alpha
         self.views, self.frames = [_view_of_folder("")], [count]
-
-    def _open(self):  # -> cv2.VideoCapture
-        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-        import cv2
-
-        return cv2.VideoCapture(utf8_path(self.path, "OpenCV"))
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:
         """Yields the frames of a view, in rising order."""
-        capture, asked = self._open(), set(frames)
-        for frame in range(max(asked, default=-1) + 1):
-            good, image = capture.read()
-            if not good:
-                raise DataError(f"{self.path}: frame {frame} cannot be decoded; make the file again")
-            if frame in asked:
-                rgba = np.full((*image.shape[:2], 4), 255, np.uint8)
-                rgba[..., :3] = image[..., ::-1]
-                yield Picture(rgba=rgba)
-        capture.release()
+        read = animation_frames if self.animated else video_frames
+        yield from (Picture(rgba=rgba) for rgba in read(self.path, frames))

@@ -5,17 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.sources.media import VIDEO_SUFFIXES, ArraySource, FolderSource, VideoSource
+from dpcli.evaluate.video.sources.media import ArraySource, FolderSource, VideoSource
 from dpcli.evaluate.video.sources.source import Source
 from dpcli.evaluate.video.sources.stored import SceneSource, ViewsSource
+from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES
 from dpcli.store import file_kind
 
+_CLIPS = (*VIDEO_SUFFIXES, ".gif", ".apng", ".png", ".webp", ".avif")
 _EXPECTED = "expected a views or gaussians file, a folder of images, an .npy array, or a video file"
 
 
 def is_media(path: Path) -> bool:
     """Returns whether a path holds a video that is no HDF5 file: a folder, an array or a video file."""
-    return path.is_dir() or path.suffix.lower() in (".npy", *VIDEO_SUFFIXES)
+    return path.is_dir() or path.suffix.lower() == ".npy" or _is_clip(path)
+
+
+def _is_clip(path: Path) -> bool:
+    """Returns whether a file is taken for a video: by its suffix, or without one, when it is neither HDF5 nor text."""
+    if path.suffix or not path.is_file():
+        return path.suffix.lower() in _CLIPS
+    with open(path, "rb") as file:
+        start = file.read(64)
+    return bool(start) and not start.startswith(b"\x89HDF\r\n") and any(byte < 9 for byte in start)
 
 
 def open_source(path: Path, *, truth: Source | None = None) -> Source:
@@ -26,7 +37,7 @@ def open_source(path: Path, *, truth: Source | None = None) -> Source:
         raise DataError(f"{path}: no such file or folder; {_EXPECTED}")
     if path.suffix.lower() == ".npy":
         return ArraySource(path)
-    if path.suffix.lower() in VIDEO_SUFFIXES:
+    if _is_clip(path):
         return VideoSource(path)
     kind = file_kind(path)
     if kind == "views":

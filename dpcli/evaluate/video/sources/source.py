@@ -40,7 +40,7 @@ class Picture:
 
     @property
     def unusable(self) -> int:
-        """How many pixels have a NaN or infinite value."""
+        """Returns how many pixels have a NaN or infinite value."""
         return 0 if self.values is None else int((~np.isfinite(self.values)).any(-1).sum())
 
     def over(self, background: Sequence[float]) -> np.ndarray:

@@ -455,7 +455,7 @@ def test_the_input_transform_starts_as_the_identity():
 @pytest.mark.parametrize("backbone", BACKBONE_CHANGES)
 @pytest.mark.parametrize("preset", ["thesis", "release", "quick", "tiny"])
 def test_every_preset_has_the_backbone(backbone, preset):
-    config = PRESETS[preset]["network"].changed(merge="cross", grouping="first")  # as --variant release has them
+    config = PRESETS[preset]["network"].changed(merge="cross", grouping="first")  # as variant = release has them
     with torch.device("meta"):
         model = Kinet(config.changed(**backbone_changes(preset, backbone)))
     assert isinstance(model.static, {"dgcnn": DGCNN, "spidercnn": SpiderCNN}[backbone])
@@ -543,5 +543,5 @@ def test_names_that_are_no_backbone(name, message):
 
 @pytest.mark.parametrize("backbone", ["dgcnn", "spidercnn"])
 def test_widths_of_another_backbone_are_refused(backbone):
-    with pytest.raises(UsageError, match=f"--backbone {backbone}: widths = .*expected numbers like"):
+    with pytest.raises(UsageError, match=f"backbone = {backbone}: widths = .*expected numbers like"):
         Kinet(KinetConfig(backbone=backbone))

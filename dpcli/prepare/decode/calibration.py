@@ -1,0 +1,345 @@
+"""Calibration files of depth cameras, as many tools write them: focal lengths, image size, lens, and depth units.
+
+Whatever a file declares is used, or refused by its name.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
+
+_FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
+_CX = ("cx", "ppx", "c_x", "mx_depth")
+_CY = ("cy", "ppy", "c_y", "my_depth")
+_MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", "intrinsicmatrix", "cameramatrix")
+_WIDTH = ("width", "w", "image_width", "depthwidth")
+_HEIGHT = ("height", "h", "image_height", "depthheight")
+_SCALE = (
+    "depth_scale",
+    "depthscale",
+    "depth_factor",
+    "depth_units",
+    "depth_unit",
+    "png_depth_scale",
+    "depth_shift",
+    "integer_depth_scale",
+    "depth_unit_scale_factor",
+)
+_LENS = (
+    "coeffs",
+    "distortion_coefficients",
+    "distortion_coeffs",
+    "d",
+    "dist_coeffs",
+    "distcoeffs",
+    "distortion",
+    "disto",
+)
+_MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model")
+_BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
+_AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
+_ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
+_COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
+_EXPECTED = (
+    'expected {"fx": .., "fy": .., "cx": .., "cy": ..} in pixels, a 3x3 or 4x4 matrix, or what RealSense, Open3D, ROS or'
+    " COLMAP write"
+)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Holds a camera's intrinsics, the size of the pictures they are for (0 = not known), and raw depth units per meter."""
+
+    intrinsics: Intrinsics
+    width: int = 0
+    height: int = 0
+    depth_scale: float | None = None
+    source: str = "the options"
+
+    def of_pictures(self, width: int, height: int) -> Intrinsics:
+        """Returns the intrinsics for pictures of that size: scaled, when the calibration's have the same shape.
+
+        Raises DataError when they are of another shape, or when the principal point lies outside of the pictures.
+        """
+        own, found = f"{self.width}x{self.height}", f"{width}x{height}"
+        camera = self.intrinsics
+        if self.width and self.height and (self.width, self.height) != (width, height):
+            x, y = width / self.width, height / self.height
+            if abs(x / y - 1) > _ASPECT:
+                raise DataError(
+                    f"{self.source}: is of {own} pictures, these have {found}, which is another shape; expected the"
+                    " calibration of the depth camera itself"
+                )
+            middle = ((camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
+            camera = replace(camera, fx=camera.fx * x, fy=camera.fy * y, cx=middle[0], cy=middle[1])
+        if not (-0.5 <= camera.cx <= width and -0.5 <= camera.cy <= height):
+            raise DataError(
+                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of these {found} pictures;"
+                " expected a calibration of pictures of this size, or its width and height beside it"
+            )
+        return camera
+
+    def require_clear_scale(self) -> None:
+        """Raises DataError when the declared raw units per meter are so few that they mean something else."""
+        if self.depth_scale is not None and self.depth_scale < _AMBIGUOUS:
+            raise DataError(
+                f"{self.source}: declares a depth scale that would be {self.depth_scale:g} raw units per meter, which is"
+                " hardly meant for whole numbers; give --depth-scale, such as 1000 for millimeters"
+            )
+
+    def notes(self) -> list[str]:
+        """Returns lines for the log about what the calibration declares beside the intrinsics."""
+        declared = [f"pictures of {self.width}x{self.height}"] if self.width else []
+        declared += [f"{self.depth_scale:g} raw units per meter"] if self.depth_scale else []
+        declared += ["a lens to be straightened"] if isinstance(self.intrinsics, LensIntrinsics) else []
+        return [f"{self.source}: declares {', '.join(declared)}"] if declared else []
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Reads a calibration: JSON or YAML of RealSense, Open3D, ROS, OpenCV, Kalibr, ScanNet's 4x4 text, COLMAP's
+    ``cameras.txt``, ``key = value`` lines, or a matrix in ``.npy`` or text; row- or column-major.
+
+    Raises DataError that names what the file lacks, or declares and can't be used.
+    """
+    if path.suffix.lower() == ".npy":
+        return _of_numbers(path, _load_npy(path))
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: is no text; {_EXPECTED}") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    if (cameras := _colmap_lines(text)) and path.suffix.lower() == ".txt":
+        return _of_colmap(path, cameras)
+    numbers = _only_numbers(text)
+    if numbers is not None:
+        return _of_numbers(path, numbers)
+    return _of_mapping(path, _parsed(path, text))
+
+
+def _parsed(path: Path, text: str) -> dict[str, Any]:
+    suffix = path.suffix.lower()
+    if suffix in (".yaml", ".yml"):
+        data = _yaml(path, text)
+    elif suffix == ".txt":
+        lines = (re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines())
+        data = {pair[0]: _number_or_text(pair[1]) for pair in lines if len(pair) == 2}
+    else:
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise DataError(f"{path}: is not JSON ({error})") from None
+    if not isinstance(data, dict):
+        raise DataError(f"{path}: {_EXPECTED}")
+    return data
+
+
+def _yaml(path: Path, text: str) -> Any:
+    import yaml
+
+    plain = re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
+    try:
+        return next((part for part in yaml.safe_load_all(plain) if part), None)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise DataError(f"{path}: is not YAML ({' '.join(str(error).split())})") from None
+
+
+def _number_or_text(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _load_npy(path: Path) -> list[float]:
+    try:
+        return [float(value) for value in np.load(path, allow_pickle=False).reshape(-1)]
+    except (OSError, ValueError, EOFError, TypeError) as error:
+        raise DataError(f"{path}: not a readable .npy array ({error})") from None
+
+
+def _only_numbers(text: str) -> list[float] | None:
+    """Returns the numbers of a text that holds nothing else but brackets and separators, None of another one."""
+    kept = [line for line in text.splitlines() if not line.lstrip().startswith("#")]
+    words = re.sub(r"[\[\](),;]", " ", "\n".join(kept)).split()
+    try:
+        return [float(word) for word in words] or None
+    except ValueError:
+        return None
+
+
+def _of_numbers(path: Path, numbers: list[float]) -> Calibration:
+    if len(numbers) == 4:
+        return Calibration(_intrinsics(path, numbers, ()), source=str(path))
+    return Calibration(_intrinsics(path, _of_matrix(path, numbers), ()), source=str(path))
+
+
+def _of_matrix(path: Path, values: Any) -> list[float]:
+    """Returns fx, fy, cx, cy of a matrix of 3x3, 3x4 or 4x4 numbers, row- or column-major, as lists or one list."""
+    try:
+        flat = np.asarray(values, np.float64).reshape(-1)
+        matrix = flat.reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[flat.size])[:3, :3]
+    except (KeyError, ValueError, TypeError):
+        raise DataError(f"{path}: its matrix is not of 3x3 or 4x4 numbers; {_EXPECTED}") from None
+    if not matrix[:2, 2].any() and matrix[2, :2].any():  # the principal point in the last row: column by column
+        matrix = matrix.T
+    if matrix[1, 0] or matrix[2, 0] or matrix[2, 1] or matrix[2, 2] != 1:
+        raise DataError(f"{path}: its matrix is not fx 0 cx, 0 fy cy, 0 0 1, by rows or by columns; {_EXPECTED}")
+    if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
+        raise DataError(f"{path}: its matrix has a skew of {matrix[0, 1]:g}; expected pixels that are rectangles")
+    return [float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])]
+
+
+def _intrinsics(path: Path, numbers: list[float], lens: tuple[float, ...]) -> Intrinsics:
+    try:
+        return LensIntrinsics(*numbers, lens) if any(lens) else Intrinsics(*numbers)
+    except UsageError as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _colmap_lines(text: str) -> list[list[str]]:
+    """Returns the words of lines such as ``1 PINHOLE 640 480 525 525 320 240``."""
+    lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    return (
+        lines
+        if lines and all(len(words) > 4 and words[1].isupper() and words[1][0].isalpha() for words in lines)
+        else []
+    )
+
+
+def _of_colmap(path: Path, cameras: list[list[str]]) -> Calibration:
+    if len({tuple(words[1:]) for words in cameras}) > 1:
+        raise DataError(f"{path}: holds {len(cameras)} different cameras; expected the line of the depth camera alone")
+    words = cameras[0]
+    model = words[1]
+    if len(words) != 4 + _COLMAP.get(model, -1):
+        raise DataError(f"{path}: camera model {model}; expected one of {', '.join(_COLMAP)}, with its parameters")
+    try:
+        width, height, *values = (float(word) for word in words[2:])
+    except ValueError:
+        raise DataError(f"{path}: {' '.join(words)!r}: expected numbers after the model") from None
+    if model.startswith("SIMPLE") or model == "RADIAL":
+        values = [values[0], *values]
+    fx, fy, cx, cy, *lens = values
+    corner = [fx, fy, cx - 0.5, cy - 0.5]  # COLMAP counts from the corner of the first pixel, not from its center
+    return Calibration(_intrinsics(path, corner, tuple(lens)), int(width), int(height), source=str(path))
+
+
+def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
+    if "CalibrationInformation" in data:
+        raise DataError(
+            f"{path}: is the raw calibration of an Azure Kinect, whose lens model is not read; {_EXPECTED}, as the"
+            " camera's SDK reports them for the depth mode"
+        )
+    own = _camera_of(path, data)
+    numbers = _pixels(path, own)
+    lens = _lens(path, own)
+    size = _resolution(own)
+    scale = _depth_scale(path, own, data)
+    return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
+
+
+def _camera_of(path: Path, data: dict[str, Any]) -> dict[str, Any]:
+    """Returns the mapping that holds intrinsics, in small letters: the whole, or the part of the depth camera."""
+    found = list(_cameras("", data, {}))
+    depth = [part for name, part in found if re.search("depth|(^|/)ir($|/)", name, re.IGNORECASE)]
+    if len(found) == 1 or (found and found[0][0] == ""):
+        return found[0][1]
+    if len(depth) == 1:
+        return depth[0]
+    if not found:
+        raise DataError(f"{path}: {_EXPECTED}")
+    names = ", ".join(name for name, _ in found[:5])
+    raise DataError(f"{path}: holds several cameras ({names}); expected one, or one called depth")
+
+
+def _cameras(name: str, data: Any, outer: dict[str, Any], depth: int = 0) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yields every mapping that holds intrinsics, with what is said around it, such as the size of the pictures."""
+    if isinstance(data, dict) and depth < 5:
+        own = {str(key).lower(): value for key, value in data.items()}
+        around = {**outer, **{key: value for key, value in own.items() if not isinstance(value, dict)}}
+        if _holds_camera(own):
+            yield name, {**outer, **own}
+        for key, value in data.items():
+            yield from _cameras(f"{name}/{key}".lstrip("/"), value, around, depth + 1)
+
+
+def _holds_camera(part: dict[str, Any]) -> bool:
+    matrix = _first(part, _MATRIX)
+    holds_matrix = isinstance(matrix, list) or (isinstance(matrix, dict) and "data" in matrix)
+    return holds_matrix or any(key in part for key in (*_FX, *_CX))
+
+
+def _first(part: dict[str, Any], names: tuple[str, ...]) -> Any:
+    return next((part[name] for name in names if part.get(name) is not None), None)
+
+
+def _pixels(path: Path, own: dict[str, Any]) -> list[float]:
+    matrix = _first(own, _MATRIX)
+    if isinstance(matrix, dict):
+        matrix = matrix.get("data")
+    if isinstance(matrix, list):
+        return [float(v) for v in matrix] if len(matrix) == 4 and _are_numbers(matrix) else _of_matrix(path, matrix)
+    values = [_first(own, names) for names in (_FX, _FY, _CX, _CY)]
+    if not _are_numbers(values):
+        raise DataError(f"{path}: {_EXPECTED}")
+    return [float(value) for value in values]
+
+
+def _are_numbers(values: list[Any]) -> bool:
+    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
+
+
+def _resolution(own: dict[str, Any]) -> tuple[int, int]:
+    size = own.get("resolution")
+    pair = size if isinstance(size, list) and len(size) == 2 else [_first(own, _WIDTH), _first(own, _HEIGHT)]
+    return (int(pair[0]), int(pair[1])) if _are_numbers(pair) and min(pair) > 0 else (0, 0)
+
+
+def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
+    """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
+    values = _first(own, _LENS)
+    if isinstance(values, dict):
+        values = values.get("data")
+    if values is None and any(f"k{k}" in own for k in (1, 2)):
+        values = [own.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+    flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
+    return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat) if _are_numbers(flat) else ()
+
+
+def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, ...]:
+    """Returns the coefficients of a lens, none where all are 0. name: of its model.
+
+    Raises DataError for a model that isn't read.
+    """
+    if not any(flat):
+        return ()
+    model = name.lower().replace("distortion.", "").replace("-", "_")
+    if model not in _BROWN or len(flat) not in (4, 5, 8, 12, 14):
+        raise DataError(
+            f"{path}: its lens is of model {model or 'unknown'} with {len(flat)} coefficients that aren't all 0; expected"
+            " plumb_bob or rational_polynomial (k1 k2 p1 p2 k3 ...), or pictures that were rectified and no coefficients"
+        )
+    return tuple(float(value) for value in flat)
+
+
+def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> float | None:
+    """Returns raw units per meter; small values are meters per unit, as RealSense has them."""
+    top = {str(key).lower(): value for key, value in whole.items()}
+    value = next((part[name] for part in (own, top) for name in _SCALE if part.get(name) is not None), None)
+    if value is None and "scale" in own and "fx" in own:  # as mappers of rooms write it
+        value = own["scale"]
+    if value is None:
+        return None
+    if not _are_numbers([value]) or not value > 0 or not np.isfinite(value):
+        raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
+    return float(value) if value >= 1 else float(f"{1 / value:.12g}")

@@ -1,0 +1,80 @@
+"""Extensions of glTF 2.0: which of them are read, which change nothing seen, and which must be named to the user."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dpcli.prepare.meshes.gltf import Gltf
+from dpcli.prepare.meshes.skinning import matrices
+from dpcli.runtime.progress import log
+
+READ = {
+    "EXT_mesh_gpu_instancing",
+    "EXT_texture_webp",
+    "KHR_animation_pointer",
+    "KHR_draco_mesh_compression",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+    "KHR_node_visibility",
+    "KHR_texture_transform",
+}
+_UNSEEN = {  # what they say does not change a picture
+    "CESIUM_primitive_outline",
+    "EXT_mesh_features",
+    "EXT_structural_metadata",
+    "FB_ngon_encoding",
+    "KHR_accessor_float64",
+    "KHR_materials_variants",
+    "KHR_node_hoverability",
+    "KHR_node_selectability",
+    "KHR_xmp",
+    "KHR_xmp_json_ld",
+    "VRM",
+    "VRMC_vrm",
+}
+_ADVICE = {
+    "EXT_meshopt_compression": "export it without compression",
+    "KHR_meshopt_compression": "export it without compression",
+    "KHR_texture_basisu": "export its textures as PNG or JPEG",
+    "EXT_texture_avif": "export its textures as PNG or JPEG",
+}
+_IDENTITY = {"TRANSLATION": (0.0, 0.0, 0.0), "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0, 1.0, 1.0)}
+
+
+def refuse_required(file: Gltf) -> None:
+    """Raises DataError when the file can't be understood without an extension that is not read."""
+    for name in map(str, file.tree.get("extensionsRequired", [])):
+        if name not in READ | _UNSEEN and not name.startswith(("KHR_materials_", "KHR_lights_punctual")):
+            advice = _ADVICE.get(name, "export it without this extension")
+            raise file.fail(f"needs the extension {name}, which is not read; {advice}")
+
+
+def name_unread(file: Gltf) -> None:
+    """Warns of every extension the file uses that changes its picture and is not read, once each."""
+    unread = [name for name in dict.fromkeys(map(str, file.tree.get("extensionsUsed", []))) if name not in READ]
+    unread = [name for name in unread if name not in _UNSEEN]
+    if unread:
+        log.warn(f"{file.path}: not read, so the pictures may differ from a viewer's: {', '.join(unread)}")
+
+
+def instances(file: Gltf, node: int) -> np.ndarray | None:
+    """Returns the transforms f64 (N,4,4) of a node's instances (EXT_mesh_gpu_instancing), or None without them."""
+    entry: dict[str, Any] = file.item("nodes", node).get("extensions", {}).get("EXT_mesh_gpu_instancing")
+    if entry is None:
+        return None
+    what = f"instances of node {node}"
+    given = {
+        key: file.accessor(index, what, len(_IDENTITY[key])).astype(np.float64)
+        for key, index in entry.get("attributes", {}).items()
+        if key in _IDENTITY
+    }
+    counts = {len(values) for values in given.values()}
+    if len(counts) != 1:
+        raise file.fail(f"{what}: their attributes have {sorted(counts)} entries; expected one number for all")
+    count = counts.pop()
+    values = [given.get(key, np.tile(rest, (count, 1))) for key, rest in _IDENTITY.items()]
+    return matrices(*values)

@@ -1,0 +1,128 @@
+"""Decodes single ROS messages: points (PointCloud2), depth (Image, CompressedImage) and a camera (CameraInfo)."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.decode.calibration import Calibration, lens_coefficients
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
+from dpcli.prepare.decode.png import decode_gray_png
+
+CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2",)
+IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo",)
+_POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_PIXELS = {"16uc1": "u2", "mono16": "u2", "16sc1": "i2", "32sc1": "i4", "32fc1": "f4", "64fc1": "f8", "8uc1": "u1"}
+_PIXELS |= {"mono8": "u1", "z16": "u2"}
+_DEPTH_HEADER = struct.Struct("<iff")  # before the PNG of image_transport's compressedDepth: format, and two numbers
+
+
+def cloud_of_message(path: Path, content: Any, keep: tuple[str, ...] = ()) -> Cloud:
+    """Returns the points of a PointCloud2, with colors where it has them, and the fields ``keep`` beside.
+
+    Raises DataError when it holds fewer bytes than it says, or no x, y, z.
+    """
+    order = ">" if content.is_bigendian else "<"
+    fields = {field.name: field for field in content.fields if field.datatype in _POINT_TYPES and field.count in (0, 1)}
+    step, width, height = int(content.point_step), int(content.width), int(content.height)
+    ends = [field.offset + np.dtype(_POINT_TYPES[field.datatype]).itemsize for field in fields.values()]
+    data = np.frombuffer(memoryview(content.data), np.uint8)
+    row_step = int(content.row_step) or width * step
+    if max(ends, default=0) > step or width * step > row_step or len(data) < row_step * height:
+        raise DataError(
+            f"{path}: a cloud of {width} x {height} points of {step} bytes, rows of {row_step}, has {len(data)} bytes;"
+            " the message is damaged"
+        )
+    kind = np.dtype(
+        {
+            "names": list(fields),
+            "formats": [order + _POINT_TYPES[field.datatype] for field in fields.values()],
+            "offsets": [field.offset for field in fields.values()],
+            "itemsize": step,
+        }
+    )
+    rows = data[: row_step * height].reshape(height, row_step)[:, : width * step]
+    points = np.ascontiguousarray(rows).reshape(-1).view(kind)
+    columns = {name: points[name].astype(points[name].dtype.newbyteorder("=")) for name in fields}
+    return cloud_of_columns(path, columns, keep)
+
+
+def depth_of_message(path: Path, kind: str, content: Any) -> np.ndarray:
+    """Returns the depth of an Image or CompressedImage, (H,W) as stored. Raises DataError that names its encoding."""
+    if kind == IMAGE_KINDS[1]:
+        return _compressed_depth(path, str(content.format), bytes(memoryview(content.data)))
+    encoding = str(content.encoding).lower()
+    if encoding not in _PIXELS:
+        raise DataError(
+            f"{path}: images of encoding {content.encoding!r}; expected depth: 16UC1, mono16 or 32FC1; choose its --topic"
+        )
+    pixel = np.dtype((">" if content.is_bigendian else "<") + _PIXELS[encoding])
+    height, width = int(content.height), int(content.width)
+    row = int(content.step) or width * pixel.itemsize
+    data = np.frombuffer(memoryview(content.data), np.uint8)
+    if len(data) < row * height or row < width * pixel.itemsize:
+        raise DataError(f"{path}: an image of {width}x{height} {content.encoding} has {len(data)} bytes; it is damaged")
+    rows = data[: row * height].reshape(height, row)[:, : width * pixel.itemsize]
+    return np.ascontiguousarray(rows).view(pixel).astype(pixel.newbyteorder("="))
+
+
+def _compressed_depth(path: Path, form: str, data: bytes) -> np.ndarray:
+    encoding, _, method = (part.strip().lower() for part in form.partition(";"))
+    if "rvl" in method:
+        raise DataError(
+            f"{path}: depth images of {form!r}; expected compressedDepth as PNG, or images that are not compressed"
+        )
+    if "compresseddepth" not in method:
+        return _decoded(path, form, data)
+    if len(data) < _DEPTH_HEADER.size:
+        raise DataError(f"{path}: a compressed depth image of {len(data)} bytes; it is damaged")
+    _, a, b = _DEPTH_HEADER.unpack_from(data)
+    stored = _decoded(path, form, data[_DEPTH_HEADER.size :])
+    if encoding != "32fc1":
+        return stored
+    with np.errstate(divide="ignore", invalid="ignore"):  # the inverse of depth was stored, 0 where nothing was seen
+        return np.where(stored > 0, a / (stored.astype(np.float32) - b), 0).astype(np.float32)
+
+
+def _decoded(path: Path, form: str, data: bytes) -> np.ndarray:
+    image = decode_gray_png(data)
+    if image is None:
+        cv2 = load_cv2()
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    if image is None:
+        raise DataError(f"{path}: a compressed image ({form!r}) can't be decoded; it is damaged or of another kind")
+    if image.ndim != 2:
+        raise DataError(f"{path}: compressed images ({form!r}) are colored; expected depth; choose its --topic")
+    return image
+
+
+def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration | None:
+    """Returns the camera of a CameraInfo for the images of ``topic``; None when it says that it isn't calibrated.
+
+    For rectified images (``rect`` in the name of the topic) its projection P counts, else its K and lens.
+    """
+    matrix, lens, projection = (
+        [float(v) for v in _either(content, name)] for name in ("k", "d", "p")
+    )  # ROS 1 has them in capitals
+    if content.roi.x_offset or content.roi.y_offset:
+        raise DataError(f"{path}: the camera_info of {topic} is of a cut-out of the picture; give --intrinsics of it")
+    rectified = "rect" in topic.rpartition("/")[2] or "rect" in topic.split("/")[-2:][0]
+    numbers = (
+        [projection[k] for k in (0, 5, 2, 6)] if rectified and any(projection) else [matrix[k] for k in (0, 4, 2, 5)]
+    )
+    if numbers[0] <= 0 or numbers[1] <= 0:
+        return None
+    bent = () if rectified else lens_coefficients(path, str(content.distortion_model), lens)
+    camera = LensIntrinsics(*numbers, bent) if bent else Intrinsics(*numbers)
+    return Calibration(camera, int(content.width), int(content.height), source=f"{path}: camera_info")
+
+
+def _either(content: Any, name: str) -> Any:
+    return getattr(content, name) if hasattr(content, name) else getattr(content, name.upper())

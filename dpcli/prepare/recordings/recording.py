@@ -1,0 +1,157 @@
+"""Recordings of robots: which files are some, which topics they hold, and their messages one after the other."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.reader import natural_key
+from dpcli.prepare.series import is_beside, is_hidden
+
+SUFFIXES = (".bag", ".mcap", ".db3")
+_METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
+_LISTED = 12
+
+
+@dataclass(frozen=True)
+class Message:
+    """Holds one message with its type, such as ``sensor_msgs/msg/Image``, and when it was recorded, in nanoseconds."""
+
+    content: Any
+    kind: str
+    logged: int
+
+    @property
+    def stamp(self) -> int | None:
+        """Returns the nanoseconds that its header tells, None when it has none or they are 0."""
+        stamp = getattr(getattr(self.content, "header", None), "stamp", None)
+        return (stamp.sec * 10**9 + stamp.nanosec or None) if stamp is not None else None
+
+
+def is_recording(path: Path) -> bool:
+    """Returns whether a path is a recording: a file of its kind, or the folder of a ROS 2 bag."""
+    if path.is_dir():
+        return (path / _METADATA).is_file() and any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+    return path.suffix.lower() in SUFFIXES
+
+
+def find_recordings(path: Path) -> list[Path]:
+    """Returns the recordings at or below a path, in natural order; the files of a ROS 2 bag count as one."""
+    if is_recording(path):
+        return [path]
+    found: list[Path] = []
+    for folder, below, names in os.walk(path):
+        bags = [name for name in below if is_recording(Path(folder, name))]
+        found += [Path(folder, name) for name in bags]
+        below[:] = [name for name in below if name not in bags and not is_hidden(name)]
+        found += [Path(folder, name) for name in names if is_recording(Path(folder, name)) and not is_hidden(name)]
+    return sorted(found, key=lambda one: natural_key(one.relative_to(path).as_posix()))
+
+
+def holds_only_recordings(path: Path, others: tuple[str, ...]) -> bool:
+    """Returns whether a path is a recording, or a folder with recordings and no file that ends in one of ``others``."""
+    if is_recording(path):
+        return True
+    if not path.is_dir() or not find_recordings(path):
+        return False
+    names = (name.lower() for _, _, files in os.walk(path) for name in files if not is_hidden(name))
+    return not any(name.endswith(others) and not is_beside(name) for name in names)
+
+
+class Recording:
+    """Reads one open recording; `open_recording` makes it."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path, self._reader = path, reader
+        self.topics: dict[str, tuple[str, int]] = {
+            name: (str(info.msgtype), info.msgcount) for name, info in reader.topics.items()
+        }  # name -> (type, number of messages)
+
+    def choose(self, topic: str, kinds: tuple[str, ...], what: str) -> str:
+        """Returns the topic that was asked for, or the only one of these kinds.
+
+        what: what is looked for, in words. Raises DataError that lists the topics when it isn't there, or several are.
+        """
+        fitting = [name for name, (kind, count) in self.topics.items() if kind in kinds and count]
+        if topic:
+            wanted = [name for name in self.topics if name.strip("/") == topic.strip("/")]
+            if wanted and self.topics[wanted[0]][0] not in kinds:
+                raise DataError(
+                    f"{self.path}: {topic} is of type {self.topics[wanted[0]][0]}; {self._list(fitting, what)}"
+                )
+            if wanted:
+                return wanted[0]
+            raise DataError(f"{self.path}: no topic {topic}; {self._list(fitting, what)}")
+        if len(fitting) != 1:
+            raise DataError(f"{self.path}: {self._list(fitting, what)}")
+        return fitting[0]
+
+    def _list(self, fitting: list[str], what: str) -> str:
+        if fitting:
+            return f"choose one that holds {what} with --topic: {', '.join(fitting[:_LISTED])}"
+        held = ", ".join(f"{name} ({kind})" for name, (kind, _) in list(self.topics.items())[:_LISTED])
+        return f"no topic holds {what}; it has {held or 'no messages'}"
+
+    def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:
+        """Yields every ``stride``-th message of a topic, in the order they were recorded. Raises DataError at damage."""
+        connections = [one for one in self._reader.connections if one.topic == topic]
+        with _damage_named(self.path):
+            raw_messages = self._reader.messages(connections=connections)
+        index = 0
+        while True:
+            with _damage_named(self.path):
+                found = next(raw_messages, None)
+                if found is None:
+                    return
+                connection, logged, raw = found
+                content = self._reader.deserialize(raw, connection.msgtype) if index % stride == 0 else None
+            if content is not None:
+                yield Message(content, connection.msgtype, logged)
+            index += 1
+
+
+@contextmanager
+def open_recording(path: Path) -> Iterator[Recording]:
+    """Opens a recording. Raises DataError when it is damaged or of a kind that can't be read."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise UsageError("recordings of robots need rosbags: pip install 'dpc-toolkit[recordings]'") from None
+    with _damage_named(path):
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        reader.open()
+    try:
+        yield Recording(path, reader)
+    finally:
+        reader.close()
+
+
+@contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    """Turns whatever a parser of recordings raises into a DataError: damaged files make it stumble over anything."""
+    try:
+        yield
+    except Exception as error:
+        said = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DataError(
+            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2 messages"
+        ) from None
+
+
+def message_times(stamps: Sequence[tuple[int | None, int]]) -> np.ndarray | None:
+    """Returns seconds since the first message, f64, of (nanoseconds in its header or None, nanoseconds in the recording).
+
+    Those of the headers count when all have them and they rise, else those of the recording; None when these don't rise.
+    """
+    for times in ([own for own, _ in stamps], [logged for _, logged in stamps]):
+        if all(time is not None for time in times) and all(a < b for a, b in zip(times, times[1:])):  # type: ignore[operator]
+            return np.array([time - times[0] for time in times], np.float64) * 1e-9  # type: ignore[operator]
+    return None

@@ -1,0 +1,117 @@
+"""Clouds of a recording of a robot: the messages of one topic are the frames of a sequence."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.path_names import as_utf8
+from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
+from dpcli.prepare.reader import Item, Sample
+from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
+from dpcli.prepare.recordings.recording import find_recordings, message_times, open_recording
+from dpcli.prepare.scans.assembling import Lengths, assemble
+from dpcli.store.schema import KEPT
+
+
+@dataclass(frozen=True)
+class RecordedClouds:
+    """Reads the clouds of ``topic`` in a recording, or in those below a folder; the rest as `CloudFolders` has it."""
+
+    raw: Path
+    topic: str = ""
+    scale: float | None = None
+    unit: str = "m"
+    fps: float | None = None
+    stride: int = 1
+    label_from_folder: bool = False
+    labels: Path | None = None
+    keep: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.labels and self.label_from_folder:
+            raise UsageError("--labels and --label-from-folder were both given; use one")
+        if self.fps is not None and not self.fps > 0:
+            raise UsageError("--scale and --fps must be more than 0")
+        Lengths(self.scale, self.unit)
+
+    @property
+    def class_names(self) -> list[str]:
+        """Returns the class names in the order of their labels."""
+        return self._table.class_names if self._table else []
+
+    @property
+    def length_unit(self) -> str:
+        """Returns the name of the output's unit of length."""
+        return self.unit
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Returns the optional fields that every sample has: time, color when the very first cloud has it, what is kept."""
+        return ("time", *(("color",) if self._has_color else ()), *(f"{KEPT}{name}" for name in self.keep))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Returns the options that decide the content, for the provenance."""
+        return {k: v for k, v in asdict(self).items() if k not in ("raw", "labels")}
+
+    @cached_property
+    def _names(self) -> dict[str, Path]:
+        """Returns the recordings by the names of their sequences."""
+        if not self.raw.exists():
+            raise DataError(
+                f"{self.raw}: no such file or folder; expected a recording (.bag, .mcap, .db3), or a folder of some"
+            )
+        found = find_recordings(self.raw)
+        if not found:
+            raise DataError(f"{self.raw}: no recording in it; expected .bag, .mcap, .db3, or folders of ROS 2 bags")
+        return {as_utf8(p.relative_to(self.raw).as_posix() if p != self.raw else p.name): p for p in found}
+
+    @cached_property
+    def _table(self) -> LabelTable | None:
+        if self.label_from_folder:
+            return labels_of_folders(self.raw, list(self._names), "CLASS/RECORDING")
+        return read_labels(self.labels) if self.labels else None
+
+    @cached_property
+    def _has_color(self) -> bool:
+        for path in self._names.values():
+            try:
+                with open_recording(path) as recording:
+                    topic = recording.choose(self.topic, CLOUD_KINDS, "clouds (PointCloud2)")
+                    first = next(recording.messages(topic))
+                    return cloud_of_message(path, first.content).color is not None
+            except DataError:
+                continue  # a bad sample: the next one tells
+        return False
+
+    def items(self) -> list[Item]:
+        """Returns the index in its final order. Raises DataError when there is no recording."""
+        items = [Item(name, path, extra={"color": self._has_color}) for name, path in self._names.items()]
+        return self._table.apply(items) if self._table else items
+
+    def read(self, item: Item, rng: np.random.Generator) -> Sample:
+        """Returns the sample of one item. Raises DataError when its data are bad."""
+        clouds: list[Cloud] = []
+        stamps: list[tuple[int | None, int]] = []
+        with open_recording(item.path) as recording:
+            topic = recording.choose(self.topic, CLOUD_KINDS, "clouds (PointCloud2)")
+            for message in recording.messages(topic, self.stride):
+                clouds.append(cloud_of_message(item.path, message.content, self.keep))
+                stamps.append((message.stamp, message.logged))
+        if not clouds:
+            raise DataError(f"{item.path}: {topic} holds no messages")
+        time = np.arange(len(clouds)) * self.stride / self.fps if self.fps else message_times(stamps)
+        if time is None:
+            raise DataError(f"{item.path}: the times of {topic} don't rise; give its rate with --fps")
+        return assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
+
+    def summary(self, items: list[Item]) -> list[str]:
+        """Returns lines for the log about what the index holds."""
+        return [f"{len(items)} recording{'s' if len(items) != 1 else ''} found"]

@@ -1,0 +1,53 @@
+"""Animated images: GIF, APNG, WebP and AVIF, whatever their file is called, decoded one frame at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+
+_SHORTEST = 20.0  # ms: players show a frame of no duration about so long
+
+
+def is_image_file(path: Path) -> bool:
+    """Returns whether a file begins as an image does that may be animated (GIF, PNG, WebP, AVIF), or as JPEG, BMP or TIFF."""
+    with open(path, "rb") as file:
+        start = file.read(16)
+    if start[4:8] == b"ftyp":
+        return start[8:12] in (b"avif", b"avis")
+    if start[:4] == b"RIFF":
+        return start[8:12] == b"WEBP"
+    return start.startswith((b"GIF8", b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*"))
+
+
+def animation_times(path: Path) -> tuple[float, ...]:
+    """Returns the seconds at which each frame appears, from 0. Raises DataError when the file is damaged or one image."""
+    from PIL import Image
+
+    times, now = [], 0.0
+    try:
+        with Image.open(path) as image:
+            for index in range(getattr(image, "n_frames", 1)):
+                image.seek(index)
+                image.load()
+                times.append(now)
+                now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
+            moves = image.format in ("GIF", "PNG", "WEBP", "AVIF")
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
+    if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
+        raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
+    return tuple(times)
+
+
+def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
+    """Yields frames by rising index, each u8 (H,W,4) with straight alpha."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        for index in wanted:
+            image.seek(index)
+            yield np.array(image.convert("RGBA"))

@@ -1,0 +1,57 @@
+"""Images in the folder of a clip: turned as their camera was held, and sorted into the series that their names tell."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from dpcli.errors import DataError
+from dpcli.runtime.progress import log
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif")
+_NAMED = 6  # series at most in a message
+
+
+def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image
+    """Returns the image turned and mirrored as its EXIF orientation asks for; itself where there is none."""
+    from PIL import ImageOps
+
+    return ImageOps.exif_transpose(image)
+
+
+def one_series(folder: Path, paths: Sequence[Path]) -> list[Path]:
+    """Returns the images of the one series that `paths` hold, in their order; images without fellows are named and left out.
+
+    Names belong to one series where they differ in numbers alone. Raises DataError, which names them, when two or more
+    series lie in the folder: they are several objects, or color beside depth.
+    """
+    series: dict[str, list[Path]] = defaultdict(list)
+    for path in paths:
+        series[re.sub(r"\d+", "#", path.stem)].append(path)
+    several = {name: own for name, own in series.items() if len(own) > 1}
+    if len(several) > 1:
+        found = ", ".join(f"{_pattern(name, own)} ({len(own)} images)" for name, own in list(several.items())[:_NAMED])
+        first = next(iter(several.values()))[0]
+        raise DataError(
+            f"{folder}: images of {len(several)} series: {found}\n"
+            f"Move each into a folder of its own and name the one you want: the one that {first.name} belongs to, or another"
+        )
+    if len(several) == 1 and len(series) > 1:
+        kept = next(iter(several.values()))
+        others = [path.name for path in paths if path not in kept]
+        if len(others) >= len(kept):
+            return list(paths)
+        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
+        log.warn(
+            f"{folder}: left out {len(others)} of {len(paths)} images, whose names are not like {kept[0].name}: "
+            f"{', '.join(others[:_NAMED])}{more}"
+        )
+        return kept
+    return list(paths)
+
+
+def _pattern(name: str, paths: Sequence[Path]) -> str:
+    """Returns the name of a series, with a # for each digit of its first image."""
+    return re.sub(r"\d", "#", paths[0].stem) + paths[0].suffix if "#" in name else paths[0].name

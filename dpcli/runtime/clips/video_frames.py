@@ -1,0 +1,219 @@
+"""Frames of video files as players show them: with their alpha, turned, with square pixels, and by their own color matrix.
+
+PyAV decodes: it brings decoders of AV1 and of the alpha of VP8 and VP9, which OpenCV lacks, and follows edit lists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.path_names import utf8_path
+from dpcli.runtime.progress import log
+
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".avi", ".webm", ".mkv", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg"),
+    *(".wmv", ".flv", ".ogv", ".3gp", ".y4m"),
+)
+# Formats of playlists aren't among them: they name other files, which nobody meant to be read.
+_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,dv,mxf,nut"
+_ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
+_STAMP_STEP = 2e-3  # s: what rounding does to time stamps
+_HDR = {16: "PQ", 18: "HLG"}  # transfer functions, by their number in H.273
+_MATRICES = (1, 4, 5, 6, 7, 9)  # in H.273: BT.709, FCC, BT.601 (two), SMPTE 240M, BT.2020
+_BT709, _BT601, _BT2020 = 1, 5, 9
+_SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
+_FULL_RANGE = 2
+
+
+@dataclass(frozen=True)
+class VideoLook:
+    """Tells of a video what one pass finds: its number of frames, their seconds or None, and whether alpha shows."""
+
+    count: int
+    times: tuple[float, ...] | None
+    has_alpha: bool
+
+
+def look_at_video(path: Path) -> VideoLook:
+    """Decodes a video once and returns what is in it; what isn't shown as stored is said in the log.
+
+    Raises DataError when no frame can be decoded, or when frames are missing that the file declares.
+    """
+    state = path.stat()
+    return _look(path, state.st_mtime_ns, state.st_size)
+
+
+def video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
+    """Yields frames by rising index, each u8 (H,W,4), straight alpha, opaque where the video has none.
+
+    Decodes from the beginning: jumping to a frame of an inter-coded video isn't exact in every container.
+    """
+    container, stream = _open(path)
+    with closing(container):
+        frames = enumerate(_decoded(path, container, stream))
+        for index in wanted:
+            frame = next((frame for at, frame in frames if at == index), None)
+            if frame is None:
+                raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
+            yield _rgba(frame, stream.sample_aspect_ratio)
+
+
+@lru_cache(maxsize=4)
+def _look(path: Path, changed: int, size: int) -> VideoLook:
+    container, stream = _open(path)
+    with closing(container):
+        stamps, first, failed, alpha = [], None, False, False
+        try:
+            for frame in _decoded(path, container, stream):
+                first, alpha = first or frame, alpha or _is_transparent(frame)
+                # Frames that the decoder held back until the end know no time base of their own.
+                stamps.append(0.0 if frame.pts is None else float(frame.pts * stream.time_base))
+        except DataError:
+            failed = True
+        if first is None:
+            raise DataError(f"{path}: no frame can be decoded; the video is empty, truncated, or of an unknown codec")
+        rate = float(stream.average_rate or 0)
+        times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
+        _check_whole(path, container, stream, len(stamps), times, failed)
+        _tell_display(path, first, stream)
+    return VideoLook(len(stamps), None if times is None else tuple(times.tolist()), alpha)
+
+
+def _is_transparent(frame) -> bool:  # av.VideoFrame
+    """Returns whether any pixel can be seen through: some writers fill an alpha channel that nobody asked for."""
+    if not any(component.is_alpha for component in frame.format.components):
+        return False
+    return bool(frame.reformat(format="rgba").to_ndarray()[..., 3].min() < 255)
+
+
+def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
+    import av
+
+    name = "file:" + utf8_path(path, "FFmpeg")
+    try:
+        container = av.open(name, options={"format_whitelist": _FORMATS}, metadata_errors="replace")
+    except (av.FFmpegError, OSError, ValueError):
+        raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown kind)") from None
+    streams = [one for one in container.streams.video if not one.disposition & one.disposition.attached_pic]
+    if not streams:
+        container.close()
+        raise DataError(f"{path}: no video in this file; expected a clip")
+    if streams[0].codec_context is None:
+        container.close()
+        raise DataError(f"{path}: no decoder for its codec; ffmpeg -i {path.name} -c:v libx264 clip.mp4 converts it")
+    return container, streams[0]
+
+
+def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
+    """Yields the frames that play. DataError at one that can't be decoded; before the first, such packets are passed over."""
+    import av
+
+    context = stream.codec_context
+    wanted = _ALPHA_DECODERS.get(context.codec.canonical_name)
+    if wanted and stream.metadata.get("alpha_mode", stream.metadata.get("ALPHA_MODE")) == "1":
+        context = av.CodecContext.create(wanted, "r")
+    context.thread_type = "AUTO"
+    begun = False
+    for packet in container.demux(stream):
+        try:
+            frames = context.decode(packet if packet.size else None)
+        except av.FFmpegError as error:
+            if begun:
+                raise DataError(f"{path}: a frame cannot be decoded ({error.strerror}); copy the video again") from None
+            continue
+        for frame in frames:
+            begun = True
+            yield frame
+
+
+def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | None, failed: bool) -> None:
+    """Raises DataError when the file declares more frames than it holds; frames that an edit list hides are no loss."""
+    declared, held = stream.frames, count
+    if declared > count + 1 and not failed:
+        held = _packets(path)
+    elif not declared and times is not None and stream.average_rate and len(container.streams) == 1:
+        seconds = float(container.duration or 0) / 1e6
+        estimate = 0 if lasts(times, seconds) else round(seconds * float(stream.average_rate))
+        declared = estimate if estimate > 1.05 * count + 3 else 0  # some containers round their duration up
+    if failed or declared > held + 1:
+        of = f" of its {declared}" if declared else ""
+        raise DataError(
+            f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
+            "copy it again, or cut the good part out"
+        )
+
+
+def _packets(path: Path) -> int:
+    """Returns how many whole packets of the video lie in the file, also those before and after what plays."""
+    import av
+
+    options = {"format_whitelist": _FORMATS, "ignore_editlist": "1"}
+    with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
+        stream = next(one for one in container.streams.video if not one.disposition & one.disposition.attached_pic)
+        try:
+            return sum(1 for packet in container.demux(stream) if packet.size and not packet.is_corrupt)
+        except av.FFmpegError:
+            return 0
+
+
+def frame_times(stamps: np.ndarray, rate: float | None) -> np.ndarray | None:
+    """Returns seconds of a video's frames from its first: by its rate where that is what their time stamps say, else
+    the stamps.
+
+    Recordings of screens and phones have frames when something happens; their rate is a mean. Stamps are rounded to
+    milliseconds in some containers and missing (0) in others.
+    """
+    steady = np.arange(len(stamps)) / rate if rate else None
+    since = stamps - stamps[0]
+    rising = len(stamps) > 1 and bool((np.diff(stamps) > 0).all()) and bool(np.isfinite(stamps).all())
+    if not rising or (steady is not None and np.abs(since - steady).max() <= _STAMP_STEP):
+        return steady
+    return since
+
+
+def lasts(times: np.ndarray, duration: float) -> bool:
+    """Returns whether frames at these times fill a clip that is said to last so long: the last one may stay for a
+    while.
+    """
+    steps = np.diff(times)
+    return len(steps) > 0 and duration - times[-1] <= max(2 * float(steps.max()), 0.1 * duration)
+
+
+def _tell_display(path: Path, frame, stream) -> None:
+    aspect = stream.sample_aspect_ratio
+    if aspect and aspect != 1:
+        log.info(f"{path}: its pixels are {aspect.numerator}:{aspect.denominator}; stretched to square ones")
+    if frame.rotation:
+        log.info(f"{path}: turned by {frame.rotation % 360} degrees, as it plays")
+    if int(frame.color_trc) in _HDR:
+        log.warn(
+            f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): without tone mapping its colors are paler than they "
+            "play; convert it to SDR first, or record without HDR"
+        )
+
+
+def _rgba(frame, aspect) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
+    """Returns u8 (H,W,4) of a decoded frame as it is shown: full range, square pixels, turned."""
+    width = round(frame.width * aspect) if aspect and aspect != 1 else frame.width
+    options = {} if frame.format.is_rgb else {"src_colorspace": _matrix(frame), "dst_color_range": _FULL_RANGE}
+    if options and not frame.format.name.startswith("gray"):
+        options["src_color_range"] = int(frame.color_range) or (_FULL_RANGE if "yuvj" in frame.format.name else 1)
+    picture = frame.reformat(width, frame.height, "rgba", **options).to_ndarray()
+    return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90)))
+
+
+def _matrix(frame) -> int:
+    """Returns the color matrix of a frame, as H.273 numbers them: the tagged one, else what players take for its size."""
+    tag = int(frame.colorspace)
+    if tag == 10:  # BT.2020 of constant luminance, which no converter here knows better
+        return _BT2020
+    if tag in _MATRICES:
+        return tag
+    return _BT709 if frame.height > _SD_LINES or frame.width > _SD_COLUMNS else _BT601

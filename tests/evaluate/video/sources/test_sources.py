@@ -1,0 +1,113 @@
+"""Videos to compare: folders of images, arrays, video files, views, and inputs that are none of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dpcli.errors import DataError
+from dpcli.evaluate.video.comparison import VideoReport, evaluate_video
+from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.sources.open_source import open_source
+from dpcli.store.gaussians import write_scene
+from tests.support.scenes import toy_scene
+from tests.support.video_clips import HEIGHT, WIDTH, clip, header, white, write, write_folder
+
+
+def numbers(report: VideoReport, name: str) -> list[float]:
+    return [getattr(view.metrics, name) for view in report.views]
+
+
+@pytest.mark.parametrize("name", ["{}.png", "{:03d}_rgba.png", "frame_{:04d}.webp"])
+def test_a_folder_of_any_naming_is_the_same_video(tmp_path: Path, name: str) -> None:
+    one = write(tmp_path / "one.h5", clip(views=1, frames=12), header(("reference",), 12))
+    noisy = clip(1, noise=6, views=1, frames=12)
+    expected = evaluate_video(write(tmp_path / "noisy.h5", noisy, header(("reference",), 12)), one)
+    if name.endswith("webp"):
+        (tmp_path / "f").mkdir()
+        for t, frame in enumerate(noisy[0]):
+            Image.fromarray(frame).save(tmp_path / "f" / name.format(t), lossless=True, exact=True)
+    else:
+        write_folder(tmp_path / "f", noisy[0], name)
+    assert numbers(evaluate_video(tmp_path / "f", one), "psnr") == numbers(expected, "psnr")
+
+
+def test_folders_of_views_match_by_name(tmp_path: Path, truth: Path, said: Path) -> None:
+    noisy = clip(1, noise=6)
+    for folder, names in (
+        ("a", ("0", "1", "2", "3")),
+        ("b", ("reference", "train_0", "eval_0", "eval_1")),
+        ("c", ("view_00", "view_01", "view_02", "view_03")),
+    ):
+        for view, name in enumerate(names):
+            write_folder(tmp_path / folder / name, noisy[view])
+        found = evaluate_video(tmp_path / folder, truth)
+        assert numbers(found, "ssim") == numbers(evaluate_video(said, truth), "ssim"), folder
+    both = evaluate_video(tmp_path / "b", tmp_path / "b")  # folders on both sides
+    assert [view.role for view in both.views].count("reference") == 1 and len(both.views) == 4
+    tests = evaluate_video(tmp_path / "b", tmp_path / "b", protocol="consistent4d")
+    assert "reference" not in [view.title for view in tests.views]
+
+
+def test_a_lone_folder_is_the_reference(tmp_path: Path, truth: Path) -> None:
+    flat = write_folder(tmp_path / "flat", clip()[0])
+    with pytest.raises(DataError, match="flat: has no view '1', '2', '3' of .*truth.h5; .*--intersect"):
+        evaluate_video(flat, truth)
+    report = evaluate_video(flat, truth, intersect=True)
+    assert numbers(report, "psnr") == [PSNR_CAP] and report.left_out[0].names == ["1", "2", "3"]
+    assert len(evaluate_video(flat, truth, protocol="thesis").views) == 1  # the others aren't asked for
+
+
+def test_arrays_of_bytes_and_floats(tmp_path: Path, truth: Path) -> None:
+    noisy = clip(1, noise=6)
+    expected = numbers(evaluate_video(write(tmp_path / "noisy.h5", noisy), truth), "psnr")
+    np.save(tmp_path / "bytes.npy", noisy)
+    np.save(tmp_path / "floats.npy", (noisy / 255).astype(np.float32))
+    np.save(tmp_path / "opaque.npy", white(noisy).astype(np.float32))
+    for name in ("bytes", "floats", "opaque"):
+        assert numbers(evaluate_video(tmp_path / f"{name}.npy", truth), "psnr") == pytest.approx(expected, abs=1e-3)
+
+
+def test_a_video_file_is_opaque(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    frames = np.floor(white(clip(views=1))[0] * 255 + 0.5).astype(np.uint8)
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter_fourcc(*"FFV1"), 10, (WIDTH, HEIGHT))
+    for frame in frames:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+    one = write(tmp_path / "one.h5", clip(views=1), header(("reference",)))
+    report = evaluate_video(tmp_path / "a.avi", one)
+    assert report.views[0].metrics.psnr > 38 and any("has no alpha" in note for note in report.notes)
+    turned = evaluate_video(one, tmp_path / "a.avi")
+    assert turned.names == ("psnr", "ssim")  # without alpha nobody knows the object
+    with pytest.raises(DataError, match="no alpha, so nobody knows"):
+        evaluate_video(one, tmp_path / "a.avi", metrics=("psnr_foreground",))
+
+
+def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "0.png").write_bytes(b"\x89PNG\r\n\x1a\nrest")
+    (tmp_path / "bad.mp4").write_bytes(b"not a film")
+    (tmp_path / "bad.npy").write_bytes(b"\x93NUMPY")
+    np.save(tmp_path / "ints.npy", np.zeros((2, 8, 8, 3), np.int32))
+    for name, what in (
+        ("empty", "no images"),
+        ("bad", "not a readable image"),
+        ("bad.mp4", "not a readable video"),
+        ("bad.npy", "not a readable .npy"),
+        ("ints.npy", "int32"),
+        ("absent.h5", "no such file"),
+    ):
+        with pytest.raises(DataError, match=what):
+            open_source(tmp_path / name)
+    scene = tmp_path / "scene.h5"
+    write_scene(scene, toy_scene())
+    with pytest.raises(DataError, match="can't be the truth"):
+        evaluate_video(truth, scene)
+    flat = write_folder(tmp_path / "flat", clip()[0])
+    with pytest.raises(DataError, match="a folder of images has no cameras to render"):
+        evaluate_video(scene, flat)

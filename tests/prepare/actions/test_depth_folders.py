@@ -1,0 +1,124 @@
+"""Folders of depth frames: which files are frames, whatever lies beside, in images, arrays and OpenEXR."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.prepare.actions.depth import DepthVideos
+
+RNG = np.random.default_rng(0)
+
+
+def depth(millimeters: int) -> np.ndarray:
+    return np.full((6, 8), millimeters, np.uint16)
+
+
+def write(folder, **images):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, image in images.items():
+        cv2.imwrite(str(folder / f"{name}.png"), image)
+    return folder
+
+
+def read(folder, **options):
+    reader = DepthVideos(inputs=(folder,), **options)
+    (item,) = reader.items()
+    return reader, reader.read(item, RNG).sequence
+
+
+def first_depths(sequence):
+    return sequence.points[sequence.frame_offsets[:-1], 2].astype(float).round(3).tolist()
+
+
+def test_hidden_files_and_previews_are_no_frames(tmp_path):
+    folder = write(tmp_path / "v", **{"000": depth(1000), "001": depth(1001), "preview": np.zeros((6, 8, 3), np.uint8)})
+    (folder / "._000.png").write_bytes(b"\0\5\x16\7")
+    reader, sequence = read(folder)
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert any("left out: preview.png" in line for line in reader.summary(reader.items()))
+
+
+@pytest.mark.parametrize(
+    "names", [("frame-{}.depth", "frame-{}.color"), ("{}_depth", "{}"), ("d_{}", "c_{}"), ("a{}", "b{}")]
+)
+def test_depth_is_told_from_the_color_beside_by_name_or_by_content(tmp_path, names):
+    color = RNG.integers(0, 255, (6, 8, 3)).astype(np.uint8)
+    images = {names[0].format(t): depth(1000 + t) for t in (0, 1)} | {names[1].format(t): color for t in (0, 1)}
+    reader, sequence = read(write(tmp_path / "v", **images))
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert any("left out" in line and "2 files" in line for line in reader.summary(reader.items()))
+
+
+def test_two_series_of_depth_are_listed_and_a_pattern_chooses(tmp_path):
+    folder = write(tmp_path / "v", **{f"{side}_{t}": depth(1000 + t) for side in ("left", "right") for t in (0, 1)})
+    with pytest.raises(DataError, match="holds 2 series of frames: left_.*, right_.*--pattern"):
+        read(folder)
+    assert first_depths(read(folder, pattern="right_*")[1]) == [1.0, 1.001]
+    with pytest.raises(DataError, match=r"no depth video in it whose names fit --pattern 'up_\*'"):
+        read(folder, pattern="up_*")
+
+
+def test_names_that_are_times_give_the_time(tmp_path):
+    names = ("1305031102.175304", "1305031102.211214", "1305031102.4")
+    reader, sequence = read(write(tmp_path / "v", **{name: depth(900) for name in names}))
+    assert reader.fields == ("time",)
+    np.testing.assert_allclose(sequence.time, [0, 0.03591, 0.224696], atol=1e-9)
+    np.testing.assert_allclose(read(tmp_path / "v", fps=10)[1].time, [0, 0.1, 0.2])
+
+
+def test_gaps_in_the_numbers_are_gaps_in_time(tmp_path):
+    reader, sequence = read(write(tmp_path / "v", **{f"{n:03d}": depth(900) for n in (4, 5, 9)}), fps=10)
+    np.testing.assert_allclose(sequence.time, [0, 0.1, 0.5])
+    assert any("6 to 8 missing" in line for line in reader.summary(reader.items()))
+    np.testing.assert_allclose(read(tmp_path / "v", fps=10, stride=2)[1].time, [0, 0.5])
+
+
+def test_arrays_of_one_frame_each_are_one_clip_and_arrays_of_many_are_videos(tmp_path):
+    for t in range(3):
+        (tmp_path / "frames").mkdir(exist_ok=True)
+        np.save(tmp_path / "frames" / f"{t}.npy", depth(1000 + t))
+    assert first_depths(read(tmp_path / "frames")[1]) == [1.0, 1.001, 1.002]
+    assert [item.name for item in DepthVideos(inputs=(tmp_path,)).items()] == ["frames"]
+    for t in range(2):
+        np.save(tmp_path / "frames" / f"{t}.npy", depth(1000 + t)[None])
+    np.save(tmp_path / "frames" / "2.npy", np.stack([depth(1), depth(2)]))
+    assert len(DepthVideos(inputs=(tmp_path / "frames",)).items()) == 3
+
+
+def test_a_frame_in_two_formats_is_one_frame(tmp_path):
+    folder = write(tmp_path / "v", **{str(t): depth(1000 + t) for t in range(2)})
+    for t in range(2):
+        np.save(folder / f"{t}.npy", depth(2000 + t))
+    reader, sequence = read(folder)
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert any("left out: *.npy (2 files)" in line for line in reader.summary(reader.items()))
+
+
+@pytest.mark.parametrize("channels", [("Y",), ("Z", "A"), ("R", "G", "B"), ("depth.V",), ("R", "G", "B", "Z")])
+def test_openexr_frames(tmp_path, channels):
+    openexr = pytest.importorskip("OpenEXR")
+    for t in range(2):
+        values = np.full((6, 8), 1.25 + t, np.float32)
+        values[0, 0] = 1e10  # what renderers write where nothing was hit
+        pixels = {name: values for name in channels}
+        if channels[-1] == "Z":
+            pixels |= {"R": values * 0.5}
+        header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+        openexr.File(header, pixels).write(str(tmp_path / f"depth_{t:03d}.exr"))
+    _, sequence = read(tmp_path)
+    assert np.diff(sequence.frame_offsets).tolist() == [47, 47] and first_depths(sequence) == [1.25, 2.25]
+
+
+def test_openexr_colors_and_damaged_files_are_named(tmp_path):
+    openexr = pytest.importorskip("OpenEXR")
+    pixels = {name: np.full((6, 8), k, np.float32) for k, name in enumerate("RGB")}
+    header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage}
+    openexr.File(header, pixels).write(str(tmp_path / "0.exr"))
+    with pytest.raises(DataError, match="0.exr: holds channels B, G, R; expected one called Z or depth"):
+        read(tmp_path)
+    (tmp_path / "0.exr").write_bytes((tmp_path / "0.exr").read_bytes()[:100])
+    with pytest.raises(DataError, match="0.exr: not a readable OpenEXR"):
+        read(tmp_path)

@@ -1,0 +1,105 @@
+"""What raw depths mean: marks of no depth are dropped and counted, and a scene that can't be true stops the conversion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.actions.depth_units import require_plausible, without_marks
+from dpcli.prepare.decode.calibration import Calibration
+from dpcli.prepare.decode.pinhole_camera import Intrinsics
+
+RNG = np.random.default_rng(0)
+
+
+def sample_of(path, frames, **options):
+    np.save(path, frames)
+    reader = DepthVideos(inputs=(path,), **options)
+    return reader.read(reader.items()[0], RNG)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "mark"),
+    [
+        ("u2", 1500, 65535),
+        ("u2", 1500, 65534),
+        ("i2", 1500, 32767),
+        ("i4", 1500, 65535),
+        ("i4", 1500, 2**31 - 1),
+        ("u4", 1500, 2**32 - 1),
+        ("f4", 1.5, np.nan),
+        ("f4", 1.5, np.inf),
+        ("f4", 1.5, -np.inf),
+        ("f4", 1.5, 1e30),
+        ("f8", 1.5, 1e10),
+        ("f4", 1.5, 65504),
+        ("f4", 1.5, 65535),
+    ],
+)
+def test_marks_of_no_depth_are_dropped_and_counted(tmp_path, kind, value, mark):
+    frames = np.full((2, 6, 7), value, kind)
+    frames[0, 0, :3] = mark
+    frames[1, 5, 5] = 0  # nothing seen, as everybody says it: not worth a word
+    sample = sample_of(tmp_path / "v.npy", frames)
+    assert np.diff(sample.sequence.frame_offsets).tolist() == [39, 41]
+    np.testing.assert_allclose(sample.sequence.points[:, 2], 1.5)
+    assert list(sample.notes.values()) == [3] and "dropped" in next(iter(sample.notes))
+
+
+@pytest.mark.parametrize("frames", [np.full((2, 3, 4), 255, np.uint8), np.full((2, 3, 4), 65532, np.uint16)])
+def test_what_may_be_a_depth_is_kept(frames):
+    found, notes = without_marks(frames)
+    assert found is frames and not notes
+
+
+@pytest.mark.parametrize(
+    ("frames", "options", "message"),
+    [
+        (
+            np.full((1, 4, 5), 4000, "u2"),
+            {"depth_scale": 0.00025},
+            "at 1.6e[+]07 m .*did you mean --depth-scale 4000, .* 1 m",
+        ),
+        (
+            np.full((1, 4, 5), 1500, "u2"),
+            {"depth_scale": 0.001},
+            "did you mean --depth-scale 1000, which makes it 1.5 m",
+        ),
+        (
+            np.full((1, 4, 5), 1500, "f4"),
+            {},
+            "at 1,500 m .*--depth-scale 1000, .*If it is true, say so: --depth-scale 1",
+        ),
+        (
+            np.full((1, 4, 5), 1.5, "f4"),
+            {"depth_scale": 1000},
+            "at 0.0015 m .*did you mean --depth-scale 1, which makes it 1.5 m",
+        ),
+    ],
+)
+def test_units_the_other_way_round_stop_with_the_right_ones(tmp_path, frames, options, message):
+    with pytest.raises(DataError, match=message):
+        sample_of(tmp_path / "v.npy", frames, **options)
+
+
+def test_far_scenes_pass_when_the_user_says_so():
+    require_plausible("v", np.full(9, 500, np.float32), 1.0, asked=True)
+    with pytest.raises(DataError, match="500 m"):
+        require_plausible("v", np.full(9, 500, np.float32), 1.0, asked=False)
+    require_plausible("v", np.empty(0, np.float32), 1.0, asked=False)
+
+
+def test_the_units_of_a_calibration_are_used_unless_others_are_given(tmp_path):
+    frames, camera = np.full((1, 4, 5), 1000, np.uint16), Intrinsics(5, 5, 2, 2)
+    calibration = Calibration(camera, depth_scale=4000.0)
+    assert sample_of(tmp_path / "v.npy", frames, calibration=calibration).sequence.points[0, 2] == 0.25
+    assert sample_of(tmp_path / "v.npy", frames, calibration=calibration, depth_scale=500).sequence.points[0, 2] == 2
+    with pytest.raises(DataError, match="hardly meant"):
+        sample_of(tmp_path / "v.npy", frames, calibration=Calibration(camera, depth_scale=1.0))
+    floats = np.full((1, 4, 5), 1.5, np.float32)
+    assert (
+        sample_of(tmp_path / "v.npy", floats, calibration=Calibration(camera, depth_scale=1.0)).sequence.points[0, 2]
+        == 1.5
+    )

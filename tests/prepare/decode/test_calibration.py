@@ -1,0 +1,188 @@
+"""Calibration files of every tool: what they declare is used, or refused by its name."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.calibration import Calibration, read_calibration
+from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics, pixel_rays
+
+FX, FY, CX, CY = 610.0, 609.5, 325.25, 237.75
+CAMERA = Intrinsics(FX, FY, CX, CY)
+ROWS = [FX, 0, CX, 0, FY, CY, 0, 0, 1]
+COLUMNS = [FX, 0, 0, 0, FY, 0, CX, CY, 1]
+NESTED = [[FX, 0, CX], [0, FY, CY], [0, 0, 1]]
+OPENCV = f"""%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: {ROWS}
+distortion_coefficients: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ 0., 0., 0., 0., 0. ]
+"""
+ROS = f"""image_width: 640
+image_height: 480
+camera_name: depth
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: {ROWS}
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0, 0, 0, 0, 0]
+"""
+KALIBR = f"cam0:\n  camera_model: pinhole\n  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n  resolution: [640, 480]\n"
+SCANNET = f"fx_depth = {FX}\nfy_depth = {FY}\nmx_depth = {CX}\nmy_depth = {CY}\ndepthWidth = 640\ndepthHeight = 480\n"
+FOUR = f"{FX} 0 {CX} 0\n0 {FY} {CY} 0\n0 0 1 0\n0 0 0 1\n"
+COLMAP = f"# Camera list\n1 PINHOLE 640 480 {FX} {FY} {CX + 0.5} {CY + 0.5}\n"
+PLAIN = {"fx": FX, "fy": FY, "cx": CX, "cy": CY}
+REALSENSE = {"width": 640, "height": 480, "ppx": CX, "ppy": CY, "fx": FX, "fy": FY, "model": "distortion.brown_conrady"}
+REALSENSE["coeffs"] = [0, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "size"),
+    [
+        ("k.json", PLAIN, (0, 0)),
+        ("k.json", {"intrinsic_matrix": COLUMNS, "width": 640, "height": 480}, (640, 480)),
+        ("k.json", {"intrinsic_matrix": ROWS}, (0, 0)),
+        ("k.json", {"camera_matrix": NESTED, "dist_coeffs": [[0, 0, 0, 0, 0]]}, (0, 0)),
+        ("k.json", {"K": COLUMNS, "w": 640, "h": 480}, (640, 480)),
+        ("k.json", REALSENSE, (640, 480)),
+        ("k.json", {"depth": REALSENSE, "color": {**REALSENSE, "fx": 900}}, (640, 480)),
+        ("k.json", {"camera": {**PLAIN, "w": 640, "h": 480}}, (640, 480)),
+        ("k.json", {"width": 640, "height": 480, "intrinsics": PLAIN}, (640, 480)),
+        ("k.json", {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, "frames": [{"a": 1}]}, (640, 480)),
+        ("k.yaml", ROS, (640, 480)),
+        ("k.yml", OPENCV, (640, 480)),
+        ("k.yaml", KALIBR, (640, 480)),
+        ("k.yaml", f"K: {ROWS}\nD: [0, 0, 0, 0, 0]\nwidth: 640\nheight: 480\n", (640, 480)),
+        ("scene0000_00.txt", SCANNET, (640, 480)),
+        ("intrinsic_depth.txt", FOUR, (0, 0)),
+        ("k.txt", "[[610.0, 0, 325.25],\n [0, 609.5, 237.75],\n [0, 0, 1]]", (0, 0)),
+        ("k.txt", f"{FX} {FY} {CX} {CY}", (0, 0)),
+        ("cameras.txt", COLMAP, (640, 480)),
+    ],
+)
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_every_form_of_one_camera(tmp_path, name, content, size, mark):
+    path = tmp_path / name
+    path.write_text(mark + (content if isinstance(content, str) else json.dumps(content)), encoding="utf-8")
+    found = read_calibration(path)
+    assert found.intrinsics == CAMERA and (found.width, found.height) == size and found.depth_scale is None
+
+
+def test_matrices_of_numpy_and_opencv(tmp_path):
+    for matrix in (np.array(NESTED), np.array(NESTED).T):
+        np.save(tmp_path / "k.npy", matrix)
+        assert read_calibration(tmp_path / "k.npy").intrinsics == CAMERA
+    storage = cv2.FileStorage(str(tmp_path / "k.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array(NESTED))
+    storage.release()
+    assert read_calibration(tmp_path / "k.yml").intrinsics == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "scale"),
+    [
+        ("depth_scale", 4000.0, 4000),
+        ("depth_scale", 0.00025, 4000),
+        ("depth_units", 0.001, 1000),
+        ("scale", 6553.5, 6553.5),
+    ],
+)
+def test_the_depth_scale_in_units_per_meter_or_meters_per_unit(tmp_path, key, value, scale):
+    (tmp_path / "k.json").write_text(json.dumps({"camera": {**PLAIN, key: value}}))
+    found = read_calibration(tmp_path / "k.json")
+    assert found.depth_scale == pytest.approx(scale)
+    found.require_clear_scale()
+
+
+def test_a_depth_scale_that_may_mean_two_things_is_refused_where_it_counts(tmp_path):
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, "depth_scale": 0.1}))
+    with pytest.raises(DataError, match="10 raw units per meter, which is hardly meant.*--depth-scale"):
+        read_calibration(tmp_path / "k.json").require_clear_scale()
+
+
+@given(st.integers(1, 8), st.integers(2, 40), st.integers(2, 40))
+@settings(max_examples=30, derandomize=True)
+def test_a_calibration_of_larger_pictures_is_scaled(factor, width, height):
+    camera = Intrinsics(50.0 * factor, 60.0 * factor, width * factor / 2 - 0.5, 1.0)
+    large = Calibration(camera, width * factor, height * factor)
+    small = large.of_pictures(width, height)
+    assert small.fx == pytest.approx(50) and small.fy == pytest.approx(60)
+    assert small.cx == pytest.approx(width / 2 - 0.5) and small.cy == pytest.approx(1.5 / factor - 0.5)
+
+
+def test_another_shape_and_a_center_outside_are_refused(tmp_path):
+    (tmp_path / "k.json").write_text(json.dumps(REALSENSE))
+    with pytest.raises(DataError, match="is of 640x480 pictures, these have 640x360, which is another shape"):
+        read_calibration(tmp_path / "k.json").of_pictures(640, 360)
+    (tmp_path / "k.json").write_text(json.dumps(PLAIN))
+    with pytest.raises(DataError, match=r"principal point \(325.25, 237.75\) lies outside of these 320x240 pictures"):
+        read_calibration(tmp_path / "k.json").of_pictures(320, 240)
+
+
+def test_a_lens_is_straightened(tmp_path):
+    bent = (0.1, -0.05, 0.001, -0.002, 0.01)
+    (tmp_path / "k.json").write_text(json.dumps({**REALSENSE, "coeffs": bent}))
+    camera = read_calibration(tmp_path / "k.json").intrinsics
+    assert isinstance(camera, LensIntrinsics) and camera.distortion == bent
+    rays = pixel_rays(480, 640, camera).astype(np.float64)[::997]
+    matrix = np.array(NESTED)
+    pixels = cv2.projectPoints(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(bent))[0].reshape(-1, 2)
+    places = np.arange(480 * 640)[::997]
+    np.testing.assert_allclose(pixels, np.stack([places % 640, places // 640], axis=1), atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("k.json", "{", "is not JSON"),
+        ("k.json", "[]", "expected"),
+        ("k.json", '{"fx": 1}', "expected"),
+        ("k.json", '{"fx": "a", "fy": 2, "cx": 3, "cy": 4}', "expected"),
+        ("k.json", '{"intrinsic_matrix": [1]}', "its matrix is not of 3x3"),
+        ("k.json", json.dumps({**PLAIN, "fx": -1}), "positive focal lengths"),
+        ("k.json", json.dumps({"K": [1, 0.5, 3, 0, 1, 3, 0, 0, 1]}), "a skew of 0.5"),
+        ("k.json", json.dumps({"a": PLAIN, "b": {**PLAIN, "fx": 2}}), r"holds several cameras \(a, b\)"),
+        ("k.json", json.dumps({**REALSENSE, "model": "kannala_brandt4", "coeffs": [0.1, 0, 0, 0]}), "kannala_brandt4"),
+        (
+            "k.json",
+            json.dumps({**REALSENSE, "model": "distortion.inverse_brown_conrady", "coeffs": [0.1] * 5}),
+            "inverse_brown",
+        ),
+        ("k.json", json.dumps({"CalibrationInformation": {}}), "raw calibration of an Azure Kinect"),
+        ("k.json", json.dumps({**PLAIN, "depth_scale": 0}), "its depth scale is 0"),
+        ("cameras.txt", "1 OPENCV_FISHEYE 640 480 1 2 3 4 5 6 7 8\n", "camera model OPENCV_FISHEYE"),
+        ("cameras.txt", COLMAP + "2 PINHOLE 640 480 1 2 3 4\n", "holds 2 different cameras"),
+        ("k.yaml", "a: [1,", "is not YAML"),
+    ],
+)
+def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(DataError, match=f"{name}: .*{message}"):
+        read_calibration(tmp_path / name)
+
+
+def test_a_file_that_is_missing_or_no_text(tmp_path):
+    (tmp_path / "k.json").write_bytes(b"\xff\xfe\x00\x80")
+    for name, message in (("none.json", "cannot be read"), ("k.json", "is no text")):
+        with pytest.raises(DataError, match=message):
+            read_calibration(tmp_path / name)

@@ -1,0 +1,161 @@
+"""Depth videos of every pixel format: gray of 9 to 16 bits arrives as it was stored, and what isn't known is refused."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.actions.depth import DepthVideos
+from dpcli.prepare.decode.depth_files import read_depth_video, rising_times
+from dpcli.prepare.decode.video_streams import ffmpeg, video_streams
+
+RNG = np.random.default_rng(0)
+LOSSLESS = {
+    "libx264": ("-qp", "0"),
+    "libx265": ("-x265-params", "lossless=1:log-level=none"),
+    "jpeg2000": ("-pred", "1"),
+}
+FORMATS = [
+    ("gray16le", "ffv1", "mkv"),
+    ("gray16be", "png", "mkv"),
+    ("gray16be", "png", "avi"),
+    ("gray16le", "tiff", "mkv"),
+    ("gray16le", "jpeg2000", "mkv"),
+    ("gray12le", "jpeg2000", "mov"),
+    ("gray14le", "ffv1", "mov"),
+    ("gray12le", "ffv1", "avi"),
+    ("gray12le", "libx265", "mp4"),
+    ("gray10le", "libx265", "mkv"),
+    ("gray10le", "libx264", "mp4"),
+    ("gray10le", "ffv1", "mkv"),
+    ("gray9le", "ffv1", "mkv"),
+    ("gray16be", "rawvideo", "nut"),
+    ("gray10be", "rawvideo", "nut"),
+    ("gray16le", "ffvhuff", "avi"),
+]
+
+
+def encode(path: Path, frames: np.ndarray, pixel_format: str, codec: str, *options: str, rate: int = 10) -> Path:
+    """Writes frames (T,H,W), or (T,H,W,3) of 16 bits, by ffmpeg."""
+    big = pixel_format.endswith("be")
+    data = frames.astype(frames.dtype.newbyteorder(">" if big else "<")).tobytes()
+    source = ["-f", "rawvideo", "-pix_fmt", pixel_format, "-s", f"{frames.shape[2]}x{frames.shape[1]}", "-r", str(rate)]
+    command = [ffmpeg(), "-v", "error", "-y", *source, "-i", "-", *options, "-c:v", codec, *LOSSLESS.get(codec, ())]
+    if codec == "rawvideo":
+        command += ["-strict", "-1"]
+    subprocess.run([*command, str(path)], input=data, check=True)
+    return path
+
+
+def bits_of(pixel_format: str) -> int:
+    return int(pixel_format.removeprefix("gray")[:-2])
+
+
+def frames_of(bits: int, count: int = 3, shape: tuple[int, int] = (48, 64)) -> np.ndarray:
+    return (np.random.default_rng(bits).integers(0, 2**16, (count, *shape)) >> (16 - bits)).astype(np.uint16)
+
+
+@pytest.mark.parametrize(("pixel_format", "codec", "container"), FORMATS)
+def test_every_bit_of_every_pixel_format_arrives(tmp_path, pixel_format, codec, container):
+    frames = frames_of(bits_of(pixel_format))
+    found = read_depth_video(encode(tmp_path / f"d.{container}", frames, pixel_format, codec))
+    np.testing.assert_array_equal(found.frames, frames)
+    np.testing.assert_allclose(found.time, [0, 0.1, 0.2], atol=1e-9)
+    np.testing.assert_array_equal(read_depth_video(tmp_path / f"d.{container}", stride=2).frames, frames[::2])
+
+
+@settings(max_examples=10, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(FORMATS), st.integers(9, 40), st.integers(9, 40), st.integers(1, 4))
+def test_sizes_that_fit_no_block(tmp_path, how, height, width, count):
+    pixel_format, codec, container = how
+    shape = (2 * height, 2 * width) if codec.startswith("lib") else (height, width)  # these pad odd sizes
+    shape = (max(shape[0], 64), max(shape[1], 64)) if codec in ("libx265", "jpeg2000") else shape
+    frames = frames_of(bits_of(pixel_format), count, shape)
+    found = read_depth_video(encode(tmp_path / f"d.{container}", frames, pixel_format, codec))
+    np.testing.assert_array_equal(found.frames, frames)
+
+
+@pytest.mark.parametrize("pixel_format", ["yuv420p10le", "rgb48le", "yuv444p16le", "gbrp12le"])
+def test_what_is_no_gray_of_known_range_is_refused_by_name(tmp_path, pixel_format):
+    encode(tmp_path / "d.mkv", frames_of(16), "gray16le", "ffv1", "-pix_fmt", pixel_format)
+    found = video_streams(tmp_path / "d.mkv")[0].pixel_format
+    with pytest.raises(DataError, match=f"d.mkv: its pixel format is {found}; expected gray of 8 to 16 bits"):
+        read_depth_video(tmp_path / "d.mkv")
+
+
+def test_colors_in_ten_bits_are_no_depth(tmp_path):
+    picture = np.random.default_rng(0).integers(0, 65536, (2, 48, 64, 3)).astype(np.uint16)
+    full = ("-vf", "scale=out_range=pc", "-pix_fmt", "yuv420p10le", "-color_range", "pc")
+    encode(tmp_path / "d.mkv", picture, "rgb48le", "ffv1", *full)
+    with pytest.raises(DataError, match="frame 0 is colored"):
+        read_depth_video(tmp_path / "d.mkv")
+
+
+def test_sixteen_bits_as_an_avi_loses_them_are_refused(tmp_path):
+    encode(tmp_path / "d.avi", frames_of(16), "gray16le", "rawvideo")
+    with pytest.raises(DataError, match="pixel format is rgb555le|d.avi: not a readable video"):
+        read_depth_video(tmp_path / "d.avi")
+
+
+def two_streams(path: Path, second: np.ndarray, *titles: str) -> Path:
+    """Writes a color stream and one of depth into one file, each with its title."""
+    encode(path.with_name("depth.mkv"), second, "gray16le", "png")
+    color = ["-f", "lavfi", "-i", f"testsrc=s=64x48:r=10:d={len(second) / 10}", "-i", str(path.with_name("depth.mkv"))]
+    named = [part for k, title in enumerate(titles) for part in (f"-metadata:s:v:{k}", f"title={title}")]
+    streams = ["-map", "0:v", "-map", "1:v", "-c:v:0", "mjpeg", "-pix_fmt:v:0", "yuvj420p", "-c:v:1", "copy"]
+    subprocess.run([ffmpeg(), "-v", "error", "-y", *color, *streams, *named, str(path)], check=True)
+    return path
+
+
+def test_the_stream_of_depth_is_taken_from_a_file_with_color_beside(tmp_path):
+    frames = frames_of(16)
+    np.testing.assert_array_equal(read_depth_video(two_streams(tmp_path / "k.mkv", frames)).frames, frames)
+    titled = two_streams(tmp_path / "t.mkv", frames, "COLOR", "DEPTH")
+    np.testing.assert_array_equal(read_depth_video(titled).frames, frames)
+
+
+def test_two_streams_that_may_both_be_depth_are_listed(tmp_path):
+    for name in ("a", "b"):
+        encode(tmp_path / f"{name}.mkv", frames_of(16), "gray16le", "ffv1")
+    both = ["-i", str(tmp_path / "a.mkv"), "-i", str(tmp_path / "b.mkv"), "-map", "0", "-map", "1", "-c", "copy"]
+    subprocess.run([ffmpeg(), "-v", "error", *both, str(tmp_path / "both.mkv")], check=True)
+    with pytest.raises(DataError, match="holds 2 video streams .*none is called depth"):
+        read_depth_video(tmp_path / "both.mkv")
+
+
+def test_time_stamps_count_and_not_the_rate_that_the_header_says(tmp_path):
+    frames = frames_of(16, 6)
+    stamps = "setpts='if(lt(N,3),N,N+12)*0.04/TB'"
+    encode(tmp_path / "v.mkv", frames, "gray16le", "ffv1", "-vf", stamps, "-fps_mode", "passthrough", rate=25)
+    encode(tmp_path / "p.mkv", frames, "gray16le", "png", "-vf", stamps, "-fps_mode", "passthrough", rate=25)
+    for name in ("v.mkv", "p.mkv"):
+        np.testing.assert_allclose(read_depth_video(tmp_path / name).time, [0, 0.04, 0.08, 0.6, 0.64, 0.68], atol=1e-3)
+        np.testing.assert_allclose(read_depth_video(tmp_path / name, stride=3).time, [0, 0.6], atol=1e-3)
+
+
+def test_times_are_true_or_absent(tmp_path):
+    assert rising_times([0.0, None, 0.2], 10) is None and rising_times([0.0, 0.2, 0.1], 10) is None
+    np.testing.assert_allclose(rising_times([0.5, 0.533, 0.567], 30), [0, 1 / 30, 2 / 30], atol=1e-12)
+    np.save(tmp_path / "a.npy", frames_of(12))
+    encode(tmp_path / "b.mkv", frames_of(12), "gray12le", "ffv1")
+    both = DepthVideos(inputs=(tmp_path,))
+    assert both.fields == () and both.read(both.items()[1], RNG).sequence.time is None
+    assert any("no times are written: a.npy says none" in line for line in both.summary(both.items()))
+    given_rate = DepthVideos(inputs=(tmp_path,), fps=5)
+    np.testing.assert_allclose(given_rate.read(given_rate.items()[0], RNG).sequence.time, [0, 0.2, 0.4])
+
+
+def test_damaged_files_are_refused_or_give_the_frames_they_have(tmp_path):
+    whole = encode(tmp_path / "d.mkv", frames_of(12, 9), "gray12le", "ffv1").read_bytes()
+    (tmp_path / "d.mkv").write_bytes(whole[: len(whole) // 2])
+    assert 0 < len(read_depth_video(tmp_path / "d.mkv").frames) < 9
+    for kept in (0, 50):
+        (tmp_path / "d.mkv").write_bytes(whole[:kept])
+        with pytest.raises(DataError, match="d.mkv: not a readable video"):
+            read_depth_video(tmp_path / "d.mkv")

@@ -1,0 +1,380 @@
+"""What glTF files of other exporters hold: emission, culling, instances, hidden nodes, odd names, clips and keys."""
+
+from __future__ import annotations
+
+import base64
+import json
+from dataclasses import replace
+from urllib.parse import quote
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.meshes.animation import list_clips, load_animation
+from dpcli.prepare.meshes.filming import Filming, film, ground_truth
+from dpcli.prepare.meshes.gltf import read_gltf
+from dpcli.prepare.meshes.skinning import Curve
+from tests.prepare.meshes.test_animation import look
+from tests.support.gltf_files import GlbFile, quad
+
+SMALL = Filming(size=48, test_azimuths=(60.0,), tracks=300, shading=0.0)
+BLUE = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 1, 1]}, "doubleSided": True}
+
+
+def load(file: GlbFile, tmp_path, frames: int = 1, clip: str | None = None):
+    return load_animation(file.write(tmp_path / "m.glb"), clip, frames)
+
+
+def square(file: GlbFile, x: float, z: float = 0.0, half: float = 1.0) -> int:
+    """One more mesh: a blue square around (x, 0, z), seen from both sides; returns its index."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half + [x, 0, z]
+    if len(file.tree["materials"]) < 2:
+        file.tree["materials"].append(BLUE)
+    indices = file.add([0, 1, 2, 0, 2, 3], "u4")
+    primitive = {"attributes": {"POSITION": file.add(corners)}, "indices": indices, "material": 1}
+    file.tree["meshes"].append({"primitives": [primitive]})
+    return len(file.tree["meshes"]) - 1
+
+
+def node(file: GlbFile, **more) -> int:
+    """One more node of the scene; returns its index."""
+    file.tree["nodes"].append(more)
+    file.tree["scenes"][0]["nodes"].append(len(file.tree["nodes"]) - 1)
+    return len(file.tree["nodes"]) - 1
+
+
+# emission
+
+
+@pytest.mark.parametrize(
+    "material, expected",
+    [
+        ({"emissiveFactor": [1, 0, 0]}, [255, 0, 0]),
+        ({"emissiveFactor": [0.2140411, 0, 1]}, [128, 0, 255]),
+        (
+            {
+                "emissiveFactor": [0.1, 0, 0],
+                "extensions": {"KHR_materials_emissive_strength": {"emissiveStrength": 2.140411}},
+            },
+            [128, 0, 0],
+        ),
+        ({"emissiveFactor": [1, 0, 0], "extensions": {"KHR_materials_unlit": {}}}, [0, 0, 0]),
+        ({}, [0, 0, 0]),
+    ],
+)
+def test_what_gives_off_light_is_seen_without_light(tmp_path, material, expected):
+    file = quad()
+    file.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}, **material}]
+    image = look(load(file, tmp_path), shading=1.0)
+    np.testing.assert_allclose(image[32, 32, :3].astype(int), expected, atol=1)
+
+
+def test_emission_has_its_own_texture_coordinates_and_adds_to_the_base_color(tmp_path):
+    file = quad()
+    file.picture(np.array([[[0, 255, 0, 255], [0, 0, 255, 255]]], np.uint8).repeat(8, 1))
+    attributes = file.tree["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TEXCOORD_1"] = file.add([[1, 1], [0, 1], [0, 0], [1, 0]])  # mirrored
+    glow = {"emissiveFactor": [1, 1, 1], "emissiveTexture": {"index": 0, "texCoord": 1}}
+    file.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}, **glow}]
+    image = look(load(file, tmp_path))
+    assert image[32, 5, :3].tolist() == [255, 0, 255] and image[32, 58, :3].tolist() == [255, 255, 0]
+
+
+# back faces
+
+
+def test_the_back_of_a_surface_shows_only_where_the_file_says_so(tmp_path):
+    file = quad()
+    node(file, mesh=square(file, 0.0, z=-0.5))
+    file.tree["nodes"][0]["rotation"] = [0, 1, 0, 0]  # its back is in front
+    assert look(load(file, tmp_path))[32, 32].tolist() == [0, 0, 255, 255]
+    file.tree["materials"][0]["doubleSided"] = True
+    assert look(load(file, tmp_path))[32, 32].tolist() == [255, 255, 255, 255]
+
+
+def test_a_mirrored_node_keeps_its_front(tmp_path):
+    file = quad()
+    file.tree["nodes"][0]["scale"] = [-1, 1, 1]
+    assert look(load(file, tmp_path))[32, 32].tolist() == [255, 255, 255, 255]
+    file.tree["nodes"][0]["scale"] = [-1, 1, -1]  # half a turn: that is its back
+    assert look(load(file, tmp_path))[32, 32, 3] == 0
+
+
+def test_a_leaf_of_two_triangles_back_to_back_has_no_holes(tmp_path):
+    file = quad()
+    primitive = file.tree["meshes"][0]["primitives"][0]
+    primitive["indices"] = file.add([0, 2, 1, 0, 3, 2, 0, 1, 2, 0, 2, 3], "u4")
+    assert (look(load(file, tmp_path))[..., 3] == 255).all()
+
+
+# instances
+
+
+def test_instances_are_drawn_where_they_stand(tmp_path, capsys):
+    file = quad()
+    quarter = [0, 0, np.sqrt(0.5), np.sqrt(0.5)]
+    attributes = {
+        "TRANSLATION": file.add([[-3.0, 0, 0], [0, 0, 0], [3, 0, 0]]),
+        "ROTATION": file.add(np.array([[0, 0, 0, 1], quarter, [0, 0, 0, 1]])),
+        "SCALE": file.add([[1.0, 1, 1], [1, 0.5, 1], [-1, 1, 1]]),
+    }
+    file.tree["nodes"][0] |= {
+        "extensions": {"EXT_mesh_gpu_instancing": {"attributes": attributes}},
+        "translation": [0, 7, 0],
+    }
+    file.tree["extensionsUsed"] = file.tree["extensionsRequired"] = ["EXT_mesh_gpu_instancing"]
+    del file.tree["animations"]
+    file.animate(0, "scale", [0, 1], [[1, 1, 1], [1, 1, 1]])
+    found = load(file, tmp_path).positions[0].reshape(3, 4, 3)
+    rest = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0.0]])
+    expected = [rest - [3, 0, 0], rest[:, [1, 0, 2]] * [-0.5, 1, 1], rest * [-1, 1, 1] + [3, 0, 0]]
+    np.testing.assert_allclose(found, np.array(expected) + [0, 7, 0], atol=1e-6)
+    assert "not read" not in capsys.readouterr().err
+    file.tree["nodes"][0]["extensions"]["EXT_mesh_gpu_instancing"]["attributes"]["SCALE"] = file.add([[1.0, 1, 1]])
+    with pytest.raises(DataError, match=r"instances of node 0: their attributes have \[1, 3\] entries"):
+        load(file, tmp_path)
+
+
+# what is hidden
+
+
+def hide(file: GlbFile, index: int, visible: bool = False) -> None:
+    file.tree["nodes"][index].setdefault("extensions", {})["KHR_node_visibility"] = {"visible": visible}
+
+
+def test_hidden_nodes_and_all_below_them_are_not_there(tmp_path):
+    file = quad()
+    below = node(file, mesh=square(file, 0.0, z=0.5))
+    file.tree["scenes"][0]["nodes"].remove(below)
+    above = node(file, children=[below])
+    hide(file, above)
+    mesh = load(file, tmp_path)
+    assert mesh.positions.shape[1] == 4 and look(mesh)[32, 32].tolist() == [255, 255, 255, 255]
+    hide(file, above, visible=True)
+    assert look(load(file, tmp_path))[32, 32].tolist() == [0, 0, 255, 255]
+    hide(file, 0), hide(file, above)
+    with pytest.raises(DataError, match="no triangles in its scene"):
+        load(file, tmp_path)
+
+
+def test_visibility_that_changes_in_the_clip(tmp_path):
+    file = quad(shift=1.0)
+    index = node(file, mesh=square(file, 0.0, z=0.5))
+    clip = file.tree["animations"][0]
+    clip["samplers"].append({"input": file.add([0.0, 0.5]), "output": file.add([0, 1], "u1"), "interpolation": "STEP"})
+    pointer = {"pointer": f"/nodes/{index}/extensions/KHR_node_visibility/visible"}
+    target = {"path": "pointer", "extensions": {"KHR_animation_pointer": pointer}}
+    clip["channels"].append({"sampler": 1, "target": target})
+    mesh = load(file, tmp_path, frames=4)
+    blue = [look(mesh, frame=frame)[32, 32].tolist() == [0, 0, 255, 255] for frame in range(4)]
+    assert blue == [False, False, True, True]
+    _, part = ground_truth(mesh, SMALL)
+    assert np.bincount(part).min() > 100 and len(np.bincount(part)) == 2
+
+
+@pytest.mark.parametrize("least", [0.0, 1e-4])
+def test_stop_motion_has_tracks_and_parts_of_all_that_is_seen(tmp_path, capsys, least):
+    """Four squares shown one after another by their scale: each is a part, and none of its tracks is lost."""
+    file = quad()
+    file.tree["nodes"], file.tree["scenes"][0]["nodes"] = [], []
+    del file.tree["animations"]
+    for k in range(4):
+        index = node(file, mesh=square(file, 0.0, half=0.5), translation=[3.0 * k, 0, 0])
+        scale = np.where(np.arange(4)[:, None] == k, 1, least) * np.ones(3)
+        file.animate(index, "scale", [0, 1, 2, 3], scale, "STEP")
+    file.animate(0, "translation", [0, 4], np.zeros((2, 3)))
+    clip = film(load(file, tmp_path, frames=4), replace(SMALL, tracks=400))
+    assert np.bincount(clip.part).tolist() == [100] * 4
+    for k in range(4):
+        extent = np.ptp(clip.track[:, clip.part == k], axis=1)[:, :2].min(1)
+        assert extent[k] > 0.1 and (np.delete(extent, k) < 1e-3).all()
+    assert "400 of 400 tracks are hidden in some frames" in capsys.readouterr().err
+
+
+def test_what_is_hidden_at_first_and_what_never_has_an_area(tmp_path):
+    file = quad(shift=1.0)
+    index = node(file, mesh=square(file, 4.0))
+    file.animate(index, "scale", [0, 0.5, 1], [[0, 0, 0], [1, 1, 1], [1, 1, 1]], "STEP")
+    _, part = ground_truth(load(file, tmp_path, frames=4), SMALL)
+    assert np.bincount(part).tolist() == [150, 150]
+    flat = quad(shift=1.0)
+    flat.tree["meshes"][0]["primitives"][0]["indices"] = flat.add([0, 0, 1, 1, 2, 2], "u4")
+    with pytest.raises(DataError, match="no triangle has an area in any frame"):
+        film(load(flat, tmp_path, frames=2), SMALL)
+
+
+# extensions
+
+
+def test_extensions_that_change_the_picture_are_named_once(tmp_path, capsys):
+    file = quad()
+    odd = ["KHR_materials_transmission", "KHR_lights_punctual", "ACME_fur"]
+    file.tree["extensionsUsed"] = [*odd, odd[0], "KHR_texture_transform", "KHR_xmp_json_ld"]
+    load(file, tmp_path)
+    assert capsys.readouterr().err.count(", ".join(odd)) == 1
+    file.tree["extensionsRequired"] = ["ACME_fur"]
+    with pytest.raises(DataError, match="ACME_fur, which is not read; export it without this extension"):
+        load(file, tmp_path)
+    file.tree["extensionsRequired"] = ["EXT_meshopt_compression"]
+    with pytest.raises(DataError, match="without compression"):
+        load(file, tmp_path)
+
+
+# normals and keys
+
+
+def test_normals_that_are_no_numbers_come_from_the_triangles(tmp_path, capsys):
+    file = quad()
+    attributes = file.tree["meshes"][0]["primitives"][0]["attributes"]
+    tilted = np.array([[0.6, 0, 0.8]] * 4)
+    tilted[1], tilted[2] = np.nan, np.inf
+    attributes["NORMAL"] = file.add(tilted)
+    found = load(file, tmp_path).normals[0]
+    np.testing.assert_allclose(found, [[0.6, 0, 0.8], [0, 0, 1], [0, 0, 1], [0.6, 0, 0.8]], atol=1e-6)
+    assert "2 normals are NaN or infinite; computed from the triangles" in capsys.readouterr().err
+
+
+def test_of_keys_at_one_time_the_last_counts(tmp_path):
+    file = quad()
+    del file.tree["animations"]
+    file.animate(0, "translation", [0, 1, 1, 2], [[0, 0, 0], [2, 0, 0], [6, 0, 0], [8, 0, 0]])
+    moved = load(file, tmp_path, frames=4).positions[:, 0, 0] + 1
+    np.testing.assert_allclose(moved, [0, 1, 6, 7], atol=1e-6)
+    for interpolation in ("LINEAR", "STEP"):
+        curve = Curve(np.array([0.0, 1, 1]), np.array([[0.0], [1], [5]]), interpolation)
+        assert curve.at(np.array([1.0, 2.0])).tolist() == [[5], [5]]
+        assert Curve(np.zeros(3), np.array([[0.0], [1], [5]]), interpolation).at(np.zeros(1)).tolist() == [[5]]
+    cubic = Curve(np.array([0.0, 1, 1]), np.array([[[0.0]] * 3, [[0], [1], [0]], [[0], [5], [0]]]), "CUBICSPLINE")
+    assert cubic.at(np.array([0.5, 1.0])).tolist() == [[0.5], [5]]
+
+
+# clips
+
+
+def named(*names: str) -> GlbFile:
+    file = quad(shift=1.0)
+    clip = file.tree["animations"][0]
+    file.tree["animations"] = [{**clip, "name": name} for name in names]
+    return file
+
+
+@pytest.mark.parametrize(
+    "wanted, name",
+    [
+        ("Walk", "Walk"),
+        ("walk (2)", "Walk (2)"),
+        ("1", "Rig|Run"),
+        ("run", "Rig|Run"),
+        ("rig|run", "Rig|Run"),
+        ("2", "Walk (2)"),
+        ("7", "7"),
+        ("4", "clip 4"),
+        ("clip 4", "clip 4"),
+    ],
+)
+def test_clips_by_name_by_number_and_by_what_is_listed(tmp_path, wanted, name):
+    path = named("Walk", "Rig|Run", "Walk", "7", "").write(tmp_path / "m.glb")
+    assert [listed for listed, _ in list_clips(path)] == ["Walk", "Rig|Run", "Walk (2)", "7", "clip 4"]
+    assert load_animation(path, wanted, 2).name == f"m {name}"
+    with pytest.raises(UsageError, match=r"has Walk, Rig\|Run, .* or its number 0 .. 4"):
+        load_animation(path, "9", 2)
+
+
+def test_all_clips_at_once(tmp_path, dpc):
+    path = named("Rig|Walk", "Rig|run/fast", "walk", "").write(tmp_path / "m.glb")
+    options = ("--frames", 2, "--size", 16, "--tracks", 8, "--jobs", 1, "--azimuths", "60")
+    done = dpc("prepare", "animation", path, "-o", tmp_path / "v.h5", *options, "--all-clips")
+    assert done.returncode == 0, done.stderr
+    assert sorted(file.name for file in tmp_path.glob("*.h5")) == [
+        "v_Walk_0.h5",
+        "v_clip_3.h5",
+        "v_run_fast.h5",
+        "v_walk_2.h5",
+    ]
+    for odd in (("-o", "-"), ("-o", tmp_path / "v.h5", "--clip", "walk")):
+        assert dpc("prepare", "animation", path, *odd, "--all-clips").returncode == 2
+
+
+def test_a_clip_s_name_moves_no_cursor(tmp_path):
+    path = named("\x1b[31mred\u202e\nx", "größe").write(tmp_path / "m.glb")
+    assert [name for name, _ in list_clips(path)] == ["\\x1b[31mred\\u202e\\nx", "größe"]
+
+
+# names of files
+
+
+def split(file: GlbFile, folder, name: str, uri: str):
+    """Writes a .gltf whose buffer is the file ``name``, spelled ``uri`` in it."""
+    data = bytes(file.data)
+    if name:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    path = folder / "m.gltf"
+    path.write_text(json.dumps({**file.tree, "buffers": [{"byteLength": len(data), "uri": uri}]}))
+    return path
+
+
+@pytest.mark.parametrize(
+    "name, uri",
+    [
+        ("tex tures/fä #1%.bin", "tex tures\\fä #1%.bin"),
+        ("a b.bin", "a%20b.bin"),
+        ("a b.bin", " a b.bin\n"),
+        ("a.bin", "./x/../a.bin"),
+        ("a.bin", "a.bin?v=2#top"),
+        ("a%20b.bin", "a%20b.bin"),
+        ("sub/a.bin", "sub\\a.bin"),
+    ],
+)
+def test_names_are_read_as_browsers_do(tmp_path, name, uri):
+    assert load_animation(split(quad(), tmp_path, name, uri), None, 1).positions.shape == (1, 4, 3)
+
+
+@pytest.mark.parametrize("uri", ["../s.bin", "{}", "file://{}", "..\\s.bin", "C:\\s.bin", "http://x/s.bin", "link.bin"])
+def test_names_that_lead_outside_are_refused(tmp_path, uri):
+    folder = tmp_path / "model"
+    folder.mkdir()
+    (tmp_path / "s.bin").write_bytes(bytes(quad().data))
+    (folder / "link.bin").symlink_to(tmp_path / "s.bin")
+    with pytest.raises(DataError, match="outside its folder"):
+        load_animation(split(quad(), folder, "", uri.format(tmp_path / "s.bin")), None, 1)
+
+
+@settings(max_examples=25, derandomize=True, deadline=None)
+@given(
+    st.sampled_from(["", "\n", "\r\n", " ", "\t"]),
+    st.integers(1, 80),
+    st.booleans(),
+    st.booleans(),
+    st.sampled_from(["data:application/octet-stream;base64,", "DATA:;base64,", "data:x;charset=y;BASE64,"]),
+)
+def test_embedded_bytes_in_every_spelling(tmp_path_factory, gap, width, padded, quoted, head):
+    file = quad()
+    text = base64.b64encode(bytes(file.data)).decode()
+    text = text if padded else text.rstrip("=")
+    text = gap.join(text[k : k + width] for k in range(0, len(text), width))
+    uri = head + (quote(text) if quoted else text)
+    read = read_gltf(split(file, tmp_path_factory.getbasetemp(), "", uri))
+    assert read.accessor(0, "x").tolist() == [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    "start, word",
+    [
+        (b"Kaydara FBX Binary  \0", "FBX"),
+        (b"; FBX 7.3.0 project file", "FBX"),
+        (b"PXR-USDC\0", "USD"),
+        (b"#usda 1.0", "USD"),
+        (b"PK\x03\x04", "zip"),
+        (b"BLENDER-v300", "Blender"),
+        (b"\x28\xb5\x2f\xfd", "compressed Blender"),
+        (b'<?xml version="1.0"?><COLLADA>', "COLLADA"),
+    ],
+)
+def test_files_of_other_formats_are_told_what_to_do(tmp_path, start, word):
+    (tmp_path / "m.glb").write_bytes(start + bytes(99))
+    with pytest.raises(DataError, match=f"not a glTF file but .*{word}.*File > Export > glTF 2.0"):
+        read_gltf(tmp_path / "m.glb")

@@ -1,0 +1,129 @@
+"""Frames in folders: what belongs to a clip, the order of its frames, their times, and gaps in their numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dpcli.errors import DataError
+from dpcli.prepare.series import about_series, choose_series, is_beside, missing_numbers
+
+CLOUDS = (".ply", ".pcd", ".npy", ".bin", ".csv", ".txt")
+
+
+def chosen(*names, **options):
+    return choose_series(Path("clip"), names, suffixes=CLOUDS, **options)
+
+
+@pytest.mark.parametrize(
+    ("names", "frames", "left_out"),
+    [
+        (["._0.ply", "0.ply", ".hidden.ply", "1.ply", "~$1.ply"], ["0.ply", "1.ply"], ()),
+        (["0.npy", "1.npy", "README.txt"], ["0.npy", "1.npy"], ("README.txt",)),
+        (["0.csv", "1.csv", "calib_cam.txt", "times.txt"], ["0.csv", "1.csv"], ("calib_cam.txt", "times.txt")),
+        (["0.npy", "1.npy", "0.csv", "1.csv"], ["0.npy", "1.npy"], ("*.csv (2 files)",)),
+        (["a_0.pcd", "a_1.pcd", "a_0.ply", "a_1.ply"], ["a_0.ply", "a_1.ply"], ("a_*.pcd (2 files)",)),
+        (["0.ply", "1.pcd", "2.ply"], ["0.ply", "1.pcd", "2.ply"], ()),
+        (["f1.ply", "f2.ply", "whole.ply"], ["f1.ply", "f2.ply"], ("whole.ply",)),
+        (["s_1.bin", "s_2.bin", "s_3.bin", "map7.bin"], ["s_1.bin", "s_2.bin", "s_3.bin"], ("map7.bin",)),
+        (["b.ply", "a.ply", "c.ply"], ["a.ply", "b.ply", "c.ply"], ()),
+        (["9bc1.ply", "3f2a.ply", "77aa.ply", "1e5f.ply"], ["1e5f.ply", "3f2a.ply", "9bc1.ply", "77aa.ply"], ()),
+        (["IMG_2.PLY", "img_1.ply"], ["img_1.ply", "IMG_2.PLY"], ()),
+    ],
+)
+def test_what_belongs_to_a_clip(names, frames, left_out):
+    series = chosen(*names)
+    assert list(series.names) == frames and series.left_out == left_out
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["cup_0.ply", "cup_1.ply", "bowl_0.ply", "bowl_1.ply"],
+        ["cup1_0.ply", "cup1_1.ply", "cup2_0.ply", "cup2_1.ply"],
+        ["left-3.bin", "left-4.bin", "right-3.bin", "right-4.bin", "right-5.bin"],
+    ],
+)
+def test_several_clips_in_a_folder_are_listed_and_one_can_be_named(names):
+    with pytest.raises(DataError, match="clip: holds 2 series of frames: .*name one: --pattern '") as caught:
+        chosen(*names)
+    pattern = str(caught.value).split("--pattern '")[1].split("'")[0]
+    series = chosen(*names, pattern=pattern)
+    assert 1 < len(series.names) < len(names) and len(series.left_out) == 1
+    assert chosen(*names, pattern="none*") is None
+
+
+def test_a_pattern_may_join_what_no_rule_would():
+    assert len(chosen("cup_0.ply", "bowl_0.ply", "README.txt", pattern="*.ply").names) == 2
+
+
+def test_nothing_but_texts_about_frames_is_no_clip():
+    assert chosen("poses.txt", "README.txt", "labels.csv") is None
+    assert is_beside("calib_cam_to_cam.txt") and not is_beside("frame_1.txt") and not is_beside("poses.ply")
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (["a_22.334Z.xyz", "a_22.3405Z.xyz", "a_22.4Z.xyz", "a_23Z.xyz"], None),
+        (
+            ["t_2022-11-07T19_50_22.334Z.xyz", "t_2022-11-07T19_50_22.4Z.xyz", "t_2022-11-07T19_51_00Z.xyz"],
+            [0, 0.066, 37.666],
+        ),
+        (["20221107_195059.ply", "20221107_195100.ply", "20221107_195101.ply"], [0, 1, 2]),
+        (["1305031102.175304.png", "1305031102.211214.png"], [0, 0.03591]),
+        (["1305031102_175304000.png", "1305031102_211214000.png"], [0, 0.03591]),
+        (["1403636579763555584.png", "1403636579813555456.png"], [0, 0.049999872]),
+        (["1700000000000.bin", "1700000000100.bin"], [0, 0.1]),
+        (["7_1305031102.175304.png", "8_1305031102.211214.png"], [0, 0.03591]),
+        (["1305031102.9.pcd", "1305031102.50.pcd", "1305031102.500000000.pcd"], [0, 41e-9, 0.499999991]),
+        (["12.345000.pcd", "12.400000.pcd"], [0, 0.055]),
+        (["v1.2.ply", "v1.9.ply", "v1.10.ply"], None),
+        (["frame_1.ply", "frame_2.ply", "frame_10.ply"], None),
+        (["1234567890_000001.ply", "1234567890_000002.ply"], None),
+    ],
+)
+def test_order_and_times_that_names_tell(names, times):
+    series = choose_series(Path("clip"), list(reversed(names)))
+    assert list(series.names) == names
+    if times is None:
+        assert series.times() is None
+    else:
+        np.testing.assert_allclose(series.times(), times, atol=1e-9)
+
+
+@given(st.lists(st.integers(0, 999_999_999), min_size=1, max_size=30, unique=True), st.booleans())
+@settings(max_examples=100, derandomize=True)
+def test_cut_fractions_and_padded_ones_are_in_the_order_of_time(nanoseconds, cut):
+    ordered = sorted(nanoseconds)
+    names = [f"s_5.{n:09d}" for n in ordered]
+    names = [name.rstrip("0").rstrip(".") if cut else name for name in names]
+    found = choose_series(Path("clip"), [f"{name}.ply" for name in sorted(names, reverse=True)])
+    # cut fractions that all could be whole numbers, such as 5.9 and 5.10, can't be told from versions
+    if not cut or any(name.partition(".")[2].startswith("0") for name in names):
+        assert [name.removesuffix(".ply") for name in found.names] == names
+
+
+def test_gaps_stay_gaps_in_time_and_are_named():
+    series = chosen(*(f"{n:010d}.bin" for n in (0, 1, 2, 7, 8)))
+    np.testing.assert_allclose(series.frame_times(10), [0, 0.1, 0.2, 0.7, 0.8])
+    assert series.frame_times(None) is None
+    assert missing_numbers(series.numbers()) == ["3 to 6"]
+    assert about_series([("a", series)]) == ["a: its frames are numbered with gaps: 3 to 6 missing"]
+    np.testing.assert_allclose(chosen("10.bin", "15.bin", "20.bin", "30.bin").frame_times(5), [0, 0.2, 0.4, 0.8])
+
+
+def test_the_name_that_says_depth_is_taken_and_the_color_named():
+    for names in (
+        ["frame-1.depth.png", "frame-1.color.png"],
+        ["1.png", "1_depth.png"],
+        ["rgb1.png", "depth1.png", "depth_vis1.png"],
+    ):
+        again = [name.replace("1", "2") for name in names]
+        series = choose_series(Path("clip"), names + again, wanted=r"^(?!.*vis).*depth")
+        assert len(series.names) == 2 and all("depth" in name for name in series.names)
+        assert len(series.left_out) == len(names) - 1

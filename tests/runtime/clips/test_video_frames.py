@@ -1,0 +1,200 @@
+"""Videos as they play: written by FFmpeg in the codecs, containers and tags people have, read back against the pictures."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from dpcli.prepare.views.matting import read_mask
+from dpcli.runtime.clips.video_frames import look_at_video, video_frames
+
+SIDE, COUNT = 64, 8
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of PNGs 0.png ...: a red square with a black foot walks over nothing, u8 (64,64,4), straight alpha."""
+    folder = tmp_path_factory.mktemp("pictures")
+    for frame in range(COUNT):
+        rgba = np.zeros((SIDE, SIDE, 4), np.uint8)
+        rgba[16:40, 8 + 4 * frame : 28 + 4 * frame] = (200, 30, 30, 255)
+        rgba[40:48, 8 + 4 * frame : 28 + 4 * frame] = (0, 0, 0, 255)
+        Image.fromarray(rgba).save(folder / f"{frame}.png")
+    return folder
+
+
+def ffmpeg(*words: object) -> None:
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-y", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+
+
+def film(pictures: Path, target: Path, *words: object) -> Path:
+    """The pictures as a video of 10 frames a second."""
+    ffmpeg("-framerate", 10, "-i", pictures / "%d.png", *words, target)
+    return target
+
+
+def decoded(path: Path) -> np.ndarray:
+    return np.stack(list(video_frames(path, range(look_at_video(path).count))))
+
+
+def stored(pictures: Path) -> np.ndarray:
+    return np.stack([read_rgba(pictures / f"{frame}.png") for frame in range(COUNT)])
+
+
+ALPHA = {
+    "vp9.webm": ("-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p", "-crf", 4, "-b:v", 0),
+    "vp8.webm": ("-c:v", "libvpx", "-pix_fmt", "yuva420p", "-auto-alt-ref", 0, "-b:v", "2M"),
+    "prores.mov": ("-c:v", "prores_ks", "-profile:v", 4, "-pix_fmt", "yuva444p10le"),
+    "animation.mov": ("-c:v", "qtrle", "-pix_fmt", "argb"),
+    "png.mov": ("-c:v", "png", "-pix_fmt", "rgba"),
+    "ffv1.mkv": ("-c:v", "ffv1", "-pix_fmt", "bgra"),
+}
+
+
+@pytest.mark.parametrize("name", ALPHA)
+def test_alpha_that_a_container_has_is_used(pictures, tmp_path, name):
+    path = film(pictures, tmp_path / name, *ALPHA[name])
+    assert look_at_video(path).has_alpha and look_at_video(path).count == COUNT
+    read, written = decoded(path), stored(pictures)
+    assert (np.abs(read[..., 3].astype(int) - written[..., 3]) > 64).mean() < 0.01
+    inside = (written[..., 3] == 255) & (read[..., 3] > 250)
+    assert np.abs(read[inside][:, :3].astype(int) - written[inside][:, :3]).mean() < 6
+
+
+@pytest.mark.parametrize("name", ["h264.mp4", "ffv1.avi"])
+def test_without_alpha_everything_is_opaque(pictures, tmp_path, name):
+    words = {"h264.mp4": ("-pix_fmt", "yuv420p"), "ffv1.avi": ("-c:v", "ffv1", "-pix_fmt", "bgr0")}[name]
+    path = film(pictures, tmp_path / name, *words)
+    assert not look_at_video(path).has_alpha and (decoded(path)[..., 3] == 255).all()
+
+
+PLAIN = ("-pix_fmt", "yuv420p", "-c:v", "libx264", "-crf", 10)
+SUFFIXES = {
+    "av1.mp4": ("-pix_fmt", "yuv420p", "-c:v", "libsvtav1", "-crf", 20),
+    "av1.mkv": ("-pix_fmt", "yuv420p", "-c:v", "libsvtav1", "-crf", 20),
+    "k.ts": PLAIN,
+    "k.mts": (*PLAIN, "-f", "mpegts"),
+    "k.flv": PLAIN,
+    "k.3gp": PLAIN,
+    "k.wmv": ("-c:v", "wmv2", "-q:v", 2),
+    "k.y4m": ("-pix_fmt", "yuv420p"),
+    "no_suffix": (*PLAIN, "-f", "mp4"),
+}
+
+
+@pytest.mark.parametrize("name", SUFFIXES)
+def test_the_decoder_says_what_can_be_read_not_the_suffix(pictures, tmp_path, name):
+    frames = open_frames(film(pictures, tmp_path / name, *SUFFIXES[name]))
+    assert len(frames) == COUNT
+    first = next(iter(frames.read([0])))
+    assert np.abs(first[28, 18, :3].astype(int) - (200, 30, 30)).max() < 24
+
+
+def test_a_trimmed_clip_has_the_frames_that_play(pictures, tmp_path):
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN, "-g", 100)
+    ffmpeg("-ss", "0.3", "-i", whole, "-c", "copy", tmp_path / "cut.mp4")
+    frames = open_frames(tmp_path / "cut.mp4")
+    assert len(frames) == COUNT - 3
+    last = list(frames.read(range(len(frames))))[-1]
+    assert np.abs(last[28, 18 + 4 * (COUNT - 1), :3].astype(int) - (200, 30, 30)).max() < 24
+
+
+def test_a_truncated_clip_is_no_trimmed_one(pictures, tmp_path):
+    path = film(pictures, tmp_path / "t.mp4", *PLAIN, "-g", 2, "-movflags", "+faststart", "-qp", 0)
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.75)])
+    with pytest.raises(DataError, match="truncated or damaged"):
+        look_at_video(path)
+
+
+def test_square_pixels_and_rotation_are_what_plays(pictures, tmp_path, capfd):
+    wide = film(pictures, tmp_path / "wide.mp4", *PLAIN, "-vf", "setsar=2/1")
+    assert decoded(wide).shape[1:3] == (SIDE, 2 * SIDE) and "2:1" in capfd.readouterr().err
+    straight = film(pictures, tmp_path / "straight.mp4", *PLAIN)
+    ffmpeg("-display_rotation", 90, "-i", straight, "-c", "copy", tmp_path / "turned.mp4")
+    turned, upright = decoded(tmp_path / "turned.mp4"), decoded(straight)
+    assert min(np.abs(np.rot90(upright, k, (1, 2)).astype(int) - turned).max() for k in (1, 3)) < 8
+    assert "turned by" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("matrix, number", [("bt709", 1), ("smpte170m", 6), ("bt2020nc", 9)])
+@pytest.mark.parametrize("full", [False, True])
+def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, full):
+    Image.new("RGB", (64, 64), (200, 30, 30)).save(tmp_path / "0.png")
+    kind = "pc" if full else "tv"
+    scale = f"scale=out_color_matrix={matrix.removesuffix('nc')}:out_range={kind}"
+    tags = ("-colorspace", matrix, "-color_range", kind)
+    film(tmp_path, tmp_path / "c.mp4", *PLAIN, "-vf", scale, *tags)
+    assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
+
+
+def test_an_hdr_clip_is_named(pictures, tmp_path, capfd):
+    tags = "setparams=color_trc=arib-std-b67:color_primaries=bt2020:colorspace=bt2020nc"
+    look_at_video(film(pictures, tmp_path / "hdr.mp4", *PLAIN, "-vf", tags))
+    assert "HDR" in capfd.readouterr().err
+
+
+def test_images_are_upright_as_their_exif_says(tmp_path):
+    rgb = np.zeros((20, 40, 3), np.uint8)
+    rgb[:, :10] = (255, 0, 0)
+    turned = Image.fromarray(np.rot90(rgb).copy())
+    exif = turned.getexif()
+    exif[0x0112] = 6  # to be turned by 90 degrees clockwise
+    turned.save(tmp_path / "0.png", exif=exif)
+    read = read_rgba(tmp_path / "0.png")
+    assert read.shape == (20, 40, 4) and tuple(read[10, 4, :3]) == (255, 0, 0)
+
+
+def test_two_series_of_a_folder_are_named(pictures, tmp_path):
+    for frame in range(3):
+        for name in ("anya_rgba_{:03d}.png", "luigi_rgba_{:03d}.png"):
+            Image.open(pictures / f"{frame}.png").save(tmp_path / name.format(frame))
+    with pytest.raises(DataError, match="images of 2 series: anya_rgba_.*luigi_rgba_"):
+        open_frames(tmp_path)
+
+
+def test_a_folder_of_videos_lists_them(pictures, tmp_path):
+    folder = tmp_path / "my clips"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("no clip")
+    for name in ("b.mp4", "a.mp4"):
+        film(pictures, folder / name, *PLAIN)
+    with pytest.raises(DataError, match="2 videos, one clip is wanted: a.mp4, b.mp4") as error:
+        open_frames(folder)
+    loop = (
+        str(error.value).partition("of its own: ")[2].replace('dpc prepare video "$clip" -o "$clip.h5"', 'echo "$clip"')
+    )
+    said = subprocess.run(["bash", "-c", loop], capture_output=True, text=True).stdout
+    assert said.split("\n")[:-1] == [str(folder / "a.mp4"), str(folder / "b.mp4")]
+
+
+@pytest.mark.parametrize("kind", ["few values", "palette", "colors", "16 bits", "small values"])
+def test_masks_of_labels_are_opaque_wherever_the_label_is_not_zero(tmp_path, kind):
+    labels = np.zeros((48, 64), np.uint8)
+    labels[8:24, 8:40], labels[24:40, 20:50] = 1, 2
+    image = {
+        "few values": Image.fromarray(np.array([0, 38, 200], np.uint8)[labels]),
+        "palette": Image.fromarray(labels).convert("P"),
+        "colors": Image.fromarray(np.array([[0, 0, 0], [128, 0, 0], [0, 128, 0]], np.uint8)[labels]),
+        "16 bits": Image.fromarray(np.array([0, 300, 40_000], np.uint16)[labels]),
+        "small values": Image.fromarray(labels),
+    }[kind]
+    image.save(tmp_path / "m.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where(labels > 0, 255, 0))
+
+
+def test_a_soft_mask_stays_soft(tmp_path):
+    y, x = np.mgrid[:48, :64]
+    soft = np.clip(255 * (16.5 - np.hypot(x - 32, y - 24)), 0, 255).round().astype(np.uint8)
+    soft = np.asarray(Image.fromarray(soft).resize((128, 96), Image.Resampling.BICUBIC))
+    Image.fromarray(soft).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), soft)
