@@ -58,11 +58,9 @@ def assemble(
     kept, dropped = drop_empty_frames(str(item.path), counts)
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
     notes |= {**dropped, **converted}
-    points = np.concatenate([clouds[t].points for t in kept])
-    if divisor != 1:
-        points = points.astype(np.float64) / divisor
-    ends = _ends(points)
-    points, shift = _near_origin(points, int(counts[kept[0]]), ends)
+    frames = [clouds[t].points for t in kept]
+    ends = tuple(end / divisor for end in _ends(frames))
+    points, shift = _joined(frames, divisor, ends)
     if shift is not None:
         notes[SHIFTED] = 1
     if lengths.unit == "m":
@@ -70,7 +68,7 @@ def assemble(
     extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
     sequence = CloudSequence(
         item.name,
-        points.astype(np.float32, copy=False),
+        points,
         offsets(counts[kept]),
         time=None if time is None else time[kept],
         color=_colors(item, [clouds[t] for t in kept]) if color else None,
@@ -81,22 +79,27 @@ def assemble(
     return Sample(sequence, notes)
 
 
-def _ends(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the least and the greatest x, y and z of points (N,3), f64 (3) each; NumPy is slow along short rows."""
-    columns = [points[:, axis] for axis in range(3)]
-    return np.array([c.min() for c in columns], np.float64), np.array([c.max() for c in columns], np.float64)
+def _ends(frames: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the least and the greatest x, y and z of frames (N,3), f64 (3) each; NumPy is slow along short rows."""
+    low = [[frame[:, axis].min() for axis in range(3)] for frame in frames]
+    high = [[frame[:, axis].max() for axis in range(3)] for frame in frames]
+    return np.min(np.array(low, np.float64), axis=0), np.max(np.array(high, np.float64), axis=0)
 
 
-def _near_origin(
-    points: np.ndarray, first: int, ends: tuple[np.ndarray, np.ndarray]
+def _joined(
+    frames: list[np.ndarray], divisor: float, ends: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns the points less the corner of their first frame (its ``first`` points), and that corner f64 (3), or None
-    where float32 holds them as they are.
+    """Returns the points of all frames f32 (P,3), divided, less the corner of the first frame, and that corner f64 (3), or
+    None where float32 holds the points as they are.
+
+    ends: the least and the greatest coordinates after the division.
     """
-    if np.abs(ends).max() <= _FAR_AWAY:
-        return points, None
-    corner = np.floor(points[:first].astype(np.float64).min(0))
-    return points - corner, corner
+    far = max(np.abs(end).max() for end in ends) > _FAR_AWAY
+    if divisor == 1 and not far:
+        return np.concatenate(frames, dtype=np.float32, casting="same_kind"), None
+    points = np.concatenate(frames, dtype=np.float64) / divisor
+    corner = np.floor(points[: len(frames[0])].min(0)) if far else np.zeros(3)
+    return (points - corner).astype(np.float32), corner if far else None
 
 
 def _doubts(low: np.ndarray, high: np.ndarray) -> dict[str, int]:
