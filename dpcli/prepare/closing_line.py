@@ -9,8 +9,9 @@ import numpy as np
 
 from dpcli.store import CloudsReader
 
-_SEQUENCES, _FRAMES = 32, 4  # looked at, spread evenly: the line takes milliseconds, however large the file
-_POINTS = 1 << 20
+_SEQUENCES, _FRAMES = 16, 3  # looked at, spread evenly: the line takes milliseconds, however large the file
+_POINTS = 1 << 18
+_LONG_UNIT = 12  # letters of a unit that is told once only, behind the lengths
 _SHIFTS_SHOWN = 20
 
 
@@ -18,7 +19,7 @@ def closing_lines(path: Path, notes: Mapping[str, int]) -> list[str]:
     """Returns the line about a finished clouds file, and one for each sequence that was shifted; none of an empty file.
 
     notes: how many points and frames readers dropped, by reason. Distances are those from the origin, the extent is the
-    box around a sequence; both are the median of up to 32 sequences, of 4 frames each, and the same in every run.
+    box around a sequence; both are the median of up to 16 sequences, of 3 frames each, and the same in every run.
     """
     with CloudsReader(path) as reader:
         if not len(reader):
@@ -41,12 +42,13 @@ def _lengths(reader: CloudsReader) -> list[str]:
         left -= len(points)
         if left < 0:
             break
-    unit = f" {reader.length_unit}" if reader.length_unit else ""
+    long = len(reader.length_unit) > _LONG_UNIT
+    unit = f" {reader.length_unit}" if reader.length_unit and not long else ""
     extent = " x ".join(_number(value) for value in np.median(extents, axis=0))
     shown = [f"extent {extent}{unit}"]
     if not reader.shifts[places].any():  # else the origin is no sensor
         shown.insert(0, f"median distance {_number(float(np.median(distances)))}{unit}")
-    return shown
+    return [*shown[:-1], f"{shown[-1]} ({reader.length_unit})"] if long else shown
 
 
 def _frames(reader: CloudsReader) -> str:
