@@ -26,7 +26,8 @@ _DRIVER = """
 <script>
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 const press = (key) => document.activeElement.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
-const point = (name, x, y) => $("canvas").dispatchEvent(new PointerEvent(name, { pointerId: 1, clientX: x, clientY: y, buttons: 1, bubbles: true }));
+const at = (x, y) => ({ pointerId: 1, clientX: x, clientY: y, buttons: 1, bubbles: true });
+const point = (name, x, y) => $("canvas").dispatchEvent(new PointerEvent(name, at(x, y)));
 HTMLElement.prototype.setPointerCapture = () => {};  // made-up pointers can't be captured
 (async () => {
   while (root.dataset.state === "loading") await pause(20);
@@ -74,7 +75,8 @@ def _run(page: Path, script: str, tmp_path: Path, state: str = "time=0.1") -> di
 
 @needs_browser
 def test_a_link_holds_the_view(page, tmp_path):
-    moved = "app.change({ azimuth: 1, elevation: 0.3, radius: 2.5, target: [0.1, 0.2, -0.3], color: 'part', trails: true, bounce: true, background: 'black' });"
+    moved = """app.change({ azimuth: 1, elevation: 0.3, radius: 2.5, target: [0.1, 0.2, -0.3], color: 'part', trails: true,
+      bounce: true, background: 'black' });"""
     address = _run(page, moved + "press('l'); return { address: app.address, written: location.href };", tmp_path)
     assert address["address"] == address["written"]
     state = address["address"].partition("#")[2]
@@ -133,7 +135,8 @@ def test_keys_do_what_the_list_says(page, tmp_path):
       seen.panel = !$("panel").hidden;
       seen.keys = Array.from($("panel").querySelectorAll("th"), (cell) => cell.textContent);
       await pause(200);
-      seen.trails = !$("trails").hidden && $("trails").getContext("2d").getImageData(0, 0, $("trails").width, $("trails").height).data.some((value) => value);
+      const { width, height } = $("trails"), lines = $("trails").getContext("2d").getImageData(0, 0, width, height).data;
+      seen.trails = !$("trails").hidden && lines.some((value) => value);
       let saved = null;
       HTMLAnchorElement.prototype.click = function () { saved = [this.download, this.href]; };
       press("s");
@@ -153,7 +156,8 @@ def test_keys_do_what_the_list_says(page, tmp_path):
 
 @needs_browser
 def test_back_and_forth_turns_at_both_ends(page, tmp_path):
-    script = "const line = new Timeline([0, 1, 2], 1, 1); return [line.bounced(1.5, 1, 1), line.bounced(0.5, 1, -1), line.bounced(1, 0.25, 1), line.bounced(1, 100, 1)];"
+    script = """const line = new Timeline([0, 1, 2], 1, 1), moves = [[1.5, 1, 1], [0.5, 1, -1], [1, 0.25, 1], [1, 100, 1]];
+      return moves.map((move) => line.bounced(...move));"""
     assert _run(page, script, tmp_path) == [[1.5, -1], [0.5, 1], [1.25, 1], [0, -1]]
 
 
