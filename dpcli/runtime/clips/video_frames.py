@@ -15,6 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
+from dpcli.runtime.clips import wide_color
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
@@ -25,7 +26,7 @@ VIDEO_SUFFIXES = (
 _FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,dv,mxf,nut"
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
-_HDR = {16: "PQ", 18: "HLG"}  # transfer functions, by their number in H.273
+_HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
 _MATRICES = (1, 4, 5, 6, 7, 9)  # in H.273: BT.709, FCC, BT.601 (two), SMPTE 240M, BT.2020
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
@@ -194,9 +195,11 @@ def _tell_display(path: Path, frame, stream) -> None:
         log.info(f"{path}: turned by {frame.rotation % 360} degrees, as it plays")
     if int(frame.color_trc) in _HDR:
         log.warn(
-            f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): without tone mapping its colors are paler than they "
-            "play; convert it to SDR first, or record without HDR"
+            f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): tone-mapped to SDR as ITU-R BT.2390 has it; players "
+            "differ in this, so convert it to SDR first where colors must be theirs"
         )
+    elif wide_color.is_wide(0, int(frame.color_primaries)):
+        log.info(f"{path}: colors of a wide gamut; converted to sRGB")
 
 
 def _rgba(frame, aspect) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
@@ -205,7 +208,12 @@ def _rgba(frame, aspect) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fractio
     options = {} if frame.format.is_rgb else {"src_colorspace": _matrix(frame), "dst_color_range": _FULL_RANGE}
     if options and not frame.format.name.startswith("gray"):
         options["src_color_range"] = int(frame.color_range) or (_FULL_RANGE if "yuvj" in frame.format.name else 1)
-    picture = frame.reformat(width, frame.height, "rgba", **options).to_ndarray()
+    transfer, primaries = int(frame.color_trc), int(frame.color_primaries)
+    wide = wide_color.is_wide(transfer, primaries)
+    picture = frame.reformat(width, frame.height, "rgba64le" if wide else "rgba", **options).to_ndarray()
+    if wide:
+        rgb, alpha = wide_color.to_srgb(picture[..., :3], transfer, primaries), picture[..., 3:] >> 8
+        picture = np.concatenate((rgb, alpha.astype(np.uint8)), axis=-1)
     return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90)))
 
 
