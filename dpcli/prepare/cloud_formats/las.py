@@ -37,7 +37,16 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     if color is not None and not color.any():
         color = None  # the point format has room for colors that nobody filled in
     extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if name in keep}, keep) if keep else {}
-    return Cloud(np.asarray(las.xyz, np.float64), color, _unit(las), extra)
+    return Cloud(_scaled(las), color, _unit(las), extra)
+
+
+def _scaled(las: Any) -> np.ndarray:
+    """Returns the coordinates f64 (N,3), by columns: laspy's own `xyz` makes them one by one and copies them twice."""
+    points = np.empty((3, len(las.points)))
+    for row, name, scale, offset in zip(points, "XYZ", las.header.scales, las.header.offsets):
+        np.multiply(las[name], scale, out=row)
+        row += offset
+    return points.T
 
 
 def _check_sizes(path: Path) -> None:
