@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.store.file import open_store, read_provenance, read_skipped, read_strings, root_attributes
+from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.schema import KEPT
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
@@ -39,7 +39,7 @@ class CloudsReader:
     def _load_index(self, file: h5py.File) -> None:
         self.attributes = root_attributes(file)
         self.provenance = read_provenance(file)
-        self.skipped = read_skipped(file)
+        self.skipped, self.positions = read_skipped(file), read_positions(file)
         self.class_names = read_strings(file, "class_names", optional=True)
         self.length_unit = str(file.attrs.get("length_unit", ""))
         self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING, write_positions, write_skipped
+from dpcli.store.file import STRING
 from dpcli.store.schema import KEPT, fields_of
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
@@ -37,9 +37,7 @@ class CloudsWriter(ResumableWriter):
     A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
     the samples of a compressed file.
     `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, and kept columns,
-    `field_NAME`); a shift is written where a sample has one. Set before the
-    block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
-    kept in the file; a shard may be empty.
+    `field_NAME`); a shift is written where a sample has one.
 
     >>> from dpcli.store import CloudSequence, CloudsReader
     >>> with CloudsWriter("two.h5", class_names=["wave"]) as writer:
@@ -74,8 +72,6 @@ class CloudsWriter(ResumableWriter):
         if unknown:
             raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
         self.fields, self.compression = (*(n for n in _FIELDS if n in fields), *kept), compression
-        self.skipped: list[tuple[str, str]] = []
-        self.positions: tuple[list[int], list[int]] | None = None
         self._names: set[str] = set()
         self._frames = self._points = self._unflushed = 0
         self._shifts: list[np.ndarray | None] = []
@@ -208,9 +204,6 @@ class CloudsWriter(ResumableWriter):
             if values:
                 self._extend(name, values)
         self._write_shifts()
-        write_skipped(self._file, self.skipped)
-        write_positions(self._file, self.positions)
-        self._file.flush()
 
     def _write_shifts(self) -> None:
         """The samples' shifts, f64 (S,3), zero where one has none; nothing where none has, as most files."""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.shards import Shard, describe_shard, shard_of
+from dpcli.runtime.machines.shards import Shard, describe_shard, shard_of
 from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudsReader
 from dpcli.store.file import read_positions

@@ -63,7 +63,7 @@ def run_conversion(
     reader = make_reader()
     from dpcli.prepare.commands.convert import convert_raw_data
     from dpcli.prepare.pipeline import Conversion
-    from dpcli.prepare.shards import Shard
+    from dpcli.runtime.machines.shards import Shard
     from dpcli.runtime.progress import log
 
     conversion = Conversion(

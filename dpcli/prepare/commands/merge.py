@@ -12,7 +12,7 @@ from dpcli.prepare.commands.copy_samples import Copy, copy_samples
 from dpcli.prepare.commands.sources import OpenFiles, Source, read_source
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Report, count_samples
-from dpcli.prepare.shards import shard_of
+from dpcli.runtime.machines.shards import shard_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.store import CloudSequence, CloudsReader

@@ -19,7 +19,7 @@ from dpcli.prepare.commands import sources
 from dpcli.prepare.commands.merge import merge, read_source
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.shards import Shard, shard_of
+from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import ROOT, ToyReader, dpc
 
