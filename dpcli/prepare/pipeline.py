@@ -24,9 +24,7 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.store import CloudsReader, CloudsWriter
 from dpcli.store.writing.already_made import already_made
-from dpcli.store.writing.item_pass import ItemPass, Wording
-
-_LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
+from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +81,7 @@ class Report:
 
     def lines(self) -> list[str]:
         """Returns what was left out, in words; nothing goes unmentioned."""
-        lines = [f"{what}: {count}" for what, count in sorted(self.notes.items())]
-        if self.skipped:
-            lines.append(f"{len(self.skipped)} skipped:")
-            lines += [f"  {name}: {reason}" for name, reason in self.skipped[:_LISTED]]
-            if len(self.skipped) > _LISTED:
-                lines.append(f"  ... and {len(self.skipped) - _LISTED} more; -v names every one")
-        return lines
+        return [*(f"{what}: {count}" for what, count in sorted(self.notes.items())), *skipped_lines(self.skipped)]
 
     def counts(self) -> str:
         """Returns what was written, in words."""

@@ -43,3 +43,6 @@ class Spread:
             return
         with cluster_executor(self.dask, self.jobs or cpu_count()) as (executor, slots):
             yield Workers(slots, executor)
+
+
+ALONE = Spread()

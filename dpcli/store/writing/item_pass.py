@@ -24,6 +24,16 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store.writing.resumable_writer import ResumableWriter
 
+_LISTED = 20  # skipped items named one by one at the end; -v names all as they come
+
+
+def skipped_lines(skipped: Sequence[tuple[str, str]]) -> list[str]:
+    """Returns what was passed over, (name, reason), in words; nothing goes unmentioned."""
+    if not skipped:
+        return []
+    lines = [f"{len(skipped)} skipped:", *(f"  {name}: {reason}" for name, reason in skipped[:_LISTED])]
+    return [*lines, f"  ... and {len(skipped) - _LISTED} more; -v names every one"] if len(skipped) > _LISTED else lines
+
 
 @dataclass(frozen=True)
 class Wording:
