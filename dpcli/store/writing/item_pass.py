@@ -64,7 +64,7 @@ class ItemPass:
         self.places = (shard or WHOLE).places(len(names))
         done = set(writer.written_names)
         if done:
-            log.info(f"continuing: {len(done)} of {len(self.places)} were {words.done} before")
+            log.info(f"continuing: {len(done)} of {len(self.places)} {words.unit}s were {words.done} before")
         self.written = array("q", (place for place in self.places if done and names[place] in done))
         self.skipped = array("q")
         self.last = self.written[-1] if done else -1
