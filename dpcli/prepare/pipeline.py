@@ -22,7 +22,7 @@ from dpcli.runtime.machines.shards import Shard, describe_shard
 from dpcli.runtime.machines.spread import Workers
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
-from dpcli.store import CloudsReader, CloudsWriter
+from dpcli.store import CloudsReader, CloudsWriter, ScoresReader, file_kind
 from dpcli.store.writing.already_made import already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -85,8 +85,8 @@ class Report:
 
     def counts(self) -> str:
         """Returns what was written, in words."""
-        written = f"{self.written} sequences, {self.frames} frames, {self.points} points"
-        return f"{written}, {len(self.skipped)} skipped"
+        clouds = f" sequences, {self.frames} frames, {self.points} points" if self.points else " samples"
+        return f"{self.written}{clouds}, {len(self.skipped)} skipped"
 
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
@@ -207,6 +207,10 @@ def _open_writer(
 
 def count_samples(report: Report, output: Path) -> Report:
     """Returns the report with what the finished file holds, whether this run wrote all of it or continued another."""
+    if file_kind(output) == "scores":
+        made = ScoresReader(output)
+        report.written, report.skipped = len(made.names), made.skipped
+        return report
     with CloudsReader(output) as reader:
         report.written = len(reader)
         report.skipped = reader.skipped

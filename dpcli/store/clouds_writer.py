@@ -133,7 +133,8 @@ class CloudsWriter(ResumableWriter):
         self._placed = None
         self._names.add(sequence.name)
 
-    def _write_again(self, given: list[Any]) -> str:
+    def write_again(self, given: list[Any]) -> str:
+        """Writes a sample as `_record` was told of it, and returns its name."""
         self.write(*given)
         return given[0].name
 

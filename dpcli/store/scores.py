@@ -100,7 +100,8 @@ class ScoresWriter(ResumableWriter):
     def _about(self) -> dict[str, Any]:
         return super()._about() | {"streams": list(self.streams)}
 
-    def _write_again(self, given: list[Any]) -> str:
+    def write_again(self, given: list[Any]) -> str:
+        """Writes a sample as `_record` was told of it, and returns its name."""
         name, split, label, scores, single = given
         self.write(name, scores, label=label, split=split, streams=dict(zip(self.streams, single)))
         return name
@@ -136,6 +137,19 @@ class ScoresReader:
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
             self.skipped, self.positions = read_skipped(file), read_positions(file)
         self._check()
+
+    @property
+    def stream_names(self) -> tuple[str, ...]:
+        """The streams in the order in which the network has them: static, dynamic, others by name."""
+        return tuple(sorted(self.streams, key=lambda name: (name != "static", name != "dynamic", name)))
+
+    def given(self, index: int) -> list[Any]:
+        """Returns sample `index` as the writer of such a file takes it again."""
+        single = [self.streams[name][index] for name in self.stream_names]
+        return [self.names[index], self.splits[index], int(self.labels[index]), self.scores[index], single]
+
+    def close(self) -> None:
+        """Does nothing: all of it is in memory."""
 
     def _check(self) -> None:
         shape = (len(self.names), len(self.class_names))

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from dpcli.errors import DataError, DpcError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime.machines.shards import WHOLE, Shard
 from dpcli.runtime.machines.spread import Workers
 from dpcli.runtime.pool import LostWorker, ordered_map
@@ -66,10 +66,21 @@ class ItemPass:
         if done:
             log.info(f"continuing: {len(done)} of {len(self.places)} {words.unit}s were {words.done} before")
         self.written = array("q", (place for place in self.places if done and names[place] in done))
+        self._refuse_others()
         self.skipped = array("q")
         self.last = self.written[-1] if done else -1
         if shard:
             writer.positions = (self.written, self.skipped)
+
+    def _refuse_others(self) -> None:
+        """Raises UsageError when a stopped run left other samples than this pass would have written; they stay."""
+        left = self.writer.written_names
+        if left != [self.names[place] for place in self.written]:
+            self.writer.keep = True
+            raise UsageError(
+                f"{self.writer.path}: a stopped run left {len(left)} other samples for it; go on with that run, write to "
+                "another file, or --force to start over"
+            )
 
     def run(
         self,

@@ -33,7 +33,7 @@ class ResumableWriter(ABC):
     write_positions), both kept in the file; a shard may be empty.
 
     A subclass has its own state ready before it calls this constructor, which opens the file and has `_create` and, to
-    continue, `_write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
+    continue, `write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
     """
 
     kind = ""
@@ -70,7 +70,7 @@ class ResumableWriter(ABC):
         """Makes the data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
 
     @abstractmethod
-    def _write_again(self, given: list[Any]) -> str:
+    def write_again(self, given: list[Any]) -> str:
         """Writes a sample as `_record` was told of it, and returns its name."""
 
     @abstractmethod
@@ -120,7 +120,7 @@ class ResumableWriter(ABC):
         self._journal = Journal(second_path(before.path), self._about())
         self._journal.begin(self._atomic.part, self._atomic.handle)
         for given in before.samples():
-            self.written_names.append(self._write_again(given))
+            self.written_names.append(self.write_again(given))
         self._journal.replace(before)
 
     def _give_up(self, before: Journal | None) -> None:

@@ -91,7 +91,7 @@ def test_predictions_don_t_depend_on_the_batch(data, run_folder, dpc_here, tmp_p
     for size in (1, 7):
         dpc_here("classify", "predict", data, "--model", run_folder, "-o", tmp_path / f"{size}.h5", "--batch", size)
     a, b = (ScoresReader(tmp_path / f"{size}.h5").scores for size in (1, 7))
-    np.testing.assert_allclose(a, b, atol=2e-5)
+    assert np.array_equal(a, b)
 
 
 def test_runs_are_called_by_the_seed_of_their_training(data, run_folder, dpc_here, tmp_path):

@@ -15,9 +15,9 @@ import pytest
 import torch
 
 from dpcli.errors import DataError, Stopped, UsageError
+from dpcli.runtime.machines.spread import Spread
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.segment.commands import estimate_flow as module
-from dpcli.runtime.machines.spread import Spread
 from dpcli.segment.commands.estimate_flow import (
     EstimatedFlow,
     FlowOfSequence,
