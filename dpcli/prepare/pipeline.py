@@ -23,6 +23,7 @@ from dpcli.runtime.machines.spread import Workers
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.store import CloudsReader, CloudsWriter, ScoresReader, file_kind
+from dpcli.store.statistics import StatisticsReader
 from dpcli.store.writing.already_made import already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -207,8 +208,8 @@ def _open_writer(
 
 def count_samples(report: Report, output: Path) -> Report:
     """Returns the report with what the finished file holds, whether this run wrote all of it or continued another."""
-    if file_kind(output) == "scores":
-        made = ScoresReader(output)
+    if file_kind(output) in ("scores", "statistics"):
+        made = (ScoresReader if file_kind(output) == "scores" else StatisticsReader)(output)
         report.written, report.skipped = len(made.names), made.skipped
         return report
     with CloudsReader(output) as reader:

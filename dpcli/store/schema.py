@@ -124,6 +124,10 @@ _SCORES = (
     *_WHO,
     Field("streams", "f32", ("S", "C"), "the same of one stream of the network", optional=True, group=True),
 )
+_STATISTICS = (
+    Field("name", "str", ("S",), "unique name"),
+    Field("statistics", "str", ("S",), "one JSON object: what was counted of the sample"),
+)
 _EMBEDDING = (
     *_WHO,
     Field("features", "f32", ("S", "D"), "the vector of each video", group=True),
@@ -178,6 +182,7 @@ TABLES = {
     "parts": _PARTS,
     "gaussians": _GAUSSIANS,
     "embedding": _EMBEDDING,
+    "statistics": _STATISTICS + _LEFT_OUT,
 }
 KINDS = tuple(TABLES)
 

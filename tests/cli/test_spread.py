@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -148,6 +149,34 @@ def test_a_dask_cluster_writes_the_same_bytes(folder, whole, tmp_path, name):
     done = run(folder, *COMMANDS[name], "--dask", "local", "--jobs", "2", "-o", tmp_path / "a.h5")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "a.h5").read_bytes() == whole[name]
+
+
+@pytest.mark.parametrize("task", ["segmentation", "motion"])
+def test_an_evaluation_in_shards_has_the_numbers_of_one(folder, whole, tmp_path, monkeypatch, capsys, task):
+    monkeypatch.chdir(folder)
+    with CloudsWriter("truth.h5", class_names=["a", "b"], fields=["part", "pose"], force=True) as writer:
+        for number in range(COUNT):
+            writer.write(drawer(f"v{number}", number, frames=3 + number % 3, points=60, label=number % 2))
+    words = ("evaluate", task, "parts.h5", "--truth", "truth.h5", "--resamples", "100")
+
+    def result(*given: object) -> dict:
+        capsys.readouterr()
+        assert exit_code(*given, "--json") == 0
+        return json.loads(capsys.readouterr().out)
+
+    plain = result(*words)
+    shards = [tmp_path / f"{k}.h5" for k in range(3)]
+    for k, path in enumerate(shards):
+        assert result(*words, "--shard", f"{k}/3", "-o", path)["samples"]["number"] == len(range(k, COUNT, 3))
+    assert exit_code("prepare", "merge", *shards, "-o", tmp_path / "all.h5") == 0
+    merged = result("evaluate", task, tmp_path / "all.h5", "--resamples", "100")
+    assert merged | {"input": "parts.h5"} == plain
+    assert result(*words, "--jobs", "2", "-o", tmp_path / "whole.h5") == plain
+    assert (tmp_path / "whole.h5").read_bytes() == (tmp_path / "all.h5").read_bytes()
+    assert exit_code(*words, "--shard", "0/3") == 2 and "-o FILE is missing" in capsys.readouterr().err
+    assert exit_code("evaluate", task, shards[0]) == 3 and "dpc prepare merge joins" in capsys.readouterr().err
+    other = {"segmentation": "motion", "motion": "segmentation"}[task]
+    assert exit_code("evaluate", other, tmp_path / "all.h5") == 3 and task in capsys.readouterr().err
 
 
 def test_more_shards_than_videos_and_a_shard_again(folder, whole, tmp_path, monkeypatch, capsys):

@@ -16,6 +16,7 @@ from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.runtime.machines.spread import Workers
 from dpcli.store import CloudsReader, CloudsWriter, PartsReader, PartsWriter, ScoresReader, ScoresWriter
 from dpcli.store.file import file_kind
+from dpcli.store.statistics import StatisticsReader, StatisticsWriter
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording
 
@@ -42,10 +43,15 @@ def _scores(reader: Reader, path: Path, **options: Any) -> ScoresWriter:
     return ScoresWriter(path, streams=reader.stream_names, **options)
 
 
+def _statistics(reader: Reader, path: Path, **options: Any) -> StatisticsWriter:
+    return StatisticsWriter(path, length_unit=reader.length_unit, **options)
+
+
 KINDS: dict[str, tuple[Callable[[Path], Reader], Callable[..., Any]]] = {
     "clouds": (CloudsReader, _clouds),
     "parts": (PartsReader, _parts),
     "scores": (ScoresReader, _scores),
+    "statistics": (StatisticsReader, _statistics),
 }  # how a file is read, and how the writer of one like it is made
 
 
