@@ -68,7 +68,11 @@ def main() -> None:
         for count in COUNTS:
             rows.append(measure(folder, count))
             whole, shards, merge, *peaks = rows[-1]
-            print(f"{count:10d} {whole:8.1f} {shards:9.1f} {merge:8.1f}  ", *(f"{peak:6.0f}" for peak in peaks), flush=True)
+            print(
+                f"{count:10d} {whole:8.1f} {shards:9.1f} {merge:8.1f}  ",
+                *(f"{peak:6.0f}" for peak in peaks),
+                flush=True,
+            )
         extra = np.array([shards + merge - whole for whole, shards, merge, *_ in rows])
         slope, fixed = np.polyfit(COUNTS, extra, 1)
         off = np.abs(np.polyval([slope, fixed], COUNTS) - extra).max()
