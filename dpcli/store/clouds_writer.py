@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,7 @@ class CloudsWriter(ResumableWriter):
         self._names: set[str] = set()
         self._frames = self._points = self._unflushed = 0
         self._shifts: list[np.ndarray | None] = []
-        self._index: dict[str, list] = {name: [] for name in _INDEX}
+        self._index: dict[str, list | array] = {name: _empty_column(name) for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
         self._chunks: PlainChunks | None = None
         self._placed: Placed | None = None
@@ -166,7 +167,11 @@ class CloudsWriter(ResumableWriter):
 
     def _append(self, name: str, values: np.ndarray | list) -> None:
         if name in self._index:
-            self._index[name].extend(values)
+            column = self._index[name]
+            if isinstance(column, array):
+                column.frombytes(np.asarray(values, _FIELD[name].dtype).tobytes())
+            else:
+                column.extend(values)
             return
         if name == "pose" and name not in self._file:
             shape = values.shape[1:]
@@ -182,7 +187,7 @@ class CloudsWriter(ResumableWriter):
             self._atomic.flush()
             self._unflushed = 0
 
-    def _extend(self, name: str, values: np.ndarray | list) -> None:
+    def _extend(self, name: str, values: np.ndarray | list | array) -> None:
         if name not in self._data:  # kept open: closing would write its unfinished chunk, each time
             self._data[name] = self._file[name]
         data = self._data[name]
@@ -211,3 +216,8 @@ class CloudsWriter(ResumableWriter):
         rows = [np.zeros(3) if shift is None else np.asarray(shift, np.float64) for shift in self._shifts]
         if np.any(rows):
             self._file.create_dataset("shift", data=np.array(rows))
+
+
+def _empty_column(name: str) -> list | array:
+    """Returns what holds a column of the index until the end: numbers as bytes, as there may be millions of samples."""
+    return [] if _FIELD[name].kind == "str" else array(_FIELD[name].dtype.char)
