@@ -27,6 +27,7 @@ class CloudsReader:
     """
 
     kinds: tuple[str, ...] = ("clouds", "parts")
+    cache = 1 << 20  # bytes of chunks that HDF5 keeps of each data set; less where many files are open at a time
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -127,7 +128,7 @@ class CloudsReader:
         """Opens the file in this process unless it is open, and returns the handle."""
         if self._file is None or self._process != os.getpid() or not self._file.id.valid:
             self._sets = {}
-            self._file, self._process = open_store(self.path, self.kinds), os.getpid()
+            self._file, self._process = open_store(self.path, self.kinds, self.cache), os.getpid()
         return self._file
 
     def _set(self, name: str) -> h5py.Dataset:

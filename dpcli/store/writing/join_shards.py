@@ -22,6 +22,7 @@ from dpcli.store.writing.item_pass import ItemPass, Wording
 
 Reader = Any  # of one of the kinds below; all have names, skipped, positions, provenance, given(), close()
 _OPEN = 256  # files held open at a time; shards are read in turn, and there may be a thousand
+_CACHE = 64 << 10  # bytes of chunks that each of their data sets may keep: a chunk is read from the disk's cache again
 
 
 def _same(given: list[Any]) -> list[Any]:
@@ -111,6 +112,7 @@ def _read_piece(reader: Reader) -> _Piece:
     if (len(written), len(skipped)) != (len(reader.names), len(reader.skipped)):
         raise DataError(f"{reader.path}: its positions don't fit its samples; make this shard again")
     reader.close()
+    reader.cache = _CACHE
     return _Piece(reader, shard, [*reader.provenance[:-1], entry])
 
 
