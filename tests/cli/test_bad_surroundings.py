@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -368,12 +369,10 @@ def test_what_a_terminal_can_not_show_is_spelled(named):
     ascii_only = {"PYTHONUTF8": "0", "LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0"}
     for line in ("DPC info F", "DPC evaluate classification F", "DPC evaluate classification F --markdown"):
         done = shell(line, named, **ascii_only)
-        assert done.returncode == 0 and ("p\\xfcnch" in done.stdout or "--markdown" in line), (
-            done.stderr
-        )  # markdown is UTF-8
+        assert done.returncode == 0 and "p\\xfcnch" in done.stdout, done.stderr
         done = shell(line, named, PYTHONUTF8="1")
         assert (
             "p\u00fcnch" in done.stdout
-            and "\\x1b[31mred\\x9b2J" in done.stdout
+            and "\\x1b[31mred\\x9b2J" in re.sub(r"\\([\\[])", r"\1", done.stdout)  # markdown escapes both
             and not {"\x1b", "\x9b"} & set(done.stdout)
         )
