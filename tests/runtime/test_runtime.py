@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import DpcError, Stopped, UsageError
+from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.runtime import device, progress, provenance
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.seeds import generator
@@ -33,6 +33,18 @@ def square(x: int) -> int:
 def die(x: int) -> int:
     os.kill(os.getpid(), signal.SIGKILL)
     return x
+
+
+def crash(item: tuple[int, int, str]) -> int:
+    """Ends its process by a signal at the numbers given, or only once where a path says so."""
+    x, number, once = item
+    if once and os.path.exists(once):
+        return x * x
+    if number:
+        if once:
+            open(once, "w").close()
+        os.kill(os.getpid(), number)
+    return x * x
 
 
 @pytest.mark.parametrize("jobs", [1, 3])
@@ -64,6 +76,23 @@ def test_any_executor_serves_and_few_items_are_in_flight():
 def test_a_killed_worker_ends_with_a_sentence():
     with pytest.raises(DpcError, match="worker process died"):
         list(ordered_map(die, range(4), 2))
+
+
+@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT])
+def test_an_item_that_crashes_its_process_is_lost_alone(number):
+    items = [(x, number if x in (1, 6) else 0, "") for x in range(7)]
+    rows = list(ordered_map(crash, items, 2))
+    assert [item for item, _ in rows] == items
+    for (x, fatal, _), result in rows:
+        if fatal:
+            assert isinstance(result, DataError) and f"crashed ({signal.Signals(number).name})" in str(result)
+        else:
+            assert result == x * x
+
+
+def test_an_item_whose_process_was_killed_is_done_again(tmp_path):
+    items = [(x, signal.SIGKILL if x == 5 else 0, str(tmp_path / "once") if x == 5 else "") for x in range(7)]
+    assert [result for _, result in ordered_map(crash, items, 3)] == [x * x for x in range(7)]
 
 
 def test_a_stop_signal_sets_the_flag_and_old_handlers_return():
