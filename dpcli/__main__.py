@@ -5,6 +5,9 @@ from __future__ import annotations
 
 def main() -> None:
     """Run `dpc` with the words of the command line."""
+    from dpcli.signal_exit import watch_signals
+
+    watch_signals()
     import sys
 
     try:

@@ -107,8 +107,7 @@ class _Pool:
             try:
                 return alone.submit(self._guarded, item).result()
             except BrokenProcessPool:
-                _kill_children(strangers)
-                return _lost()
+                return _lost(_kill_children(strangers))
 
     def _end_broken(self) -> None:
         _kill_children(self._strangers)
@@ -124,16 +123,21 @@ class _Pool:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _kill_children(strangers: set) -> None:
-    """Ends the processes of a broken executor. It sends them SIGTERM, which they ignore, and would wait for them for ever."""
-    for child in set(multiprocessing.active_children()) - strangers:
+def _kill_children(strangers: set) -> str:
+    """Ends the processes of a broken executor, and returns the name of the signal that broke it, "" where nobody can say.
+
+    The executor sends them SIGTERM, which they ignore, and would wait for them for ever.
+    """
+    children = set(multiprocessing.active_children()) - strangers
+    codes = [child.exitcode for child in children if not child.is_alive()]
+    for child in children:
         child.kill()
+    return next((signal.Signals(-code).name for code in codes if code and code < 0), "")
 
 
-def _lost() -> LostWorker:
-    return LostWorker(
-        "the process that worked on it died (killed, or out of memory), and so did the one that tried it again"
-    )
+def _lost(how: str = "") -> LostWorker:
+    why = f"by {how}" if how else "killed, or out of memory"
+    return LostWorker(f"the process that worked on it died ({why}), and so did the one that tried it again")
 
 
 def ordered_map(

@@ -13,6 +13,7 @@ from dpcli import __version__
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_pipe
+from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -37,6 +38,7 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CAC
         raise DataError(f"{path}: the file is empty, expected HDF5; did the command that writes it fail?")
     if magic != _MAGIC:
         raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); `dpc prepare` makes them from raw data")
+    check_heaps(path)
     try:
         file = h5py.File(path, "r", rdcc_nbytes=cache)
     except OSError as error:

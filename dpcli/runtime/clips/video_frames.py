@@ -23,7 +23,11 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".flv", ".ogv", ".3gp", ".y4m"),
 )
 # Formats of playlists aren't among them: they name other files, which nobody meant to be read.
-_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,dv,mxf,nut"
+# files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
+VIDEO_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
+    "dv,mxf,nut"
+)
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
 _HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
@@ -101,7 +105,7 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
 
     name = "file:" + utf8_path(path, "FFmpeg")
     try:
-        container = av.open(name, options={"format_whitelist": _FORMATS}, metadata_errors="replace")
+        container = av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError):
         raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown kind)") from None
     streams = [one for one in container.streams.video if not one.disposition & one.disposition.attached_pic]
@@ -157,7 +161,7 @@ def _packets(path: Path) -> int:
     """Returns how many whole packets of the video lie in the file, also those before and after what plays."""
     import av
 
-    options = {"format_whitelist": _FORMATS, "ignore_editlist": "1"}
+    options = {"format_whitelist": VIDEO_FORMATS, "ignore_editlist": "1"}
     with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
         stream = next(one for one in container.streams.video if not one.disposition & one.disposition.attached_pic)
         try:

@@ -15,6 +15,7 @@ from typing import Any
 
 from dpcli.config_diff import differences
 from dpcli.errors import DpcError, Stopped, UsageError
+from dpcli.runtime.whole_file import DiskFull, disk_full
 from dpcli.store.file import write_positions, write_root, write_skipped
 from dpcli.store.writing.atomic_file import AtomicFile
 from dpcli.store.writing.journal import Journal, Placed, data_suffix, journal_path, second_path
@@ -24,8 +25,8 @@ class ResumableWriter(ABC):
     """Context manager that writes `path` through a file beside it renamed when whole.
 
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
-    written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
-    the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
+    written survives a stop (Stopped, KeyboardInterrupt, a full disk, or any exception once `keep` is set) and a kill at any
+    moment: the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
     is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists, or what another provenance kept for
     it, and `force` is off.
 
@@ -151,13 +152,17 @@ class ResumableWriter(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Removes all but, after a stop, the journal and the file it points into."""
-        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
-        kept = bool(self._journal and stopped and len(self))
+        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep or disk_full(self.path, error)
+        kept = self._kept() if stopped else ""
         if hasattr(self, "_atomic"):
             try:
-                self._atomic.failed(kind, error, trace, keep=kept)
+                self._atomic.failed(kind, error, trace, kept)
             finally:
-                self._leave_journal(kept)
+                self._leave_journal(bool(kept))
+
+    def _kept(self) -> str:
+        """Returns what a run that continues finds, in words; "" where that is nothing."""
+        return f"the {len(self)} samples done are kept" if self._journal and len(self) else ""
 
     def _leave_journal(self, kept: bool) -> None:
         if self._journal and kept:
@@ -177,8 +182,10 @@ class ResumableWriter(ABC):
             self._leave(type(error), error, None)
             raise
         try:
-            self._atomic.commit()
-        except DpcError:  # the HDF5 file is gone, and with it what the journal points to
-            self._leave_journal(kept=False)
+            self._atomic.commit(self._kept())
+        except (
+            DpcError
+        ) as error:  # unless the disk was full, the HDF5 file is gone, and with it what the journal points to
+            self._leave_journal(isinstance(error, DiskFull) and bool(self._kept()))
             raise
         self._leave_journal(kept=False)
