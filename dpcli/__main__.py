@@ -11,9 +11,11 @@ def main() -> None:
     import sys
 
     try:
-        from dpcli.standard_streams import ready_streams
+        from dpcli.standard_streams import hush_warnings, ready_streams
 
         ready_streams()
+        if "--debug" not in sys.argv:
+            hush_warnings()
 
         from dpcli.cli.app import main
 

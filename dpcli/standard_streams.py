@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -69,6 +70,13 @@ def rich_console(stream: TextIO) -> Console:
     width = None if stream.isatty() else _PIPE_WIDTH
     file = getattr(stream, "unfiltered", stream)
     return Console(file=file, highlight=False, width=width, markup=False, emoji=False)
+
+
+def hush_warnings() -> None:
+    """Keeps Python's warnings, which libraries mean for programmers, off the screen, here and in workers, unless asked for."""
+    if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
+        os.environ["PYTHONWARNINGS"] = "ignore"
+        warnings.simplefilter("ignore")
 
 
 def printable(text: str, kept: str = "") -> str:

@@ -179,3 +179,28 @@ def test_a_bar_spells_its_task_and_values():
         bar.note(name="\u202ex")
         bar.advance()
     assert "fit \\x1b[2J 1/1" in stream.getvalue() and "\\u202ex" in stream.getvalue()
+
+
+WARNS = """
+import sys, warnings
+from dpcli import __main__, errors
+import dpcli.cli.app as app
+def main():
+    warnings.warn("overflow encountered", RuntimeWarning)
+    raise errors.DataError("not an image <_io.BytesIO object at 0x7f12ab34cd50>")
+app.main = main
+__main__.main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "environment", "heard"),
+    [([], {}, False), (["--debug"], {}, True), ([], {"PYTHONWARNINGS": "default"}, True)],
+)
+def test_warnings_of_libraries_are_for_debugging(words, environment, heard):
+    run = [sys.executable, "-c", WARNS, *words]
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONWARNINGS"}
+    where = {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    done = subprocess.run(run, capture_output=True, text=True, env={**clean, **where, **environment})
+    assert ("RuntimeWarning: overflow encountered" in done.stderr) == heard, done.stderr
+    assert "not an image _io.BytesIO" in done.stderr and "0x7f" not in done.stderr

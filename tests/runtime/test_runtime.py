@@ -45,18 +45,6 @@ def die_once_at_three(item: tuple[int, str]) -> int:
     return x
 
 
-def crash(item: tuple[int, int, str]) -> int:
-    """Ends its process by a signal at the numbers given, or only once where a path says so."""
-    x, number, once = item
-    if once and os.path.exists(once):
-        return x * x
-    if number:
-        if once:
-            open(once, "w").close()
-        os.kill(os.getpid(), number)
-    return x * x
-
-
 @pytest.mark.parametrize("jobs", [1, 3])
 def test_results_come_in_order_and_failures_as_results(jobs):
     rows = list(ordered_map(square, range(8), jobs))

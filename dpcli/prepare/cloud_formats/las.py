@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import struct
 import sys
@@ -44,13 +43,15 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 def _load_laspy() -> ModuleType:
     """Returns laspy without the client of web addresses that it loads where there is one: that takes four times as long."""
-    if "laspy" in sys.modules or "requests" in sys.modules:
-        return importlib.import_module("laspy")
-    sys.modules["requests"] = None  # type: ignore[assignment]  # an import of it fails at once
+    hidden = not {"laspy", "requests"} & sys.modules.keys()
+    if hidden:
+        sys.modules["requests"] = None  # type: ignore[assignment]  # an import of it fails at once
     try:
-        return importlib.import_module("laspy")
+        import laspy
     finally:
-        del sys.modules["requests"]
+        if hidden:
+            del sys.modules["requests"]
+    return laspy
 
 
 def _scaled(las: Any) -> np.ndarray:
