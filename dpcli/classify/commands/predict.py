@@ -67,7 +67,7 @@ def predict(
     when the output holds something else, DataError when data and model don't fit.
     """
     weights = find_model(task.model)
-    open_model = partial(_open_model, weights, task.backbone, task.device)
+    open_model = partial(_open_model, weights.resolve(), task.backbone, task.device)  # workers may stand elsewhere
     model, info = open_model()
     with input_file(task.data) as path, output_file(task.output) as target:
         reader = CloudsReader(path)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from dpcli.classify.network.sync_norm import SyncNorm
 from dpcli.ops import gather_points
@@ -55,13 +54,27 @@ class SharedLayers(nn.Module):
                 norm.running_var.lerp_(var.to(norm.running_var) * (rows / max(rows - 1, 1)), norm.momentum)
 
 
+class ClipLinear(nn.Linear):
+    """Applies a linear layer to one row for each clip.
+
+    Outside of training a clip's result doesn't depend, to the bit, on the clips beside it: a product of so few rows is
+    rounded by their number, so each row has a product of its own.
+    """
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Returns (B,C) for rows (B,F), or (C) for one."""
+        if self.training or rows.ndim < 2:
+            return super().forward(rows)
+        return torch.cat([linear(row, self.weight, self.bias) for row in rows.split(1)])
+
+
 class GlobalHead(SharedLayers):
     """Computes class logits: [xyz, feature] of every centroid -> two shared layers -> max over the clip -> linear."""
 
     def __init__(self, inputs: int, widths: tuple[int, int], classes: int, dropout: float) -> None:
         super().__init__(inputs, widths)
         self.dropout = nn.Dropout(dropout)
-        self.classify = nn.Linear(widths[1], classes)
+        self.classify = ClipLinear(widths[1], classes)
 
     def embed(self, centers: Tensor, features: Tensor) -> Tensor:
         """Returns the clip's feature vector, (B, widths[1])."""
@@ -75,16 +88,7 @@ class GlobalHead(SharedLayers):
 
     def forward(self, centers: Tensor, features: Tensor) -> Tensor:
         """Returns the class logits (B,C) of centers (B,M,3) with features (B,M,F)."""
-        return clip_by_clip(self.classify, self.dropout(self.embed(centers, features)), self.training)
-
-
-def clip_by_clip(layers: Callable[[Tensor], Tensor], rows: Tensor, training: bool) -> Tensor:
-    """Returns `layers(rows)` (B,C) of one row for each clip (B,F).
-
-    Outside of training a clip's result doesn't depend, to the bit, on the clips beside it: a product of so few rows is
-    rounded by their number, so each row has a product of its own.
-    """
-    return layers(rows) if training else torch.cat([layers(row) for row in rows.split(1)])
+        return self.classify(self.dropout(self.embed(centers, features)))
 
 
 def he_init(module: nn.Module) -> None:

@@ -91,4 +91,4 @@ def _name_scenes(views: Sequence[str], folder: Path) -> list[tuple[Path, Path]]:
     names = [name.removesuffix(".h5").replace("/", "-") for name in short_names(paths)]
     if len(set(names)) < len(names):
         raise UsageError(f"{len(names)} clips have {len(set(names))} names; each scene needs a name of its own")
-    return [(path, folder / f"{name}.h5") for path, name in zip(paths, names)]
+    return [(path.resolve(), (folder / f"{name}.h5").resolve()) for path, name in zip(paths, names)]

@@ -161,7 +161,7 @@ def estimate_flow_of_file(
         inputs = {"clouds": path} | ({"flow": weights} if weights else {})
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         device = str(choose_device(device)) if weights else "cpu"
-        work = FlowOfSequence(flow, points, as_points, seed, device)
+        work = FlowOfSequence(str(weights.resolve()) if weights else flow, points, as_points, seed, device)
         if force or not _already_there(target, entry):
             keep_freed_memory()
             with CloudsWriter(

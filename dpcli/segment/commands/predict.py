@@ -84,8 +84,9 @@ def predict_file(
     where a stopped run ended.
     """
     drawings.check()
-    open_segmenter = partial(_open_segmenter, settings, model, device, seed)
-    segmenter = open_segmenter()
+    segmenter = _open_segmenter(settings, model, device, seed)
+    place = model and str(Path(model).resolve() if Path(model).exists() else model)  # workers may stand elsewhere
+    open_segmenter = partial(_open_segmenter, settings, place, device, seed)
     refinement = settings.refinement
     if not isinstance(segmenter, NetworkSegmenter):
         refinement = replace(refinement, split_bodies=False)
@@ -101,7 +102,8 @@ def predict_file(
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
-        work = PartsOfSequence(once, str(estimator or settings.input.flow), refinement, seed)
+        flow = str(estimator.resolve() if estimator else settings.input.flow)
+        work = PartsOfSequence(once, flow, refinement, seed)
         fields = [name for name in reader.fields if name not in ("part", "pose")]
         if force or not _already_there(target, entry):
             with PartsWriter(

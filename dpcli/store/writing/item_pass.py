@@ -128,28 +128,28 @@ class ItemPass:
 
     def _take(self, place: int, result: Any, write: Callable[[int, Any], dict[str, float]], bar: Progress) -> None:
         """Writes a result, or notes what was raised instead of one."""
-        if not isinstance(result, Exception) and place < self.last:
-            # a stopped run had passed it over as bad; putting it in now would break the order of the file
-            result = DataError("is good now but was skipped before the stop; --force starts over and includes it")
-        if not isinstance(result, Exception):
+        if not isinstance(result, Exception) and place > self.last:
             with _interrupted_after():
                 counted = write(place, result)
             self.written.append(place)
             bar.advance(1, **counted)
             return
-        self._skip(place, result)
+        if not isinstance(result, Exception):
+            # a stopped run had passed it over as bad; putting it in now would break the order of the file
+            self._skip(place, "is good now but was skipped before the stop; --force starts over and includes it")
+        elif isinstance(result, self.skips):
+            self._skip(place, str(result))
+        elif isinstance(result, DataError):
+            raise DataError(f"{self.names[place]}: {result}{self.words.advice}") from None
+        else:
+            log.error(f"{self.names[place]}: failed in an unforeseen way")
+            raise result
         bar.advance(1)
 
-    def _skip(self, place: int, error: Exception) -> None:
-        name = self.names[place]
-        if not isinstance(error, self.skips):
-            if isinstance(error, DataError):
-                raise DataError(f"{name}: {error}{self.words.advice}") from None
-            log.error(f"{name}: failed in an unforeseen way")
-            raise error
-        self.writer.skipped.append((name, str(error)))
+    def _skip(self, place: int, reason: str) -> None:
+        self.writer.skipped.append((self.names[place], reason))
         self.skipped.append(place)
-        log.detail(f"skipped {name}: {error}")
+        log.detail(f"skipped {self.names[place]}: {reason}")
 
 
 def _work_on(work: Callable[[Any], Any], item: tuple[int, Any]) -> Any:
