@@ -16,9 +16,11 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError, reading
+from dpcli.path_names import as_utf8
 from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
+from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.shards import WHOLE, Shard, describe_shard
 from dpcli.prepare.thinning import Thinning
@@ -135,6 +137,21 @@ def _fingerprint(path: Path) -> str:
         return ""
 
 
+def all_items(reader: Reader) -> list[Item]:
+    """Returns a reader's index and, at its end, an item with a problem for all below its folder that can't be opened.
+
+    So a dangling link or a FIFO named like data is skipped by name. Raises DataError when the index can't be made.
+    """
+    raw = getattr(reader, "raw", None)
+    with reading(raw or type(reader).__name__):
+        items = list(reader.items())
+    if not isinstance(raw, Path) or not raw.is_dir():
+        return items
+    odd = unreadable_entries(raw, {item.path for item in items})
+    names = [as_utf8(path.relative_to(raw).as_posix()) for path, _ in odd]
+    return items + [Item(name, path, problem=f"{as_utf8(str(path))}: {why}") for name, (path, why) in zip(names, odd)]
+
+
 def convert(
     reader: Reader,
     output: Path,
@@ -152,7 +169,7 @@ def convert(
     UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
     after a stop signal, with what is done kept beside `output`.
     """
-    items = reader.items()
+    items = all_items(reader)
     for line in reader.summary(items):
         log.info(line)
     items = items[: conversion.limit]

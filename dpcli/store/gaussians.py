@@ -252,7 +252,7 @@ def read_scene(path: str | Path) -> GaussianScene:
             scene = GaussianScene(**arrays, size=size, reference=int(file.attrs["reference"]), metrics=metrics)
         except (TypeError, ValueError) as error:
             raise DataError(f"{path}: size, reference or metrics is damaged ({error}); fit again") from None
-    scene.validate(str(path))
+        scene.validate(str(path))
     return scene
 
 

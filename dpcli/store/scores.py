@@ -119,7 +119,7 @@ class ScoresReader:
                     raise DataError(f"{path}: data set {key!r} is missing; the file is incomplete, make it again")
             self.scores, self.labels = file["scores"][:], file["label"][:]
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
-        self._check()
+            self._check()
 
     def _check(self) -> None:
         shape = (len(self.names), len(self.class_names))
