@@ -137,19 +137,24 @@ def _fingerprint(path: Path) -> str:
         return ""
 
 
-def all_items(reader: Reader) -> list[Item]:
-    """Returns a reader's index and, at its end, an item with a problem for all below its folder that can't be opened.
+def all_items(reader: Reader) -> tuple[list[Item], list[Item]]:
+    """Returns a reader's index, and an item with a problem for each entry below its folder that can't be opened.
 
     So a dangling link or a FIFO named like data is skipped by name. Raises DataError when the index can't be made.
     """
-    raw = getattr(reader, "raw", None)
-    with reading(raw or type(reader).__name__):
+    given = getattr(reader, "inputs", ()) or (getattr(reader, "raw", None),)
+    roots = [root for root in given if isinstance(root, Path)]
+    with reading(", ".join(map(str, roots)) or type(reader).__name__):
         items = list(reader.items())
-    if not isinstance(raw, Path) or not raw.is_dir():
-        return items
-    odd = unreadable_entries(raw, {item.path for item in items})
-    names = [as_utf8(path.relative_to(raw).as_posix()) for path, _ in odd]
-    return items + [Item(name, path, problem=f"{as_utf8(str(path))}: {why}") for name, (path, why) in zip(names, odd)]
+    taken = {item.path for item in items}
+    odd = [(root, path, why) for root in roots if root.is_dir() for path, why in unreadable_entries(root, taken)]
+    used, extra = {item.name for item in items}, []
+    for root, path, why in odd:
+        name = as_utf8(path.relative_to(root).as_posix())
+        name = as_utf8(str(path)) if name in used else name
+        used.add(name)
+        extra.append(Item(name, path, problem=f"{as_utf8(str(path))}: {why}"))
+    return items, extra
 
 
 def convert(
@@ -169,10 +174,10 @@ def convert(
     UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
     after a stop signal, with what is done kept beside `output`.
     """
-    items = all_items(reader)
+    items, unread = all_items(reader)
     for line in reader.summary(items):
         log.info(line)
-    items = items[: conversion.limit]
+    items = [*items, *unread][: conversion.limit]
     config = configuration(reader, conversion.thinning, items, conversion.compression)
     provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()

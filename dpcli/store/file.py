@@ -116,12 +116,12 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
             elif item.dtype.kind not in "fiub" and h5py.check_string_dtype(item.dtype) is None:
                 raise DataError(f"{path}: {item.name} has type {item.dtype}, expected numbers or strings")
             else:
-                _refuse_claim(item, path)
+                refuse_claim(item, path)
 
     visit(file)
 
 
-def _refuse_claim(item: h5py.Dataset, path: Path) -> None:
+def refuse_claim(item: h5py.Dataset, path: Path) -> None:
     """Raises DataError for a data set of a shape that its stored bytes can't fill, before anybody makes room for it."""
     stored = item.id.get_storage_size()
     packed = item.chunks is not None and item.id.get_create_plist().get_nfilters() > 0
