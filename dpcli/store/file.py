@@ -246,7 +246,15 @@ def write_root(
     class_names: Sequence[str],
     provenance: Sequence[dict],
 ) -> None:
-    """Writes root attributes, class names and provenance (docs/format.md). No clock time, so bytes repeat."""
+    """Writes root attributes, class names and provenance (docs/format.md). No clock time, so bytes repeat.
+
+    Raises DataError for a class name with NUL, which HDF5 can't hold.
+    """
+    for name in class_names:
+        if "\0" in name:
+            raise DataError(
+                f"{source}: the class name {name[:80]!r} holds NUL; expected text, copy the list of classes again"
+            )
     last = provenance[-1] if provenance else {}
     file.attrs.update(
         {
