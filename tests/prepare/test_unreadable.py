@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, DpcError
+from dpcli.prepare.cloud_formats.arrays import read_npz
 from dpcli.prepare.convert_item import convert_item
 from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
@@ -77,3 +79,18 @@ def test_a_label_is_no_number_of_classes_until_it_is_plausible(tmp_path, label):
     table.write_text(f"name,label\na,0\nb,{label}\n")
     with pytest.raises(DataError, match="l.csv:3: label .* claims"):
         read_labels(table)
+
+
+@pytest.mark.parametrize("megabytes, keys", [(300, 1), (150, 3), (120, 4)])
+def test_an_archive_that_unpacks_to_far_more_is_refused(tmp_path, megabytes, keys):
+    bomb = tmp_path / "b.npz"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        for key in range(keys):
+            with archive.open(f"a{key}.npy", "w") as member:
+                np.lib.format.write_array_header_1_0(
+                    member, {"descr": "|u1", "fortran_order": False, "shape": (megabytes << 20,)}
+                )
+                for _ in range(megabytes):
+                    member.write(bytes(1 << 20))
+    with pytest.raises(DataError, match="claims .* can't hold"):
+        read_npz(bomb)
