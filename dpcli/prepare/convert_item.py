@@ -24,7 +24,7 @@ def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[i
     try:
         with reading(item.path):
             sample = reader.read(item, rng)
-            sample.sequence = thinning.apply(sample.sequence, rng)
     except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
         raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
+    sample.sequence = thinning.apply(sample.sequence, rng)  # our own code: what fails here is a bug
     return sample
