@@ -105,14 +105,11 @@ def _read_mat5(path: Path) -> np.ndarray:
 def _read_mat73(path: Path) -> np.ndarray:
     import h5py
 
-    try:
-        with reading(path), h5py.File(path, "r") as file:
-            if not isinstance(file.get("depth"), h5py.Dataset):
-                raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
-            refuse_claim(file["depth"], path)
-            return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
-    except OSError as error:
-        raise DataError(f"{path}: not a readable MATLAB 7.3 file, perhaps truncated ({error})") from None
+    with reading(f"{path}, a MATLAB 7.3 file"), h5py.File(path, "r") as file:
+        if not isinstance(file.get("depth"), h5py.Dataset):
+            raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
+        refuse_claim(file["depth"], path)
+        return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:

@@ -66,18 +66,15 @@ _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and 
 
 def read_file(path: Path, *names: str) -> list[np.ndarray]:
     """Reads data sets of an HDF5 file as arrays. Raises DataError when absent, damaged, or kept in another file."""
-    try:
-        with reading(path), h5py.File(path, "r") as file:
-            for name in names:
-                if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                    found = ", ".join(sorted(file)) or "none"
-                    raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
-                if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
-                    raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
-                refuse_claim(file[name], path)
-            return [file[name][()] for name in names]
-    except OSError as error:
-        raise DataError(f"{path}: not a readable HDF5 file, perhaps truncated ({str(error).splitlines()[0]})") from None
+    with reading(path), h5py.File(path, "r") as file:
+        for name in names:
+            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                found = ", ".join(sorted(file)) or "none"
+                raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
+            if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
+                raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
+            refuse_claim(file[name], path)
+        return [file[name][()] for name in names]
 
 
 @lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
@@ -146,7 +143,7 @@ class ModelNet40:
         if not problem:
             try:
                 labels = read_labels(path)
-            except DataError as error:
+            except (DataError, OSError) as error:
                 problem = str(error)
         if problem:
             return [Item(name, path or folder, homes[0] if homes else "", problem=problem)]
