@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
 from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.schema import KEPT
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
@@ -144,8 +144,12 @@ class CloudsReader:
         """Sequence `index`, or only some of its frames (repeats allowed), with all optional fields or those named.
 
         Touches only what it needs: one contiguous read from the first to the last frame asked for.
-        DataError when a value is NaN or infinite.
+        DataError when a value is NaN or infinite, or the file is damaged there.
         """
+        with reading(self.path):
+            return self._read(index, frames, fields)
+
+    def _read(self, index: int, frames: slice | Sequence[int] | None, fields: Sequence[str] | None) -> CloudSequence:
         first = int(self._sequence_offsets[index])
         count = int(self._sequence_offsets[index + 1]) - first
         wanted = (
