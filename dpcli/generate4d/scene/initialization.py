@@ -12,6 +12,7 @@ from torch import Tensor
 
 from dpcli.errors import DataError
 from dpcli.generate4d.config import FitConfig
+from dpcli.generate4d.shape.silhouette import ball_thickness
 from dpcli.generate4d.targets import Targets
 
 _ROUNDS, _CANDIDATES = 200, 20_000  # at most so many draws of so many points look for those inside a hull
@@ -78,27 +79,6 @@ def inflate_silhouette(
     )
     world = (camera - world_to_camera[:3, 3]) @ world_to_camera[:3, :3]
     return world.astype(np.float32), rgba[rows[picked], columns[picked], :3].astype(np.float32)
-
-
-def ball_thickness(mask: np.ndarray) -> np.ndarray:
-    """Returns half the thickness (H,W) in pixels of a silhouette that is the union of the balls of its medial axis.
-
-    A disc becomes a ball, a limb a rod. The thickness is at least half a pixel inside the mask and 0 outside.
-    """
-    from scipy import ndimage
-
-    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
-    ridge = (distance > 0) & (distance >= ndimage.maximum_filter(distance, size=3) - 0.5)
-    squared = np.zeros(mask.shape)
-    for row, column in zip(*np.nonzero(ridge)):
-        radius = distance[row, column]
-        reach = int(radius)
-        top, left = max(row - reach, 0), max(column - reach, 0)
-        window = squared[top : row + reach + 1, left : column + reach + 1]
-        dy = np.arange(top, top + window.shape[0])[:, None] - row
-        dx = np.arange(left, left + window.shape[1]) - column
-        np.maximum(window, radius**2 - dy**2 - dx**2, out=window)
-    return np.where(mask, ndimage.gaussian_filter(np.sqrt(squared.clip(0.25)), 1.0), 0.0)
 
 
 def carve_hull(

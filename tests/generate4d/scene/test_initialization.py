@@ -11,8 +11,9 @@ import torch
 from dpcli.errors import DataError
 from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.scene.canonical_gaussians import NAMES, CanonicalGaussians
-from dpcli.generate4d.scene.initialization import ball_thickness, carve_hull, inflate_silhouette, sample_sphere
+from dpcli.generate4d.scene.initialization import carve_hull, inflate_silhouette, sample_sphere
 from dpcli.generate4d.scene.losses import picture_loss, roundness_loss, thickness_loss
+from dpcli.generate4d.shape.silhouette import ball_thickness
 from dpcli.ops.cameras import orbit_pose, pinhole
 
 RNG = np.random.default_rng(0)
