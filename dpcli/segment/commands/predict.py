@@ -24,6 +24,7 @@ from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segme
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
+from dpcli.store.sequence import OF_PARTS
 from dpcli.store.writing.already_made import WORK, already_made
 
 _ROWS = 8  # sequences in a picture
@@ -75,7 +76,7 @@ def predict_file(
         config = {"settings": said, **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
-        fields = [name for name in reader.fields if name not in ("part", "pose")]
+        fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
         if force or not _already_there(target, history[-1]):
             with PartsWriter(
                 target,
