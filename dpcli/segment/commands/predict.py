@@ -27,6 +27,7 @@ from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segme
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
+from dpcli.store.sequence import OF_PARTS
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -104,7 +105,7 @@ def predict_file(
         once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
         flow = str(estimator.resolve() if estimator else settings.input.flow)
         work = PartsOfSequence(once, flow, refinement, seed)
-        fields = [name for name in reader.fields if name not in ("part", "pose")]
+        fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
         if force or not _already_there(target, entry):
             with PartsWriter(
                 target,
