@@ -1,0 +1,136 @@
+"""Rounds of pictures with layers for the training of a shape prior: from models, moving or still, and made-up creatures.
+
+A round is made from the seed and its number alone, so that a training that goes on sees the pictures it would have seen.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
+from dpcli.prepare.meshes.animation import load_animation, load_still
+from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
+from dpcli.prepare.meshes.skinning import skin, vertex_normals
+from dpcli.prepare.synthetic.creature_mesh import make_skin
+from dpcli.prepare.synthetic.gait import bone_motion
+from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
+from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import PrepareStream, generator
+
+_POSES, _CELLS = 6, 56  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
+_PER_MESH = 16  # pictures of one mesh in a round
+_MOST_TRIANGLES = 200_000  # larger models are passed over: one would hold up all others
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """Names a model and its clips; none: it stands still."""
+
+    path: Path
+    clips: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PictureSource:
+    """Makes rounds of pictures. made, moving: shares of made-up creatures and of animated models, 0..1; still models have
+    the rest. A folder's share grows with the root of its number of models: many of them are alike.
+    """
+
+    files: tuple[MeshFile, ...]
+    size: int
+    seed: int
+    made: float = 0.5
+    moving: float = 0.35
+
+    def make(self, number: int, count: int) -> LayeredViews:
+        """Makes the `count` pictures of a round, in random order."""
+        rng = generator(self.seed, PrepareStream.SHAPE_PICTURES, number)
+        parts, have = [], 0
+        while have < count:
+            mesh = self._draw_mesh(rng)
+            if mesh is None or len(mesh.triangles) > _MOST_TRIANGLES:
+                continue
+            views = draw_views(_recolored(mesh, rng), _PER_MESH, self.size, rng)
+            parts.append(views)
+            have += len(views.rgba)
+        order = rng.permutation(have)[:count]
+        return LayeredViews(
+            np.concatenate([part.rgba for part in parts])[order], np.concatenate([part.depth for part in parts])[order]
+        )
+
+    def _draw_mesh(self, rng: np.random.Generator) -> AnimatedMesh | None:
+        """Draws a mesh in some poses; None where a model can't be read, which is said once per model."""
+        kind = rng.random()
+        moving = [file for file in self.files if file.clips]
+        still = [file for file in self.files if not file.clips]
+        if kind < self.made or not self.files:
+            return made_creature(rng)
+        if moving and (kind < self.made + self.moving or not still):
+            return _read(_draw_file(moving, rng), rng)
+        return _read(_draw_file(still, rng), rng)
+
+
+def made_creature(rng: np.random.Generator) -> AnimatedMesh:
+    """Makes a creature of random plan in random poses."""
+    animal = wild_creature(rng)
+    body = make_skin(animal, rng, _CELLS)
+    moved = bone_motion(animal, wild_turns(animal, _POSES, rng), np.zeros((_POSES, 3)))
+    positions, normals = skin(body.vertices, vertex_normals(body.vertices, body.triangles), body.bones, body.weights, moved)
+    return AnimatedMesh(
+        name="creature",
+        time=np.arange(_POSES, dtype=float),
+        positions=positions,
+        normals=normals,
+        triangles=body.triangles,
+        material=np.zeros(len(body.triangles), np.int64),
+        materials=(Material(),),
+        color=body.color,
+        uv=np.zeros((len(body.vertices), 2), np.float32),
+        bones=body.bones,
+        weights=body.weights,
+        bone_pose=moved,
+        bone_parent=np.array([bone.parent for bone in animal.bones]),
+    )
+
+
+def _draw_file(files: Sequence[MeshFile], rng: np.random.Generator) -> MeshFile:
+    """Draws a model; each counts one over the root of the number of models in its folder."""
+    folders = [str(file.path.parent) for file in files]
+    number = Counter(folders)
+    weight = np.array([number[folder] ** -0.5 for folder in folders])
+    return files[int(rng.choice(len(files), p=weight / weight.sum()))]
+
+
+def _read(file: MeshFile, rng: np.random.Generator) -> AnimatedMesh | None:
+    """Reads a model in random poses of a random clip, sometimes stretched a little along its axes."""
+    clip = file.clips[int(rng.integers(len(file.clips)))] if file.clips else None
+    try:
+        mesh = load_still(file.path) if clip is None else load_animation(file.path, clip, _POSES)
+    except DataError as error:
+        log.detail(f"left out: {error}")
+        return None
+    stretch = np.exp(0.12 * rng.normal(size=3)).astype(np.float32)
+    return replace(mesh, positions=mesh.positions * stretch)
+
+
+def _recolored(mesh: AnimatedMesh, rng: np.random.Generator) -> AnimatedMesh:
+    """Returns the mesh with colors mixed, so that no color tells what a thing is; one time in three as it is."""
+    if rng.random() < 1 / 3:
+        return mesh
+    mix = rng.dirichlet([0.6] * 3, size=3)
+    gain = np.exp(0.3 * rng.normal(size=3))
+    materials = []
+    for material in mesh.materials:
+        color = np.array(material.color[:3])
+        if material.texture is None:
+            color = rng.random(3) if rng.random() < 0.5 else np.clip(mix @ color * gain, 0, 1)
+        else:
+            color = np.clip(color * gain, 0, 1.5)
+        materials.append(replace(material, color=(*map(float, color), material.color[3])))
+    return replace(mesh, materials=tuple(materials))
