@@ -14,7 +14,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
-from dpcli.prepare.meshes.animation import load_animation, load_still
+from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_clips
 from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
 from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.prepare.synthetic.creature_mesh import make_skin
@@ -74,6 +74,47 @@ class PictureSource:
         if moving and (kind < self.made + self.moving or not still):
             return _read(_draw_file(moving, rng), rng)
         return _read(_draw_file(still, rng), rng)
+
+
+def picture_sources(
+    learned: Sequence[MeshFile], held: Sequence[MeshFile], size: int, seed: int, *, made: float, moving: float
+) -> tuple[PictureSource, PictureSource]:
+    """Returns the source to learn from and the one to validate on: held-out models alone, made-up creatures without any."""
+    return (
+        PictureSource(tuple(learned), size, seed, made, moving),
+        PictureSource(tuple(held), size, seed, made=0.0, moving=1.0),
+    )
+
+
+def find_meshes(places: Sequence[Path], held_out: str | None) -> tuple[list[MeshFile], list[MeshFile]]:
+    """Returns the models in files and folders, those to learn from and those that the text file `held_out` names.
+
+    A line of it is a path or the end of one; what follows # is not read. Raises DataError where a model can't be read,
+    a folder has none, or a line names none.
+    """
+    paths = [path for place in places for path in _models_in(place)]
+    text = Path(held_out).read_text() if held_out else ""
+    ends = [end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end]
+    for end in ends:
+        if not any(_ends_with(path, end) for path in paths):
+            raise DataError(f"{held_out}: {end} is none of the {len(paths)} models; name paths, or ends of paths, below them")
+    files = [MeshFile(path, names_of_clips(path)) for path in paths]
+    held = [file for file in files if any(_ends_with(file.path, end) for end in ends)]
+    return [file for file in files if file not in held], held
+
+
+def _models_in(place: Path) -> list[Path]:
+    """Returns the models that a file or folder holds, in order."""
+    if place.is_file():
+        return [place]
+    found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
+    if not found:
+        raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")
+    return found
+
+
+def _ends_with(path: Path, end: str) -> bool:
+    return ("/" + path.as_posix()).endswith("/" + end)
 
 
 def made_creature(rng: np.random.Generator) -> AnimatedMesh:
