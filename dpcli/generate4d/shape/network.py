@@ -74,8 +74,12 @@ class ShapeNetwork(nn.Module):
         )
         self.turn = nn.Sequential(nn.Linear(4, config.hidden), nn.ReLU(), nn.Linear(config.hidden, widths[-1]))
         self.out = nn.Conv2d(widths[0], 4 * (LAYERS + 1), 1)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        for layer in self.modules():
+            if isinstance(layer, (nn.Conv2d, nn.Linear)):  # without normalization the signal has to keep its size
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)
+        for last in (self.name[-1], self.out):
+            nn.init.normal_(last.weight, std=0.01)
         self.register_buffer("centers", torch.linspace(-_REACH, _REACH, config.bins))
 
     def encode(self, pictures: Tensor) -> Encoded:
