@@ -7,8 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from dpcli.generate4d.shape.network import ShapeConfig, ShapeNetwork
 from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 
@@ -20,7 +18,8 @@ DEFAULT = "creatures"  # the shipped network
 def save_shape_model(path: Path, model: ShapeNetwork, notes: dict[str, Any]) -> None:
     """Writes the weights as float16; notes: a small JSON object, `size` and `confidence` among it."""
     header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
-    save_weights(path, {name: value.half() for name, value in model.state_dict().items()}, header)
+    state = {name: value.half() if value.is_floating_point() else value for name, value in model.state_dict().items()}
+    save_weights(path, state, header)
 
 
 def find_shape_model(name: str | Path) -> Path:
@@ -39,5 +38,5 @@ def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = ShapeNetwork(ShapeConfig.from_json(header["config"]))
-    load_state(model, {name: value.to(torch.float32) for name, value in tensors.items()}, path)
+    load_state(model, {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}, path)
     return model.eval(), json.loads(header["notes"])

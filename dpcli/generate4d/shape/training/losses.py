@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from dpcli.generate4d.shape.network import ShapeNetwork, inflated_layers
+from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, inflated_layers
 from dpcli.generate4d.shape.training.rounds import Batch
 
 _RIDGE = 0.005  # squared sides of the picture: a narrow object has no angle to speak of
@@ -60,19 +60,24 @@ def difference_error(depth: Tensor, truth: Tensor) -> Tensor:
 
 
 def shape_loss(model: ShapeNetwork, batch: Batch, guessed: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-    """Returns the loss and its parts. guessed: bool (B), which pictures are decoded at the network's own angles."""
-    encoded = model.encode(batch.pictures)
+    """Returns the loss and its parts. guessed: bool (D), which of the first D pictures are decoded at the network's own
+    angles; the others at the true ones. Of the pictures behind them only the angles are learned.
+    """
+    encoded, count = model.encode(batch.pictures), len(guessed)
     truth = object_angles(batch.depth)
+    angles = -(model.angle_targets(truth) * encoded.angles.log_softmax(-1)).sum(-1).mean()
     own = model.likely_angles(encoded.angles.detach())
-    depth, second = model.decode(encoded, batch.pictures, torch.where(guessed[:, None], own, truth))
+    encoded = Encoded([level[:count] for level in encoded.levels], encoded.angles[:count], encoded.gain[:count])
+    batch = Batch(batch.pictures[:count], batch.depth[:count])
+    chosen = torch.where(guessed[:, None], own[:count], truth[:count])
+    depth, second = model.decode(encoded, batch.pictures, chosen)
     error = depth_error(depth, batch.depth)
     there = ~batch.depth[:, 0].isnan()
     presence = functional.binary_cross_entropy_with_logits(second[there], (~batch.depth[:, 2].isnan()).float()[there])
-    angles = -(model.angle_targets(truth) * encoded.angles.log_softmax(-1)).sum(-1).mean()
     gain = gain_of(error.detach(), batch)
     certain = functional.smooth_l1_loss(encoded.gain[guessed], gain[guessed]) if guessed.any() else 0 * error.sum()
     smooth = difference_error(depth, batch.depth)
-    loss = 10 * error.mean() + 5 * smooth + 0.3 * presence + 0.2 * angles + 0.1 * certain
+    loss = 10 * error.mean() + 5 * smooth + 0.3 * presence + angles + 0.1 * certain
     return loss, {"depth": error.detach().mean(), "angles": angles.detach(), "second": presence.detach()}
 
 

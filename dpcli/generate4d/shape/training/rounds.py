@@ -74,7 +74,8 @@ class Window:
         for index in np.unique(which):
             own = self._held[index]
             parts.append(own.take(rng.integers(len(own.rgba), size=int((which == index).sum()))))
-        pictures, depth = (torch.cat(tensors) for tensors in zip(*parts))
+        order = torch.from_numpy(rng.permutation(count))
+        pictures, depth = (torch.cat(tensors)[order] for tensors in zip(*parts))
         mirrored = torch.from_numpy(rng.random(count) < 0.5)[:, None, None, None]
         return Batch(*(torch.where(mirrored, x.flip(-1), x) for x in (pictures, depth)))
 

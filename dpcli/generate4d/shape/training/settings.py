@@ -15,7 +15,8 @@ class ShapeSchedule:
     """Holds how long a shape network learns, from pictures of which size, and how often it sees each."""
 
     steps: int = setting(20_000, "Steps of the optimizer.", least=1)
-    batch: int = setting(32, "Pictures per step.", least=1)
+    batch: int = setting(64, "Pictures per step, in which the turn of the whole is learned.", least=1)
+    decoded: int = setting(16, "Pictures of each step in which the layers are learned, too: the easier part.", least=1)
     size: int = setting(64, "Side of the pictures, pixels; a multiple of 2 to the number of levels.", least=16)
     lr: float = setting(2e-3, "Largest learning rate; it falls to zero as a cosine.", above=0)
     round: int = setting(1024, "Pictures that are made at a time.", least=1)
@@ -54,7 +55,7 @@ PRESETS = {
     "release": {"network": ShapeConfig(), "schedule": ShapeSchedule(), "data": ShapeData()},
     "tiny": {
         "network": ShapeConfig(widths=(8, 16), hidden=16, bins=5),
-        "schedule": ShapeSchedule(steps=20, batch=4, size=16, round=16, rounds=2, reuse=4),
+        "schedule": ShapeSchedule(steps=20, batch=4, decoded=2, size=16, round=16, rounds=2, reuse=4),
         "data": ShapeData(validation=16),
     },
 }

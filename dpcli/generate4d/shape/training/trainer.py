@@ -106,7 +106,7 @@ class ShapeTrainer:
             group["lr"] = self._learning_rate()
         rng = generator(self.seed, Generate4DStream.SHAPE_STEP, self.step)
         batch = window.draw(self.schedule.batch, rng)
-        guessed = torch.from_numpy(rng.random(self.schedule.batch) < _GUESSED)
+        guessed = torch.from_numpy(rng.random(min(self.schedule.decoded, self.schedule.batch)) < _GUESSED)
         with reduced_products(torch.device("cpu"), self.schedule.bfloat16):
             loss, parts = shape_loss(self.model, batch, guessed)
         self.optimizer.zero_grad(set_to_none=True)
@@ -115,8 +115,8 @@ class ShapeTrainer:
             self.optimizer.step()
         keep = min(_MEMORY, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
-            for mean, now in zip(self.mean.parameters(), self.model.parameters()):
-                mean.lerp_(now, 1 - keep)
+            for mean, now in zip(self.mean.state_dict().values(), self.model.state_dict().values()):
+                mean.lerp_(now, 1 - keep) if mean.is_floating_point() else mean.copy_(now)
         for key, value in {"steps": 1.0, "loss": loss.detach(), **parts}.items():
             self.sums[key] = self.sums.get(key, 0.0) + float(value)
         self.step += 1
@@ -171,7 +171,6 @@ def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> tuple[dict[st
         turned.append((angles - object_angles(part.depth))[:, 0].abs().rad2deg())
         claimed.append(encoded.gain)
         gained.append(gain_of(error, part))
-    model.train(False)
     means = [float(torch.cat(parts).mean()) for parts in (errors, plain, turned)]
     confidence = calibrate(torch.cat(claimed).numpy(), (torch.cat(gained) > 0).numpy().astype(np.float64))
     return dict(zip(("validation_loss", "validation_inflated", "validation_angle"), means)), confidence
