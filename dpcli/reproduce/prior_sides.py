@@ -1,4 +1,4 @@
-"""What a shape prior shows from the sides, without any fit, on models of body plans that it never learned from.
+"""The sides that a shape prior shows, without any fit, of models of body plans that it never learned from.
 
     python -m dpcli.reproduce.prior_sides MESHES OUT [--models network,folder,...] [--clips animals_pack/Fox.glb:Walk,...]
 
@@ -90,7 +90,9 @@ def true_layers(caster: FrameCaster, camera: Camera, picture: np.ndarray) -> Sha
         color[layer, ray[own]] = shown[own]
     depth = depth.T.reshape(4, height, width)
     presence = (~np.isnan(depth[::2])).astype(np.float32)
-    return ShapeLayers(np.nan_to_num(depth).astype(np.float32), presence, color.transpose(0, 2, 1).reshape(4, 3, height, width))
+    return ShapeLayers(
+        np.nan_to_num(depth).astype(np.float32), presence, color.transpose(0, 2, 1).reshape(4, 3, height, width)
+    )
 
 
 def compare(shown: np.ndarray, truth: np.ndarray) -> tuple[float, float]:

@@ -33,7 +33,7 @@ def train_prior(
     """
     settings = ShapeTraining(**CATALOG.resolve(PRESETS[str(given.preset)], given))
     from dpcli.generate4d.commands.train_prior import check_sizes, train_shape_prior
-    from dpcli.prepare.meshes.shape_pictures import find_meshes, picture_sources
+    from dpcli.prepare.synthetic.shape_pictures import find_meshes, picture_sources
 
     check_sizes(settings)
     learned, held = find_meshes(meshes or [], settings.data.held_out)

@@ -58,9 +58,7 @@ def train_shape_prior(
         weights = sum(value.numel() for value in model.parameters())
         log.info(f"{weights:,} weights; {len(kept.rgba)} pictures for validation; {settings.schedule.steps} steps")
         batch = kept.take(range(len(kept.rgba)))
-        trainer = ShapeTrainer(
-            model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop
-        )
+        trainer = ShapeTrainer(model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop)
         return trainer.run()
 
 
@@ -68,7 +66,9 @@ def check_sizes(settings: ShapeTraining) -> None:
     """Raises UsageError where the pictures can't be halved as often as the network has levels."""
     factor, size = 2 ** len(settings.network.widths), settings.schedule.size
     if size % factor:
-        raise UsageError(f"size = {size}: expected a multiple of {factor}, as the network has {len(settings.network.widths)} levels")
+        raise UsageError(
+            f"size = {size}: expected a multiple of {factor}, as the network has {len(settings.network.widths)} levels"
+        )
 
 
 def _start(settings: ShapeTraining, folder: RunFolder) -> ShapeNetwork:

@@ -142,13 +142,7 @@ def _shrink(picture: np.ndarray, place: _CutOut, size: int) -> Tensor:
 
 
 def _expand(
-    depth: Tensor,
-    second: Tensor,
-    mask: Tensor,
-    picture: np.ndarray,
-    place: _CutOut,
-    camera: Camera,
-    confidence: float,
+    depth: Tensor, second: Tensor, mask: Tensor, picture: np.ndarray, place: _CutOut, camera: Camera, confidence: float
 ) -> ShapeLayers:
     """Returns the layers of a whole picture (4,H,W) from those of its cut-out: depth (4,S,S), second and mask (S,S)."""
     weight = mask[None, None] + 1e-4  # outside the silhouette depths mean little

@@ -38,5 +38,7 @@ def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
     tensors, header = load_weights(path, _FORMAT, _MAKER)
     model = ShapeNetwork(ShapeConfig.from_json(header["config"]))
-    load_state(model, {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}, path)
+    load_state(
+        model, {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}, path
+    )
     return model.eval(), json.loads(header["notes"])

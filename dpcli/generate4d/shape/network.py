@@ -103,7 +103,9 @@ class ShapeNetwork(nn.Module):
     def likely_angles(self, logits: Tensor) -> Tensor:
         """Returns the angles (...) of the most likely bins of logits (...,bins), the mean of that bin and its neighbors."""
         share = logits.softmax(-1)
-        near = (self.centers - self.centers[share.argmax(-1)][..., None]).abs() < 1.5 * (self.centers[1] - self.centers[0])
+        near = (self.centers - self.centers[share.argmax(-1)][..., None]).abs() < 1.5 * (
+            self.centers[1] - self.centers[0]
+        )
         return (share * near * self.centers).sum(-1) / (share * near).sum(-1)
 
     def angle_targets(self, angles: Tensor) -> Tensor:

@@ -140,7 +140,9 @@ def _pair_of_legs(
         ankle = np.array([*(top + out)[[0]], 0.12 * animal.leg, (top + out)[2] + ahead])
         sole = ankle + [0, -0.1 * animal.leg, foot]
         name = f"leg_{pair}_{side}"
-        animal.limb(name, f"spine_{min(k, 2)}", [top, knee, ankle, sole], [1.2 * thick, 0.8 * thick, 0.5 * thick, 0.5 * thick])
+        animal.limb(
+            name, f"spine_{min(k, 2)}", [top, knee, ankle, sole], [1.2 * thick, 0.8 * thick, 0.5 * thick, 0.5 * thick]
+        )
 
 
 def _pair_of_arms(

@@ -1,4 +1,4 @@
-"""What a shape network learns from: true layers, their differences, the angles of the whole, and its own gain."""
+"""The losses of a shape network: errors of layers and of their differences, the angles of the whole, its own gain."""
 
 from __future__ import annotations
 
@@ -33,10 +33,7 @@ def object_angles(depth: Tensor) -> Tensor:
     toward = mean(offset * middle[:, None])
     determinant = variance[:, 0] * variance[:, 1] - across.square()
     slope = torch.stack(
-        [
-            variance[:, 1] * toward[:, 0] - across * toward[:, 1],
-            variance[:, 0] * toward[:, 1] - across * toward[:, 0],
-        ],
+        [variance[:, 1] * toward[:, 0] - across * toward[:, 1], variance[:, 0] * toward[:, 1] - across * toward[:, 0]],
         1,
     )
     return (slope / determinant[:, None]).atan()

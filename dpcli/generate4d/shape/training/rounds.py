@@ -81,9 +81,7 @@ class Window:
 
 
 @contextmanager
-def open_window(
-    make: MakeViews, count: int, kept: int, at: int, end: int, jobs: int
-) -> Iterator[Window]:
+def open_window(make: MakeViews, count: int, kept: int, at: int, end: int, jobs: int) -> Iterator[Window]:
     """Opens the window as it stands before round `at` is taken; `end`: the number of rounds. jobs: processes that make them."""
     made = ordered_map(partial(make_round, make, count), range(max(at - kept + 1, 0), end), jobs)
     try:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
 from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_clips
 from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
@@ -93,11 +93,15 @@ def find_meshes(places: Sequence[Path], held_out: str | None) -> tuple[list[Mesh
     a folder has none, or a line names none.
     """
     paths = [path for place in places for path in _models_in(place)]
+    if held_out and not Path(held_out).is_file():
+        raise UsageError(f"--held-out {held_out}: no such file")
     text = Path(held_out).read_text() if held_out else ""
     ends = [end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end]
     for end in ends:
         if not any(_ends_with(path, end) for path in paths):
-            raise DataError(f"{held_out}: {end} is none of the {len(paths)} models; name paths, or ends of paths, below them")
+            raise DataError(
+                f"{held_out}: {end} is none of the {len(paths)} models; name paths, or ends of paths, below them"
+            )
     files = [MeshFile(path, names_of_clips(path)) for path in paths]
     held = [file for file in files if any(_ends_with(file.path, end) for end in ends)]
     return [file for file in files if file not in held], held
@@ -107,6 +111,8 @@ def _models_in(place: Path) -> list[Path]:
     """Returns the models that a file or folder holds, in order."""
     if place.is_file():
         return [place]
+    if not place.is_dir():
+        raise UsageError(f"{place}: no such file or folder")
     found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
     if not found:
         raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")
@@ -122,7 +128,9 @@ def made_creature(rng: np.random.Generator) -> AnimatedMesh:
     animal = wild_creature(rng)
     body = make_skin(animal, rng, _CELLS)
     moved = bone_motion(animal, wild_turns(animal, _POSES, rng), np.zeros((_POSES, 3)))
-    positions, normals = skin(body.vertices, vertex_normals(body.vertices, body.triangles), body.bones, body.weights, moved)
+    positions, normals = skin(
+        body.vertices, vertex_normals(body.vertices, body.triangles), body.bones, body.weights, moved
+    )
     return AnimatedMesh(
         name="creature",
         time=np.arange(_POSES, dtype=float),
