@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -130,6 +131,14 @@ def score_clip(mesh: AnimatedMesh, priors: dict[str, ShapePrior], size: int) -> 
     return found
 
 
+def find_model(folder: Path, end: str) -> Path:
+    """Returns the first model below a folder whose path ends so; ends the program where there is none."""
+    found = [path for path in sorted(folder.rglob(Path(end).name)) if path.as_posix().endswith(f"/{end}")]
+    if not found:
+        sys.exit(f"{folder}: no {end} below it")
+    return found[0]
+
+
 def table(scores: dict[str, dict[str, dict]]) -> str:
     """Returns markdown: a line per prior, a pair of columns per role; means over clips, with a 95 % interval of the IoU."""
     names = list(next(iter(scores.values())))
@@ -160,7 +169,7 @@ def main(load: Callable[[str], ShapePrior] = Network) -> None:
     scores = {}
     for word in given.clips.split(","):
         path, clip = word.split(":")
-        mesh = load_animation(given.meshes / path, clip, given.frames)
+        mesh = load_animation(find_model(given.meshes, path), clip, given.frames)
         for role, yaw in ROLES.items():
             scores[f"{word} {role}"] = score_clip(normalized(mesh, OBJECT_RADIUS, np.radians(yaw)), priors, given.size)
     given.out.mkdir(parents=True, exist_ok=True)
