@@ -17,6 +17,7 @@ from dpcli.generate4d.shape.training.confidence import probability
 
 _FILL = 0.89  # of the cut-out's side is filled by the object, as in training
 _TURN_COST = 1.0  # logarithm of probability, for an object that turns by one bin from a frame to the next
+_INDEPENDENT = 4  # frames
 
 
 @dataclass(frozen=True)
@@ -92,28 +93,24 @@ class Network:
 
 
 def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
-    """Returns the angles (T,2) of a clip's frames that are likely together: logits (T,2,bins), turns cost (Viterbi).
+    """Returns the mean angles (T,2) of a clip's frames, each in the light of all: logits (T,2,bins).
 
-    What a single picture leaves open, such as which way the object faces, is thus decided once.
+    A picture that leaves open which way the object faces is thus decided by others. Frames of a clip err alike, so that
+    together they count as at most _INDEPENDENT of them.
     """
-    return torch.stack([_likely_path(model, logits[:, axis]) for axis in range(2)], 1)
+    evidence = logits.log_softmax(-1) * min(1.0, _INDEPENDENT / len(logits))
+    bins = torch.arange(logits.shape[-1])
+    turns = -_TURN_COST * (bins[:, None] - bins).abs()
+    before, after = _passed_on(evidence, turns), _passed_on(evidence.flip(0), turns).flip(0)
+    return model.mean_angles(before + evidence + after)
 
 
-def _likely_path(model: ShapeNetwork, logits: Tensor) -> Tensor:
-    """Returns angles (T) along the path of bins with the largest sum of logits (T,bins) less the cost of turns."""
-    bins = torch.arange(logits.shape[1])
-    cost = _TURN_COST * (bins[:, None] - bins).abs()
-    best, came = logits[0], []
-    for row in logits[1:]:
-        total, source = (best - cost).max(1)
-        came.append(source)
-        best = total + row
-    path = [int(best.argmax())]
-    for source in reversed(came):
-        path.append(int(source[path[-1]]))
-    near = (bins - torch.tensor(path[::-1])[:, None]).abs() <= 1
-    share = logits.softmax(-1) * near
-    return (share * model.centers).sum(-1) / share.sum(-1)
+def _passed_on(evidence: Tensor, turns: Tensor) -> Tensor:
+    """Returns what the frames before each one say about it, logits (T,2,bins): the forward half of a chain's marginals."""
+    said = [torch.zeros_like(evidence[0])]
+    for row in evidence[:-1]:
+        said.append(torch.logsumexp((said[-1] + row)[..., :, None] + turns, -2))
+    return torch.stack(said)
 
 
 def _place(mask: np.ndarray) -> _CutOut | None:

@@ -100,13 +100,9 @@ class ShapeNetwork(nn.Module):
         out = functional.pixel_shuffle(self.out(x), 2).float()
         return out[:, :LAYERS] + inflated_layers(pictures[:, 4]) + tilted_plane(angles, out.shape[-1]), out[:, LAYERS]
 
-    def likely_angles(self, logits: Tensor) -> Tensor:
-        """Returns the angles (...) of the most likely bins of logits (...,bins), the mean of that bin and its neighbors."""
-        share = logits.softmax(-1)
-        near = (self.centers - self.centers[share.argmax(-1)][..., None]).abs() < 1.5 * (
-            self.centers[1] - self.centers[0]
-        )
-        return (share * near * self.centers).sum(-1) / (share * near).sum(-1)
+    def mean_angles(self, logits: Tensor) -> Tensor:
+        """Returns the mean angles (...) that logits (...,bins) stand for: where two answers are as likely, none is taken."""
+        return (logits.softmax(-1) * self.centers).sum(-1)
 
     def angle_targets(self, angles: Tensor) -> Tensor:
         """Returns the shares (...,bins) that the bins of true angles (...) get: the two nearest, linearly."""

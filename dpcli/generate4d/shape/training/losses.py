@@ -63,7 +63,7 @@ def shape_loss(model: ShapeNetwork, batch: Batch, guessed: Tensor) -> tuple[Tens
     encoded, count = model.encode(batch.pictures), len(guessed)
     truth = object_angles(batch.depth)
     angles = -(model.angle_targets(truth) * encoded.angles.log_softmax(-1)).sum(-1).mean()
-    own = model.likely_angles(encoded.angles.detach())
+    own = model.mean_angles(encoded.angles.detach())
     encoded = Encoded([level[:count] for level in encoded.levels], encoded.angles[:count], encoded.gain[:count])
     batch = Batch(batch.pictures[:count], batch.depth[:count])
     chosen = torch.where(guessed[:, None], own[:count], truth[:count])

@@ -164,7 +164,7 @@ def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> tuple[dict[st
     for start in range(0, len(held.pictures), batch):
         part = Batch(*(tensor[start : start + batch] for tensor in held))
         encoded = model.encode(part.pictures)
-        angles = model.likely_angles(encoded.angles)
+        angles = model.mean_angles(encoded.angles)
         error = depth_error(model.decode(encoded, part.pictures, angles)[0], part.depth)
         errors.append(error)
         plain.append(depth_error(inflated_layers(part.pictures[:, 4]), part.depth))
