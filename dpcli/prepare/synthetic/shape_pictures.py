@@ -23,8 +23,8 @@ from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import PrepareStream, generator
 
-_POSES, _CELLS = 6, 56  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
-_PER_MESH = 16  # pictures of one mesh in a round
+_POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
+_PER_MESH = 6  # pictures of one mesh in a round
 _MOST_TRIANGLES = 200_000  # larger models are passed over: one would hold up all others
 
 

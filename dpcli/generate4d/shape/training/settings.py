@@ -19,9 +19,9 @@ class ShapeSchedule:
     decoded: int = setting(16, "Pictures of each step in which the layers are learned, too: the easier part.", least=1)
     size: int = setting(64, "Side of the pictures, pixels; a multiple of 2 to the number of levels.", least=16)
     lr: float = setting(2e-3, "Largest learning rate; it falls to zero as a cosine.", above=0)
-    round: int = setting(1024, "Pictures that are made at a time.", least=1)
-    rounds: int = setting(12, "Rounds of pictures that are kept.", least=1)
-    reuse: int = setting(10, "Times that a picture is seen.", least=1)
+    round: int = setting(1024, "Pictures that are made at a time; a training begins with four times as many.", least=1)
+    rounds: int = setting(24, "Rounds of pictures that are kept.", least=1)
+    reuse: int = setting(6, "Times that a picture is seen.", least=1)
     bfloat16: bool = setting(False, "Matrix products in bfloat16: faster on processors that have it.")
 
     def __post_init__(self) -> None:
