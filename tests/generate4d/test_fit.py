@@ -101,7 +101,9 @@ def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):
     mask = axis[:, None] ** 2 + axis**2 < 0.3**2
     rgba = np.where(mask[..., None], np.uint8([200, 60, 20, 255]), np.uint8(0))
     pose, lens = orbit_pose(0.5, 0.1), pinhole(DEFAULT_FOVY, SIZE, SIZE)
-    with ViewsWriter(path, ViewsHeader("ball", lens[None], pose[None], np.zeros(1), ["reference"], 0, (SIZE, SIZE))) as w:
+    with ViewsWriter(
+        path, ViewsHeader("ball", lens[None], pose[None], np.zeros(1), ["reference"], 0, (SIZE, SIZE))
+    ) as w:
         w.add(0, 0, rgba)
     radius = 0.3 * SIZE / lens[0, 0] * 2
     for prior in ("auto", "none"):
@@ -156,7 +158,11 @@ def test_what_is_wrong_is_said(tmp_path, dpc_here):
     for code, words, arguments in (
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
         (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
-        (3, "no weights of a shape network", (views, "-o", tmp_path / "a.h5", "--prior", "network")),
+        (
+            2,
+            "--prior-model nosuch: no such file",
+            (views, "-o", tmp_path / "a.h5", "--prior", "network", "--prior-model", "nosuch"),
+        ),
         (2, "prior = magic: expected one of", (views, "-o", tmp_path / "a.h5", "--prior", "magic")),
         (2, "preset = slow: expected one of", (views, "-o", tmp_path / "a.h5", "--preset", "slow")),
         (2, "--run FOLDER", (views, "-o", "-", "--preset", "tiny")),

@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from dpcli.generate4d.shape.network import ShapeConfig, ShapeNetwork
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
 
 _FORMAT, _MAKER = "dpc-shape-1", "dpc generate4d train-prior"

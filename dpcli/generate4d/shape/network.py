@@ -7,43 +7,17 @@ angles for all its frames together, and training decodes at the true ones, so th
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dpcli.runtime.settings.fields import check, setting
+from dpcli.generate4d.shape.config import ShapeConfig
 
 LAYERS = 4  # front_1, back_1, front_2, back_2
 _REACH = 1.25  # radians, the outermost bins of an angle
 _CELLS = 3  # the coarsest features are pooled to so many cells along a side before the angles are named
-
-
-@dataclass(frozen=True)
-class ShapeConfig:
-    """Holds the sizes of a shape network."""
-
-    widths: tuple[int, ...] = setting(
-        (24, 64, 128, 192), "Channels of the levels; the first works at half of the pictures' size.", least=1
-    )
-    hidden: int = setting(128, "Width of the layers that name the angles.", least=1)
-    bins: int = setting(15, "Bins of each angle.", least=2)
-
-    def __post_init__(self) -> None:
-        check(self)
-
-    def to_json(self) -> str:
-        """Returns the text that a weights file keeps."""
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> ShapeConfig:
-        """Returns the sizes that `to_json` wrote."""
-        values = json.loads(text)
-        return cls(**{**values, "widths": tuple(values["widths"])})
 
 
 class Encoded(NamedTuple):

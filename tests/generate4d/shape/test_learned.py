@@ -7,10 +7,11 @@ import pytest
 import torch
 
 from dpcli.errors import DataError, UsageError
+from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.layers import Camera, points_of
 from dpcli.generate4d.shape.learned import Network
 from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
-from dpcli.generate4d.shape.network import ShapeConfig, ShapeNetwork
+from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.silhouette import Inflated
 from dpcli.ops.cameras import orbit_pose, pinhole
 from dpcli.runtime.weights import save_weights

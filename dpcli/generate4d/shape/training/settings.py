@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from dpcli.generate4d.shape.network import ShapeConfig
+from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.runtime.settings.catalog import Catalog
 from dpcli.runtime.settings.fields import check, setting
 

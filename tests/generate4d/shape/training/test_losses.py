@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.learned import choose_angles
-from dpcli.generate4d.shape.network import ShapeConfig, ShapeNetwork, tilted_plane
+from dpcli.generate4d.shape.network import ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.training.confidence import calibrate, probability
 from dpcli.generate4d.shape.training.losses import depth_error, object_angles
 
