@@ -25,7 +25,9 @@ from dpcli.runtime.seeds import PrepareStream, generator
 
 _POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
 _PER_MESH = 6  # pictures of one mesh in a round
-_MOST_TRIANGLES = 200_000  # larger models are passed over: one would hold up all others
+_MOST_MISSES = 200  # models in a row that show nothing
+_SAID: set[str] = set()  # what was said of models in this process
+_MOST_TRIANGLES = 200_000  # larger models are passed over, since one would hold up all others
 
 
 @dataclass(frozen=True)
@@ -49,16 +51,22 @@ class PictureSource:
     moving: float = 0.35
 
     def make(self, number: int, count: int) -> LayeredViews:
-        """Makes the `count` pictures of a round, in random order."""
+        """Makes the `count` pictures of a round, in random order. Raises DataError where no model shows anything."""
         rng = generator(self.seed, PrepareStream.SHAPE_PICTURES, number)
-        parts, have = [], 0
+        parts, have, misses = [], 0, 0
         while have < count:
-            mesh = self._draw_mesh(rng)
-            if mesh is None or len(mesh.triangles) > _MOST_TRIANGLES:
-                continue
-            views = draw_views(_recolored(mesh, rng), _PER_MESH, self.size, rng)
-            parts.append(views)
-            have += len(views.rgba)
+            with log.each_once(_SAID):
+                mesh = self._draw_mesh(rng)
+            views = draw_views(_recolored(mesh, rng), _PER_MESH, self.size, rng) if mesh is not None else None
+            if views is not None and len(views.rgba):
+                parts.append(views)
+                have += len(views.rgba)
+            else:
+                misses += 1
+                if misses > _MOST_MISSES and not have:
+                    raise DataError(
+                        f"none of {misses} models drawn shows anything; are these {len(self.files)} models whole?"
+                    )
         order = rng.permutation(have)[:count]
         return LayeredViews(
             np.concatenate([part.rgba for part in parts])[order], np.concatenate([part.depth for part in parts])[order]
@@ -162,7 +170,10 @@ def _read(file: MeshFile, rng: np.random.Generator) -> AnimatedMesh | None:
     try:
         mesh = load_still(file.path) if clip is None else load_animation(file.path, clip, _POSES)
     except DataError as error:
-        log.detail(f"left out: {error}")
+        log.warn(f"left out: {error}")
+        return None
+    if len(mesh.triangles) > _MOST_TRIANGLES:
+        log.warn(f"left out: {file.path}: {len(mesh.triangles):,} triangles, expected at most {_MOST_TRIANGLES:,}")
         return None
     stretch = np.exp(0.12 * rng.normal(size=3)).astype(np.float32)
     return replace(mesh, positions=mesh.positions * stretch)

@@ -75,3 +75,15 @@ def test_mistakes_are_said(models):
     (models / "empty").mkdir()
     with pytest.raises(DataError, match="no .glb or .gltf"):
         find_meshes([models / "empty"], None)
+
+
+def test_a_model_that_cannot_be_drawn_is_said_once_and_ends_when_there_is_no_other(tmp_path, capsys):
+    flat = quad()
+    del flat.tree["animations"]
+    flat.tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = 99  # there is no such accessor
+    flat.write(tmp_path / "flat.glb")
+    learned, _ = find_meshes([tmp_path], None)
+    with pytest.raises(DataError, match="shows anything"):
+        PictureSource(tuple(learned), 16, 0, made=0.0, moving=0.0).make(0, 4)
+    assert capsys.readouterr().err.count("left out") == 1
+    assert len(PictureSource(tuple(learned), 16, 0, made=0.9, moving=0.0).make(0, 12).rgba) == 12
