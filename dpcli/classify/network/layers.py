@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -73,7 +75,16 @@ class GlobalHead(SharedLayers):
 
     def forward(self, centers: Tensor, features: Tensor) -> Tensor:
         """Returns the class logits (B,C) of centers (B,M,3) with features (B,M,F)."""
-        return self.classify(self.dropout(self.embed(centers, features)))
+        return clip_by_clip(self.classify, self.dropout(self.embed(centers, features)), self.training)
+
+
+def clip_by_clip(layers: Callable[[Tensor], Tensor], rows: Tensor, training: bool) -> Tensor:
+    """Returns `layers(rows)` (B,C) of one row for each clip (B,F).
+
+    Outside of training a clip's result doesn't depend, to the bit, on the clips beside it: a product of so few rows is
+    rounded by their number, so each row has a product of its own.
+    """
+    return layers(rows) if training else torch.cat([layers(row) for row in rows.split(1)])
 
 
 def he_init(module: nn.Module) -> None:

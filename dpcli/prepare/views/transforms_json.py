@@ -52,7 +52,11 @@ def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     """Returns options and digests of everything read, for provenance."""
     _check(options)
     views, times = _grid(path)
-    config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
+    config = {
+        key: str(value) if isinstance(value, Path) else value
+        for key, value in asdict(options).items()
+        if key != "pattern"
+    }
     config["input_digest"] = digest_of(view.paths[time] for view in views for time in times)
     masks = [view.masks[time] for view in views for time in times if time in view.masks]
     return {**config, "mask_digest": digest_of(masks)} if masks else config
@@ -60,8 +64,10 @@ def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
 
 def _check(options: VideoOptions) -> None:
     options.check()
-    if options.views or options.mask:
-        raise UsageError("--views and --mask belong to clips without cameras; transforms_*.json lists all views itself")
+    if options.views or options.mask or options.pattern:
+        raise UsageError(
+            "--views, --mask and --pattern belong to clips without cameras; transforms_*.json lists all views itself"
+        )
 
 
 def transforms_clip(path: Path, options: VideoOptions) -> Clip:

@@ -103,7 +103,7 @@ class ClipIndex:
         if is_transforms(self.clip):
             transforms_config(self.clip, self.options)  # finds every picture that the lists name
             return [Item(clip_name(self.clip), self.clip)]
-        frames = open_frames(self.clip)
+        frames = open_frames(self.clip, self.options.pattern)
         if self.options.mask:
             find_masks(frames, self.options.mask)
         find_given_views(frames, spread_frames(len(frames), self.options.frames), self.options)

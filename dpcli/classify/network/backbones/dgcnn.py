@@ -14,7 +14,7 @@ from torch.nn.functional import batch_norm, linear
 from dpcli.classify.network.backbones.frame_graph import frame_graph, pool_edges
 from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.network.layers import SharedLayers
+from dpcli.classify.network.layers import SharedLayers, clip_by_clip
 from dpcli.classify.network.sync_norm import SyncNorm
 from dpcli.errors import UsageError
 from dpcli.ops import gather_points
@@ -97,6 +97,9 @@ class DenseHead(nn.Module):
 
     def forward(self, values: Tensor) -> Tensor:
         """Returns the logits (B,classes) of features (B,inputs)."""
+        return clip_by_clip(self._logits, values, self.training)
+
+    def _logits(self, values: Tensor) -> Tensor:
         for layer in self.hidden:
             values = self.dropout(layer(values))
         return self.classify(values)
@@ -194,7 +197,7 @@ class InputTransform(nn.Module):
     def forward(self, points: Tensor, idx: Tensor) -> Tensor:
         """Points (B,N,3), neighbors (B,N,K) -> points (B,N,3) times the matrix."""
         pooled = self.point.pool(self.edges.pool(points, points, idx, points))
-        matrix = self.matrix(self.hidden(pooled)).view(-1, 3, 3)
+        matrix = clip_by_clip(lambda row: self.matrix(self.hidden(row)), pooled, self.training).view(-1, 3, 3)
         return full_precision(torch.matmul)(points, matrix + torch.eye(3).to(matrix))
 
 
