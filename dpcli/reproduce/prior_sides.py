@@ -2,7 +2,7 @@
 
     python -m dpcli.reproduce.prior_sides MESHES OUT [--models network,folder,...] [--clips animals_pack/Fox.glb:Walk,...]
 
-MESHES: the folder of models. One view of a clip, in profile and from the front, becomes layers by each prior; the columns
+MESHES: the folder of models. One view of a clip, in profile, obliquely and from the front, becomes layers by each prior; the columns
 between fronts and backs are drawn from four azimuths that no prior saw: PSNR on white and IoU of the silhouettes. The
 row `oracle` has the true layers.
 """
@@ -34,7 +34,7 @@ CLIPS = (
     "further/Robot.glb:Robot_Walking,further/Robot.glb:Robot_Dance"
 )
 SIDES = (15.0, -75.0, 105.0, -165.0)
-ROLES = {"profile": 90.0, "front": 0.0}  # yaw of the model, degrees
+ROLES = {"profile": 90.0, "oblique": 45.0, "front": 0.0}  # yaw of the model, degrees
 
 
 def columns_of(layers: ShapeLayers, camera: Camera, step: float) -> tuple[np.ndarray, np.ndarray]:
