@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material, Texture
 from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 
 _MOST = 20_000  # points that a surface is made of
 _REACH = 3.0  # of an alpha shape's balls, in distances between neighboring points: wide enough to close, thin enough for holes

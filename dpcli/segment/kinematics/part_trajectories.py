@@ -1,4 +1,4 @@
-"""Where each part is in every frame, seen from frame 0: the pairwise motions of a parts file made one."""
+"""Makes the motions of all pairs of frames one: each part's motion from frame 0 to every frame."""
 
 from __future__ import annotations
 
