@@ -14,6 +14,7 @@ from dpcli.ops import fps, three_nn_interpolate
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.frame_pairs import choose_points, sequence_scale
+from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
 from dpcli.segment.prediction_settings import Refinement
@@ -54,11 +55,10 @@ def predict_parts(
     frames = _prepare_frames(clouds, index, options, seed)
     reported, place = pairs_to_report(len(clouds), options.pairs), {t: n for n, t in enumerate(frames.numbers)}
     pairs = [(place[i], place[j]) for i, j in reported if i in place and j in place]
-    flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
-    masks = _refine_masks(frames.thin, flows, masks, options)
+    masks, motions = _find_masks_and_motions(frames.thin, pairs, segmenter, estimate, options)
     full = [_carry_back(cloud, few, mask) for cloud, few, mask in zip(frames.whole, frames.thin, masks)]
     labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
-    motion, flow = _find_motions(frames, masks, full, flows, pairs, options.icp)
+    motion, flow = _in_input_units(frames, masks, full, motions, pairs)
     if len(pairs) < len(reported):
         known = [(frames.numbers[i], frames.numbers[j]) for i, j in pairs]
         motion, flow = _add_still_pairs(reported, known, clouds, motion, flow)
@@ -96,6 +96,22 @@ def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
         return cloud if len(cloud) >= _FEWEST else cloud[choose_points(len(cloud), _FEWEST, rng)]
     some = cloud[np.sort(choose_points(len(cloud), min(len(cloud), _SPREAD * most), rng))]
     return some[fps(some[None], most)[0]]
+
+
+def _find_masks_and_motions(
+    frames: list[Tensor], pairs: Pairs, segmenter: Segmenter, estimate: Estimate, options: Refinement
+) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
+    """Returns the masks (N_t,S) and for every pair the motions (S,3,3), (S,3).
+
+    They come from one explanation of all frames, or, pair by pair, from flows and the masks of single frames.
+    """
+    if isinstance(segmenter, MultibodySegmenter):
+        with torch_threads(1):
+            masks, motions = segmenter.explain(frames, pairs)
+        return masks, [motions[pair] for pair in pairs]
+    flows, masks = _find_flows_and_masks(frames, pairs, estimate, segmenter)
+    masks = _refine_masks(frames, flows, masks, options)
+    return masks, fit_part_motions(frames, masks, flows, pairs, options.icp)
 
 
 def _find_flows_and_masks(
@@ -163,13 +179,13 @@ def _carry_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
     return spread / spread.sum(1, keepdim=True).clamp(min=1e-12)
 
 
-def _find_motions(
-    frames: _Frames, masks: list[Tensor], full: list[Tensor], flows: Flows, pairs: Pairs, steps: int
+def _in_input_units(
+    frames: _Frames, masks: list[Tensor], full: list[Tensor], motions: list[tuple[Tensor, Tensor]], pairs: Pairs
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns motions f32 (Q,S,4,4) in the input's own coordinates and the flow of all points, pair by pair."""
     slots, center = masks[0].shape[1], torch.from_numpy(frames.center)
     motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
-    for q, ((i, _), own) in enumerate(zip(pairs, fit_part_motions(frames.thin, masks, flows, pairs, steps))):
+    for q, ((i, _), own) in enumerate(zip(pairs, motions)):
         flow.append(part_flow(frames.whole[i], full[i], own, frames.scale))
         motion[q] = motion_in_input_units(own, masks[i], frames.scale, center)
     return motion, flow

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 from dpcli.runtime.settings.catalog import Catalog
 from dpcli.runtime.settings.fields import check, setting
 from dpcli.segment.baselines.settings import ClassicalSettings
+from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.network.config import Precision
 
 
@@ -53,6 +54,13 @@ class PredictSettings(NamedTuple):
     classical: ClassicalSettings = ClassicalSettings()
     refinement: Refinement = Refinement()
     precision: Precision = Precision()
+    multibody: MultibodySettings = MultibodySettings()
 
 
-CATALOG = Catalog(input=InputSettings, classical=ClassicalSettings, refinement=Refinement, precision=Precision)
+CATALOG = Catalog(
+    input=InputSettings,
+    classical=ClassicalSettings,
+    refinement=Refinement,
+    precision=Precision,
+    multibody=MultibodySettings,
+)

@@ -17,6 +17,7 @@ from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
+from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.model_file import default_model
 from dpcli.segment.prediction import Estimate, predict_parts
 from dpcli.segment.prediction_settings import PredictSettings, Refinement
@@ -70,8 +71,10 @@ def predict_file(
         sequences = sequences_of_split(reader, settings.input.split, data)
         estimator = find_estimator(settings.input.flow)
         said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
-        if settings.classical.method is not None:
+        if settings.classical.classical:
             said["classical"] = settings.classical.used()
+        elif settings.classical.method == "multibody":
+            said["multibody"] = asdict(settings.multibody)
         config = {"settings": said, **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         history = [*reader.provenance, provenance.record(config, seed, inputs)]
@@ -98,10 +101,12 @@ def predict_file(
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:
     """Returns the segmenter that the options ask for. Raises UsageError for options that contradict one another."""
     classical, chosen = settings.classical, choose_device(device)
-    if classical.method is None:
+    if classical.method == "network":
         return NetworkSegmenter.load(model or default_model(), chosen, wanted(settings.precision.amp, chosen))
     if model is not None:
         raise UsageError(f"--model {model}: --method {classical.method} uses no network; give one of both")
+    if classical.method == "multibody":
+        return MultibodySegmenter(settings.multibody)
     points = settings.refinement.points
     if classical.parts is not None and classical.parts > points:
         raise UsageError(

@@ -52,9 +52,7 @@ def label_points(
     around = 0.5 * cost + 0.5 * cost[frames.neighbors].mean(1)
     first = around.argmin(1) if start is None else start
     share = np.eye(len(bodies), dtype=np.float32)[first] * 0.8 + np.float32(0.2 / len(bodies))
-    mean_field_kernel(
-        cost, frames.neighbors, nearest, settings.border, settings.agreement, _TEMPERATURES, share
-    )
+    mean_field_kernel(cost, frames.neighbors, nearest, settings.border, settings.agreement, _TEMPERATURES, share)
     return measure(frames, bodies, share, settings, cost)
 
 

@@ -50,7 +50,9 @@ def find_hypotheses(frames: Frames) -> tuple[list[Hypothesis], PairMotions]:
 
 def _pairs(frames: int) -> list[tuple[int, int]]:
     """Returns the ordered pairs of frames in which bodies are searched."""
-    return [(t, u) for t in range(frames) for u in range(frames) if t != u and (frames <= _ALL_PAIRS or abs(t - u) == 1)]
+    return [
+        (t, u) for t in range(frames) for u in range(frames) if t != u and (frames <= _ALL_PAIRS or abs(t - u) == 1)
+    ]
 
 
 def _spread(seeds: list, frames: int) -> list:
