@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -96,16 +95,20 @@ def keep_different(frames: Frames, found: list[Hypothesis], known: list[Hypothes
     """Returns the hypotheses, in their order, that take their points elsewhere than all before and all known ones."""
     kept: list[Hypothesis] = []
     for one in found:
-        sample = one.points[:: max(1, len(one.points) // 24)]
-        ways = range(len(frames))
-        own = np.stack([move(relative_motion(one.trajectory, one.frame, u), sample) for u in ways])
-        apart: Callable[[Hypothesis], float] = lambda other: max(  # noqa: E731
-            np.linalg.norm(own[u] - move(relative_motion(other.trajectory, one.frame, u), sample), axis=1).mean()
-            for u in ways
-        )
-        if all(apart(other) > _ALIKE * frames.spacing for other in [*(known or []), *kept]):
+        others = [*(known or []), *kept]
+        if all(_distance(one, other) > _ALIKE * frames.spacing for other in others):
             kept.append(one)
     return kept[:_MOST]
+
+
+def _distance(one: Hypothesis, other: Hypothesis) -> float:
+    """Returns how far the other's trajectory takes the one's points from its own, on average, in the worst frame."""
+    sample, t = one.points[:: max(1, len(one.points) // 24)], one.frame
+    apart = [
+        move(relative_motion(one.trajectory, t, u) - relative_motion(other.trajectory, t, u), sample)
+        for u in range(len(one.trajectory))
+    ]
+    return max(float(np.linalg.norm(gap, axis=1).mean()) for gap in apart)
 
 
 def search_regions(
@@ -140,11 +143,8 @@ def _search_region(
         columns(points), starts, _STEPS, _WIDE, narrow, POINT_SHARE, frames.scales[u]
     )
     chosen = motion_proposals.choose_distinct(ends, score, points.astype(np.float64), 0.03, _KEPT)
-    steps = [relative_motion(body, a, b) for a, b in ((t, u),)]
-    return [
-        carry(frames, t, points, {**_with_body(motions, body, len(frames)), (t, u): np.stack([ends[h], *steps])})
-        for h in chosen
-    ]
+    more = _with_body(motions, body, len(frames))
+    return [carry(frames, t, points, {**more, (t, u): ends[h][None]}) for h in chosen]
 
 
 def _with_body(motions: PairMotions, body: Trajectory, frames: int) -> PairMotions:
