@@ -17,9 +17,10 @@ class InputSettings:
     """Holds which sequences are divided, and how the flow between their frames is estimated."""
 
     flow: str = setting(
-        "icp",
-        "Flow between frames: icp (rigid bodies), nearest (point), or the file or folder of a trained estimator"
-        " (dpc segment flow).",
+        "auto",
+        "Flow between frames: icp (rigid bodies), nearest (point), the file or folder of a trained estimator (dpc segment"
+        " flow), or tracks (the points' own identities, method multibody); auto: tracks where the file has them, else"
+        " icp.",
     )
     split: str = setting("all", "Sequences of this split, or all.")
 

@@ -69,7 +69,8 @@ def predict_file(
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         sequences = sequences_of_split(reader, settings.input.split, data)
-        estimator = find_estimator(settings.input.flow)
+        flow = _choose_flow(settings, reader)
+        estimator = find_estimator(flow)
         said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
         if settings.classical.classical:
             said["classical"] = settings.classical.used()
@@ -92,7 +93,7 @@ def predict_file(
                 force=force,
                 resume=True,
             ) as writer:
-                estimate = partial(estimate_flow_both_ways, method=str(estimator or settings.input.flow))
+                estimate = partial(estimate_flow_both_ways, method=str(estimator or flow))
                 _predict_sequences(reader, sequences, segmenter, estimate, refinement, seed, writer, fields)
         _draw(target, drawings)
     return len(sequences)
@@ -106,13 +107,32 @@ def _open_segmenter(settings: PredictSettings, model: str | None, device: str, s
     if model is not None:
         raise UsageError(f"--model {model}: --method {classical.method} uses no network; give one of both")
     if classical.method == "multibody":
-        return MultibodySegmenter(settings.multibody)
+        return MultibodySegmenter(settings.multibody, settings.input.flow in ("auto", "tracks"))
     points = settings.refinement.points
     if classical.parts is not None and classical.parts > points:
         raise UsageError(
             f"--parts {classical.parts}: more than the {points} points of a frame that are divided (--points)"
         )
     return ClassicalSegmenter(classical, seed)
+
+
+def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
+    """Returns the estimator of flow between frames, which multibody needs none of.
+
+    Raises UsageError for a flow that the method can't use, or tracks that the file lacks.
+    """
+    flow, method = settings.input.flow, settings.classical.method
+    if flow == "tracks" and method != "multibody":
+        raise UsageError(
+            f"--flow tracks: --method {method} doesn't read tracks; leave --method out, or give --flow icp"
+        )
+    if flow == "tracks" and "track" not in reader.fields:
+        raise UsageError(f"--flow tracks: {reader.path} has no field track; leave --flow out, and motions are searched")
+    if flow not in ("auto", "tracks", "icp") and method == "multibody":
+        raise UsageError(
+            f"--flow {flow}: multibody finds the motions itself; add --method network or a classical one, or leave it out"
+        )
+    return "icp" if flow in ("auto", "tracks") else flow
 
 
 def _already_there(target: Path, entry: dict) -> bool:

@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.segment.flow.surface_icp import Surface, columns
-from dpcli.segment.multibody.frames import Frames, Trajectory, compose, move, relative_motion
+from dpcli.segment.multibody.frames import Frames, Trajectory
 from dpcli.segment.multibody.label_kernels import mean_field_kernel, support_kernel
 from dpcli.segment.multibody.settings import MultibodySettings
 
 _TEMPERATURES = np.geomspace(0.2, 0.03, 10)
-_FEWEST = 6  # points of a frame that can hold a motion
 
 
 @dataclass
@@ -96,22 +94,7 @@ def refit(frames: Frames, found: Explanation, settings: MultibodySettings, own: 
     own: onto the body's own points only, not onto whole frames. tight: last residual of the ICP, in spacings.
     """
     bodies = [
-        body_of(frames, _refit_body(frames, body.trajectory, found.label == k, own, tight))
+        body_of(frames, frames.fit(body.trajectory, found.label == k, own, tight))
         for k, body in enumerate(found.bodies)
     ]
     return label_points(frames, bodies, settings, found.label)
-
-
-def _refit_body(frames: Frames, trajectory: Trajectory, inside: np.ndarray, own: bool, tight: float) -> Trajectory:
-    """Returns a body's trajectory, frame after frame brought to where its points (mask (N)) of other frames agree."""
-    trajectory = trajectory.copy()
-    points = [frames.points[frames.slice(t)][inside[frames.slice(t)]] for t in range(len(frames))]
-    for u in range(len(frames)):
-        others = [move(relative_motion(trajectory, t, u), points[t]) for t in frames.partners[u]]
-        source = np.concatenate(others)
-        if len(source) < _FEWEST or (own and len(points[u]) < 3 * _FEWEST):
-            continue
-        target = Surface(points[u]) if own else frames.surfaces[u]
-        step = target.icp(columns(source), np.eye(3, 4), 6, 2 * tight * frames.spacing, tight * frames.spacing)
-        trajectory[u] = compose(step, trajectory[u])
-    return trajectory

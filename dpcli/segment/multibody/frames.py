@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.flow.surface_icp import Surface
+from dpcli.segment.flow.surface_icp import Surface, columns
 
 _PARTNERS = 6  # other frames that a point is compared with, so that the cost stays linear in frames
 POINT_SHARE = 0.15  # of point-to-point distance in a residual, besides point to plane
 _OF_SPACING = 0.6  # residual that counts one half, in spacings of the points
+_FEWEST = 6  # points of a frame that can hold a motion
 
 Trajectory = np.ndarray  # (F,3,4): takes a body from its own coordinates to every frame
 
@@ -64,6 +65,23 @@ class Frames:
                 gap[own] += np.linalg.norm(move(apart, self.points[own]), axis=1)
             gap[own] /= len(others)
         return gap
+
+    def fit(self, trajectory: Trajectory, inside: np.ndarray, own: bool, tight: float) -> Trajectory:
+        """Returns a body's trajectory, frame after frame brought by ICP to where its points (mask (N)) of others agree.
+
+        own: onto the body's own points only, not onto the whole frame. tight: last residual of the ICP, in spacings.
+        """
+        trajectory = trajectory.copy()
+        points = [self.points[self.slice(t)][inside[self.slice(t)]] for t in range(len(self))]
+        for u in range(len(self)):
+            others = [move(relative_motion(trajectory, t, u), points[t]) for t in self.partners[u]]
+            source = np.concatenate(others)
+            if len(source) < _FEWEST or (own and len(points[u]) < 3 * _FEWEST):
+                continue
+            target = Surface(points[u]) if own else self.surfaces[u]
+            step = target.icp(columns(source), np.eye(3, 4), 6, 2 * tight * self.spacing, tight * self.spacing)
+            trajectory[u] = compose(step, trajectory[u])
+        return trajectory
 
 
 def choose_partners(t: int, frames: int) -> list[int]:

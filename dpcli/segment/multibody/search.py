@@ -4,33 +4,45 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.multibody.explanation import Body, Explanation, body_of, label_points, refit, without_empty
+from dpcli.segment.multibody.explanation import Explanation, body_of, label_points, refit, without_empty
 from dpcli.segment.multibody.frames import Frames
-from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses, keep_different, search_regions
+from dpcli.segment.multibody.hypotheses import Hypothesis, PairMotions, find_hypotheses, keep_different, search_regions
 from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.multibody.tracks import TrackedFrames, patch_hypotheses
 
 _TRIED = 4  # bodies tried on the whole per round
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
-def explain_sequence(clouds: list[np.ndarray], settings: MultibodySettings) -> Explanation:
-    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1."""
-    return Search(Frames(clouds), settings).run()
+def explain_sequence(
+    clouds: list[np.ndarray], settings: MultibodySettings, tracks: list[np.ndarray] | None = None
+) -> Explanation:
+    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1.
+
+    tracks: the identity i64 (n_t) of each point, which makes correspondences exact; none: they are searched.
+    """
+    if tracks is None:
+        return Search(Frames(clouds), settings).run()
+    frames = TrackedFrames(clouds, tracks, settings.flexible)
+    return Search(frames, settings, patch_hypotheses(frames)).run()
 
 
 class Search:
     """Searches the explanation of one sequence."""
 
-    def __init__(self, frames: Frames, settings: MultibodySettings) -> None:
+    def __init__(self, frames: Frames, settings: MultibodySettings, hypotheses: list[Hypothesis] | None = None) -> None:
         self.frames, self.settings = frames, settings
-        self.hypotheses, self.motions = find_hypotheses(frames)
+        self.motions: PairMotions = {}
+        if hypotheses is None:
+            hypotheses, self.motions = find_hypotheses(frames)
+        self.hypotheses = hypotheses
         self.pool = [body_of(frames, one.trajectory) for one in self.hypotheses]
 
     def run(self) -> Explanation:
         """Returns the explanation: grown, pruned, its worst regions searched anew, and its motions tightened."""
         found = self._grow(self._first())
         found = self._prune(found)
-        for _ in range(self.settings.regrow):
+        for _ in range(self.settings.regrow if self.motions else 0):
             better = self._regrow(found)
             if better.energy >= found.energy - 1e-4:
                 break
@@ -114,6 +126,3 @@ class Search:
             fitted = refit(self.frames, found, self.settings, own, tight)
             found = fitted if fitted.energy < found.energy else found
         return self._clean(found)
-
-
-__all__ = ["Body", "Search", "explain_sequence"]

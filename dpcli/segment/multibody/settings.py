@@ -15,13 +15,16 @@ class MultibodySettings:
     """
 
     most_bodies: int = setting(24, "multibody: most bodies of a sequence.", least=1)
-    body_price: float = setting(0.003, "multibody: cost of a further body, as a share of all points.", least=0)
-    border: float = setting(0.3, "multibody: cost of a point whose neighbors are all in other bodies.", least=0)
+    body_price: float = setting(0.001, "multibody: cost of a further body, as a share of all points.", least=0)
+    border: float = setting(0.2, "multibody: cost of a point whose neighbors are all in other bodies.", least=0)
     agreement: float = setting(
-        0.3, "multibody: cost of a point whose nearest points in other frames are all in other bodies.", least=0
+        0.2, "multibody: cost of a point whose nearest points in other frames are all in other bodies.", least=0
     )
     displacement: float = setting(
-        0.1, "multibody: cost of a point per diameter that it lies from where the largest body would take it.", least=0
+        0.05, "multibody: cost of a point per diameter that it lies from where the largest body would take it.", least=0
+    )
+    flexible: float = setting(
+        0.02, "multibody: deviation from rigid motion that counts one half where tracks are given, diameters.", above=0
     )
     regrow: int = setting(1, "multibody: times that badly explained regions are searched anew.", least=0)
 
