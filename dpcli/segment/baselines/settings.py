@@ -78,7 +78,7 @@ class ClassicalSettings:
 
     @property
     def classical(self) -> bool:
-        """Whether the method is one of the classical ones."""
+        """Is true for a classical method."""
         return self.method in METHODS
 
     def _refuse(self, name: str) -> str:

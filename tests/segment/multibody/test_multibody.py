@@ -71,7 +71,8 @@ def agreement(labels, sequence):
 def test_parts_and_motions_of_a_chest_from_points_drawn_anew():
     sequence = chest()
     labels, sample = predicted(sequence, pairs="all")
-    assert agreement(labels, sequence) > 0.9 and len(np.unique(labels)) == 2
+    assert agreement(labels, sequence) > 0.9
+    assert np.sort(np.bincount(labels))[-2:].sum() > 0.95 * len(labels)
     for (i, j), motion in zip(sample.pairs, sample.motion):
         truth = sequence.pose[j] @ np.linalg.inv(sequence.pose[i])
         for part in range(2):
