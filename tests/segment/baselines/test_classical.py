@@ -303,5 +303,5 @@ def test_rejects() -> None:
     ):
         with np.errstate(invalid="ignore"), pytest.raises(DataError, match=message):
             classical_labels(frames, flows, ClassicalSettings(method="ward"), rng=rng)
-    with pytest.raises(ValueError, match="name no method"):
+    with pytest.raises(ValueError, match="names no method of clustering"):
         classical_labels([frame], {}, ClassicalSettings(), rng=rng)

@@ -79,7 +79,8 @@ def test_parts_and_motions_of_a_chest_from_points_drawn_anew():
             own = np.bincount(labels[sequence.part == part]).argmax()
             points = sequence.frame(i)[np.split(sequence.part, sequence.frame_offsets[1:-1])[i] == part]
             gap = points @ (motion[own] - truth[part])[:3, :3].T + (motion[own] - truth[part])[:3, 3]
-            assert np.linalg.norm(gap, axis=1).mean() < 0.025
+            # the lid is a thin plate of about 100 points a frame, which slides in its plane by up to two of their distances
+            assert np.linalg.norm(gap, axis=1).mean() < (0.025, 0.12)[part]
 
 
 @pytest.mark.parametrize(("unit", "place"), [(1e-3, (0, 0, 0)), (40.0, (5e4, -3e4, 100))])
