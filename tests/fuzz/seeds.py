@@ -6,7 +6,6 @@ A command names its inputs as in/NAME: those files and folders are what it is gi
 from __future__ import annotations
 
 import json
-import pickle
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +33,6 @@ prepare depth in/depth_npy -o out/o.h5 --fov 60 --jobs 1
 prepare depth in/depth_png -o out/o.h5 --fov 60 --jobs 1
 prepare depth in/depth_avi -o out/o.h5 --fov 60 --jobs 1
 prepare depth in/depth_tiff -o out/o.h5 --fov 60 --jobs 1
-prepare depth in/depth_npz -o out/o.h5 --fov 60 --jobs 1
 prepare depth in/depth_npy -o out/o.h5 --fov 60 --jobs 1 --labels in/labels.csv
 prepare depth in/depth_npy -o out/o.h5 --jobs 1 --intrinsics in/intrinsics.json
 prepare depth in/depth_npy -o out/o.h5 --jobs 1 --intrinsics in/camera.yaml
@@ -125,17 +123,15 @@ def _depth(base: Path, rng: np.random.Generator) -> None:
     from tests.support.prepare_helpers import write_video
 
     depth = rng.integers(1000, 2000, (5, 12, 16)).astype(np.uint16)
-    for kind in ("npy", "npz", "tiff"):
-        (base / f"depth_{kind}").mkdir(parents=True)
+    (base / "depth_npy").mkdir(parents=True)
     np.save(base / "depth_npy" / "a.npy", depth)
     np.save(base / "depth_npy" / "b.npy", depth[:3])
-    np.savez_compressed(base / "depth_npz" / "a.npz", depth=depth)
     frames = [Image.fromarray(frame) for frame in depth]
-    frames[0].save(base / "depth_tiff" / "a.tiff", save_all=True, append_images=frames[1:])
-    for name in ("a", "b"):
-        (base / "depth_png" / name).mkdir(parents=True)
+    for name, kind in (("a", "png"), ("b", "png"), ("a", "tiff")):
+        place = base / f"depth_{kind}" / name
+        place.mkdir(parents=True)
         for number, frame in enumerate(frames):
-            frame.save(base / "depth_png" / name / f"{number:03d}.png")
+            frame.save(place / f"{number:03d}.{kind}")
     write_video(base / "depth_avi" / "a.avi", depth)
 
 
@@ -181,8 +177,8 @@ def _texts(base: Path, _rng: np.random.Generator) -> None:
         "image_width: 16\nimage_height: 12\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
         "  data: [20.0, 0, 8, 0, 20.0, 6, 0, 0, 1]\n"
     )
-    (base / "labels.csv").write_text("name,label,split,subject\na,0,train,1\nb,1,test,2\n")
-    (base / "map.toml").write_text('classes = ["all"]\n[labels]\ndrawer = "all"\n')
+    (base / "labels.csv").write_text("name,label,split,subject\na.npy,0,train,1\nb.npy,1,test,2\n")
+    (base / "map.toml").write_text('[labels]\ndrawer = "all"\n')
     (base / "split.csv").write_text("name,split\n")
     (base / "classify.toml").write_text('preset = "tiny"\nepochs_static = 1\nepochs_dynamic = 1\n')
     (base / "segment.toml").write_text("epochs = 1\npairs_per_epoch = 2\n")
@@ -244,11 +240,19 @@ def _scans(base: Path) -> None:
     write_scans(drive, {f"{n:06d}": visible(len(LABELS), n) for n in range(2)}, {"000000": LABELS, "000001": LABELS})
     (drive / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     det = base / "kitti_det" / "training"
-    write_scan(det / "velodyne" / "000000.bin", visible(30) @ np.linalg.inv(velodyne_to_camera())[:3, :3].T)
+    write_scan(det / "velodyne" / "000000.bin", _scanned(visible(30)))
     write_calibration(det / "calib" / "000000.txt", P2=P2, R0_rect=np.eye(3), Tr_velo_to_cam=velodyne_to_camera()[:3])
     (det / "label_2").mkdir()
     (det / "label_2" / "000000.txt").write_text("Car 0 0 0 0 0 9 9 1.5 1.6 4 0 1 12 0\n")
-    write_png(det / "image_2" / "000000.png", np.zeros((4, 6, 3), np.uint8))
+    write_png(det / "image_2" / "000000.png", np.zeros((375, 1242), np.uint8))
+
+
+def _scanned(points: np.ndarray) -> np.ndarray:
+    """Points of the camera in the scanner's axes."""
+    from tests.support.kitti_helpers import velodyne_to_camera
+
+    back = np.linalg.inv(velodyne_to_camera())
+    return points @ back[:3, :3].T + back[:3, 3]
 
 
 def _articulated(base: Path) -> None:
