@@ -20,7 +20,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz lint clean table-4.1 table-4.2 table-5.2
+.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.2
 .PHONY: table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
@@ -38,6 +38,7 @@ help:
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make fuzz                     every option of the commands with odd values: none may end as a bug; half an hour"
+	@echo "make kills [KILLS=100]        kill -9 at random moments of ten commands: each must end as if nothing had happened"
 	@echo "make clean                    remove .venv, demo/ and caches"
 	@echo "PYTHON=python3.12 make ...    uses another Python (3.10 to 3.13)"
 
@@ -179,6 +180,11 @@ table-5.2: $(READY)
 fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz.fuzz_options fuzz --only "$(ONLY)"
 
+KILLS ?= 100
+SEED  ?= 1
+kills: $(READY)
+	$(BIN)/python -m tests.fuzz.fuzz_kills fuzz/kills --kills $(KILLS) --seed $(SEED) --only "$(ONLY)"
+
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m tests.bench.bench_ops
@@ -186,6 +192,7 @@ bench: $(READY)
 	$(BIN)/python -m tests.bench.bench_video_metrics
 	$(BIN)/python -m tests.bench.bench_part_metrics
 	$(BIN)/python -m tests.bench.bench_segment
+	$(BIN)/python -m tests.bench.bench_spread
 	$(DPC) classify profile --preset thesis --steps
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_store $(BENCH_DATA))
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")

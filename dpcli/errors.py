@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import re
+
+_ADDRESS = re.compile(r"<([\w.]+) object at 0x[0-9a-fA-F]+>")
+
 
 class DpcError(Exception):
-    """The work failed (exit code 1)."""
+    """The work failed (exit code 1).
+
+    Places in memory, which libraries put into their messages, are left out: they tell nobody anything, and files that keep
+    the message would differ from run to run.
+    """
 
     exit_code = 1
+
+    def __init__(self, *said: object) -> None:
+        super().__init__(*(_ADDRESS.sub(r"\1", one) if isinstance(one, str) else one for one in said))
 
 
 class UsageError(DpcError):

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.store.file import open_store, read_provenance, read_skipped, read_strings, root_attributes
+from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.schema import KEPT
 from dpcli.store.sequence import POINT_FIELDS, CloudSequence
 
@@ -27,6 +27,7 @@ class CloudsReader:
     """
 
     kinds: tuple[str, ...] = ("clouds", "parts")
+    cache = 1 << 20  # bytes of chunks that HDF5 keeps of each data set; less where many files are open at a time
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -39,7 +40,7 @@ class CloudsReader:
     def _load_index(self, file: h5py.File) -> None:
         self.attributes = root_attributes(file)
         self.provenance = read_provenance(file)
-        self.skipped = read_skipped(file)
+        self.skipped, self.positions = read_skipped(file), read_positions(file)
         self.class_names = read_strings(file, "class_names", optional=True)
         self.length_unit = str(file.attrs.get("length_unit", ""))
         self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
@@ -127,7 +128,7 @@ class CloudsReader:
         """Opens the file in this process unless it is open, and returns the handle."""
         if self._file is None or self._process != os.getpid() or not self._file.id.valid:
             self._sets = {}
-            self._file, self._process = open_store(self.path, self.kinds), os.getpid()
+            self._file, self._process = open_store(self.path, self.kinds, self.cache), os.getpid()
         return self._file
 
     def _set(self, name: str) -> h5py.Dataset:
@@ -182,6 +183,10 @@ class CloudsReader:
             extra={key: values.pop(key) for key in [key for key in values if key.startswith(KEPT)]},
             **values,
         )
+
+    def given(self, index: int) -> list:
+        """Returns sequence `index` as the writer of such a file takes it again."""
+        return [self.read(index)]
 
     def close(self) -> None:
         """Closes the handle of this process; the next read opens the file again."""

@@ -13,14 +13,17 @@ from dpcli import __version__
 from dpcli.errors import DataError
 from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_pipe
+from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 STRING = h5py.string_dtype("utf-8")
 
+_CACHE = 1 << 20  # bytes, HDF5's own choice
 
-def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
-    """Opens a file of the contract for reading.
+
+def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CACHE) -> h5py.File:
+    """Opens a file of the contract for reading; HDF5 keeps at most `cache` bytes of chunks of each of its data sets.
 
     Raises DataError when it isn't HDF5, is truncated, is not ours, is of another schema or kind, or refers to data
     outside itself (external links, virtual data sets, external storage) or to Python objects.
@@ -35,8 +38,9 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS) -> h5py.File:
         raise DataError(f"{path}: the file is empty, expected HDF5; did the command that writes it fail?")
     if magic != _MAGIC:
         raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); `dpc prepare` makes them from raw data")
+    check_heaps(path)
     try:
-        file = h5py.File(path, "r")
+        file = h5py.File(path, "r", rdcc_nbytes=cache)
     except OSError as error:
         raise DataError(_opening_problem(path, error)) from None
     try:

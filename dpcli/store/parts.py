@@ -205,6 +205,11 @@ class PartsReader(CloudsReader):
         """Counts the frame pairs of each sequence, i64 (S)."""
         return np.diff(self._pair_offsets)
 
+    def given(self, index: int) -> list:
+        """Returns sequence `index` as the writer of such a file takes it again."""
+        said = self.read_parts(index)
+        return [self.read(index), said.probability, said.pairs, said.motion, said.flow]
+
     def read_parts(self, index: int) -> PartsSample:
         """Reads what is said of sequence `index`; DataError when its values don't fit the sequence."""
         frames = self._frame_offsets[self._sequence_offsets[index] : self._sequence_offsets[index + 1] + 1]

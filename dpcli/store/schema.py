@@ -99,6 +99,8 @@ _LEFT_OUT = (
     Field("skipped", "str", ("n", 2), "name and reason of every sample that was left out", optional=True),
     Field("position", "i64", ("S",), "in a shard: the place of each sample in the whole list", optional=True),
     Field("skipped_position", "i64", ("n",), "in a shard: the same of the samples left out", optional=True),
+)
+_EXPLAINED = (
     Field("activation", "f32", ("P",), "how active each point is (`dpc classify explain pac`)", True, group=True),
 )
 _PARTS = (
@@ -121,6 +123,10 @@ _SCORES = (
     Field("scores", "f32", ("S", "C"), "class probabilities"),
     *_WHO,
     Field("streams", "f32", ("S", "C"), "the same of one stream of the network", optional=True, group=True),
+)
+_STATISTICS = (
+    Field("name", "str", ("S",), "unique name"),
+    Field("statistics", "str", ("S",), "one JSON object: what was counted of the sample"),
 )
 _EMBEDDING = (
     *_WHO,
@@ -170,12 +176,13 @@ EVERYWHERE = (
 )
 # What a kind has beside EVERYWHERE; a `parts` file has all that a `clouds` file has, with a `part` of its own.
 TABLES = {
-    "clouds": _CLOUDS + _LEFT_OUT,
+    "clouds": _CLOUDS + _LEFT_OUT + _EXPLAINED,
     "views": _VIEWS,
-    "scores": _SCORES,
+    "scores": _SCORES + _LEFT_OUT,
     "parts": _PARTS,
     "gaussians": _GAUSSIANS,
     "embedding": _EMBEDDING,
+    "statistics": _STATISTICS + _LEFT_OUT,
 }
 KINDS = tuple(TABLES)
 

@@ -15,6 +15,7 @@ from dpcli.store.embedding import StreamEmbedding, write_embedding
 from dpcli.store.file import open_store
 from dpcli.store.gaussians import write_scene
 from dpcli.store.schema import KINDS, TABLES, fields_of, fill_tables, table
+from dpcli.store.statistics import StatisticsWriter
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scenes import toy_scene
 
@@ -55,6 +56,11 @@ def write_vectors(path: Path) -> None:
     write_embedding(path, ["a", "b"], labels, ["", ""], {"static": stream}, class_names=["x"], provenance=[{}])
 
 
+def write_statistics(path: Path) -> None:
+    with StatisticsWriter(path, class_names=["a"], provenance=[{"command": "dpc"}]) as writer:
+        writer.write("v", {"count": 1})
+
+
 WRITERS = {
     "clouds": write_clouds,
     "views": write_views,
@@ -62,6 +68,7 @@ WRITERS = {
     "parts": lambda path: write_parts(path, [perfect(truth_sequence("s0", seed=0), 4, CHAIN)]),
     "gaussians": lambda path: write_scene(path, toy_scene(), provenance={"command": "dpc fit"}),
     "embedding": write_vectors,
+    "statistics": write_statistics,
 }
 
 

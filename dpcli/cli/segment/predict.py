@@ -7,14 +7,17 @@ from typing import Annotated
 
 import typer
 
+from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Output, Picture, Seed
 from dpcli.cli.settings_options import options_of
+from dpcli.cli.spread_options import SpreadOptions
 from dpcli.runtime.settings.catalog import Given
 from dpcli.segment.prediction_settings import CATALOG, PredictSettings
 
 EVERYDAY = ("method", "parts", "flow", "pairs", "points", "split")
 
 
+@with_option_groups
 @options_of(CATALOG, EVERYDAY)
 def predict(
     data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
@@ -36,6 +39,7 @@ def predict(
     ] = None,
     seed: Seed = 0,
     device: Device = "auto",
+    spread: SpreadOptions,
     force: Force = False,
 ) -> None:
     """Find the parts of every point, the same through all frames, each part's rigid motion, and the flow between frames."""
@@ -44,7 +48,15 @@ def predict(
 
     drawings = Drawings(picture, turntable, ply)
     sequences = predict_file(
-        data, output, settings, model=model, drawings=drawings, seed=seed, device=device, force=force
+        data,
+        output,
+        settings,
+        model=model,
+        drawings=drawings,
+        seed=seed,
+        device=device,
+        force=force,
+        spread=spread.spread,
     )
     if output != "-":
         typer.echo(f"{output}: parts of {sequences} sequences")

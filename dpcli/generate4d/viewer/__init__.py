@@ -17,6 +17,7 @@ from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
 from dpcli.generate4d.out.picture_colors import WEIGHTS
 from dpcli.generate4d.viewer.input_sheet import input_sheet
 from dpcli.ops.cameras import orbit_of
+from dpcli.standard_streams import printable
 from dpcli.store.gaussians import GaussianScene
 
 SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "trails.js", "app.js")
@@ -45,7 +46,7 @@ def write_page(
     page = filled(
         source_text("page.html", __package__),
         {
-            "TITLE": html.escape(title),
+            "TITLE": html.escape(printable(title)),
             "STYLE": source_text(STYLE),
             "HEADER": as_json(header),
             "DATA": as_base64(blob),

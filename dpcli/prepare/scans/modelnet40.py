@@ -15,6 +15,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.reader import Item, Sample, describe, natural_key, require_folder
 from dpcli.store import CloudSequence
+from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = (
     "airplane",
@@ -65,6 +66,7 @@ _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and 
 
 def read_file(path: Path, *names: str) -> list[np.ndarray]:
     """Reads data sets of an HDF5 file as arrays. Raises DataError when absent, damaged, or kept in another file."""
+    check_heaps(path)
     try:
         with h5py.File(path, "r") as file:
             for name in names:
