@@ -18,6 +18,7 @@ import argparse
 import multiprocessing
 import os
 import random
+import re
 import shutil
 import sys
 import time
@@ -30,13 +31,13 @@ from pathlib import Path
 from tests.fuzz.damage import Damage, draw
 from tests.fuzz.forks import Ended, Limits, forked
 from tests.fuzz.minimize import Budget, differences, edited, minimal
-from tests.fuzz.seeds import MADE, cases, inputs_of, write_raw
+from tests.fuzz.seeds import cases, inputs_of, made_for, write_raw
 from tests.fuzz.verdict import cause, faults
 from tests.support.commands import exit_code
 
 LIMITS = Limits(seconds=60, cpu=20, memory=3 << 30, file=100 << 20)
 SEEDS_LIMITS = Limits(seconds=300)
-TRIES = 60  # runs to make one finding smaller
+TRIES, SECONDS = 60, 30  # at most, to make one finding smaller
 COLLECTED = "sys.modules"  # file of the names of modules that the undamaged runs loaded
 
 
@@ -102,50 +103,50 @@ class Bench:
         return ended, [cause(one, ended) for one in found]
 
 
-def make_seeds(folder: Path) -> None:
-    """Writes the inputs, in forks, so that this process loads nothing that starts threads."""
+def make_seeds(folder: Path, chosen: list[list[str]]) -> None:
+    """Writes the inputs of these commands, in forks, so that this process loads nothing that starts threads."""
     folder.mkdir(parents=True)
     made = forked(lambda: write_raw(folder) or 0, SEEDS_LIMITS)
     assert made.code == 0, made.said
-    for line in MADE.strip().splitlines():
+    for line in made_for(chosen):
         made = forked(lambda line=line: exit_code(*line.split()), SEEDS_LIMITS, folder)
         assert made.code == 0, (line, made.said)
-    shutil.copyfile(folder / "scores.h5", folder / "scores2.h5")
-    shutil.copyfile(folder / "parts.h5", folder / "parts2.h5")
-    for line, name in (("evaluate classification scores.h5 --split all --resamples 0 --json", "result.json"),):
-        made = forked(lambda line=line: exit_code(*line.split()), SEEDS_LIMITS, folder)
-        (folder / name).write_text(made.printed)
+    for name in ("scores", "parts"):
+        if (folder / f"{name}.h5").is_file():
+            shutil.copyfile(folder / f"{name}.h5", folder / f"{name}2.h5")
+    line = "evaluate classification scores.h5 --split all --resamples 0 --json"
+    (folder / "result.json").write_text(forked(lambda: exit_code(*line.split()), SEEDS_LIMITS, folder).printed)
 
 
 def _collecting(words: Sequence[str], modules: Path) -> int:
     code = exit_code(*words)
-    with modules.open("a") as file:
-        file.writelines(f"{name}\n" for name in list(sys.modules) if name.split(".")[0] in PRELOADED)
+    with modules.open("w") as file:
+        file.writelines(f"{name}\n" for name in list(sys.modules) if name.split(".")[0] not in LEFT_OUT)
     return code
 
 
-PRELOADED = {"dpcli", "torch", "numba", "scipy", "sklearn", "h5py", "PIL", "av", "cv2", "lxml", "trimesh", "laspy",
-             "yourdfpy", "imageio", "matplotlib", "rosbags", "pyarrow", "safetensors", "yaml", "plyfile", "rich"}  # fmt: skip
+# Not loaded before the forks: it starts threads, or is this program itself.
+LEFT_OUT = {"open3d", "tests", "__main__", "__mp_main__"}
 
 
 def load(modules: Path) -> None:
-    """Imports here what the commands import, so that forks have it."""
-    for name in dict.fromkeys(modules.read_text().split()):
-        try:
-            import_module(name)
-        except ImportError:
-            pass  # a module that its package makes at run time
+    """Imports here what a command imported, so that forks have it."""
+    for name in modules.read_text().split():
+        if name not in sys.modules:
+            try:
+                import_module(name)
+            except Exception:  # a module that its package makes at run time, or one of another system
+                pass
 
 
-def prepared(bench: Bench, only: str) -> list[Case]:
-    """The cases that begin so, each run once to load its modules and once more to be measured."""
-    chosen = [words for words in cases() if " ".join(words).startswith(only)]
+def prepared(bench: Bench, chosen: list[list[str]]) -> list[Case]:
+    """The cases of these commands, each run once to load its modules and once more to be measured."""
     modules = bench.seeds / COLLECTED
     for words in chosen:
         bench.lay(words)
         ended = forked(lambda words=words: _collecting(words, modules), SEEDS_LIMITS, bench.scratch)
         assert ended.code == 0, (words, ended.said)
-    load(modules)
+        load(modules)
     return [_measured(bench, words) for words in chosen]
 
 
@@ -199,7 +200,7 @@ def results(place: Path, all_cases: Sequence[Case], asked: argparse.Namespace) -
 
 def smaller(bench: Bench, finding: Finding) -> Finding | None:
     """The finding with as little damage as has the same cause, laid out in the scratch folder; None if it doesn't recur."""
-    budget = Budget(TRIES)
+    budget = Budget(TRIES, SECONDS)
 
     def recurs(damages: Sequence[Damage]) -> bool:
         return finding.cause in bench.judged(finding.case, damages)[1]
@@ -275,15 +276,16 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--inputs", type=int, default=10_000)
     parser.add_argument("--minutes", type=float, default=20, help="no new input after this time")
-    parser.add_argument("--only", default="", help="only commands that begin so")
+    parser.add_argument("--only", default="", help="only commands that begin so (a regular expression)")
     parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args(words)
     place = asked.folder.absolute()
     for name in ("seeds", "findings"):
         shutil.rmtree(place / name, ignore_errors=True)
     os.environ["OMP_NUM_THREADS"] = "1"
-    make_seeds(place / "seeds")
-    all_cases = prepared(Bench(place / "seeds", place / "measured"), asked.only)
+    chosen = [words for words in cases() if re.match(asked.only, " ".join(words))]
+    make_seeds(place / "seeds", chosen)
+    all_cases = prepared(Bench(place / "seeds", place / "measured"), chosen)
     print(f"{len(all_cases)} commands on {sum(len(one.files) for one in all_cases)} files", flush=True)
     return 1 if report(place, asked, all_cases) else 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -9,15 +10,15 @@ T = TypeVar("T")
 
 
 class Budget:
-    """Counts tries down; `test` says no once none is left."""
+    """Counts tries down, and seconds; the limited test says no once none is left."""
 
-    def __init__(self, tries: int) -> None:
-        self.left = tries
+    def __init__(self, tries: int, seconds: float) -> None:
+        self.left, self.until = tries, time.monotonic() + seconds
 
     def limited(self, test: Callable[[Sequence[T]], bool]) -> Callable[[Sequence[T]], bool]:
         def tried(parts: Sequence[T]) -> bool:
             self.left -= 1
-            return self.left >= 0 and test(parts)
+            return self.left >= 0 and time.monotonic() < self.until and test(parts)
 
         return tried
 

@@ -73,7 +73,7 @@ prepare animation in/arm.gltf -o out/o.h5 --size 16 --frames 2 --azimuths 60 --t
 prepare artemis in/animal --motion walk -o out/o.h5 --size 16 --frames 2 --tracks 8
 prepare merge in/gestures.h5 in/drawers.h5 -o out/o.h5 --labels in/map.toml
 prepare split in/gestures.h5 -o out/split --list in/split.csv
-classify train in/gestures.h5 -o out/model --config in/classify.toml
+classify train in/gestures.h5 -o out/model --preset tiny --config in/classify.toml
 classify predict in/gestures.h5 --model in/model -o out/o.h5 --clips-per-video 1 --split all
 classify fuse in/scores.h5 -o out/o.h5
 classify explain pac in/gestures.h5 --model in/model -o out/o.h5
@@ -82,7 +82,7 @@ segment train in/drawers.h5 -o out/partnet --config in/segment.toml --flow neare
 segment predict in/drawers.h5 --model in/partnet -o out/o.h5 --split all
 segment predict in/objects.h5 -o out/o.h5 --method ward --parts 2 --split all
 segment estimate-flow in/objects.h5 -o out/o.h5 --flow nearest
-generate4d fit in/views.h5 -o out/o.h5 --config in/fit.toml --size 16
+generate4d fit in/views.h5 -o out/o.h5 --preset tiny --config in/fit.toml --size 16
 generate4d render in/scene.h5 -o out/r.png --size 16
 generate4d export in/scene.h5 --as ply -o out/o.ply
 generate4d view in/scene.h5 -o out/v.html
@@ -106,6 +106,18 @@ def cases() -> list[list[str]]:
 def inputs_of(words: list[str]) -> list[str]:
     """The names below in/ that a command is given."""
     return list(dict.fromkeys(word.removeprefix("in/") for word in words if word.startswith("in/")))
+
+
+def made_for(all_words: list[list[str]]) -> list[str]:
+    """The lines of MADE whose files these commands are given, or whose files those lines are given."""
+    needed = {name.replace("2.h5", ".h5") for words in all_words for name in inputs_of(words)} | {"scores.h5"}
+    lines = []
+    for line in reversed(MADE.strip().splitlines()):
+        words = line.split()
+        if words[words.index("-o") + 1] in needed:
+            lines.insert(0, line)
+            needed.update(words)
+    return lines
 
 
 def write_raw(base: Path) -> None:
@@ -180,7 +192,7 @@ def _texts(base: Path, _rng: np.random.Generator) -> None:
     (base / "labels.csv").write_text("name,label,split,subject\na.npy,0,train,1\nb.npy,1,test,2\n")
     (base / "map.toml").write_text('[labels]\ndrawer = "all"\n')
     (base / "split.csv").write_text("name,split\n")
-    (base / "classify.toml").write_text('preset = "tiny"\nepochs_static = 1\nepochs_dynamic = 1\n')
+    (base / "classify.toml").write_text("epochs = 1\nepochs_dynamic = 1\n")
     (base / "segment.toml").write_text("epochs = 1\npairs_per_epoch = 2\n")
     (base / "fit.toml").write_text("dense_steps = 1\nsparse_steps = 1\n")
 
