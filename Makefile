@@ -38,7 +38,8 @@ help:
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
-	@echo "make fuzz                     every option of the commands with odd values: none may end as a bug; half an hour"
+	@echo "make fuzz [SEED=0 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
+	@echo "make soak [MINUTES=60]        a long stream, 60,000 samples, 256 shards: speed, memory and open files stay as they are"
 	@echo "make kills [KILLS=100]        kill -9 at random moments of ten commands: each must end as if nothing had happened"
 	@echo "make clean                    remove .venv, demo/ and caches"
 	@echo "PYTHON=python3.12 make ...    uses another Python (3.10 to 3.13)"
@@ -187,7 +188,13 @@ prior: $(READY)
 	$(BIN)/python -m dpcli.reproduce.prior_sides "$(MESHES)" prior --models prior/run
 
 fuzz: $(READY)
-	$(BIN)/python -m tests.fuzz.fuzz_options fuzz --only "$(ONLY)"
+	$(BIN)/python -m tests.fuzz.fuzz_files fuzz/files $(if $(SEED),--seed $(SEED)) $(if $(INPUTS),--inputs $(INPUTS)) \
+	    $(if $(MINUTES),--minutes $(MINUTES)) --only "$(ONLY)"
+	$(BIN)/python -m tests.fuzz.fuzz_options fuzz/options --only "$(ONLY)"
+
+soak: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/python -m tests.bench.soak soak $(if $(MINUTES),--minutes $(MINUTES))
 
 KILLS ?= 100
 SEED  ?= 1
@@ -211,5 +218,5 @@ lint: $(READY)
 	$(BIN)/python -m ruff format --quiet --check . || { echo "make: some files are not formatted; ruff format . does it" >&2; exit 1; }
 
 clean:
-	rm -rf $(VENV) demo table fuzz build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo table fuzz soak build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
