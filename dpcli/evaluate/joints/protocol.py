@@ -58,8 +58,9 @@ def evaluate_joints(
     with PairedSequences(path, truth, split=split, intersect=intersect, fields=("part", "joint")) as paired:
         if "joint" not in paired.predicted.fields:
             raise DataError(f"{path}: no joints in it; `dpc segment joints {path} -o joints.h5` finds them")
-        for pair in paired:
-            joint = paired.predicted.read(paired.predicted.names.index(pair.truth.name), fields=("joint",)).joint
+        for place, (row, _) in enumerate(paired.rows):
+            pair = paired.pair(place)
+            joint = paired.predicted.read(row, fields=("joint",)).joint
             names.append(pair.truth.name)
             labels.append(pair.truth.label)
             found.append(joint_statistics(pair.truth.part, pair.truth.joint, pair.predicted.part, joint))
