@@ -13,9 +13,7 @@ from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE, no_joints
 
 _POINTS = 64  # of a part that a joint is fitted to
-_NOISE = (
-    1.0  # of the distance between neighboring points: how far estimated motions are off at the least (0.3 to 1.7 tried)
-)
+_NOISE = 0.3  # of the distance between neighboring points: how far estimated motions are off at the least
 _APART = 2.0  # nats for each such distance between two parts: joined parts touch
 _LARGE = 2.0  # nats by which the largest part is preferred as parent
 
