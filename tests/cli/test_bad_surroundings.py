@@ -22,6 +22,7 @@ from dpcli.segment.training.flow_store import FlowStore
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
 from dpcli.store.file import read_skipped, write_skipped
 from tests.support.prepare_helpers import ROOT, write_msr
+from tests.support.sessions import members
 
 DPC = [sys.executable, "-m", "dpcli"]
 NAMES = [f"a{1 + n % 20:02}_s{1 + n % 8:02}_e{1 + n // 20:02}" for n in range(40)]
@@ -226,19 +227,6 @@ def start(raw: Path, output: Path, count: int) -> subprocess.Popen:
     return process
 
 
-def alive(session: int) -> list[str]:
-    """Processes of a session that still run."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (folder / "stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == session and fields[0] not in "ZX":
-            found.append(folder.name)
-    return found
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
 @pytest.mark.parametrize("everyone", [True, False])
 def test_a_signal_in_the_middle_keeps_what_is_done(raw, tmp_path, number, code, everyone):
@@ -255,9 +243,9 @@ def test_a_signal_in_the_middle_keeps_what_is_done(raw, tmp_path, number, code, 
     assert "Traceback" not in told and "samples are kept" in told
     assert leftovers(tmp_path) == [".out.h5.new", ".out.h5.part"]
     limit = time.monotonic() + 90
-    while alive(process.pid) and time.monotonic() < limit:
+    while members(process.pid) and time.monotonic() < limit:
         time.sleep(0.05)
-    assert alive(process.pid) == []
+    assert not members(process.pid)
     again = start(raw, output, 10**6)
     _, told = again.communicate(timeout=300)
     assert again.returncode == 0 and "continuing: " in told, told

@@ -21,6 +21,7 @@ from dpcli.store import CloudsWriter
 from dpcli.store.file import file_kind
 from tests.support.commands import exit_code
 from tests.support.drawers import drawer
+from tests.support.sessions import workers_of
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNT = 7
@@ -120,19 +121,6 @@ def test_a_worker_killed_in_the_middle_costs_only_time(folder, whole, tmp_path, 
     _, err = process.communicate(timeout=300)
     assert killed and process.returncode == 0, err
     assert (tmp_path / "a.h5").read_bytes() == whole[name], err
-
-
-def workers_of(session: int) -> list[int]:
-    """The processes of a session whose parent is the fork server, not the command itself."""
-    found = {}
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (place / "stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == session and fields[0] not in "ZX":
-            found[int(place.name)] = int(fields[1])
-    return [pid for pid, parent in found.items() if parent in found and parent != session]
 
 
 def process_time(pid: int) -> float:

@@ -29,6 +29,7 @@ import h5py
 import numpy as np
 
 from tests.generate4d.test_fit import toy_views
+from tests.support.sessions import members, workers_of
 
 ROOT = Path(__file__).resolve().parents[2]
 LONGEST = 300  # seconds of a run
@@ -89,19 +90,6 @@ def run(folder: Path, words: list[str]) -> tuple[int, str, float]:
     return process.returncode, said, time.monotonic() - began
 
 
-def members(session: int) -> dict[int, int]:
-    """Returns the living processes of a session and their parents."""
-    found = {}
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (place / "stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == session and fields[0] not in "ZX":
-            found[int(place.name)] = int(fields[1])
-    return found
-
-
 def fingerprint(path: Path) -> str:
     """Returns a digest of a result: a file's bytes; of a scene, which tells how long it took, the data sets; of a folder the weights."""
     if path.is_dir():
@@ -129,8 +117,7 @@ def kill(process: subprocess.Popen, how: str, rng: np.random.Generator) -> bool:
     """Kills a session's whole group, the command alone, or one of its workers; returns whether anything was there to kill."""
     if process.poll() is not None:
         return False
-    family = members(process.pid)
-    workers = [pid for pid, parent in family.items() if parent in family and parent != process.pid]
+    workers = workers_of(process.pid)
     if how == "worker" and not workers:
         how = "group"
     if how == "group":

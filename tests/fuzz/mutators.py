@@ -19,13 +19,54 @@ NUMBERS = (
     "-1 0 1 nan inf -inf 1e309 1e30 1e-320 99999999999 20000000 2147483648 9223372036854775808 0x10 1_0 +3 .".split()
 )
 NAMES = (
-    "", ".", "..", "../../outside/x", "/outside/x", "file:///outside/x", "a\x1b[31mRED\x1b[0m", "a\0b", "\ud800", "é",
-    "a\nb", "a" * 300, "<b>x</b>", "|a|", "-o", "~", "C:\\x", "\u202ereversed", "nan", "%s%n", "{0}", "__class__",
-)  # fmt: skip
+    "",
+    ".",
+    "..",
+    "../../outside/x",
+    "/outside/x",
+    "file:///outside/x",
+    "a\x1b[31mRED\x1b[0m",
+    "a\0b",
+    "\ud800",
+    "é",
+    "a\nb",
+    "a" * 300,
+    "<b>x</b>",
+    "|a|",
+    "-o",
+    "~",
+    "C:\\x",
+    "\u202ereversed",
+    "nan",
+    "%s%n",
+    "{0}",
+    "__class__",
+)
 VALUES = (
-    None, True, False, 0, -1, 1e308, 2**31, 2**63, 10**30, float("nan"), float("inf"), "", "x", "../../outside/x",
-    "\x1b[31mRED", "\0", "\ud800", [], {}, [[]], [0] * 1000, {"": 0}, "9" * 400,
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    -1,
+    1e308,
+    2**31,
+    2**63,
+    10**30,
+    float("nan"),
+    float("inf"),
+    "",
+    "x",
+    "../../outside/x",
+    "\x1b[31mRED",
+    "\0",
+    "\ud800",
+    [],
+    {},
+    [[]],
+    [0] * 1000,
+    {"": 0},
+    "9" * 400,
+)
 
 
 def odd_name(rng: random.Random) -> bytes:
@@ -148,8 +189,16 @@ def _text_encoding(data: bytes, rng: random.Random) -> bytes:
     return rng.choice((b"\xef\xbb\xbf" + data, said.encode("utf-16"), said.encode("utf-32-le"), b"\xff\xfe" + data))
 
 
-_TEXT: tuple[Mutator, ...] = (_text_number, _text_number, _text_number, _text_word, _text_word, _text_line,
-                              _text_separator, _text_encoding)  # fmt: skip
+_TEXT: tuple[Mutator, ...] = (
+    _text_number,
+    _text_number,
+    _text_number,
+    _text_word,
+    _text_word,
+    _text_line,
+    _text_separator,
+    _text_encoding,
+)
 
 
 def json_text(data: bytes, rng: random.Random) -> bytes:

@@ -24,6 +24,7 @@ from dpcli.store import clouds_writer as writer_module
 from dpcli.store.writing import item_pass
 from dpcli.store.writing.journal import Journal
 from tests.support.prepare_helpers import DPC, ROOT, ToyReader, dpc
+from tests.support.sessions import members
 
 SYNTHETIC = ("prepare", "synthetic", "gestures", "--frames", "8", "--size", "64", "--videos-per-class", "6")
 ABOUT = {"kind": "clouds", "provenance": [{"config": 1}]}
@@ -260,18 +261,6 @@ def test_a_lost_worker_keeps_what_is_done(tmp_path, monkeypatch):
     assert read == [3, 4] and digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
 
 
-def survivors(session: int) -> list[str]:
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (folder / "stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == session and fields[0] not in "ZX":
-            found.append(folder.name)
-    return found
-
-
 def test_kill_minus_nine_at_random_moments(tmp_path):
     """The same command again and again, killed each time a little later, ends with the bytes of one whole run."""
     out, rng = tmp_path / "out.h5", np.random.default_rng(5)
@@ -296,9 +285,9 @@ def test_kill_minus_nine_at_random_moments(tmp_path):
         size = journal.stat().st_size if journal.exists() else 0
         assert out.exists() or size >= kept  # what an earlier run had is still there
         kept = size
-        while survivors(process.pid) and time.monotonic() < deadline:
+        while members(process.pid) and time.monotonic() < deadline:
             time.sleep(0.02)
-        assert survivors(process.pid) == []
+        assert not members(process.pid)
     last = dpc(*SYNTHETIC, "-o", out, "--jobs", "2")
     assert last.returncode == 0 and ("continuing: " in last.stderr or "already complete" in last.stderr), last.stderr
     assert digest(out) == digest(tmp_path / "whole.h5")

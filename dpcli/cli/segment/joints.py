@@ -18,7 +18,7 @@ def joints(
             "-o",
             "--output",
             help="object.urdf (one object, meshes beside it), joints.json, joints.h5 (the parts file with its joints, for "
-            "`dpc evaluate joints`), or a folder for a URDF of each sequence.",
+            "`dpc evaluate joints`; - for a pipe), or a folder for a URDF of each sequence.",
         ),
     ],
     sequence: Annotated[str | None, typer.Option("--sequence", help="Take this sequence only. Default: all.")] = None,
@@ -30,4 +30,5 @@ def joints(
 
     counts = find_joints(parts, output, sequence=sequence, picture=picture, force=force)
     found = ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no joint: one part only"
-    typer.echo(f"{output}: {found}")
+    if str(output) != "-":
+        typer.echo(f"{output}: {found}")

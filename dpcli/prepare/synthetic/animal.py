@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import UsageError
-from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.filming import Filming, film
-from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.prepare.synthetic import creature
-from dpcli.prepare.synthetic.creature_mesh import make_skin
+from dpcli.prepare.synthetic.creature_mesh import animated_creature, make_skin
 from dpcli.prepare.synthetic.gait import MOTIONS, bone_motion, turn_bones
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.seeds import PrepareStream, generator
@@ -33,24 +32,7 @@ def make_animal(motion: str, frames: int, cycles: float = 0.0, seed: int = 0, ce
     body = make_skin(animal, generator(seed, PrepareStream.ANIMAL_COAT), cells)
     phase = cycles * np.arange(frames) / frames
     turned = bone_motion(animal, *turn_bones(animal, motion, phase))
-    normals = vertex_normals(body.vertices, body.triangles)
-    positions, normals = skin(body.vertices, normals, body.bones, body.weights, turned)
-    return AnimatedMesh(
-        name=f"{kind.kind} {seed} {motion}",
-        time=phase * kind.period,
-        positions=positions,
-        normals=normals,
-        triangles=body.triangles,
-        material=np.zeros(len(body.triangles), np.int64),
-        materials=(Material(),),
-        color=body.color,
-        uv=np.zeros((len(body.vertices), 2), np.float32),
-        bones=body.bones,
-        weights=body.weights,
-        bone_pose=turned,
-        bone_parent=np.array([bone.parent for bone in animal.bones]),
-        bone_name=tuple(bone.name for bone in animal.bones),
-    )
+    return animated_creature(animal, body, turned, name=f"{kind.kind} {seed} {motion}", time=phase * kind.period)
 
 
 def animal_clip(motion: str, frames: int, cycles: float, filming: Filming, jobs: int = 1) -> Clip:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
 from dpcli.prepare.meshes.gltf_material import to_linear
+from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.prepare.synthetic.creature import Creature, Shape
 from dpcli.prepare.synthetic.surface_nets import surface_nets
 
@@ -25,6 +27,28 @@ class Skin:
     color: np.ndarray
     bones: np.ndarray
     weights: np.ndarray
+
+
+def animated_creature(animal: Creature, body: Skin, pose: np.ndarray, *, name: str, time: np.ndarray) -> AnimatedMesh:
+    """Returns the skin moved by its bones. pose f64 (T,B,4,4): each bone's motion from rest; time f64 (T) seconds."""
+    normals = vertex_normals(body.vertices, body.triangles)
+    positions, normals = skin(body.vertices, normals, body.bones, body.weights, pose)
+    return AnimatedMesh(
+        name=name,
+        time=time,
+        positions=positions,
+        normals=normals,
+        triangles=body.triangles,
+        material=np.zeros(len(body.triangles), np.int64),
+        materials=(Material(),),
+        color=body.color,
+        uv=np.zeros((len(body.vertices), 2), np.float32),
+        bones=body.bones,
+        weights=body.weights,
+        bone_pose=pose,
+        bone_parent=np.array([bone.parent for bone in animal.bones]),
+        bone_name=tuple(bone.name for bone in animal.bones),
+    )
 
 
 def make_skin(animal: Creature, rng: np.random.Generator, cells: int = 120) -> Skin:

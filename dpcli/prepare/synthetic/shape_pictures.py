@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_clips
 from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
-from dpcli.prepare.meshes.skinning import skin, vertex_normals
-from dpcli.prepare.synthetic.creature_mesh import make_skin
+from dpcli.prepare.synthetic.creature_mesh import animated_creature, make_skin
 from dpcli.prepare.synthetic.gait import bone_motion
 from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
 from dpcli.runtime.progress import log
@@ -136,24 +135,7 @@ def made_creature(rng: np.random.Generator) -> AnimatedMesh:
     animal = wild_creature(rng)
     body = make_skin(animal, rng, _CELLS)
     moved = bone_motion(animal, wild_turns(animal, _POSES, rng), np.zeros((_POSES, 3)))
-    positions, normals = skin(
-        body.vertices, vertex_normals(body.vertices, body.triangles), body.bones, body.weights, moved
-    )
-    return AnimatedMesh(
-        name="creature",
-        time=np.arange(_POSES, dtype=float),
-        positions=positions,
-        normals=normals,
-        triangles=body.triangles,
-        material=np.zeros(len(body.triangles), np.int64),
-        materials=(Material(),),
-        color=body.color,
-        uv=np.zeros((len(body.vertices), 2), np.float32),
-        bones=body.bones,
-        weights=body.weights,
-        bone_pose=moved,
-        bone_parent=np.array([bone.parent for bone in animal.bones]),
-    )
+    return animated_creature(animal, body, moved, name="creature", time=np.arange(_POSES, dtype=float))
 
 
 def _draw_file(files: Sequence[MeshFile], rng: np.random.Generator) -> MeshFile:

@@ -12,7 +12,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
 from dpcli.segment.kinematics.urdf_writer import make_folder, tree_json, write_trees, write_urdf
-from dpcli.store import CloudSequence, input_file
+from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
 
 SUFFIXES = (".h5", ".urdf", ".json")
@@ -21,11 +21,11 @@ SUFFIXES = (".h5", ".urdf", ".json")
 def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path | None, force: bool) -> Counter[str]:
     """Finds the joints of the sequences of a parts file, or of one, and returns how many of each type there are.
 
-    output: `.h5`, a parts file that holds the joints too; `.urdf`, one object, with a folder of meshes beside it; `.json`;
+    output: `.h5` or `-` (a pipe), a parts file that holds the joints too; `.urdf`, one object, with a folder of meshes beside it; `.json`;
     a folder for a URDF of each sequence. picture: of the one, or the first. Raises UsageError for an output that exists
     (without `force`) or can't hold what was asked for, DataError for a sequence whose motions are unknown.
     """
-    if output.exists() and not force:
+    if str(output) != "-" and output.exists() and not force:
         raise UsageError(f"{output}: exists already; --force replaces it")
     with input_file(parts) as path, PartsReader(path) as reader:
         chosen = _chosen(reader, sequence)
@@ -34,8 +34,12 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
                 f"-o {output}: one object, but {path.name} has {len(chosen)} sequences; name one with --sequence, or a folder"
             )
         counts: Counter[str] = Counter()
-        write = _WRITERS.get(output.suffix.lower(), _write_folder)
-        write(_trees(reader, chosen, counts, picture), output, reader, path, force)
+        trees = _trees(reader, chosen, counts, picture)
+        if str(output) == "-":
+            with output_file("-") as target:
+                _write_parts(trees, target, reader, path, force)
+        else:
+            _WRITERS.get(output.suffix.lower(), _write_folder)(trees, output, reader, path, force)
     return counts
 
 

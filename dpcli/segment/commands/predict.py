@@ -132,6 +132,8 @@ def _open_segmenter(settings: PredictSettings, model: str | None, device: str, s
     classical, chosen = settings.classical, choose_device(device)
     if classical.method == "network":
         return NetworkSegmenter.load(model or default_model(), chosen, wanted(settings.precision.amp, chosen))
+    if settings.precision.amp:
+        raise UsageError(f"amp = true: --method {classical.method} uses no network; add --fast, or leave it out")
     if model is not None:
         raise UsageError(f"--model {model}: --method {classical.method} uses no network; give one of both")
     if classical.method == "multibody":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,7 +11,7 @@ from scipy.spatial import cKDTree
 from dpcli.segment.kinematics.joint_fit import JointFit, fit_joint
 from dpcli.segment.kinematics.part_trajectories import Trajectories, part_trajectories, points_at_start
 from dpcli.store import CloudSequence, PartsSample
-from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE, no_joints
+from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
 
 _POINTS = 64  # of a part that a joint is fitted to
 _NOISE = 0.3  # of the distance between neighboring points: how far estimated motions are off at the least
@@ -93,11 +94,11 @@ def _relative_joint(trajectories: Trajectories, parent: int, child: int, points:
     thinned = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
     fit = fit_joint(relative[both], thinned, noise)
     value = np.interp(np.arange(len(both)), np.flatnonzero(both), fit.value)
-    return JointFit(fit.kind, fit.axis, fit.point, value, fit.residual, fit.length)
+    return replace(fit, value=value)
 
 
 def _gap(first: np.ndarray, second: np.ndarray) -> float:
-    """Returns the distance between two clouds where they are nearest; a tenth of the points decides, so that one can't."""
+    """Returns the distance between two clouds where they are nearest: the fifth least, so that no single point decides."""
     distances = np.sort(cKDTree(first).query(second)[0])
     return float(distances[min(len(distances) - 1, 4)])
 
@@ -123,13 +124,9 @@ def _oriented(fits: dict[tuple[int, int], JointFit], parent: int, child: int) ->
     if (parent, child) in fits:
         return fits[parent, child]
     fit = fits[child, parent]
-    return JointFit(fit.kind, fit.axis, fit.point, -fit.value, fit.residual, fit.length)
+    return replace(fit, value=-fit.value)
 
 
-def joint_counts(tree: KinematicTree) -> dict[str, int]:
-    """Returns how many joints of each type the tree has.
-
-    The names are those of a file's `joint`.
-    """
-    names = {REVOLUTE: "revolute", PRISMATIC: "prismatic", FIXED: "fixed", FREE: "free"}
-    return {name: n for kind, name in names.items() if (n := sum(j.fit.kind == kind for j in tree.joints))}
+def joint_counts(tree: KinematicTree) -> Counter[str]:
+    """Returns how many joints of each type, by its name, the tree has."""
+    return Counter(TYPES[joint.fit.kind] for joint in tree.joints)

@@ -39,8 +39,11 @@ def find_hypotheses(frames: Frames) -> tuple[list[Hypothesis], PairMotions]:
     with ThreadPoolExecutor(2) as pool:
         found = list(pool.map(lambda pair: find_bodies(clouds[pair[0]], clouds[pair[1]], _SEARCH), pairs))
         motions = {pair: bodies.motion for pair, bodies in zip(pairs, found)}
-        seeds = [(pair, k, np.flatnonzero(bodies.label == k)) for pair, bodies in zip(pairs, found)
-                 for k in range(len(bodies.motion))]  # fmt: skip
+        seeds = [
+            (pair, k, np.flatnonzero(bodies.label == k))
+            for pair, bodies in zip(pairs, found)
+            for k in range(len(bodies.motion))
+        ]
         seeds = sorted((seed for seed in seeds if len(seed[2]) >= _FEWEST), key=lambda seed: -len(seed[2]))
         seeds = _spread(seeds, len(frames))
         carried = pool.map(lambda seed: carry(frames, seed[0][0], clouds[seed[0][0]][seed[2]], motions), seeds)

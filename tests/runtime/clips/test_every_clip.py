@@ -172,8 +172,11 @@ def test_what_opencv_writes(code, half_width, half_height, rate, data):
 
 
 BY_IMAGEIO = {"a.mp4": {}, "a.mkv": {}, "a.mov": {}, "a.avi": {}}
-BY_IMAGEIO |= {f"{pixels}.{suffix}": {"codec": "libx265", "output_params": ["-pix_fmt", pixels, "-x265-params", "crf=8"]}
-               for pixels in ("yuv420p", "yuv420p10le", "yuv444p12le") for suffix in ("mp4", "mkv")}  # fmt: skip
+BY_IMAGEIO |= {
+    f"{pixels}.{suffix}": {"codec": "libx265", "output_params": ["-pix_fmt", pixels, "-x265-params", "crf=8"]}
+    for pixels in ("yuv420p", "yuv420p10le", "yuv444p12le")
+    for suffix in ("mp4", "mkv")
+}
 
 
 @pytest.mark.parametrize("name", BY_IMAGEIO)

@@ -80,6 +80,13 @@ def test_the_urdf_is_posed_as_the_points_are(parts, tmp_path, dpc_here):
         assert np.median(far) < 0.02 and np.quantile(far, 0.95) < 0.06
 
 
+def test_joints_flow_through_a_pipe(truth, parts, dpc):
+    found = dpc("segment", "joints", parts, "-o", "-")
+    assert found.returncode == 0, found.stderr
+    scored = dpc("evaluate", "joints", "-", "--truth", truth, "--split", "all", "--json", stdin=found.stdout)
+    assert scored.returncode == 0 and json.loads(scored.stdout)["metrics"]["type"] > 0.8, scored.stderr
+
+
 def test_a_folder_holds_one_object_for_each_sequence(parts, tmp_path, dpc_here):
     done = dpc_here("segment", "joints", parts, "-o", tmp_path / "robots")
     assert done.returncode == 0, done.stderr

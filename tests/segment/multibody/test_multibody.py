@@ -46,8 +46,10 @@ def chest(seed=0, frames=4, points=320, unit=1.0, place=(0, 0, 0), keep=False):
         whole = turn(0.1 * t, (0.0, 0.6, 0.8), (0.2, 0.1, 0.0))
         lid = whole @ turn(-0.3 * (t + 1), (0.0, 1.0, 0.0), (0.0, 0.0, 0.3))
         if drawn is None or not keep:
-            drawn = [box_surface(rng, points - few, (0, 0, 0), (0.5, 0.6, 0.29)),
-                     box_surface(rng, few, (0, 0, 0.3), (0.5, 0.6, 0.04))]  # fmt: skip
+            drawn = [
+                box_surface(rng, points - few, (0, 0, 0), (0.5, 0.6, 0.29)),
+                box_surface(rng, few, (0, 0, 0.3), (0.5, 0.6, 0.04)),
+            ]
         moved = [p @ m[:3, :3].T + m[:3, 3] for p, m in zip(drawn, (whole, lid))]
         order = rng.permutation(points)[: points - 20 * (t % 2 if keep else 0)]
         clouds.append(np.float32(np.concatenate(moved)[order] * unit + place))
