@@ -101,7 +101,9 @@ def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):
     mask = axis[:, None] ** 2 + axis**2 < 0.3**2
     rgba = np.where(mask[..., None], np.uint8([200, 60, 20, 255]), np.uint8(0))
     pose, lens = orbit_pose(0.5, 0.1), pinhole(DEFAULT_FOVY, SIZE, SIZE)
-    with ViewsWriter(path, ViewsHeader("ball", lens[None], pose[None], np.zeros(1), ["reference"], 0, (SIZE, SIZE))) as w:
+    with ViewsWriter(
+        path, ViewsHeader("ball", lens[None], pose[None], np.zeros(1), ["reference"], 0, (SIZE, SIZE))
+    ) as w:
         w.add(0, 0, rgba)
     radius = 0.3 * SIZE / lens[0, 0] * 2
     for prior in ("auto", "none"):
