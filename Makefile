@@ -20,8 +20,8 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz lint clean table-4.1 table-4.2 table-5.2
-.PHONY: table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
+.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.2
+.PHONY: prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
@@ -37,7 +37,10 @@ help:
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
-	@echo "make fuzz                     every option of the commands with odd values: none may end as a bug; half an hour"
+	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
+	@echo "make fuzz [SEED=1 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
+	@echo "make soak [MINUTES=60]        a long stream, 60,000 samples, 256 shards: speed, memory and open files stay as they are"
+	@echo "make kills [KILLS=100]        kill -9 at random moments of ten commands: each must end as if nothing had happened"
 	@echo "make clean                    remove .venv, demo/ and caches"
 	@echo "PYTHON=python3.12 make ...    uses another Python (3.10 to 3.13)"
 
@@ -176,8 +179,27 @@ table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
 	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2
 
+# The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
+HELD_OUT := dpcli/reproduce/held_out_models.txt
+PRIOR ?= --set bfloat16=true
+prior: $(READY)
+	$(if $(MESHES),,$(error make prior needs MESHES=folder, a folder with the models of $(HELD_OUT) and many others below it))
+	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)
+	$(BIN)/python -m dpcli.reproduce.prior_sides "$(MESHES)" prior --models prior/run
+
 fuzz: $(READY)
-	$(BIN)/python -m tests.fuzz.fuzz_options fuzz --only "$(ONLY)"
+	$(BIN)/python -m tests.fuzz.fuzz_files fuzz/files $(if $(SEED),--seed $(SEED)) $(if $(INPUTS),--inputs $(INPUTS)) \
+	    $(if $(MINUTES),--minutes $(MINUTES)) --only "$(ONLY)"
+	$(BIN)/python -m tests.fuzz.fuzz_options fuzz/options --only "$(ONLY)"
+
+soak: $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/python -m tests.bench.soak soak $(if $(MINUTES),--minutes $(MINUTES))
+
+KILLS ?= 100
+SEED  ?= 1
+kills: $(READY)
+	$(BIN)/python -m tests.fuzz.fuzz_kills fuzz/kills --kills $(KILLS) --seed $(SEED) --only "$(ONLY)"
 
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
@@ -186,6 +208,7 @@ bench: $(READY)
 	$(BIN)/python -m tests.bench.bench_video_metrics
 	$(BIN)/python -m tests.bench.bench_part_metrics
 	$(BIN)/python -m tests.bench.bench_segment
+	$(BIN)/python -m tests.bench.bench_spread
 	$(DPC) classify profile --preset thesis --steps
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_store $(BENCH_DATA))
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")
@@ -195,5 +218,5 @@ lint: $(READY)
 	$(BIN)/python -m ruff format --quiet --check . || { echo "make: some files are not formatted; ruff format . does it" >&2; exit 1; }
 
 clean:
-	rm -rf $(VENV) demo table fuzz build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo table fuzz soak build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

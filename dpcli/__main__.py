@@ -5,12 +5,17 @@ from __future__ import annotations
 
 def main() -> None:
     """Run `dpc` with the words of the command line."""
+    from dpcli.signal_exit import watch_signals
+
+    watch_signals()
     import sys
 
     try:
-        from dpcli.standard_streams import ready_streams
+        from dpcli.standard_streams import hush_warnings, ready_streams
 
         ready_streams()
+        if "--debug" not in sys.argv:
+            hush_warnings()
 
         from dpcli.cli.app import main
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from dpcli.errors import DataError
+
+_ABSOLUTE = re.compile(r"\s*(/|[A-Za-z]:|file:|[A-Za-z][A-Za-z0-9+.-]*://)", re.IGNORECASE)
 
 
 def as_utf8(text: str) -> str:
@@ -33,18 +36,22 @@ def short_names(paths: Sequence[str | Path]) -> list[str]:
 def path_inside(root: Path | None, folder: Path, name: str) -> Path:
     """Returns where ``name``, which stands in a file, lies below ``folder``; nothing is opened.
 
-    Raises DataError when it leaves ``root``: by ``..``, as an absolute path, or through a link. root None: it may.
+    A backslash is a slash, as in names written on Windows. Raises DataError when it leaves ``root``: by ``..``, as an
+    absolute path, with a drive or as an address (``file://``), or through a link. root None: it may.
     """
-    plain = name.removeprefix("file://")
+    plain = name.replace("\\", "/")
     if "\0" in plain or any(len(part.encode("utf-8", "surrogateescape")) > 255 for part in plain.split("/")):
         raise DataError(f"the name {name[:80]!r} cannot be a file's; expected a path below {as_utf8(str(folder))}")
-    place = folder / plain
     if root is None:
-        return place
+        return folder / plain.removeprefix("file://")
+    place = folder / plain
     try:
-        inside = place.resolve().is_relative_to(root.resolve())
+        inside = not _ABSOLUTE.match(plain) and place.resolve().is_relative_to(root.resolve())
     except (OSError, RuntimeError):  # a circle of links
         inside = False
     if not inside:
-        raise DataError(f"{name[:80]!r} lies outside the folder {as_utf8(str(root))}; only files in it are opened")
+        raise DataError(
+            f"{name[:80]!r} lies outside the folder {as_utf8(str(root))}, or isn't named from within it; only files in it"
+            " are opened"
+        )
     return place

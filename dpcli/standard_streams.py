@@ -1,13 +1,22 @@
-"""Standard streams under odd conditions: closed, or on a terminal that doesn't show every letter."""
+"""Standard streams under odd conditions: closed, on a terminal that doesn't show every letter, or with texts that would command it."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
+import warnings
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 # Control characters, the halves of letters that broken UTF-8 leaves, and what turns the direction of the text around.
-_UNSEEN = re.compile("[\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+_UNSEEN = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\U000e0000-\U000e007f]"
+)
+_PIPE_WIDTH = 250  # columns when nobody's terminal sets a limit
 
 
 def ready_streams() -> None:
@@ -27,6 +36,47 @@ def ready_streams() -> None:
             setattr(sys, name, open(number, "w", closefd=False))
         else:
             stream.reconfigure(errors="backslashreplace")
+        setattr(sys, name, PrintableStream(getattr(sys, name)))
+
+
+class PrintableStream:
+    """A text stream to which nothing goes that would command a terminal, whoever writes it; otherwise as the stream it holds."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.unfiltered = stream
+
+    def write(self, text: str) -> int:
+        """Writes text in which control characters, but line breaks and tabs, are spelled."""
+        return self.unfiltered.write(printable(text, kept="\n\t"))
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Writes one line after the other."""
+        for line in lines:
+            self.write(line)
+
+    @property
+    def encoding(self) -> str:
+        """Returns UTF-8: click writes past a stream of ASCII, but letters that can't be shown are spelled here."""
+        return "utf-8"
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.unfiltered, name)
+
+
+def rich_console(stream: TextIO) -> Console:
+    """Returns rich's console on a stream, wide in a pipe. Its colors pass, so texts of files must be made `printable` before."""
+    from rich.console import Console
+
+    width = None if stream.isatty() else _PIPE_WIDTH
+    file = getattr(stream, "unfiltered", stream)
+    return Console(file=file, highlight=False, width=width, markup=False, emoji=False)
+
+
+def hush_warnings() -> None:
+    """Keeps Python's warnings, which libraries mean for programmers, off the screen, here and in workers, unless asked for."""
+    if not sys.warnoptions and "PYTHONWARNINGS" not in os.environ:
+        os.environ["PYTHONWARNINGS"] = "ignore"
+        warnings.simplefilter("ignore")
 
 
 def printable(text: str, kept: str = "") -> str:

@@ -10,7 +10,14 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "dpcli"
-COMMON = {"config_diff", "errors", "file_lock", "path_names", "standard_streams"}  # files that every room may import
+COMMON = {
+    "config_diff",
+    "errors",
+    "file_lock",
+    "path_names",
+    "signal_exit",
+    "standard_streams",
+}  # files that every room may import
 GROUND = {"store", "ops", "runtime", "draw"}
 ALLOWED = {
     "store": {"runtime"},

@@ -80,7 +80,11 @@ def test_what_is_imported_is_declared_and_nothing_more() -> None:
     declared = names(project()["dependencies"])
     extras = project()["optional-dependencies"]
     optional = names(
-        [text for extra in ("cluster", "exr", "gsplat", "parquet", "recordings", "zero123") for text in extras[extra]]
+        [
+            text
+            for extra in ("cluster", "exr", "gsplat", "parquet", "recordings", "splats", "zero123")
+            for text in extras[extra]
+        ]
     )
     optional |= {"dask", "huggingface-hub", "llvmlite"}  # come with distributed, diffusers and numba
     used = set().union(*(imported(path) for path in (ROOT / "dpcli").rglob("*.py")))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,26 +36,19 @@ def predict_videos(
     source: ClipSource,
     clips_per_video: int | None,
     batch: int,
-    device: torch.device,
+    device: torch.device | str,
     streams: Sequence[str] = STREAMS,
-    done: Container[int] = (),
 ) -> Iterator[VideoScores]:
-    """Yields the scores of every video of `source` that isn't `done`, in order, one video in memory at a time.
+    """Yields the scores of every video of `source`, in order, one video in memory at a time.
 
-    streams: those that were trained; with the static one alone, its scores are the fused ones. done: numbers of sequences.
+    A batch holds clips of one video only, so that a video's scores are the same whatever is scored beside it. streams:
+    those that were trained; with the static one alone, its scores are the fused ones.
     """
-    current, kept = -1, []
-    left = [clip for clip in source.clips(clips_per_video) if clip.sequence not in done]
-    for clips, points in batches(source, left, batch):
-        rows = clip_scores(model, points.to(device), streams).cpu().unbind(1)
-        for clip, probabilities in zip(clips, rows):
-            if clip.sequence != current and kept:
-                yield _mean(current, kept, streams)
-                kept = []
-            current = clip.sequence
-            kept.append(probabilities)
-    if kept:
-        yield _mean(current, kept, streams)
+    for sequence in source.sequences:
+        clips = source.video_clips(sequence, clips_per_video)
+        found = [clip_scores(model, points.to(device), streams).cpu() for _, points in batches(source, clips, batch)]
+        fused, *single = torch.cat(found, 1).mean(1).numpy()
+        yield VideoScores(sequence, fused, dict(zip(streams, single)), len(clips))
 
 
 def clip_scores(model: Kinet, points: torch.Tensor, streams: Sequence[str]) -> torch.Tensor:
@@ -65,8 +58,3 @@ def clip_scores(model: Kinet, points: torch.Tensor, streams: Sequence[str]) -> t
     static, dynamic = model(points)
     fused = fuse(static, dynamic, model.config.fusion)
     return torch.stack([fused, torch.softmax(static, -1), torch.softmax(dynamic, -1)])
-
-
-def _mean(sequence: int, kept: list[torch.Tensor], streams: Sequence[str]) -> VideoScores:
-    fused, *single = torch.stack(kept).mean(0).numpy()
-    return VideoScores(sequence, fused, dict(zip(streams, single)), len(kept))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import errno
 import functools
 import math
 import os
@@ -17,8 +18,9 @@ import typer
 
 from dpcli import __version__
 from dpcli.cli.help_groups import SectionedGroup
-from dpcli.errors import DpcError, UsageError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime.tuning import tune_environment
+from dpcli.signal_exit import INTERRUPTED, let_end, set_working, signal_outcome
 
 tune_environment()  # before torch and numba load
 
@@ -34,7 +36,7 @@ ROOMS = {
 }
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
-CLOSED_PIPE, INTERRUPTED = 141, 130  # what a shell reports for SIGPIPE and SIGINT
+CLOSED_PIPE = 141  # what a shell reports for SIGPIPE
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 
 
@@ -148,7 +150,10 @@ def _explain(error: BaseException) -> int:
         return error.exit_code
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
-        return 2
+        return DataError.exit_code
+    if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM) and error.filename:
+        log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
+        return DataError.exit_code
     full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None
     if full is not None:
         log.error(str(full))
@@ -204,7 +209,7 @@ def _refusing_nan(command: Any) -> Any:
 
 
 def _keeping_inputs(command: Any) -> Any:
-    """The command, or all below it, ending where a file that it would write is one that it reads, or no regular file."""
+    """The command, or all below it, ending where it would write what it reads, no regular file, or where nobody may."""
     for below in getattr(command, "commands", {}).values():
         _keeping_inputs(below)
     run = command.callback
@@ -214,6 +219,7 @@ def _keeping_inputs(command: Any) -> Any:
 
     @functools.wraps(run)
     def checked(*args: Any, **values: Any) -> Any:
+        from dpcli.runtime.whole_file import check_writable
         from dpcli.store.pipes import check_output
 
         inputs: list[str] = []
@@ -230,6 +236,8 @@ def _keeping_inputs(command: Any) -> Any:
         for name, option in written.items():
             if values.get(name) and str(values[name]) != "-":
                 check_output(Path(values[name]), option, inputs)
+                if name != "output" or values.get("force"):  # else it may be complete, and nothing is written
+                    check_writable(Path(values[name]), option)
         return run(*args, **values)
 
     command.callback = checked
@@ -240,26 +248,40 @@ def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
     command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(_words_to_complete() or arguments))))
+    code = _run(command, arguments)
+    let_end()
+    ended = signal_outcome() or (INTERRUPTED, "interrupted")
+    if code == INTERRUPTED or (code and signal_outcome()):  # a signal that came when all was done changes nothing
+        from dpcli.runtime.progress import log
+
+        code, said = ended
+        log.error(said)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _run(command: Any, arguments: list[str]) -> Any:
+    """Runs the command; returns its exit code, or None for 0. Says what went wrong, unless a signal did."""
     from dpcli.runtime.progress import log
 
     try:
+        set_working(True)
         code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
         sys.stdout.flush()
+        return code
     except SystemExit as ended:  # typer turns Ctrl-C and a closed pipe into this, silently
-        code = _explain(ended.__context__) if isinstance(ended.__context__, BrokenPipeError) else ended.code
+        return _explain(ended.__context__) if isinstance(ended.__context__, BrokenPipeError) else ended.code
     except (Exception, KeyboardInterrupt) as error:
         if log.debug and not isinstance(error, (BrokenPipeError, KeyboardInterrupt)):
             import traceback
 
             traceback.print_exc()
+        if signal_outcome():  # libraries make other errors of an interrupt
+            return INTERRUPTED
         try:
-            code = _explain(error)
+            return _explain(error)
         except Exception as unexpected:
             if not log.debug:
                 log.error(
                     f"{type(unexpected).__name__}: {unexpected} (a bug, or an unusual machine; --debug shows where)"
                 )
-            code = 1
-    if code == INTERRUPTED:
-        log.error("interrupted")
-    sys.exit(code if isinstance(code, int) else 0)
+            return 1

@@ -12,9 +12,8 @@ import typer
 
 from dpcli.cli.options import Json, Picture
 from dpcli.errors import UsageError
-from dpcli.standard_streams import printable
+from dpcli.standard_streams import printable, rich_console
 
-_PIPE_WIDTH = 120
 _CLASSES_SHOWN, _COMMAND_SHOWN, _SKIPPED_SHOWN = 100, 300, 20
 
 
@@ -129,20 +128,17 @@ def _draw_views(path: Any, picture: Any, *, samples: int, frames: int, view: str
 
 
 def _show(found: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    width = None if sys.stdout.isatty() else _PIPE_WIDTH
-    console = Console(file=sys.stdout, highlight=False, soft_wrap=True, width=width)
+    console = rich_console(sys.stdout)
     for name, value in _lines(found):
-        console.print(printable(f"{name:<20} {value}"), markup=False)
+        console.print(printable(f"{name:<20} {value}"), soft_wrap=True)
     if found.get("classes"):
         console.print()
-        console.print(_class_table(found))
+        console.print(_class_table(found), soft_wrap=True)
     for number, entry in enumerate(found["provenance"], 1):
         short = _shortened(str(entry.get("command", "")))
-        console.print(f"{'provenance' if number == 1 else '':<20} {number}. {printable(short)}", markup=False)
+        console.print(f"{'provenance' if number == 1 else '':<20} {number}. {printable(short)}", soft_wrap=True)
     for name, value in _settings_lines(found):
-        console.print(printable(f"{name:<20} {value}"), markup=False)
+        console.print(printable(f"{name:<20} {value}"), soft_wrap=True)
 
 
 def _settings_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
@@ -157,11 +153,7 @@ def _settings_lines(found: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _show_model(told: dict[str, Any]) -> None:
-    from rich.console import Console
-
-    console = Console(
-        file=sys.stdout, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else _PIPE_WIDTH
-    )
+    console = rich_console(sys.stdout)
     made = f"dpc {told['version']}, " if told["version"] else ""
     lines = [
         ("file", told["file"]),
@@ -174,7 +166,7 @@ def _show_model(told: dict[str, Any]) -> None:
         within = value.items() if isinstance(value, dict) else [("", value)]
         lines += [(f"{key} {name}".replace("_", " ").strip(), _model_value(one)) for name, one in within]
     for name, value in lines:
-        console.print(printable(f"{name:<24} {value}"), markup=False)
+        console.print(printable(f"{name:<24} {value}"), soft_wrap=True)
 
 
 def _model_value(value: Any) -> str:

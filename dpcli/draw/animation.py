@@ -20,9 +20,14 @@ if TYPE_CHECKING:
 
 KINDS = (".mp4", ".gif", ".png")
 _X264 = ("-crf", "18", "-preset", "veryfast", "-threads", "2", "-movflags", "+faststart")  # crf 18: visually lossless
-_BT709 = (  # browsers take untagged videos for BT.709 from some size on, while FFmpeg converts by BT.601
-    *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-colorspace", "bt709", "-color_primaries", "bt709"),
-    *("-color_trc", "bt709", "-color_range", "tv"),
+# Browsers take videos that lack any of the tags for BT.601 or BT.709 by their size, while FFmpeg converts by BT.601. Newer
+# FFmpegs tag a video as its frames are tagged, whatever options say: so a filter tags them.
+_BT709 = (
+    *(
+        "-vf",
+        "scale=out_color_matrix=bt709:out_range=tv,setparams=range=tv:color_primaries=bt709:color_trc=bt709:colorspace=bt709",
+    ),
+    *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"),
 )
 _COLORS = 255  # of an animation
 _PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from

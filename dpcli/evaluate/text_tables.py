@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.markdown import as_markdown, markdown_table
 from dpcli.standard_streams import printable
 
 UNDEFINED = "-"
@@ -21,6 +22,7 @@ class TextTable:
     rows: list[list[str]]
 
     def __post_init__(self) -> None:  # names of classes and files are among them
+        self.title = printable(self.title)
         self.header = [printable(cell) for cell in self.header]
         self.rows = [[printable(cell) for cell in row] for row in self.rows]
 
@@ -80,10 +82,8 @@ def resampling_note(resampling: Resampling, of: str, number: int) -> list[str]:
 
 def markdown_tables(tables: list[TextTable], notes: list[str]) -> str:
     """Returns the tables, then the notes, as markdown for a document."""
-    made = [f"**{table.title}**\n\n{_markdown_table(table)}" for table in tables]
-    return "\n\n".join([*made, *map(printable, notes)])
-
-
-def _markdown_table(table: TextTable) -> str:
-    lines = [table.header, ["---", *["---:"] * (len(table.header) - 1)], *table.rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    made = [
+        f"**{as_markdown(table.title)}**\n\n{markdown_table(table.header, table.rows, [True] * len(table.header))}"
+        for table in tables
+    ]
+    return "\n\n".join([*made, *map(as_markdown, notes)])

@@ -135,7 +135,9 @@ class Supervision:
         "the role train, or a diffusion model; auto takes the network where it is sure, else the inflated silhouette.",
     )
     prior_model: str | None = setting(
-        None, "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded."
+        None,
+        "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded; of network: other weights, a "
+        "file or a folder of train-prior.",
     )
     regularize: bool = setting(True, "Keep the object from going flat by the loss `thickness` and the limit `aspect`.")
 

@@ -31,14 +31,13 @@ def closing_lines(path: Path, notes: Mapping[str, int]) -> list[str]:
 
 def _lengths(reader: CloudsReader) -> list[str]:
     distances, extents = [], []
-    places = np.unique(np.linspace(0, len(reader) - 1, min(_SEQUENCES, len(reader))).astype(int))
+    places = _spread(len(reader), _SEQUENCES)
     left = _POINTS
-    for place in places.tolist():
-        count = int(reader.frame_counts[place])
-        frames = np.unique(np.linspace(0, count - 1, min(_FRAMES, count)).astype(int)).tolist()
+    for place in places:
+        frames = _spread(int(reader.frame_counts[place]), _FRAMES)
         points = np.concatenate([reader.read(place, [t], fields=()).points for t in frames])
         distances.append(float(np.median(np.sqrt(np.einsum("ij,ij->i", points, points)))))
-        extents.append(points.max(0) - points.min(0))
+        extents.append([np.ptp(points[:, axis]) for axis in range(3)])  # NumPy is slow along short rows
         left -= len(points)
         if left < 0:
             break
@@ -49,6 +48,11 @@ def _lengths(reader: CloudsReader) -> list[str]:
     if not reader.shifts[places].any():  # else the origin is no sensor
         shown.insert(0, f"median distance {_number(float(np.median(distances)))}{unit}")
     return [*shown[:-1], f"{shown[-1]} ({reader.length_unit})"] if long else shown
+
+
+def _spread(count: int, wanted: int) -> list[int]:
+    """Returns up to so many of the indices below `count`, spread evenly, first and last among them."""
+    return sorted({int(place) for place in np.linspace(0, count - 1, min(wanted, count))})
 
 
 def _frames(reader: CloudsReader) -> str:

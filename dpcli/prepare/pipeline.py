@@ -5,32 +5,29 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import signal
-import threading
 from collections import Counter
-from collections.abc import Iterator
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.errors import DataError, UsageError, reading
+from dpcli.path_names import as_utf8
 from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
+from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.reader import Item, Reader, Sample
-from dpcli.prepare.shards import WHOLE, Shard, describe_shard
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.device import cpu_count
-from dpcli.runtime.pool import ordered_map
-from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.machines.shards import Shard, describe_shard
+from dpcli.runtime.machines.spread import Workers
+from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
-from dpcli.runtime.signals import StopRequest, stop_requested
-from dpcli.store import CloudsReader, CloudsWriter
+from dpcli.store import CloudsReader, CloudsWriter, ScoresReader, file_kind
+from dpcli.store.statistics import StatisticsReader
 from dpcli.store.writing.already_made import already_made
-
-_LISTED = 20  # skipped samples and notes named one by one at the end; -v names all as they come
+from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,18 +84,12 @@ class Report:
 
     def lines(self) -> list[str]:
         """Returns what was left out, in words; nothing goes unmentioned."""
-        lines = [f"{what}: {count}" for what, count in sorted(self.notes.items())]
-        if self.skipped:
-            lines.append(f"{len(self.skipped)} skipped:")
-            lines += [f"  {name}: {reason}" for name, reason in self.skipped[:_LISTED]]
-            if len(self.skipped) > _LISTED:
-                lines.append(f"  ... and {len(self.skipped) - _LISTED} more; -v names every one")
-        return lines
+        return [*(f"{what}: {count}" for what, count in sorted(self.notes.items())), *skipped_lines(self.skipped)]
 
     def counts(self) -> str:
         """Returns what was written, in words."""
-        written = f"{self.written} sequences, {self.frames} frames, {self.points} points"
-        return f"{written}, {len(self.skipped)} skipped"
+        clouds = f" sequences, {self.frames} frames, {self.points} points" if self.points else " samples"
+        return f"{self.written}{clouds}, {len(self.skipped)} skipped"
 
 
 def configuration(reader: Reader, thinning: Thinning, items: list[Item], compression: str) -> dict[str, Any]:
@@ -135,6 +126,26 @@ def _fingerprint(path: Path) -> str:
         return ""
 
 
+def all_items(reader: Reader) -> tuple[list[Item], list[Item]]:
+    """Returns a reader's index, and an item with a problem for each entry below its folder that can't be opened.
+
+    So a dangling link or a FIFO named like data is skipped by name. Raises DataError when the index can't be made.
+    """
+    given = getattr(reader, "inputs", ()) or (getattr(reader, "raw", None),)
+    roots = [root for root in given if isinstance(root, Path)]
+    with reading(", ".join(map(str, roots)) or type(reader).__name__):
+        items = list(reader.items())
+    taken = {item.path for item in items}
+    odd = [(root, path, why) for root in roots if root.is_dir() for path, why in unreadable_entries(root, taken)]
+    used, extra = {item.name for item in items}, []
+    for root, path, why in odd:
+        name = as_utf8(path.relative_to(root).as_posix())
+        name = as_utf8(str(path)) if name in used else name
+        used.add(name)
+        extra.append(Item(name, path, problem=f"{as_utf8(str(path))}: {why}"))
+    return items, extra
+
+
 def convert(
     reader: Reader,
     output: Path,
@@ -152,10 +163,10 @@ def convert(
     UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
     after a stop signal, with what is done kept beside `output`.
     """
-    items = reader.items()
+    items, unread = all_items(reader)
     for line in reader.summary(items):
         log.info(line)
-    items = items[: conversion.limit]
+    items = [*items, *unread][: conversion.limit]
     config = configuration(reader, conversion.thinning, items, conversion.compression)
     provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()
@@ -163,12 +174,36 @@ def convert(
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
         return _closed(count_samples(report, output), output)
-    work = partial(convert_item, reader, conversion.thinning, conversion.seed)
-    with stop_requested() as stop, _open_writer(output, reader, conversion, provenance, resume) as writer:
-        run = _Run(writer, report, stop, conversion, items)
-        run.stream(work, slots or conversion.processes, executor)
-        writer.skipped = report.skipped
+    with _open_writer(output, reader, conversion, provenance, resume) as writer:
+        taken = _write_items(writer, items, conversion)
+        taken.run(
+            partial(convert_item, reader, conversion.thinning, conversion.seed),
+            lambda place: (place, items[place]),
+            partial(_write_sample, writer, report, items),
+            Workers(slots or conversion.processes, executor),
+        )
     return _closed(count_samples(report, output), output)
+
+
+def _write_items(writer: CloudsWriter, items: list[Item], conversion: Conversion) -> ItemPass:
+    skip = conversion.on_error == "skip"
+    return ItemPass(
+        writer,
+        [item.name for item in items],
+        Wording(conversion.task, "sample", "converted", " (--on-error skip passes bad samples over)"),
+        conversion.shard,
+        skips=(DataError,) if skip else (),
+    )
+
+
+def _write_sample(
+    writer: CloudsWriter, report: Report, items: list[Item], place: int, sample: Sample
+) -> dict[str, float]:
+    writer.write(sample.sequence)
+    report.notes.update(sample.notes)
+    for what, count in sample.notes.items():
+        log.detail(f"{items[place].name}: {what}: {count}")
+    return {"frames": sample.sequence.num_frames}
 
 
 def _closed(report: Report, output: Path) -> Report:
@@ -193,97 +228,12 @@ def _open_writer(
     )
 
 
-class _Run:
-    """Passes once over the items that are not written yet, in order, into the writer."""
-
-    def __init__(
-        self, writer: CloudsWriter, report: Report, stop: StopRequest, conversion: Conversion, items: list[Item]
-    ) -> None:
-        self.writer, self.report, self.stop, self.conversion = writer, report, stop, conversion
-        self.items = [(place, items[place]) for place in (conversion.shard or WHOLE).places(len(items))]
-        done = set(writer.written_names)
-        if done:
-            log.info(f"continuing: {len(done)} of {len(self.items)} were converted before")
-        written = [place for place, item in self.items if item.name in done]
-        self.last = written[-1] if written else -1
-        self.todo = [(place, item) for place, item in self.items if item.name not in done]
-        self.places: tuple[list[int], list[int]] = (written, [])  # of the samples written, of those skipped
-        writer.positions = self.places if conversion.shard else None
-
-    def stream(self, work: Any, jobs: int, executor: Executor | None) -> None:
-        """Writes every item's sample, or note why it has none; a stop or a failure leaves the file to be continued."""
-        with Progress(self.conversion.task, total=len(self.items), unit="video") as bar:
-            bar.skip(len(self.items) - len(self.todo))
-            try:
-                jobs = min(jobs, len(self.todo))  # one item needs no process of its own
-                for indexed, result in ordered_map(work, self.todo, jobs, executor):
-                    self.take(indexed, result, bar)
-                    self.stop.check(self.kept())
-            except KeyboardInterrupt:
-                log.warn(f"interrupted; {self.kept()}; run again to continue")
-                raise
-            except Exception as error:
-                lost = isinstance(error, DpcError) or executor is not None
-                if lost:  # a signal to the whole process group takes the workers down as well: a stop, not a failure
-                    self.stop.check(self.kept())
-                self.writer.keep = lost and not isinstance(error, DataError)  # it says nothing about the samples
-                raise
-        if not len(self.writer) and self.writer.positions is None:
-            reason = self.report.skipped[0][1] if self.report.skipped else "the index is empty"
-            raise DataError(f"none of the {len(self.items)} samples is good; the first: {reason}")
-
-    def kept(self) -> str:
-        """Returns how many samples are kept, in words."""
-        return f"{len(self.writer)} of {len(self.items)} samples are kept"
-
-    def take(self, indexed: tuple[int, Item], result: Any, bar: Progress) -> None:
-        """Writes a sample, or note what was raised instead of one."""
-        (place, item) = indexed
-        if isinstance(result, Sample) and place > self.last:
-            with _interrupted_after():
-                self.writer.write(result.sequence)
-            self.places[0].append(place)
-            self.report.notes.update(result.notes)
-            for what, count in result.notes.items():
-                log.detail(f"{item.name}: {what}: {count}")
-            bar.advance(1, frames=result.sequence.num_frames)
-        else:
-            _skip(item, result, self.report, bar, self.conversion.on_error)
-            self.places[1].append(place)
-
-
-@contextmanager
-def _interrupted_after() -> Iterator[None]:
-    """Delays Ctrl-C until the block has ended, because a half-appended sample would be lost."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    pending: list[int] = []
-    previous = signal.signal(signal.SIGINT, lambda number, frame: pending.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-    if pending:
-        raise KeyboardInterrupt
-
-
-def _skip(item: Item, result: Any, report: Report, bar: Progress, on_error: str) -> None:
-    if isinstance(result, Sample):
-        # a stopped run had passed it over as bad; putting it in now would break the order of the file
-        result = DataError("is readable now but was skipped before the stop; --force starts over and includes it")
-    if not isinstance(result, DataError):
-        log.error(f"{item.name}: reading it failed in an unforeseen way")
-        raise result
-    if on_error == "stop":
-        raise DataError(f"{item.name}: {result} (--on-error skip passes bad samples over)")
-    report.skipped.append((item.name, str(result)))
-    log.detail(f"skipped {item.name}: {result}")
-    bar.advance(1)
-
-
 def count_samples(report: Report, output: Path) -> Report:
     """Returns the report with what the finished file holds, whether this run wrote all of it or continued another."""
+    if file_kind(output) in ("scores", "statistics"):
+        made = (ScoresReader if file_kind(output) == "scores" else StatisticsReader)(output)
+        report.written, report.skipped = len(made.names), made.skipped
+        return report
     with CloudsReader(output) as reader:
         report.written = len(reader)
         report.skipped = reader.skipped

@@ -8,13 +8,13 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
-from dpcli.errors import DpcError
+from dpcli.errors import DataError
 from dpcli.runtime import shared_memory as handover
 from dpcli.runtime.tuning import fast_transport, keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
@@ -51,6 +51,95 @@ def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
         return error
 
 
+class LostWorker(DataError):
+    """The process that worked on an item died, and so did the one that tried it again: the item is passed over."""
+
+
+def _was_lost(error: Exception) -> bool:
+    """Returns whether an executor says that whoever worked on an item died; Dask's class is told by its name, as Dask need not be there."""
+    return isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker"
+
+
+class _Pool:
+    """Holds processes of this machine, or an executor of the caller's, and replaces processes that died."""
+
+    def __init__(self, function: Callable[[Any], Any], jobs: int, executor: Executor | None) -> None:
+        self._guarded = partial(_guarded, function)
+        packed = executor is None and handover.POSSIBLE and fast_transport()
+        self._work = partial(handover.packed, self._guarded) if packed else self._guarded
+        self._jobs, self._given = jobs, executor
+        self._open()
+
+    def _open(self) -> None:
+        self._strangers = set(multiprocessing.active_children())
+        self._executor = self._given or _new_pool(self._jobs)
+
+    def submit(self, item: Any) -> Future:
+        """Has an item worked on, by new processes where the old ones broke."""
+        try:
+            return self._executor.submit(self._work, item)
+        except BrokenProcessPool:
+            self._end_broken()
+            self._open()
+            return self._executor.submit(self._work, item)
+
+    def result(self, item: Any, future: Future) -> Any:
+        """Returns an item's result, or LostWorker as one. What was on its way as a process died is tried again, alone, as
+        nobody can say which item took it down."""
+        try:
+            return self._unpacked(item, future.result())
+        except Exception as error:
+            if not _was_lost(error):
+                raise
+        return self._try_alone(item) if self._given is None else _lost()
+
+    def _unpacked(self, item: Any, result: Any) -> Any:
+        if not isinstance(result, handover.Parcel):
+            return result
+        try:
+            return handover.unpacked(result)
+        except OSError:  # not allowed here, or that worker is gone
+            return self._try_alone(item)
+
+    def _try_alone(self, item: Any) -> Any:
+        strangers = set(multiprocessing.active_children())
+        with _new_pool(1) as alone:
+            try:
+                return alone.submit(self._guarded, item).result()
+            except BrokenProcessPool:
+                return _lost(_kill_children(strangers))
+
+    def _end_broken(self) -> None:
+        _kill_children(self._strangers)
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
+    def close(self) -> None:
+        """Ends the processes; an executor of the caller's stays."""
+        if self._given is None:
+            try:
+                self._executor.submit(int)  # the one public way to learn that processes died since the last item
+            except BrokenProcessPool:
+                _kill_children(self._strangers)
+            self._executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _kill_children(strangers: set) -> str:
+    """Ends the processes of a broken executor, and returns the name of the signal that broke it, "" where nobody can say.
+
+    The executor sends them SIGTERM, which they ignore, and would wait for them for ever.
+    """
+    children = set(multiprocessing.active_children()) - strangers
+    codes = [child.exitcode for child in children if not child.is_alive()]
+    for child in children:
+        child.kill()
+    return next((signal.Signals(-code).name for code in codes if code and code < 0), "")
+
+
+def _lost(how: str = "") -> LostWorker:
+    why = f"by {how}" if how else "killed, or out of memory"
+    return LostWorker(f"the process that worked on it died ({why}), and so did the one that tried it again")
+
+
 def ordered_map(
     function: Callable[[Any], Any], items: Iterable[Any], jobs: int, executor: Executor | None = None
 ) -> Iterator[tuple[Any, Any]]:
@@ -58,45 +147,24 @@ def ordered_map(
 
     At most `2 * jobs` results exist at a time, so memory doesn't grow with the number of items. `jobs <= 1` without an
     executor runs in this process; else `executor`, or `jobs` processes started by `forkserver` (safe beside threads).
-    A worker that dies (out of memory, killed) ends the iteration with a DpcError.
+    A worker that dies (out of memory, killed) costs time: what was on its way is worked on again. An item that takes
+    down a second one has LostWorker for its result.
     """
     if executor is None and jobs <= 1:
         for item in items:
             yield item, _guarded(function, item)
         return
-    own = executor is None
-    strangers = set(multiprocessing.active_children())
-    pool = executor or _new_pool(jobs)
-    guarded = partial(_guarded, function)
-    work = partial(handover.packed, guarded) if own and handover.POSSIBLE and fast_transport() else guarded
-    waiting: deque = deque()
-
-    def first() -> tuple[Any, Any]:
-        done, future = waiting.popleft()
-        result = future.result()
-        if isinstance(result, handover.Parcel):
-            try:
-                return done, handover.unpacked(result)
-            except OSError:  # not allowed here, or that worker is gone: then this finds the pool broken
-                return done, pool.submit(guarded, done).result()
-        return done, result
-
+    pool, waiting = _Pool(function, jobs, executor), deque()
     try:
         for item in items:
-            waiting.append((item, pool.submit(work, item)))
+            waiting.append((item, pool.submit(item)))
             if len(waiting) >= 2 * max(jobs, 1):
-                yield first()
+                done, future = waiting.popleft()
+                yield done, pool.result(done, future)
         while waiting:
-            yield first()
-    except BrokenProcessPool:
-        # the executor ends the other workers by SIGTERM, which they ignore, and would wait for them for ever
-        for child in set(multiprocessing.active_children()) - strangers if own else ():
-            child.kill()
-        raise DpcError(
-            "a worker process died (killed, or out of memory); run again, perhaps with a smaller --jobs"
-        ) from None
+            done, future = waiting.popleft()
+            yield done, pool.result(done, future)
     finally:
         for _, future in waiting:
             future.cancel()
-        if own:
-            pool.shutdown(wait=True, cancel_futures=True)
+        pool.close()

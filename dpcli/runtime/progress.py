@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TextIO
 
-from dpcli.standard_streams import printable
+from dpcli.standard_streams import printable, rich_console
 
 _PLAIN_INTERVAL = 5.0  # seconds between lines in a log that is not a terminal
 
@@ -18,9 +20,24 @@ class _Log:
     def __init__(self) -> None:
         self.level = 1
         self.debug = False
+        self._said: set[str] | None = None
+
+    @contextmanager
+    def each_once(self, said: set[str]) -> Iterator[None]:
+        """Writes no text that is in `said`, to which it adds those it writes: for files that are read again and again."""
+        before, self._said = self._said, said
+        try:
+            yield
+        finally:
+            self._said = before
 
     def _write(self, text: str) -> None:
-        sys.stderr.write("dpc: " + printable(text, kept="\n\t") + "\n")
+        if self._said is not None:
+            if text in self._said:
+                return
+            self._said.add(text)
+        lines = printable(text, kept="\n\t").replace("\n", "\n     ")  # no name can begin a message of its own
+        sys.stderr.write(f"dpc: {lines}\n")
         sys.stderr.flush()
 
     def detail(self, text: str) -> None:
@@ -62,7 +79,7 @@ class Progress:
     """
 
     def __init__(self, task: str, total: int | None, unit: str = "it", stream: TextIO | None = None) -> None:
-        self.task, self.total, self.unit = task, total, unit
+        self.task, self.total, self.unit = printable(task), total, unit
         self.stream = stream or sys.stderr
         self.done, self.first = 0, 0
         self.counters: dict[str, float] = {}
@@ -78,12 +95,11 @@ class Progress:
         return self
 
     def _open_bar(self) -> None:
-        from rich.console import Console
         from rich.progress import BarColumn, TextColumn
         from rich.progress import Progress as Bar
 
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[text]}"))
-        self._bar = Bar(*columns, console=Console(file=self.stream), transient=False)
+        task, text = (TextColumn(of, markup=False) for of in ("{task.description}", "{task.fields[text]}"))
+        self._bar = Bar(task, BarColumn(), text, console=rich_console(self.stream), transient=False)
         self._handle = self._bar.add_task(self.task, total=self.total, text="")
         self._bar.start()
 
@@ -113,7 +129,7 @@ class Progress:
         parts += [f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in self.values.items()]
         if self.total and rate > 0 and self.done < self.total:
             parts.append(f"eta {duration((self.total - self.done) / rate)}")
-        return " ".join(parts)
+        return printable(" ".join(parts))
 
     def _show(self, last: bool = False) -> None:
         if self._bar is not None:

@@ -115,6 +115,15 @@ def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
         raise DataError(f"{option} {path}: is a folder; name a file in it")
 
 
+def check_writable(path: Path, option: str = "-o") -> None:
+    """Raises DataError where nothing can be made or replaced in the folder that is to hold `path`, or in the folder that it is."""
+    folder = next((one for one in (path, *path.absolute().parents) if one.is_dir()), Path("/"))
+    if not os.access(folder, os.W_OK | os.X_OK):
+        read_only = hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY
+        why = "the file system is read-only" if read_only else "no permission"
+        raise DataError(f"{option} {path}: the folder {folder} can't be written to ({why}); name another place")
+
+
 def check_regular(path: Path, option: str = "-o") -> None:
     """Raises UsageError where a device, pipe or socket is, or a handle such as /dev/stdout."""
     target = os.readlink(path) if path.is_symlink() else ""

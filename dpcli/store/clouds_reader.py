@@ -9,12 +9,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError
-from dpcli.store.file import open_store, read_provenance, read_skipped, read_strings, root_attributes
+from dpcli.errors import DataError, reading
+from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.schema import KEPT
-from dpcli.store.sequence import POINT_FIELDS, CloudSequence
+from dpcli.store.sequence import OF_PARTS, POINT_FIELDS, CloudSequence
 
-OPTIONAL = ("time", *POINT_FIELDS, "pose")
+OPTIONAL = ("time", *POINT_FIELDS, *OF_PARTS)
+_OF_FRAMES = ("time", *OF_PARTS)
 
 
 class CloudsReader:
@@ -27,6 +28,7 @@ class CloudsReader:
     """
 
     kinds: tuple[str, ...] = ("clouds", "parts")
+    cache = 1 << 20  # bytes of chunks that HDF5 keeps of each data set; less where many files are open at a time
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -39,7 +41,7 @@ class CloudsReader:
     def _load_index(self, file: h5py.File) -> None:
         self.attributes = root_attributes(file)
         self.provenance = read_provenance(file)
-        self.skipped = read_skipped(file)
+        self.skipped, self.positions = read_skipped(file), read_positions(file)
         self.class_names = read_strings(file, "class_names", optional=True)
         self.length_unit = str(file.attrs.get("length_unit", ""))
         self.names, self.splits = read_strings(file, "name"), read_strings(file, "split")
@@ -66,7 +68,7 @@ class CloudsReader:
         self.shifts = self._read_shifts(file)
         self.fields = (*(key for key in OPTIONAL if key in file), *(key for key in file if key.startswith(KEPT)))
         for key in self.fields:
-            rows = frames if key in ("time", "pose") else self.num_points
+            rows = frames if key in _OF_FRAMES else self.num_points
             if len(file[key]) != rows:
                 raise DataError(f"{self.path}: {key} has {len(file[key])} rows, expected {rows}")
 
@@ -127,7 +129,7 @@ class CloudsReader:
         """Opens the file in this process unless it is open, and returns the handle."""
         if self._file is None or self._process != os.getpid() or not self._file.id.valid:
             self._sets = {}
-            self._file, self._process = open_store(self.path, self.kinds), os.getpid()
+            self._file, self._process = open_store(self.path, self.kinds, self.cache), os.getpid()
         return self._file
 
     def _set(self, name: str) -> h5py.Dataset:
@@ -143,8 +145,12 @@ class CloudsReader:
         """Sequence `index`, or only some of its frames (repeats allowed), with all optional fields or those named.
 
         Touches only what it needs: one contiguous read from the first to the last frame asked for.
-        DataError when a value is NaN or infinite.
+        DataError when a value is NaN or infinite, or the file is damaged there.
         """
+        with reading(self.path):
+            return self._read(index, frames, fields)
+
+    def _read(self, index: int, frames: slice | Sequence[int] | None, fields: Sequence[str] | None) -> CloudSequence:
         first = int(self._sequence_offsets[index])
         count = int(self._sequence_offsets[index + 1]) - first
         wanted = (
@@ -161,7 +167,7 @@ class CloudsReader:
         sizes = np.diff(offsets) if picks is None else np.diff(offsets)[picks]
         values = {}
         for key in ("points", *(self.fields if fields is None else fields)):
-            if key in ("time", "pose"):
+            if key in _OF_FRAMES:
                 values[key] = self._set(key)[first + low : first + high][wanted - low]
             else:
                 values[key] = _pick(self._set(key)[span], offsets - offsets[0], picks)
@@ -182,6 +188,10 @@ class CloudsReader:
             extra={key: values.pop(key) for key in [key for key in values if key.startswith(KEPT)]},
             **values,
         )
+
+    def given(self, index: int) -> list:
+        """Returns sequence `index` as the writer of such a file takes it again."""
+        return [self.read(index)]
 
     def close(self) -> None:
         """Closes the handle of this process; the next read opens the file again."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ import h5py
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.store.file import STRING, write_positions, write_skipped
+from dpcli.store.file import STRING
 from dpcli.store.schema import KEPT, fields_of
-from dpcli.store.sequence import POINT_FIELDS, CloudSequence
+from dpcli.store.sequence import OF_PARTS, POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
 from dpcli.store.writing.resumable_writer import ResumableWriter
 from dpcli.store.writing.whole_chunks import PlainChunks, chunk_writer
@@ -27,7 +28,7 @@ _PER_SAMPLE = {
     if field.shape == ("S",) and not field.optional
 }
 _INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
-_FIELDS = ("time", *POINT_FIELDS, "pose")  # the order in which they are made, whoever names them: equal bytes
+_FIELDS = ("time", *POINT_FIELDS, *OF_PARTS)  # the order in which they are made, whoever names them: equal bytes
 _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
 
 
@@ -36,10 +37,8 @@ class CloudsWriter(ResumableWriter):
 
     A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
     the samples of a compressed file.
-    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, and kept columns,
-    `field_NAME`); a shift is written where a sample has one. Set before the
-    block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see write_positions), both
-    kept in the file; a shard may be empty.
+    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, joint, and kept columns,
+    `field_NAME`); a shift is written where a sample has one.
 
     >>> from dpcli.store import CloudSequence, CloudsReader
     >>> with CloudsWriter("two.h5", class_names=["wave"]) as writer:
@@ -74,12 +73,10 @@ class CloudsWriter(ResumableWriter):
         if unknown:
             raise UsageError(f"unknown field {min(unknown)!r}; expected {', '.join(_FIELDS)}")
         self.fields, self.compression = (*(n for n in _FIELDS if n in fields), *kept), compression
-        self.skipped: list[tuple[str, str]] = []
-        self.positions: tuple[list[int], list[int]] | None = None
         self._names: set[str] = set()
         self._frames = self._points = self._unflushed = 0
         self._shifts: list[np.ndarray | None] = []
-        self._index: dict[str, list] = {name: [] for name in _INDEX}
+        self._index: dict[str, list | array] = {name: _empty_column(name) for name in _INDEX}
         self._data: dict[str, h5py.Dataset] = {}
         self._chunks: PlainChunks | None = None
         self._placed: Placed | None = None
@@ -123,7 +120,7 @@ class CloudsWriter(ResumableWriter):
             dtype, shape = POINT_FIELDS.get(name, (np.float32, ()))
             chunks = (POINTS_PER_CHUNK, *shape)
             file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunks, **PACKED)
-        # pose is created with the first sample, which tells the number of parts
+        # pose and joint are created with the first sample, which tells the number of parts
 
     def write(self, sequence: CloudSequence) -> None:
         """Appends one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
@@ -137,7 +134,8 @@ class CloudsWriter(ResumableWriter):
         self._placed = None
         self._names.add(sequence.name)
 
-    def _write_again(self, given: list[Any]) -> str:
+    def write_again(self, given: list[Any]) -> str:
+        """Writes a sample as `_record` was told of it, and returns its name."""
         self.write(*given)
         return given[0].name
 
@@ -148,11 +146,11 @@ class CloudsWriter(ResumableWriter):
         missing = [name for name in self.fields if sequence.value(name) is None]
         if missing:
             raise DataError(f"sample {sequence.name!r}: no {', '.join(missing)}, though the other samples have it")
-        if "pose" in self.fields and "pose" in self._file:
-            own, others = sequence.pose.shape[1], self._file["pose"].shape[1]
+        for name in OF_PARTS.keys() & self._file.keys():
+            own, others = getattr(sequence, name).shape[1], self._file[name].shape[1]
             if own != others:
                 raise DataError(
-                    f"sample {sequence.name!r}: pose has {own} parts, earlier samples have {others}; pad to the largest"
+                    f"sample {sequence.name!r}: {name} has {own} parts, earlier samples have {others}; pad to the largest"
                 )
 
     def _append_sequence(self, sequence: CloudSequence) -> None:
@@ -169,9 +167,13 @@ class CloudsWriter(ResumableWriter):
 
     def _append(self, name: str, values: np.ndarray | list) -> None:
         if name in self._index:
-            self._index[name].extend(values)
+            column = self._index[name]
+            if isinstance(column, array):
+                column.frombytes(np.asarray(values, _FIELD[name].dtype).tobytes())
+            else:
+                column.extend(values)
             return
-        if name == "pose" and name not in self._file:
+        if name in OF_PARTS and name not in self._file:
             shape = values.shape[1:]
             self._file.create_dataset(
                 name, (0, *shape), _FIELD[name].dtype, maxshape=(None, *shape), chunks=(64, *shape), **PACKED
@@ -185,7 +187,7 @@ class CloudsWriter(ResumableWriter):
             self._atomic.flush()
             self._unflushed = 0
 
-    def _extend(self, name: str, values: np.ndarray | list) -> None:
+    def _extend(self, name: str, values: np.ndarray | list | array) -> None:
         if name not in self._data:  # kept open: closing would write its unfinished chunk, each time
             self._data[name] = self._file[name]
         data = self._data[name]
@@ -208,12 +210,14 @@ class CloudsWriter(ResumableWriter):
             if values:
                 self._extend(name, values)
         self._write_shifts()
-        write_skipped(self._file, self.skipped)
-        write_positions(self._file, self.positions)
-        self._file.flush()
 
     def _write_shifts(self) -> None:
         """The samples' shifts, f64 (S,3), zero where one has none; nothing where none has, as most files."""
         rows = [np.zeros(3) if shift is None else np.asarray(shift, np.float64) for shift in self._shifts]
         if np.any(rows):
             self._file.create_dataset("shift", data=np.array(rows))
+
+
+def _empty_column(name: str) -> list | array:
+    """Returns what holds a column of the index until the end: numbers as bytes, as there may be millions of samples."""
+    return [] if _FIELD[name].kind == "str" else array(_FIELD[name].dtype.char)

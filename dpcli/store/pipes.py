@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime.whole_file import check_regular, refuse_pipe
+from dpcli.runtime.whole_file import DiskFull, check_regular, check_writable, disk_full, refuse_pipe
 
 _PAGES = (".html", ".htm", ".md", ".tex")
 _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
@@ -41,13 +41,31 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
     if direct is not None:
         yield direct
         return
-    with tempfile.TemporaryDirectory(prefix="dpc-") as folder:
-        path = Path(folder) / "stdin.h5"
+    with _spool() as folder:
+        path = folder / "stdin.h5"
         with open(path, "wb") as spool:
             shutil.copyfileobj(stream, spool, _PIECE)
         if path.stat().st_size == 0:
             raise DataError("stdin: empty; the command before the pipe wrote nothing (see its message above)")
         yield path
+
+
+@contextmanager
+def _spool() -> Iterator[Path]:
+    """Yields a folder in $TMPDIR for what goes through a pipe. Raises DiskFull that names $TMPDIR where there is no room."""
+    advice = "what goes through a pipe is kept there first; set TMPDIR to a folder with more room"
+    try:
+        place = tempfile.gettempdir()
+    except FileNotFoundError as error:  # not one place in which a file could be written
+        raise DiskFull(f"TMPDIR: {str(error).partition('] ')[2] or error}; {advice}") from None
+    try:
+        with tempfile.TemporaryDirectory(prefix="dpc-") as folder:
+            yield Path(folder)
+    except (DiskFull, OSError) as error:
+        full = disk_full(f"TMPDIR ({place})", error, advice)
+        if full is None or not (isinstance(error, DiskFull) or str(error.filename or place).startswith(place)):
+            raise
+        raise full from None
 
 
 def standard_input() -> BinaryIO:
@@ -60,10 +78,12 @@ def standard_input() -> BinaryIO:
 def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
     """Raises UsageError, before anything is opened, where what is there must not be replaced, --force or not.
 
-    An input under whatever name (links, `-` for a redirected file); what lies in an input folder (a model, raw data) and is
-    no result of dpc's own; whatever is no regular file: renaming a file over a device would put an end to the device.
+    That is an input under whatever name (links, `-` for a redirected file); what lies in an input folder (a model, raw data)
+    and is no result of dpc's own; whatever is no regular file: renaming a file over a device would put an end to the device.
+    DataError where the place can't be written to.
     """
     if path.is_dir() or not os.path.lexists(path):
+        check_writable(path, option)
         return
     check_regular(path, option)
     for given in map(str, inputs):
@@ -123,8 +143,8 @@ def output_file(argument: str | Path, stdout: BinaryIO | None = None) -> Iterato
     stream = stdout or sys.stdout.buffer
     if stream.isatty():
         raise UsageError("refusing to write HDF5 to a terminal; use -o FILE, or pipe into another dpc command")
-    with tempfile.TemporaryDirectory(prefix="dpc-") as folder:
-        path = Path(folder) / "stdout.h5"
+    with _spool() as folder:
+        path = folder / "stdout.h5"
         yield path
         with open(path, "rb") as spool:
             shutil.copyfileobj(spool, stream, _PIECE)

@@ -86,6 +86,15 @@ _CLOUDS = (
         optional=True,
     ),
     Field(
+        "joint",
+        "f64",
+        ("F", "parts", 9),
+        "the joint above each part, in the frame's coordinates: parent part (-1: none), type (0 none, 1 revolute, 2"
+        " prismatic, 3 fixed, 4 free), direction of the axis x y z, a point on it x y z, value (radians or `length_unit`);"
+        " padded as `pose`",
+        optional=True,
+    ),
+    Field(
         "shift",
         "f64",
         ("S", 3),
@@ -99,6 +108,8 @@ _LEFT_OUT = (
     Field("skipped", "str", ("n", 2), "name and reason of every sample that was left out", optional=True),
     Field("position", "i64", ("S",), "in a shard: the place of each sample in the whole list", optional=True),
     Field("skipped_position", "i64", ("n",), "in a shard: the same of the samples left out", optional=True),
+)
+_EXPLAINED = (
     Field("activation", "f32", ("P",), "how active each point is (`dpc classify explain pac`)", True, group=True),
 )
 _PARTS = (
@@ -121,6 +132,10 @@ _SCORES = (
     Field("scores", "f32", ("S", "C"), "class probabilities"),
     *_WHO,
     Field("streams", "f32", ("S", "C"), "the same of one stream of the network", optional=True, group=True),
+)
+_STATISTICS = (
+    Field("name", "str", ("S",), "unique name"),
+    Field("statistics", "str", ("S",), "one JSON object: what was counted of the sample"),
 )
 _EMBEDDING = (
     *_WHO,
@@ -170,12 +185,13 @@ EVERYWHERE = (
 )
 # What a kind has beside EVERYWHERE; a `parts` file has all that a `clouds` file has, with a `part` of its own.
 TABLES = {
-    "clouds": _CLOUDS + _LEFT_OUT,
+    "clouds": _CLOUDS + _LEFT_OUT + _EXPLAINED,
     "views": _VIEWS,
-    "scores": _SCORES,
+    "scores": _SCORES + _LEFT_OUT,
     "parts": _PARTS,
     "gaussians": _GAUSSIANS,
     "embedding": _EMBEDDING,
+    "statistics": _STATISTICS + _LEFT_OUT,
 }
 KINDS = tuple(TABLES)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,15 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes
+from dpcli.store.file import (
+    STRING,
+    open_store,
+    read_positions,
+    read_provenance,
+    read_skipped,
+    read_strings,
+    root_attributes,
+)
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.resumable_writer import ResumableWriter
 
@@ -20,8 +29,8 @@ _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 class ScoresWriter(ResumableWriter):
     """Context manager; `write` one sample after the other, the file appears whole when the block ends.
 
-    A score row is small (C floats), so rows are kept in memory until the end, and with `resume=True` in the journal, too:
-    see `ResumableWriter`. `streams` names extra score arrays (such as static, dynamic) stored beside the final one.
+    A score row is small (C floats), so rows are kept in memory until the end, as floats alone, and with `resume=True` in
+    the journal, too: see `ResumableWriter`. `streams` names extra score arrays (such as static, dynamic) stored beside the final one.
     """
 
     kind = "scores"
@@ -39,7 +48,10 @@ class ScoresWriter(ResumableWriter):
         resume: bool = False,
     ) -> None:
         self.streams = tuple(streams)
-        self._rows: list[tuple] = []
+        self._names: list[str] = []
+        self._splits: list[str] = []
+        self._labels = array("i")
+        self._rows = [array("f") for _ in range(1 + len(self.streams))]  # of the scores, then of each stream
         super().__init__(
             path,
             class_names=class_names,
@@ -72,11 +84,15 @@ class ScoresWriter(ResumableWriter):
         main, *single = (
             np.asarray(row, _FIELD["scores"].dtype) for row in (scores, *(own[key] for key in self.streams))
         )
-        self._rows.append((name, split, int(label), main, single))
+        self._names.append(name)
+        self._splits.append(split)
+        self._labels.append(int(label))
+        for rows, row in zip(self._rows, (main, *single)):
+            rows.frombytes(row.tobytes())
         self._record([name, split, int(label), main, single])
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._names)
 
     def __enter__(self) -> ScoresWriter:
         return self
@@ -84,22 +100,22 @@ class ScoresWriter(ResumableWriter):
     def _about(self) -> dict[str, Any]:
         return super()._about() | {"streams": list(self.streams)}
 
-    def _write_again(self, given: list[Any]) -> str:
+    def write_again(self, given: list[Any]) -> str:
+        """Writes a sample as `_record` was told of it, and returns its name."""
         name, split, label, scores, single = given
         self.write(name, scores, label=label, split=split, streams=dict(zip(self.streams, single)))
         return name
 
     def _complete(self) -> None:
-        if not self._rows:
+        if not self._names and self.positions is None:
             raise DataError(f"{self.path}: not one sample was scored; nothing was written")
         file = self._file
-        names, splits, labels, scores, streams = zip(*self._rows)
-        file.create_dataset("name", data=np.array(names, dtype=object), dtype=STRING)
-        file.create_dataset("split", data=np.array(splits, dtype=object), dtype=STRING)
-        file.create_dataset("label", data=np.array(labels, _FIELD["label"].dtype), **_PACKED)
-        file.create_dataset("scores", data=np.stack(scores))
-        for stream, rows in zip(self.streams, zip(*streams)):
-            file.create_dataset(f"streams/{stream}", data=np.stack(rows))
+        file.create_dataset("name", data=np.array(self._names, dtype=object), dtype=STRING)
+        file.create_dataset("split", data=np.array(self._splits, dtype=object), dtype=STRING)
+        file.create_dataset("label", data=np.array(self._labels, _FIELD["label"].dtype), **_PACKED)
+        for name, rows in zip(("scores", *(f"streams/{stream}" for stream in self.streams)), self._rows):
+            table = np.frombuffer(rows, _FIELD["scores"].dtype) if rows else np.zeros(0, _FIELD["scores"].dtype)
+            file.create_dataset(name, data=table.reshape(len(self._names), len(self.class_names)))
 
 
 class ScoresReader:
@@ -119,7 +135,21 @@ class ScoresReader:
                     raise DataError(f"{path}: data set {key!r} is missing; the file is incomplete, make it again")
             self.scores, self.labels = file["scores"][:], file["label"][:]
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
-        self._check()
+            self.skipped, self.positions = read_skipped(file), read_positions(file)
+            self._check()
+
+    @property
+    def stream_names(self) -> tuple[str, ...]:
+        """The streams in the order in which the network has them: static, dynamic, others by name."""
+        return tuple(sorted(self.streams, key=lambda name: (name != "static", name != "dynamic", name)))
+
+    def given(self, index: int) -> list[Any]:
+        """Returns sample `index` as the writer of such a file takes it again."""
+        single = [self.streams[name][index] for name in self.stream_names]
+        return [self.names[index], self.splits[index], int(self.labels[index]), self.scores[index], single]
+
+    def close(self) -> None:
+        """Does nothing: all of it is in memory."""
 
     def _check(self) -> None:
         shape = (len(self.names), len(self.class_names))

@@ -16,6 +16,7 @@ from dpcli.store.file import file_kind, open_store, read_provenance, root_attrib
 from dpcli.store.gaussians import read_scene
 from dpcli.store.parts import PartsReader
 from dpcli.store.scores import ScoresReader
+from dpcli.store.statistics import StatisticsReader
 from dpcli.store.views import ViewsReader
 
 _ROWS = 1 << 20  # points read at a time for the ranges: 12 MiB
@@ -42,6 +43,7 @@ def summary(path: str | Path) -> dict[str, Any]:
         "views": _views,
         "gaussians": _gaussians,
         "embedding": _embedding,
+        "statistics": _statistics,
     }[kind]
     return {**common, **own(path)}
 
@@ -110,6 +112,15 @@ def _scores(path: Path) -> dict[str, Any]:
         "streams": sorted(reader.streams),
         "range": {"scores": _ends(reader.scores)},
         **_who(reader.class_names, reader.labels, reader.splits),
+    }
+
+
+def _statistics(path: Path) -> dict[str, Any]:
+    reader = StatisticsReader(path)
+    return {
+        "counts": {"samples": len(reader.names)},
+        "of": str(reader.provenance[-1].get("config", {}).get("task", "")),
+        "skipped": [{"name": name, "reason": reason} for name, reason in reader.skipped],
     }
 
 

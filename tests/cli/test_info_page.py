@@ -19,7 +19,7 @@ from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter,
 from dpcli.store.embedding import StreamEmbedding, write_embedding
 from dpcli.store.gaussians import write_scene
 from dpcli.store.views import ViewsHeader
-from tests.support.browser import needs_browser, open_page
+from tests.support.browser import PRESSED, needs_browser, open_page
 from tests.support.scenes import toy_scene
 
 WIDTH, HEIGHT = 900, 640
@@ -293,6 +293,25 @@ def test_keys(balls, tmp_path):
         "0,false,height,1,false,true",
     ]
     assert shown.attribute("zoom") == "true"
+
+
+@needs_browser
+def test_keys_work_whatever_has_the_focus(balls, tmp_path):
+    """Space plays once and presses no button; sliders and menus keep their arrows, and Enter presses buttons."""
+    script = """
+    whenReady(() => {
+      const told = [];
+      for (const where of ["#slider", "#speed", "#home", "#play", "#look button"]) {
+        page.change({ play: false, color: "part" });
+        told.push(where, pressed(where, " "), page.state.play, pressed(where, "3"), page.state.color);
+        told.push(pressed(where, "ArrowRight"), pressed(where, "Enter"));
+      }
+      root.dataset.told = told.join(" ");
+    });"""
+    shown = show(balls, tmp_path, "play=0&frame=0&theme=light", PRESSED + script, wanted="told")
+    arrows = {"#slider": "false", "#speed": "false", "#home": "true", "#play": "true", "#look button": "true"}
+    right = [f"{where} true true true height {own} false" for where, own in arrows.items()]
+    assert shown.attribute("told") == " ".join(right)
 
 
 @needs_browser

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from dpcli.draw.animation import output_kind, write_pictures
 from dpcli.errors import DataError, DpcError, UsageError
+from tests.support.browser import needs_browser, open_page
 
 
 def moving_square(count: int = 6, shape: tuple[int, int] = (31, 40)) -> list[np.ndarray]:
@@ -105,3 +108,29 @@ def test_the_ground_of_an_animation_keeps_its_color(tmp_path):
     write_pictures(tmp_path / "a.gif", pictures, fps=10)
     with Image.open(tmp_path / "a.gif") as image:
         assert (np.asarray(image.convert("RGB"))[:5] == 255).all()
+
+
+@needs_browser
+@pytest.mark.parametrize("side", [96, 800])  # browsers take untagged videos of these sizes for different matrices
+def test_a_browser_shows_the_colors_that_were_written(tmp_path, side):
+    colors = [(200, 30, 30), (30, 160, 60), (40, 60, 200), (230, 200, 60), (120, 120, 120), (255, 255, 255)]
+    picture = np.repeat(np.repeat(np.array([colors], np.uint8), side, 0), side // 6, 1)
+    write_pictures(tmp_path / "a.mp4", [picture] * 3, fps=10)
+    film = base64.b64encode((tmp_path / "a.mp4").read_bytes()).decode()
+    page = tmp_path / "a.html"
+    page.write_text(f"""<html><body><video id="v" muted src="data:video/mp4;base64,{film}"></video><script>
+    const video = document.querySelector("video"), canvas = document.createElement("canvas");
+    video.onseeked = () => {{
+      [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
+      const context = canvas.getContext("2d");
+      context.drawImage(video, 0, 0);
+      const at = (k) => [...context.getImageData((k + 0.5) * video.videoWidth / 6, video.videoHeight / 2, 1, 1).data];
+      document.documentElement.dataset.seen = [0, 1, 2, 3, 4, 5].map((k) => at(k).slice(0, 3).join()).join(" ");
+    }};
+    video.onloadeddata = () => {{ video.currentTime = 0.1; }};
+    </script></body></html>""")
+    html, said = open_page(page.as_uri(), tmp_path, "--virtual-time-budget=8000")
+    seen = re.search(r'data-seen="([^"]*)"', html)
+    assert seen, said[-2000:]
+    read = np.array([[int(level) for level in color.split(",")] for color in seen[1].split()])
+    assert np.abs(read - colors).max() <= 8

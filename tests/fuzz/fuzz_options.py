@@ -11,11 +11,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import signal
 import sys
-import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -26,10 +24,11 @@ import typer
 from dpcli.cli import app as cli
 from dpcli.reproduce.runs import override
 from dpcli.runtime.settings.value_types import words_of
+from tests.fuzz.forks import Ended, Limits, forked
 from tests.generate4d.test_fit import toy_views
 from tests.support.commands import exit_code
 
-SECONDS, MEMORY, FILE = 60, 14 << 30, 300 << 20
+LIMITS = Limits()
 ODD = {
     "int": ("-1", "0", "1", "99999999999"),
     "float": ("nan", "inf", "-1", "0", "1e300"),
@@ -82,35 +81,8 @@ evaluate runs scores.h5 scores.h5
 """
 
 
-def ended(words: Sequence[str]) -> tuple[int, str]:
-    return forked(lambda: exit_code(*words))
-
-
-def forked(work: Callable[[], int]) -> tuple[int, str]:
-    """Exit code (a signal's number negative) and stderr of the work in a fork of this process, which starts no threads."""
-    reading, writing = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.setsid()
-        nothing = os.open(os.devnull, os.O_RDWR)
-        for number, target in ((0, nothing), (1, nothing), (2, writing)):
-            os.dup2(target, number)
-        sys.stdout, sys.stderr = (open(number, "w", buffering=1, closefd=False) for number in (1, 2))
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-        resource.setrlimit(resource.RLIMIT_FSIZE, (FILE, FILE))
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        signal.alarm(SECONDS)
-        code = 99
-        try:
-            code = work()
-        except BaseException:
-            traceback.print_exc()
-        os._exit(code)
-    os.close(writing)
-    with open(reading, "rb") as pipe:
-        said = pipe.read().decode(errors="replace")
-    status = os.waitpid(child, 0)[1]
-    return os.waitstatus_to_exitcode(status), said
+def ended(words: Sequence[str]) -> Ended:
+    return forked(lambda: exit_code(*words), LIMITS)
 
 
 def options_of(words: Sequence[str]) -> list[Any]:
@@ -163,10 +135,10 @@ def make_data(folder: Path) -> None:
     np.save("depth.npy", rng.integers(1000, 2000, (5, 24, 32)).astype(np.uint16))
     for frame in range(3):
         np.save(f"clouds/{frame}.npy", rng.random((50, 3), np.float32))
-    forked(lambda: bool(toy_views(Path("views.h5"), train=1)) - 1)
+    forked(lambda: bool(toy_views(Path("views.h5"), train=1)) - 1, LIMITS)
     for line in DATA.strip().splitlines():
-        code, said = ended(forced(line))
-        assert code == 0, (line, said)
+        made = ended(forced(line))
+        assert made.code == 0, (line, made.said)
 
 
 def main() -> int:
@@ -179,14 +151,14 @@ def main() -> int:
     for line in COMMANDS.strip().splitlines():
         if not line.startswith(asked.only):
             continue
-        code, said = ended(forced(line))
-        assert code == 0, (line, said)
+        made = ended(forced(line))
+        assert made.code == 0, (line, made.said)
         for words in (*odd(forced(line)), *odd_settings(forced(line))):
-            code, said = ended(words)
+            one = ended(words)
             calls += 1
-            if is_bug(code, said):
+            if is_bug(one.code, one.said):
                 bugs += 1
-                print(f"{' '.join(words)}\n    {code}: {said.strip().splitlines()[-1]}", flush=True)
+                print(f"{' '.join(words)}\n    {one.code}: {one.said.strip().splitlines()[-1]}", flush=True)
         print(f"{calls} calls, {bugs} bugs after: {line}", flush=True)
     return 1 if bugs else 0
 

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpcli.errors import DpcError, UsageError
-from dpcli.prepare.pipeline import convert
+from dpcli.errors import UsageError
+from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.reader import Item, Sample
+from dpcli.store.writing.item_pass import ItemPass
 from tests.support.prepare_helpers import ToyReader, dpc
 
 
@@ -53,10 +54,8 @@ def test_any_executor_gives_the_same_bytes_with_few_in_flight(tmp_path, monkeypa
             most[0] = max(most[0], waiting[0])
             return super().submit(*given, **more)
 
-    from dpcli.prepare import pipeline
-
-    take = pipeline._Run.take
-    monkeypatch.setattr(pipeline._Run, "take", lambda *given: (waiting.__setitem__(0, waiting[0] - 1), take(*given)))
+    take = ItemPass._take
+    monkeypatch.setattr(ItemPass, "_take", lambda *given: (waiting.__setitem__(0, waiting[0] - 1), take(*given)))
     with Counting(3) as executor:
         report = convert(ToyReader(count=20, bad=(3,)), tmp_path / "a.h5", slots=3, executor=executor)
     assert digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5") and report.skipped == whole.skipped
@@ -73,7 +72,7 @@ def cluster():
 
 
 def test_a_lost_worker_costs_only_time(cluster, tmp_path):
-    from dpcli.prepare.dask_cluster import cluster_executor
+    from dpcli.runtime.machines.dask_cluster import cluster_executor
 
     reader = SlowReader(count=40, folder=str(tmp_path))
     convert(SlowReader(count=40, folder=str(tmp_path)), tmp_path / "whole.h5")
@@ -103,19 +102,16 @@ def test_a_lost_worker_costs_only_time(cluster, tmp_path):
     assert len(readers - own) >= 2 and own.isdisjoint(readers)
 
 
-def test_a_sample_that_kills_every_worker_ends_the_run_and_keeps_the_others(cluster, tmp_path):
-    from dpcli.prepare.dask_cluster import cluster_executor
+def test_a_sample_that_kills_every_worker_is_passed_over_by_name(cluster, tmp_path):
+    from dpcli.runtime.machines.dask_cluster import cluster_executor
 
     reader = SlowReader(count=6, folder=str(tmp_path), deadly=4)
-    with (
-        pytest.raises(DpcError, match="was lost with 4 workers"),
-        cluster_executor(cluster.scheduler_address, 2) as (executor, n),
-    ):
-        convert(reader, tmp_path / "a.h5", slots=n, executor=executor)
-    assert (tmp_path / ".a.h5.part").exists() and not (tmp_path / "a.h5").exists()
-    convert(SlowReader(count=6, folder=str(tmp_path)), tmp_path / "a.h5")
-    convert(SlowReader(count=6, folder=str(tmp_path)), tmp_path / "whole.h5")
-    assert digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
+    with cluster_executor(cluster.scheduler_address, 2) as (executor, n):
+        report = convert(reader, tmp_path / "a.h5", slots=n, executor=executor)
+    ((name, reason),) = report.skipped
+    assert report.written == 5 and name == "toy004" and "the process that worked on it died" in reason
+    convert(reader, tmp_path / "b.h5", Conversion(jobs=2))
+    assert digest(tmp_path / "a.h5") == digest(tmp_path / "b.h5")
 
 
 def test_the_command_on_a_local_cluster(tmp_path):
@@ -128,7 +124,7 @@ def test_the_command_on_a_local_cluster(tmp_path):
 
 
 def test_addresses_that_are_none():
-    from dpcli.prepare.dask_cluster import cluster_executor
+    from dpcli.runtime.machines.dask_cluster import cluster_executor
 
     pytest.importorskip("distributed", reason="needs the extra `cluster`")
     with pytest.raises(UsageError, match="--dask node1:8786: expected local"), cluster_executor("node1:8786", 2):

@@ -21,6 +21,7 @@ from dpcli.prepare.pipeline import Conversion, convert, convert_item
 from dpcli.runtime import pool
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store import clouds_writer as writer_module
+from dpcli.store.writing import item_pass
 from dpcli.store.writing.journal import Journal
 from tests.support.prepare_helpers import DPC, ROOT, ToyReader, dpc
 
@@ -221,7 +222,7 @@ def test_a_command_spelled_otherwise_goes_on_and_another_one_is_refused(tmp_path
         return convert(ToyReader(), tmp_path / "a.h5", Conversion(**more))
 
     with monkeypatch.context() as patch, pytest.raises(DpcError, match="died"):
-        patch.setattr(pipeline, "ordered_map", dies_after_three)
+        patch.setattr(item_pass, "ordered_map", dies_after_three)
         run(["toy", "RAW"])
     kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(UsageError, match="of other work .config.points 0, now 1; config.sampling"):
@@ -251,7 +252,7 @@ def test_a_lost_worker_keeps_what_is_done(tmp_path, monkeypatch):
     whole = convert(ToyReader(), tmp_path / "whole.h5")
 
     with monkeypatch.context() as patch, pytest.raises(DpcError, match="died"):
-        patch.setattr(pipeline, "ordered_map", dies_after_three)
+        patch.setattr(item_pass, "ordered_map", dies_after_three)
         convert(ToyReader(), tmp_path / "a.h5")
     read = []
     monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))

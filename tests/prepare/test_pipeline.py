@@ -143,7 +143,12 @@ def test_unreadable_files_are_bad_samples_and_bugs_are_not(tmp_path, monkeypatch
     monkeypatch.setattr(ToyReader, "read", missing)
     with pytest.raises(DataError, match="the first: secret.bin: Permission denied"):
         convert(ToyReader(), tmp_path / "a.h5")
-    monkeypatch.setattr(ToyReader, "read", lambda self, item, rng: 1 / 0)
+    with monkeypatch.context() as patched:
+        patched.setattr(ToyReader, "read", lambda self, item, rng: 1 / 0)
+        with pytest.raises(DataError, match="toy000: damaged.*ZeroDivisionError"):
+            convert(ToyReader(), tmp_path / "a.h5")
+    monkeypatch.undo()
+    monkeypatch.setattr(Thinning, "apply", lambda self, sequence, rng: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         convert(ToyReader(), tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []
@@ -187,7 +192,7 @@ def test_a_foreign_file_is_not_overwritten(tmp_path):
     assert path.read_text() == "precious"
 
 
-def test_a_full_disk_is_explained_and_leaves_nothing(tmp_path, monkeypatch):
+def test_a_full_disk_is_explained_and_keeps_what_is_done(tmp_path, monkeypatch, capsys):
     original = CloudsWriter.write
 
     def write(self, sequence):
@@ -196,10 +201,13 @@ def test_a_full_disk_is_explained_and_leaves_nothing(tmp_path, monkeypatch):
         original(self, sequence)
 
     monkeypatch.setattr(CloudsWriter, "write", write)
-    with pytest.raises(DpcError, match="no space left") as error:
+    with pytest.raises(DpcError, match="no space left on the device; the 2 samples done are kept") as error:
         convert(ToyReader(), tmp_path / "a.h5")
     assert error.value.exit_code == 1
-    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path / "a.h5").exists()
+    monkeypatch.undo()
+    assert convert(ToyReader(), tmp_path / "a.h5").written == 5
+    assert "continuing: 2 of 5" in capsys.readouterr().err
 
 
 class Stopper:

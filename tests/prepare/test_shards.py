@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.shards import Shard, describe_shard, shard_of
+from dpcli.runtime.machines.shards import Shard, describe_shard, shard_of
 from dpcli.runtime.provenance import command_line
 from dpcli.store import CloudsReader
 from dpcli.store.file import read_positions
@@ -104,12 +104,12 @@ def test_shards_that_do_not_belong_together_are_refused(tmp_path):
     reader = ToyReader(count=7)
     a, b, c = cut(reader, tmp_path, 3)
     for paths, message in (
-        ([a, c], "--shard 1/3: missing; convert it first"),
+        ([a, c], "--shard 1/3: missing; make it first"),
         ([a, b, b], "named twice"),
         ([a, b, c, tmp_path / "copy.h5"], "as .*1.h5 is; each shard once"),
-        ([a, b, tmp_path / "seed.h5"], "another conversion than .*seed 0 and 1"),
-        ([a, b, tmp_path / "four.h5"], "another conversion than .*0/3 and 2/4"),
-        ([a, b, tmp_path / "longer.h5"], "items 7 and 8"),
+        ([a, b, tmp_path / "seed.h5"], "another run than .*seed 0, now 1"),
+        ([a, b, tmp_path / "four.h5"], "another run than .*0/3 and 2/4"),
+        ([a, b, tmp_path / "longer.h5"], "items 7, now 8"),
     ):
         (tmp_path / "copy.h5").write_bytes(b.read_bytes())
         convert(reader, tmp_path / "seed.h5", Conversion(shard=Shard(2, 3), points=20, seed=1, force=True))

@@ -10,14 +10,15 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from dpcli.errors import DpcError, Stopped, UsageError
+from dpcli.errors import Stopped, UsageError
 from dpcli.runtime import device, progress, provenance
-from dpcli.runtime.pool import ordered_map
+from dpcli.runtime.pool import LostWorker, ordered_map
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.weights import load_weights, save_weights
@@ -30,8 +31,17 @@ def square(x: int) -> int:
     return x * x
 
 
-def die(x: int) -> int:
-    os.kill(os.getpid(), signal.SIGKILL)
+def die_at_three(x: int) -> int:
+    if x == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return x
+
+
+def die_once_at_three(item: tuple[int, str]) -> int:
+    x, folder = item
+    if x == 3 and not Path(folder, "died").exists():
+        Path(folder, "died").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
     return x
 
 
@@ -61,9 +71,15 @@ def test_any_executor_serves_and_few_items_are_in_flight():
         assert len(list(rows)) == 49
 
 
-def test_a_killed_worker_ends_with_a_sentence():
-    with pytest.raises(DpcError, match="worker process died"):
-        list(ordered_map(die, range(4), 2))
+def test_an_item_that_kills_whoever_works_on_it_costs_itself_alone():
+    rows = dict(ordered_map(die_at_three, range(9), 2))
+    assert isinstance(rows.pop(3), LostWorker) and rows == {x: x for x in range(9) if x != 3}
+
+
+def test_a_worker_that_is_killed_once_costs_nothing(tmp_path):
+    items = [(x, str(tmp_path)) for x in range(9)]
+    assert [done for _, done in ordered_map(die_once_at_three, items, 2)] == list(range(9))
+    assert list(tmp_path.iterdir())
 
 
 def test_a_stop_signal_sets_the_flag_and_old_handlers_return():

@@ -15,6 +15,7 @@ from dpcli.store.embedding import StreamEmbedding, write_embedding
 from dpcli.store.file import open_store
 from dpcli.store.gaussians import write_scene
 from dpcli.store.schema import KINDS, TABLES, fields_of, fill_tables, table
+from dpcli.store.statistics import StatisticsWriter
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scenes import toy_scene
 
@@ -27,8 +28,9 @@ def write_clouds(path: Path) -> None:
     sequence.color, sequence.track = rng.integers(0, 255, (count, 3), np.uint8), np.arange(count)
     sequence.scene_flow, sequence.time = np.zeros((count, 3), np.float32), np.arange(sequence.num_frames) / 10
     sequence.pose = np.tile(np.eye(4), (sequence.num_frames, 4, 1, 1))
+    sequence.joint = np.zeros((sequence.num_frames, 4, 9))
     sequence.shift, sequence.extra = np.ones(3), {"field_NAME": np.zeros(count, np.float32)}
-    fields = ["time", "color", "part", "track", "scene_flow", "pose", "field_NAME"]
+    fields = ["time", "color", "part", "track", "scene_flow", "pose", "joint", "field_NAME"]
     with CloudsWriter(path, class_names=["a", "b"], fields=fields, provenance={"command": "dpc"}) as writer:
         writer.write(sequence)
         writer.skipped, writer.positions = [("bad", "why")], ([0], [1])
@@ -55,6 +57,11 @@ def write_vectors(path: Path) -> None:
     write_embedding(path, ["a", "b"], labels, ["", ""], {"static": stream}, class_names=["x"], provenance=[{}])
 
 
+def write_statistics(path: Path) -> None:
+    with StatisticsWriter(path, class_names=["a"], provenance=[{"command": "dpc"}]) as writer:
+        writer.write("v", {"count": 1})
+
+
 WRITERS = {
     "clouds": write_clouds,
     "views": write_views,
@@ -62,6 +69,7 @@ WRITERS = {
     "parts": lambda path: write_parts(path, [perfect(truth_sequence("s0", seed=0), 4, CHAIN)]),
     "gaussians": lambda path: write_scene(path, toy_scene(), provenance={"command": "dpc fit"}),
     "embedding": write_vectors,
+    "statistics": write_statistics,
 }
 
 

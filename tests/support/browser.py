@@ -1,4 +1,4 @@
-"""A page in headless Chromium: what it became and, asked for, its picture. Nothing else lives here."""
+"""A page in headless Chromium: what it became and, asked for, its picture; keys pressed in it."""
 
 from __future__ import annotations
 
@@ -32,3 +32,14 @@ def open_page(address: str, folder: Path, *flags: str) -> tuple[str, str]:
             os.killpg(process.pid, signal.SIGKILL)  # its helpers too: they would keep the pipes open
             said = process.communicate()[1]
     pytest.fail(f"{_TRIES} browsers hung for {_SECONDS} s on {address}: {said[-1000:]}")
+
+
+# JavaScript for a page's end: `pressed(where, key)` focuses an element and presses a key there, and returns whether the page
+# took the key, so that the element itself doesn't get it.
+PRESSED = """
+const pressed = (where, key) => {
+  const at = document.querySelector(where);
+  at.focus();
+  return !at.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true }));
+};
+"""

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.commands.scores_made import already_scored
-from dpcli.classify.data.clips import ClipSource
+from dpcli.classify.data.clips import ClipSource, OneVideo
 from dpcli.classify.data.videos import check_classes, report_short, select_videos
-from dpcli.classify.network.kinet import STREAMS
+from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.video_scores import VideoScores, predict_videos
-from dpcli.errors import DataError
 from dpcli.runtime import provenance
-from dpcli.runtime.device import choose_device
-from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.device import choose_device, cpu_count
+from dpcli.runtime.machines.once_per_process import OncePerProcess
+from dpcli.runtime.machines.shards import describe_shard
+from dpcli.runtime.machines.spread import ALONE, Spread
+from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
+from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
+from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
+
+_WORTH_WORKERS = 500  # clips; fewer are scored by one process before a second has started
 
 
 @dataclass(frozen=True)
@@ -33,17 +36,39 @@ class Prediction:
     complete: bool = False
 
 
+@dataclass(frozen=True)
+class ScoreVideo:
+    """Scores one video; picklable, for worker processes."""
+
+    model: OncePerProcess[tuple[Kinet, ModelInfo]]
+    clips_per_video: int | None
+    batch: int
+    device: str
+    streams: tuple[str, ...]
+    seed: int
+
+    def __call__(self, numbered: tuple[int, CloudSequence]) -> VideoScores:
+        """Returns the scores of a sequence; its number in the file chooses the points of its clips."""
+        (number, sequence), (model, info) = numbered, self.model.get()
+        source = ClipSource(OneVideo(number, sequence), [number], info.config, timing=info.timing, seed=self.seed)
+        return next(predict_videos(model, source, self.clips_per_video, self.batch, self.device, self.streams))
+
+
 def predict(
-    task: ModelTask, clips_per_video: int | None = None, drop_short: bool = False, batch: int = 8
+    task: ModelTask,
+    clips_per_video: int | None = None,
+    drop_short: bool = False,
+    batch: int = 8,
+    spread: Spread = ALONE,
 ) -> Prediction:
     """Scores the videos and writes a scores file; goes on where a stopped run ended.
 
-    clips_per_video: spread evenly over a video, None takes every start. Raises UsageError when the output holds something
-    else, DataError when data and model don't fit.
+    clips_per_video: spread evenly over a video, None takes every start. spread: who works on which videos. Raises UsageError
+    when the output holds something else, DataError when data and model don't fit.
     """
-    device = choose_device(task.device)
     weights = find_model(task.model)
-    model, info = load_model(weights, task.backbone)
+    open_model = partial(_open_model, weights.resolve(), task.backbone, task.device)  # workers may stand elsewhere
+    model, info = open_model()
     with input_file(task.data) as path, output_file(task.output) as target:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
@@ -51,15 +76,25 @@ def predict(
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
         report_short(source, info.config.num_frames)
         config = _record(task, weights, info, source, clips_per_video)
-        history = [*reader.provenance, provenance.record(config, task.seed, {"clouds": path})]
-        if not task.force and already_scored(target, history[-1]):
-            return Prediction(len(source.sequences), len(info.class_names), complete=True)
-        keep_freed_memory()
-        with _writer(task, target, info, history) as writer:
-            done = _done(source, writer)
-            videos = predict_videos(model.to(device), source, clips_per_video, batch, device, writer.streams, done)
-            _write(videos, source, writer, len(done), task.split if task.split == "validation" else None)
-    return Prediction(len(writer), len(info.class_names))
+        entry = describe_shard(provenance.record(config, task.seed, {"clouds": path}), spread.shard)
+        complete = not task.force and already_scored(target, entry)
+        if not complete:
+            keep_freed_memory()
+            with _writer(task, target, info, [*reader.provenance, entry]) as writer:
+                once = OncePerProcess(open_model, config["weights"] + task.device, (model, info))
+                device = str(choose_device(task.device))
+                work = ScoreVideo(once, clips_per_video, batch, device, writer.streams, task.seed)
+                _score_videos(source, work, writer, task.split if task.split == "validation" else None, spread)
+        made = ScoresReader(target)
+    for line in skipped_lines(made.skipped):
+        log.warn(line)
+    return Prediction(len(made.names), len(info.class_names), complete)
+
+
+def _open_model(weights: Path, backbone: str | None, device: str) -> tuple[Kinet, ModelInfo]:
+    chosen = choose_device(device)
+    model, info = load_model(weights, backbone)
+    return model.to(chosen), info
 
 
 def _record(
@@ -77,11 +112,8 @@ def _record(
     }
 
 
-@contextmanager
-def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict]) -> Iterator[ScoresWriter]:
-    """Opens the scores file. What was scored is kept for the next run when this one fails, unless the data are bad: too
-    little memory says nothing about what was scored."""
-    with ScoresWriter(
+def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict]) -> ScoresWriter:
+    return ScoresWriter(
         target,
         class_names=info.class_names,
         seed=task.seed,
@@ -90,37 +122,32 @@ def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict])
         streams=tuple(info.notes.get("streams", STREAMS)),
         force=task.force,
         resume=task.output != "-",
-    ) as writer:
-        try:
-            yield writer
-        except Exception as error:
-            writer.keep = not isinstance(error, DataError)
-            raise
+    )
 
 
-def _done(source: ClipSource, writer: ScoresWriter) -> set[int]:
-    """Returns the sequences that an earlier run has scored."""
-    before = set(writer.written_names)
-    done = {i for i in source.sequences if source.reader.names[i] in before}
-    if done:
-        log.info(f"continuing: {len(done)} of {len(source.sequences)} videos were scored before")
-    return done
-
-
-def _write(
-    videos: Iterator[VideoScores], source: ClipSource, writer: ScoresWriter, done: int, split: str | None
+def _score_videos(
+    source: ClipSource, work: ScoreVideo, writer: ScoresWriter, split: str | None, spread: Spread
 ) -> None:
-    """Writes the scores as they come. done: videos scored before; split: what to call the videos' split, None: as their
-    file does."""
-    reader, total = source.reader, len(source.sequences)
-    with stop_requested() as stop, Progress("classify predict", total, "video") as bar:
-        bar.skip(done)
-        for video in videos:
-            i = video.sequence
-            label, own = int(reader.labels[i]), split or reader.splits[i]
-            writer.write(reader.names[i], video.fused, label=label, split=own, streams=video.streams)
-            bar.advance(1, clips=video.clips)
-            if writer.resume:
-                stop.check(f"{len(writer)} of {total} videos are kept")
-            else:  # a pipe
-                stop.check("nothing was kept", again="to start over")
+    """Writes the scores of the videos that an earlier run has not scored. split: what to call the videos' split, None: as
+    their file does."""
+    reader, chosen = source.reader, source.sequences
+
+    def load(place: int) -> tuple[int, CloudSequence]:
+        return chosen[place], reader.read(chosen[place], fields=())
+
+    def write(place: int, video: VideoScores) -> dict[str, float]:
+        i = video.sequence
+        label, own = int(reader.labels[i]), split or reader.splits[i]
+        writer.write(reader.names[i], video.fused, label=label, split=own, streams=video.streams)
+        return {"clips": video.clips}
+
+    names = [reader.names[i] for i in chosen]
+    taken = ItemPass(writer, names, Wording("classify predict", "video", "scored"), spread.shard)
+    with spread.workers(_worthwhile_processes(source, work)) as workers:
+        taken.run(work, load, write, workers)
+
+
+def _worthwhile_processes(source: ClipSource, work: ScoreVideo) -> int:
+    """Returns how many processes pay: one for each core where there is more to do than their start takes, else one."""
+    clips = sum(len(source.video_clips(sequence, work.clips_per_video)) for sequence in source.sequences)
+    return cpu_count() if work.device == "cpu" and clips > _WORTH_WORKERS else 1

@@ -11,7 +11,7 @@ from dpcli.classify.data.augment import NONE, Augmentation
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
 from dpcli.runtime.seeds import ClassifyStream, generator
-from dpcli.store import CloudsReader
+from dpcli.store import CloudSequence, CloudsReader
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,19 @@ def uniform_frames(length: int, frames: int, phase: float = 0.0) -> tuple[int, .
     return tuple(int(t) for t in np.minimum((np.arange(frames) + phase) * length // frames, length - 1))
 
 
+class OneVideo:
+    """Holds one sequence of a `clouds` file, with its number there, as a reader that knows no other."""
+
+    def __init__(self, number: int, sequence: CloudSequence) -> None:
+        self.path, self.names = sequence.name, {number: sequence.name}
+        self.frame_counts = {number: sequence.num_frames}
+        self._sequence = sequence
+
+    def read(self, number: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
+        """Returns some frames of the sequence, without any field."""
+        return CloudSequence.from_frames(self._sequence.name, [self._sequence.frame(t) for t in frames])
+
+
 class ClipSource:
     """Loads clips of some sequences of a `clouds` file as arrays that a network takes. Picklable, for DataLoader workers.
 
@@ -66,7 +79,7 @@ class ClipSource:
 
     def __init__(
         self,
-        reader: CloudsReader,
+        reader: CloudsReader | OneVideo,
         sequences: Sequence[int],
         config: KinetConfig,
         *,
@@ -89,9 +102,10 @@ class ClipSource:
 
     def clips(self, count: int | None) -> list[Clip]:
         """Returns the clips of every video, for prediction: every start, or `count` a video."""
-        return [clip for s in self.sequences for clip in self._video_clips(s, count)]
+        return [clip for s in self.sequences for clip in self.video_clips(s, count)]
 
-    def _video_clips(self, sequence: int, count: int | None) -> list[Clip]:
+    def video_clips(self, sequence: int, count: int | None) -> list[Clip]:
+        """Returns the clips of one video: every start, or `count`."""
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
         if self.timing == "uniform":
             return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from dpcli.classify.network.sync_norm import SyncNorm
 from dpcli.ops import gather_points
@@ -53,13 +54,27 @@ class SharedLayers(nn.Module):
                 norm.running_var.lerp_(var.to(norm.running_var) * (rows / max(rows - 1, 1)), norm.momentum)
 
 
+class ClipLinear(nn.Linear):
+    """Applies a linear layer to one row for each clip.
+
+    Outside of training a clip's result doesn't depend, to the bit, on the clips beside it: a product of so few rows is
+    rounded by their number, so each row has a product of its own.
+    """
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Returns (B,C) for rows (B,F), or (C) for one."""
+        if self.training or rows.ndim < 2:
+            return super().forward(rows)
+        return torch.cat([linear(row, self.weight, self.bias) for row in rows.split(1)])
+
+
 class GlobalHead(SharedLayers):
     """Computes class logits: [xyz, feature] of every centroid -> two shared layers -> max over the clip -> linear."""
 
     def __init__(self, inputs: int, widths: tuple[int, int], classes: int, dropout: float) -> None:
         super().__init__(inputs, widths)
         self.dropout = nn.Dropout(dropout)
-        self.classify = nn.Linear(widths[1], classes)
+        self.classify = ClipLinear(widths[1], classes)
 
     def embed(self, centers: Tensor, features: Tensor) -> Tensor:
         """Returns the clip's feature vector, (B, widths[1])."""

@@ -8,13 +8,17 @@ import typer
 
 from dpcli.cli.classify import predict_stream as streaming
 from dpcli.cli.classify.options import Data, Model, Split
+from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Seed, TrustedBackbone
+from dpcli.cli.spread_options import SpreadOptions
 from dpcli.errors import UsageError
 
 
+@with_option_groups
 def predict(
     data: Data,
     model: Model,
+    *,
     output: Annotated[
         str | None,
         typer.Option("-o", "--output", help="File to write, or - for a pipe. With --stream: may be left out."),
@@ -32,6 +36,7 @@ def predict(
     follow: streaming.Follow = None,
     seed: Seed = 0,
     device: Device = "auto",
+    spread: SpreadOptions,
     json_output: streaming.JsonLines = False,
     force: Force = False,
 ) -> None:
@@ -42,6 +47,7 @@ def predict(
     if stream:
         batch_options = {"split": split != "auto", "clips-per-video": clips_per_video != 0}
         batch_options |= {"drop-short": drop_short, "batch": batch != 8}
+        batch_options |= {"jobs": spread.jobs is not None, "shard": bool(spread.shard), "dask": bool(spread.dask)}
         streaming.refuse_batch_options(batch_options)
         streaming.predict_stream(task, hop, window, follow, json_output)
         return
@@ -52,7 +58,7 @@ def predict(
         raise UsageError("--batch must be at least 1 and --clips-per-video at least 0")
     from dpcli.classify.commands.predict import predict as run
 
-    result = run(task, clips_per_video or None, drop_short, batch)
+    result = run(task, clips_per_video or None, drop_short, batch, spread.spread)
     if result.complete:
         typer.echo(f"{output}: complete")
     elif output != "-":

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dpcli.cli.evaluate.options import (
     Intersect,
     IntervalOptions,
+    KeepOptions,
     Parts,
     PartsProtocol,
     PartsTruth,
@@ -13,18 +14,21 @@ from dpcli.cli.evaluate.options import (
 )
 from dpcli.cli.evaluate.output import print_result
 from dpcli.cli.option_groups import with_option_groups
+from dpcli.cli.spread_options import SpreadOptions
 
 
 @with_option_groups
 def motion(
     parts: Parts,
-    truth: PartsTruth,
+    truth: PartsTruth = None,
     *,
     protocol: PartsProtocol = "dpc",
     split: Split = None,
     intersect: Intersect = False,
     intervals: IntervalOptions,
-    output: PictureOptions,
+    keep: KeepOptions,
+    spread: SpreadOptions,
+    form: PictureOptions,
 ) -> None:
     """Evaluate the motion in a parts file: end-point error (EPE3D), AccS, AccR, Outlier, and the errors of part motions."""
     from dpcli.evaluate.commands.motion import run_motion
@@ -36,6 +40,7 @@ def motion(
         split=split,
         intersect=intersect,
         resampling=intervals.resampling,
-        picture=output.picture,
+        picture=form.picture,
+        keeping=keep.keeping(spread),
     )
-    print_result(result, output)
+    print_result(result, form)

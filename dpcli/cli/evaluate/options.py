@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dpcli.cli.options import Json, Picture, Seed
+from dpcli.cli.options import Force, Json, Picture, Seed
+from dpcli.cli.spread_options import SpreadOptions
 from dpcli.errors import UsageError
 from dpcli.evaluate.choices import PARTS_PROTOCOLS
 
 if TYPE_CHECKING:
     from dpcli.evaluate.bootstrap import Resampling
+    from dpcli.evaluate.segmentation.sequence_pass import Keeping
 
 
 def word_option(option: str, words: Sequence[str], help: str) -> Any:
@@ -40,9 +42,12 @@ def _word_parser(option: str, words: Sequence[str]) -> Callable[[str], str]:
     return read
 
 
-Parts = Annotated[str, typer.Argument(help="Parts file that `dpc segment predict` wrote, or - for a pipe.")]
+Parts = Annotated[
+    str,
+    typer.Argument(help="Parts file that `dpc segment predict` wrote, or - for a pipe; or statistics kept with -o."),
+]
 PartsTruth = Annotated[
-    Path,
+    Path | None,
     typer.Option("--truth", help="Clouds file with the true parts, and with poses or scene flow for the true motion."),
 ]
 Split = Annotated[
@@ -90,6 +95,25 @@ class IntervalOptions:
         from dpcli.evaluate.bootstrap import Resampling
 
         return Resampling(self.resamples, self.confidence, self.seed)
+
+
+@dataclass(frozen=True)
+class KeepOptions:
+    """Says where what was counted of each sequence is kept."""
+
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Keep each sequence's counts in this file: a stopped run goes on, shards are merged."
+        ),
+    ] = None
+    force: Force = False
+
+    def keeping(self, spread: SpreadOptions) -> Keeping:
+        """The choice as the commands take it. UsageError for a shard without a file."""
+        from dpcli.evaluate.segmentation.sequence_pass import Keeping
+
+        return Keeping(self.output, spread.spread, self.force)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 
 from dpcli.errors import DataError
-from dpcli.standard_streams import printable
+from dpcli.standard_streams import printable, rich_console
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from dpcli.cli.evaluate.options import FormOptions
     from dpcli.evaluate.results import Result
     from dpcli.evaluate.text_tables import TextTable
-
-_PIPE_WIDTH = 250  # columns when nobody's terminal sets a limit
 
 
 def print_result(result: Result, form: FormOptions) -> None:
@@ -42,16 +40,14 @@ def print_object(data: dict[str, Any]) -> None:
 
 def print_tables(tables: list[TextTable], notes: list[str], stream: TextIO) -> None:
     """Writes tables, then notes, to a terminal, or plainly to a file; a hint stands for a table wider than the terminal."""
-    from rich.console import Console
-
-    console = Console(file=stream, highlight=False, width=None if stream.isatty() else _PIPE_WIDTH)
+    console = rich_console(stream)
     for table in tables:
         if table.width > console.width:
             console.print(f"{table.title}: {table.width} columns wide; widen the terminal, or use --picture.\n")
         else:
             console.print(_rich_table(table), "")
     for note in notes:
-        console.print(printable(note), markup=False)
+        console.print(printable(note))
 
 
 def _rich_table(table: TextTable) -> Table:

@@ -6,6 +6,7 @@ from dpcli.cli.evaluate.options import (
     IgnoreBelow,
     Intersect,
     IntervalOptions,
+    KeepOptions,
     Parts,
     PartsProtocol,
     PartsTruth,
@@ -14,19 +15,22 @@ from dpcli.cli.evaluate.options import (
 )
 from dpcli.cli.evaluate.output import print_result
 from dpcli.cli.option_groups import with_option_groups
+from dpcli.cli.spread_options import SpreadOptions
 
 
 @with_option_groups
 def segmentation(
     parts: Parts,
-    truth: PartsTruth,
+    truth: PartsTruth = None,
     *,
     protocol: PartsProtocol = "dpc",
     ignore_below: IgnoreBelow = 0,
     split: Split = None,
     intersect: Intersect = False,
     intervals: IntervalOptions,
-    output: PictureOptions,
+    keep: KeepOptions,
+    spread: SpreadOptions,
+    form: PictureOptions,
 ) -> None:
     """Evaluate the parts of a parts file: average precision, PQ, F1, precision and recall at IoU 0.5, mIoU, Rand index."""
     from dpcli.evaluate.commands.segmentation import run_segmentation
@@ -39,6 +43,7 @@ def segmentation(
         split=split,
         intersect=intersect,
         resampling=intervals.resampling,
-        picture=output.picture,
+        picture=form.picture,
+        keeping=keep.keeping(spread),
     )
-    print_result(result, output)
+    print_result(result, form)

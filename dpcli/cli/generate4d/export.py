@@ -19,15 +19,18 @@ def export(
         Format,
         typer.Option(
             "--as",
-            help="Format: ply or splat (the canonical Gaussians for a file name, every frame for a folder), ply-sequence, "
-            "splat-sequence (every frame), clouds (points with parts), cameras or metrics (.json).",
+            help="Format: ply, splat, compressed.ply or spz (the canonical Gaussians for a file name, every frame for a "
+            "folder), ply-sequence, splat-sequence (every frame), clouds (points with parts), cameras or metrics (.json).",
         ),
     ] = "ply",
     time: Annotated[
         float | None, typer.Option("--time", help="Write this second, not the canonical Gaussians, into one file.")
     ] = None,
     axes: Annotated[
-        Axes, typer.Option("--axes", help="player: x right, y down, z forward; keep: y up, as in the scene.")
+        Axes,
+        typer.Option(
+            "--axes", help="player: x right, y down, z forward; keep: y up, as in the scene. spz is always y up."
+        ),
     ] = "player",
     min_opacity: Annotated[
         float | None,
@@ -39,7 +42,7 @@ def export(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Write a scene for players and other tools: 3DGS .ply, .splat, point clouds with parts, cameras, metrics."""
+    """Write a scene for players and other tools: 3DGS .ply, .splat, .spz, point clouds with parts, cameras, metrics."""
     from dpcli.generate4d.commands.export import export_scene
 
     export_scene(

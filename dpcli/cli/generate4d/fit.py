@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from dpcli.cli.options import Device, Force, Output, Picture, Seed
+from dpcli.cli.option_groups import with_option_groups
+from dpcli.cli.options import Device, Force, Picture, Seed
 from dpcli.cli.settings_options import options_of
+from dpcli.cli.spread_options import SpreadOptions
+from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.config import CATALOG, PRESETS
 from dpcli.runtime.settings.catalog import Given
 
 
+@with_option_groups
 @options_of(CATALOG, everyday=("size", "parts", "prior", "prior_model"), presets=PRESETS, preset="quick")
 def fit(
     views: Annotated[
-        str, typer.Argument(help="A views file (dpc prepare video | animation | artemis), or - for a pipe.")
+        list[str],
+        typer.Argument(help="Views files (dpc prepare video | animation | artemis), one or many, or - for a pipe."),
     ],
-    output: Output,
+    output: Annotated[
+        str, typer.Option("-o", "--output", help="File to write, or - for a pipe; of many clips the folder.")
+    ],
+    *,
     given: Given,
     run: Annotated[
         str | None,
@@ -28,11 +37,31 @@ def fit(
     picture: Picture = None,
     seed: Seed = 0,
     device: Device = "auto",
+    spread: SpreadOptions,
     force: Force = False,
 ) -> None:
-    """Fit a 4D scene to the pictures of a views file. Running again continues; SIGTERM saves first (exit 75)."""
-    from dpcli.generate4d.commands.fit import fit_scene
+    """Fit a 4D scene to the pictures of each views file. Running again continues; SIGTERM saves first (exit 75)."""
     from dpcli.generate4d.config import resolve_settings
 
     config, supervision = resolve_settings(given)
-    fit_scene(views, output, config, supervision, run=run, picture=picture, seed=seed, device=device, force=force)
+    many = len(views) > 1 or output.endswith("/") or Path(output).is_dir()
+    if many:
+        if run is not None or picture is not None:
+            raise UsageError("--run and --picture are for one clip; several have a folder NAME.fit each, with previews")
+        _fit_many(views, Path(output), config, supervision, seed=seed, device=device, force=force, spread=spread.spread)
+        return
+    if spread != SpreadOptions():
+        raise UsageError("--jobs, --shard and --dask spread many clips; one is fitted as a whole")
+    from dpcli.generate4d.commands.fit import fit_scene
+
+    fit_scene(views[0], output, config, supervision, run=run, picture=picture, seed=seed, device=device, force=force)
+
+
+def _fit_many(views: list[str], folder: Path, *settings: Any, **options: Any) -> None:
+    from dpcli.generate4d.commands.fit_clips import fit_clips
+
+    fitted = fit_clips(views, folder, *settings, **options)
+    typer.echo(f"{folder}: {len(fitted.scenes)} scenes")
+    if fitted.failed:
+        named = "; ".join(f"{views}: {reason}" for views, reason in fitted.failed[:5])
+        raise DataError(f"{len(fitted.failed)} clips have no scene: {named}")

@@ -13,6 +13,9 @@ from dpcli.cli.options import Force, Scene
 def view(
     scene: Scene,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page (.html).")],
+    clip: Annotated[
+        Path | None, typer.Option("--input", help="The clip that was fitted (.h5): its pictures are shown beside.")
+    ] = None,
     title: Annotated[str | None, typer.Option("--title", help="Heading. Default: what was fitted.")] = None,
     min_opacity: Annotated[float, typer.Option("--min-opacity", min=0, max=1, help="Leave fainter Gaussians out.")] = 1
     / 255,
@@ -25,4 +28,4 @@ def view(
     """Write one HTML file that shows a scene in any browser, without server or network: turn, zoom, play, color by part."""
     from dpcli.generate4d.commands.view import view_scene
 
-    view_scene(scene, output, title=title, min_opacity=min_opacity, fps=fps, force=force)
+    view_scene(scene, output, clip=clip, title=title, min_opacity=min_opacity, fps=fps, force=force)

@@ -11,6 +11,7 @@ import typer
 
 from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, PointsAtMost, Sampling
+from dpcli.cli.spread_options import Dask, Shard
 from dpcli.errors import UsageError
 
 
@@ -27,15 +28,8 @@ class ConversionOptions:
     compression: Compression = "none"
     on_error: OnError = "skip"
     jobs: Jobs = None
-    shard: Annotated[
-        str,
-        typer.Option(
-            "--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them."
-        ),
-    ] = ""
-    dask: Annotated[
-        str, typer.Option("--dask", metavar="ADDRESS", help="Read on a Dask cluster: tcp://HOST:PORT, or local.")
-    ] = ""
+    shard: Shard = ""
+    dask: Dask = ""
     check: Check = False
     seed: Seed = 0
     force: Force = False
@@ -63,7 +57,7 @@ def run_conversion(
     reader = make_reader()
     from dpcli.prepare.commands.convert import convert_raw_data
     from dpcli.prepare.pipeline import Conversion
-    from dpcli.prepare.shards import Shard
+    from dpcli.runtime.machines import shards
     from dpcli.runtime.progress import log
 
     conversion = Conversion(
@@ -73,7 +67,7 @@ def run_conversion(
         compression=options.compression,
         on_error=options.on_error,
         jobs=options.jobs,
-        shard=Shard.parse(options.shard) if options.shard else None,
+        shard=shards.Shard.parse(options.shard) if options.shard else None,
         seed=options.seed,
         force=options.force,
         task=f"prepare {name}",

@@ -6,12 +6,16 @@ from typing import Annotated
 
 import typer
 
+from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Output, Seed
+from dpcli.cli.spread_options import SpreadOptions
 
 
+@with_option_groups
 def estimate_flow(
     data: Annotated[str, typer.Argument(help="A clouds file, or - for a pipe.")],
     output: Output,
+    *,
     flow: Annotated[
         str,
         typer.Option(
@@ -33,10 +37,7 @@ def estimate_flow(
     split: Annotated[str, typer.Option("--split", help="Sequences of this split, or all.")] = "all",
     seed: Seed = 0,
     device: Device = "auto",
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", min=1, help="Processes. Default: for icp the CPUs this process may use, else 1."),
-    ] = None,
+    spread: SpreadOptions,
     force: Force = False,
 ) -> None:
     """Write the scene flow of every frame to the next (of the last frame back) as the field scene_flow of a clouds file."""
@@ -51,8 +52,8 @@ def estimate_flow(
         split=split,
         seed=seed,
         device=device,
-        jobs=jobs,
         force=force,
+        spread=spread.spread,
     )
     if output != "-":
         typer.echo(f"{output}: flow of {done.sequences} sequences, {done.frames} frames")

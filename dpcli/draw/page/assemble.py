@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.runtime.whole_file import write_whole
+from dpcli.standard_streams import printable
 
 _MARK = re.compile(r"<!--([A-Z]+)-->")
 # shared/ is in every page, the scene viewer's too; web/ is of the pages about a file, which have one template and one style sheet.
@@ -37,7 +38,16 @@ def filled(template: str, marks: Mapping[str, str]) -> str:
 
 def as_json(header: Any) -> str:
     """Spell a value as JSON that may stand within a `<script>`: it holds no `<`, so nothing in it can end the script."""
-    return json.dumps(header, allow_nan=False, sort_keys=True).replace("<", "\\u003c")
+    return json.dumps(_spelled(header), allow_nan=False, sort_keys=True).replace("<", "\\u003c")
+
+
+def _spelled(value: Any) -> Any:
+    """Returns a value of JSON whose texts, names among them, are printable; a page shows them as they are."""
+    if isinstance(value, str):
+        return printable(value, kept="\n\t")
+    if isinstance(value, Mapping):
+        return {_spelled(key): _spelled(one) for key, one in value.items()}
+    return [_spelled(one) for one in value] if isinstance(value, (list, tuple)) else value
 
 
 def as_base64(data: bytes) -> str:
@@ -61,7 +71,7 @@ def data_page(header: Mapping[str, Any], name: str, *, script: Sequence[str], da
     return filled(
         source_text(_TEMPLATE),
         {
-            "TITLE": html.escape(str(header["title"])),
+            "TITLE": html.escape(printable(str(header["title"]))),
             "STYLE": source_text(STYLE) + source_text(_DATA_STYLE),
             "BODY": name,
             "MAIN": source_text(f"web/{name}.html"),

@@ -8,13 +8,14 @@ from dpcli.evaluate.bootstrap import Resampling
 from dpcli.evaluate.results import Result
 from dpcli.evaluate.segmentation.protocol import evaluate_segmentation
 from dpcli.evaluate.segmentation.result_json import segmentation_json
+from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Keeping, made_by
 from dpcli.evaluate.segmentation.tables import segmentation_notes, segmentation_tables
-from dpcli.store import PartsReader, input_file
+from dpcli.store import input_file
 
 
 def run_segmentation(
     parts: str,
-    truth: Path,
+    truth: Path | None,
     *,
     protocol: str,
     ignore_below: int,
@@ -22,8 +23,9 @@ def run_segmentation(
     intersect: bool,
     resampling: Resampling,
     picture: Path | None = None,
+    keeping: Keeping = NOT_KEPT,
 ) -> Result:
-    """Returns the segmentation metrics of a parts file (`-`: from a pipe), and draws bars where `picture` is named.
+    """Returns the segmentation metrics of a parts file (`-`: from a pipe), or of kept statistics, and draws bars where `picture` is named.
 
     The other arguments and errors are those of `evaluate_segmentation`.
     """
@@ -36,10 +38,11 @@ def run_segmentation(
             split=split,
             intersect=intersect,
             resampling=resampling,
+            keeping=keeping,
         )
         if picture is not None:
             from dpcli.evaluate.segmentation.class_bars import draw_segmentation_bars
 
             draw_segmentation_bars(report, picture)
-        data = segmentation_json(report, parts, PartsReader(path).provenance)
+        data = segmentation_json(report, parts, made_by(path))
     return Result(data, segmentation_tables(report), segmentation_notes(report))

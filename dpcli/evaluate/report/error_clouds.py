@@ -57,7 +57,7 @@ def part_blocks(
     """Returns how errors are spread over sequences, frames and pairs, the worst sequences by name, and clouds of some."""
     fields = ("part", "pose") if motion else ("part",)
     with PairedSequences(path, truth, split=split, intersect=intersect, fields=fields) as paired:
-        errors = [_sequence_error(row, pair, motion) for row, pair in zip(paired.rows, paired, strict=True)]
+        errors = [_sequence_error(row, paired.pair(place), motion) for place, row in enumerate(paired.rows)]
         known = [own for own in errors if not np.isnan(own.mean)]
         shown = _choose_sequences(known)
         unit = paired.truth.length_unit

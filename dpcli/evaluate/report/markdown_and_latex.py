@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from dpcli.evaluate.markdown import as_markdown, markdown_code, markdown_table
 from dpcli.evaluate.report.blocks import Cell, Report, Section, Table
+from dpcli.standard_streams import printable
 
 _LATEX = {
     "\\": r"\textbackslash{}",
@@ -31,23 +33,19 @@ _LATEX = {
     "\n": " ",
     '"': r"\textquotedbl{}",
 }
-_MARKDOWN = "\\`*_[]<>|#"
 
 
 def report_markdown(report: Report) -> str:
     """Returns the summary, the thesis's rows beside ours, and each result's tables and notes."""
     lines = [
-        f"# {_escape_markdown(report.title)}",
+        f"# {as_markdown(report.title)}",
         _markdown_table(report.summary),
-        *(_escape_markdown(text) + "." for text in report.left_out),
+        *(as_markdown(text) + "." for text in report.left_out),
     ]
     for own in report.beside:
-        lines += [f"## {_escape_markdown(own.title)}", _markdown_table(own), _escape_markdown(own.note)]
+        lines += [f"## {as_markdown(own.title)}", _markdown_table(own), as_markdown(own.note)]
     for section in report.sections:
-        lines += [
-            f"## {_escape_markdown(section.task)}: {_escape_markdown(section.title)}",
-            *_markdown_section(section),
-        ]
+        lines += [f"## {as_markdown(section.task)}: {as_markdown(section.title)}", *_markdown_section(section)]
     return "\n\n".join(line for line in lines if line) + "\n"
 
 
@@ -55,40 +53,20 @@ def _markdown_section(section: Section) -> list[str]:
     lines = []
     for own in section.blocks:
         if isinstance(own, Table):
-            lines += [f"**{_escape_markdown(own.title)}**", _markdown_table(own), _escape_markdown(own.note)]
-    lines.append("\n".join(f"- {_escape_markdown(note)}" for note in section.notes))
+            lines += [f"**{as_markdown(own.title)}**", _markdown_table(own), as_markdown(own.note)]
+    lines.append("\n".join(f"- {as_markdown(note)}" for note in section.notes))
     protocol = next((terms for title, terms in section.details if title == "Protocol"), [])
-    lines.append("; ".join(f"{_escape_markdown(term)}: {_escape_markdown(words)}" for term, words in protocol))
-    return [*lines, *(f"Command: {_markdown_code(command)}" for command in section.commands)]
+    lines.append("; ".join(f"{as_markdown(term)}: {as_markdown(words)}" for term, words in protocol))
+    return [*lines, *(f"Command: {markdown_code(command)}" for command in section.commands)]
 
 
 def _markdown_table(table: Table) -> str:
-    aligned = ["---", *("---:" if _numeric(table, place) else "---" for place in range(1, len(table.header)))]
-    rows = [[_escape_markdown(own.text) for own in row] for row in table.rows]
-    return "\n".join(
-        f"| {' | '.join(row)} |" for row in [[_escape_markdown(name) or " " for name in table.header], aligned, *rows]
-    )
+    numeric = [_numeric(table, place) for place in range(len(table.header))]
+    return markdown_table(table.header, [[own.text for own in row] for row in table.rows], numeric)
 
 
 def _numeric(table: Table, place: int) -> bool:
     return all(row[place].sort is not None or row[place].text == "-" for row in table.rows)
-
-
-def _escape_markdown(text: str) -> str:
-    """Returns text that means nothing to markdown: on one line, its marks escaped."""
-    flat = " ".join(text.split())
-    return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in flat)
-
-
-def _markdown_code(text: str) -> str:
-    """Returns text between so many backticks that none in it ends it."""
-    fence = "`" * (1 + max((len(run) for run in _backtick_runs(text)), default=0))
-    pad = " " if fence != "`" else ""
-    return f"{fence}{pad}{' '.join(text.split())}{pad}{fence}"
-
-
-def _backtick_runs(text: str) -> list[str]:
-    return [run for run in "".join(c if c == "`" else " " for c in text).split(" ") if run]
 
 
 def report_latex(report: Report) -> str:
@@ -103,7 +81,7 @@ def report_latex(report: Report) -> str:
 
 
 def _comment(text: str) -> str:
-    return "% " + " ".join(text.split())
+    return "% " + printable(" ".join(text.split()))
 
 
 def _latex_table(table: Table, caption: str, note: str = "") -> str:
@@ -147,4 +125,4 @@ def _join_cells(cells: Sequence[str]) -> str:
 
 def escape_latex(text: str) -> str:
     """Returns text as LaTeX prints it: what it would take as a command is escaped."""
-    return "".join(_LATEX.get(letter, letter) for letter in text)
+    return "".join(_LATEX.get(letter, letter) for letter in printable(text, kept="\n"))

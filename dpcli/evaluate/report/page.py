@@ -8,6 +8,7 @@ from importlib.resources import files
 
 from dpcli.evaluate.report.blocks import MISSING, Cell, Figure, Report, Section, Table
 from dpcli.evaluate.report.error_clouds import palette_words
+from dpcli.standard_streams import printable
 
 _LONG, _LONG_NAME = 44, 26  # characters from which a cell, a row's name, may break into lines
 
@@ -28,7 +29,7 @@ def report_html(report: Report) -> str:
     for text in source.joinpath("page.html").read_text("utf-8").split("<!--"):
         mark, closed, rest = text.partition("-->")
         made.append(pieces[mark] + rest if closed else text)
-    return "".join(made)
+    return printable("".join(made), kept="\n\t")
 
 
 def _body(report: Report) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +26,8 @@ from dpcli.evaluate.segmentation.motion_metrics import (
     part_motion_update,
 )
 from dpcli.evaluate.segmentation.rigid_motion import true_flow, true_motion
-from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair
+from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Counted, Keeping, count_sequences, read_counted
+from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair, named_truth
 
 
 @dataclass
@@ -54,99 +57,94 @@ class MotionReport:
     without_truth: int = 0
 
 
-@dataclass
-class _Collected:
-    """Holds what is known of each sequence that counts, which have no pair that counts, and how many pairs don't."""
-
-    names: list[str] = field(default_factory=list)
-    labels: list[int] = field(default_factory=list)
-    statistics: list[MotionStatistics] = field(default_factory=list)
-    pairs: list[np.ndarray] = field(default_factory=list)
-    without_pairs: list[str] = field(default_factory=list)
-    without_truth: int = 0
-
-
 def evaluate_motion(
     path: str | Path,
-    truth: str | Path,
+    truth: str | Path | None,
     *,
     protocol: str = "dpc",
     split: str | None = None,
     intersect: bool = False,
     resampling: Resampling | None = None,
+    keeping: Keeping = NOT_KEPT,
 ) -> MotionReport:
     """Returns the metrics of all frame pairs of a parts file against the `part` and `pose` of a clouds file.
 
-    Where it has no poses but `scene_flow`, the flow of pairs f -> f + 1 is compared with that, at all points; other
-    pairs are left out and counted, motions of parts are not compared. Points without a true part don't count.
-    protocol: "dpc", every point counts the same; "release", as the published code: means over the points of each 6
-    successive pairs, then over these batches; UsageError for another. split, intersect and DataErrors: as
-    `PairedSequences`. resampling: how to find the intervals; without it there are none.
+    path may be the statistics that `keeping` wrote; they tell the other choices, and need no truth. Where the truth has no
+    poses but `scene_flow`, the flow of pairs f -> f + 1 is compared with that, at all points; other pairs are left out and
+    counted, motions of parts are not compared. Points without a true part don't count. protocol: "dpc", every point
+    counts the same; "release", as the published code: means over the points of each 6 successive pairs, then over these
+    batches; UsageError for another. split, intersect and DataErrors: as `PairedSequences`. resampling: how to find the
+    intervals; without it there are none.
     """
     check_protocol(protocol)
-    resampling = resampling or Resampling(0)
-    with PairedSequences(
-        path, truth, split=split, intersect=intersect, fields=("part", "pose"), instead=("scene_flow",)
-    ) as paired:
-        from_poses = "pose" in paired.fields
-        found = _collect(paired, from_poses)
-    _check_found(found, path)
+    counted = read_counted(path, "motion")
+    if counted is None:
+        with PairedSequences(
+            path, named_truth(truth), split=split, intersect=intersect, fields=("part", "pose"), instead=("scene_flow",)
+        ) as paired:
+            from_poses = "pose" in paired.fields
+            about = {"task": "motion", "protocol": protocol, "from_poses": from_poses}
+            measure = partial(_sequence_values, from_poses=from_poses, truth=str(truth))
+            counted = count_sequences(paired, measure, about, keeping)
+    return _make_report(counted, path, resampling or Resampling(0))
+
+
+def _make_report(counted: Counted, path: str | Path, resampling: Resampling) -> MotionReport:
+    protocol, from_poses = counted.about["protocol"], counted.about["from_poses"]
+    found = [(name, row) for name, row in zip(counted.names, counted.rows, strict=True) if len(row["pairs"])]
+    without_pairs = [name for name, row in zip(counted.names, counted.rows, strict=True) if not len(row["pairs"])]
+    without_truth = sum(row["predicted_pairs"] - len(row["pairs"]) for row in counted.rows)
+    statistics = [MotionStatistics(**row["statistics"]) for _, row in found]
+    _check_found(statistics, without_truth, path)
     reason = "no frame pair predicted" if from_poses else "no frame pair f -> f + 1 predicted"
     batch = RELEASE_BATCH if protocol == "release" else None
-    metric = motion_weighted(found.statistics, MAIN_TAU[protocol], batch)
+    metric = motion_weighted(statistics, MAIN_TAU[protocol], batch)
     return MotionReport(
         protocol,
-        paired.split,
-        str(truth),
-        paired.truth.length_unit,
-        motion_compute(motion_merge(found.statistics), batch),
-        _metrics_by_class(found, batch),
-        paired.truth.class_names,
-        [*paired.left_out, *([LeftOut(reason, found.without_pairs)] if found.without_pairs else [])],
-        len(found.statistics),
-        found.names,
-        found.statistics,
-        found.pairs,
+        counted.about["split"],
+        counted.about["truth"],
+        counted.length_unit,
+        motion_compute(motion_merge(statistics), batch),
+        _metrics_by_class([row["label"] for _, row in found], statistics, batch),
+        counted.class_names,
+        [*counted.left_out, *([LeftOut(reason, without_pairs)] if without_pairs else [])],
+        len(statistics),
+        [name for name, _ in found],
+        statistics,
+        [row["pairs"] for _, row in found],
         resampling,
-        resampling.intervals(metric, len(found.statistics)),
+        resampling.intervals(metric, len(statistics)),
         from_poses,
-        found.without_truth,
+        without_truth,
     )
 
 
-def _collect(paired: PairedSequences, from_poses: bool) -> _Collected:
-    found = _Collected()
-    for pair in paired:
-        predicted = len(pair.parts.pairs)
-        pair = pair if from_poses else _only_next_frames(pair)
-        found.without_truth += predicted - len(pair.parts.pairs)
-        if len(pair.parts.pairs) == 0:
-            found.without_pairs.append(pair.truth.name)
-            continue
-        found.names.append(pair.truth.name)
-        found.pairs.append(pair.parts.pairs)
-        found.labels.append(pair.truth.label)
-        found.statistics.append(_sequence_statistics(pair, Path(paired.truth.path)))
-    return found
+def _sequence_values(pair: SequencePair, from_poses: bool, truth: str) -> dict[str, Any]:
+    predicted = len(pair.parts.pairs)
+    pair = pair if from_poses else _only_next_frames(pair)
+    values = {"label": pair.truth.label, "pairs": pair.parts.pairs, "predicted_pairs": predicted}
+    return values | {"statistics": vars(_sequence_statistics(pair, Path(truth))) if len(pair.parts.pairs) else {}}
 
 
-def _check_found(found: _Collected, path: str | Path) -> None:
+def _check_found(statistics: list[MotionStatistics], without_truth: int, path: str | Path) -> None:
     """Raises DataError where no point of no pair counts."""
-    if any(one.points.any() for one in found.statistics):
+    if any(one.points.any() for one in statistics):
         return
     why = "no point has a true part"
-    if not found.statistics:
+    if not statistics:
         why = "holds no frame pairs; sequences of one frame have no motion"
-        if found.without_truth:
-            why = f"none of its {found.without_truth} frame pairs is f -> f + 1, of which alone scene_flow tells"
+        if without_truth:
+            why = f"none of its {without_truth} frame pairs is f -> f + 1, of which alone scene_flow tells"
     raise DataError(f"{path}: nothing to compare: {why}")
 
 
-def _metrics_by_class(found: _Collected, batch: int | None) -> dict[int, MotionMetrics]:
-    rows = list(zip(found.labels, found.statistics, strict=True))
+def _metrics_by_class(
+    labels: list[int], statistics: list[MotionStatistics], batch: int | None
+) -> dict[int, MotionMetrics]:
+    rows = list(zip(labels, statistics, strict=True))
     return {
         label: motion_compute(motion_merge(one for own, one in rows if own == label), batch)
-        for label in sorted({label for label in found.labels if label >= 0})
+        for label in sorted({label for label in labels if label >= 0})
     }
 
 
@@ -162,7 +160,7 @@ def _sequence_statistics(pair: SequencePair, truth: Path) -> MotionStatistics:
     try:
         return motion_merge(_compare_with_poses(pair) if pair.truth.pose is not None else _compare_with_flow(pair))
     except DataError as error:
-        raise DataError(f"{truth}: {pair.truth.name!r}: {error}; make the file again") from None
+        raise DataError(f"{truth}: {error}; make the file again") from None
 
 
 def _compare_with_poses(pair: SequencePair) -> Iterator[MotionStatistics]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +23,8 @@ from dpcli.evaluate.segmentation.metrics import (
     segmentation_update,
     segmentation_weighted,
 )
-from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair
+from dpcli.evaluate.segmentation.sequence_pass import NOT_KEPT, Counted, Keeping, count_sequences, read_counted
+from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair, named_truth
 
 FIXES = (
     "parts are matched one to one (release: two predictions of IoU exactly 0.5 both find the same part)",
@@ -56,49 +59,58 @@ class SegmentationReport:
 
 def evaluate_segmentation(
     path: str | Path,
-    truth: str | Path,
+    truth: str | Path | None,
     *,
     protocol: str = "dpc",
     ignore_below: int = 0,
     split: str | None = None,
     intersect: bool = False,
     resampling: Resampling | None = None,
+    keeping: Keeping = NOT_KEPT,
 ) -> SegmentationReport:
     """Returns the metrics of a parts file against the `part` of a clouds file, over all frames of all sequences that count.
 
-    protocol: "dpc", or "release" with the quirks of the published code (FIXES lists the differences); UsageError for
-    another. ignore_below: true parts of fewer points are ignored. split, intersect and DataErrors: as `PairedSequences`.
-    resampling: how to find the intervals; without it there are none.
+    path may be the statistics that `keeping` wrote; they tell the other choices, and need no truth. protocol: "dpc", or
+    "release" with the quirks of the published code (FIXES lists the differences); UsageError for another. ignore_below:
+    true parts of fewer points are ignored. split, intersect and DataErrors: as `PairedSequences`. resampling: how to find
+    the intervals; without it there are none.
     """
     check_protocol(protocol)
-    names, labels, sequences = [], [], []
-    with PairedSequences(path, truth, split=split, intersect=intersect) as paired:
-        for pair in paired:
-            names.append(pair.truth.name)
-            labels.append(pair.truth.label)
-            sequences.append(_sequence_statistics(pair, protocol, ignore_below))
-    whole, resampling = segmentation_merge(sequences), resampling or Resampling(0)
+    counted = read_counted(path, "segmentation")
+    if counted is None:
+        with PairedSequences(path, named_truth(truth), split=split, intersect=intersect) as paired:
+            about = {"task": "segmentation", "protocol": protocol, "ignore_below": ignore_below}
+            measure = partial(_sequence_values, protocol=protocol, ignore_below=ignore_below)
+            counted = count_sequences(paired, measure, about, keeping)
+    return _make_report(counted, resampling or Resampling(0))
+
+
+def _make_report(counted: Counted, resampling: Resampling) -> SegmentationReport:
+    about, labels = counted.about, [row["label"] for row in counted.rows]
+    sequences = [SegmentationStatistics(**row["statistics"]) for row in counted.rows]
+    protocol, ignore_below = about["protocol"], about["ignore_below"]
+    whole = segmentation_merge(sequences)
     if whole.frames == 0:
         of_size = f" of at least {ignore_below} points" if ignore_below else ""
-        raise DataError(f"{truth}: not one frame has a true part{of_size}")
+        raise DataError(f"{about['truth']}: not one frame has a true part{of_size}")
     return SegmentationReport(
         protocol,
         ignore_below,
-        paired.split,
-        str(truth),
+        about["split"],
+        about["truth"],
         segmentation_compute(whole, protocol),
         whole,
         _metrics_by_class(labels, sequences, protocol),
-        paired.truth.class_names,
-        paired.left_out,
-        names,
+        counted.class_names,
+        counted.left_out,
+        counted.names,
         sequences,
         resampling,
         resampling.intervals(segmentation_weighted(sequences, protocol), len(sequences)),
     )
 
 
-def _sequence_statistics(pair: SequencePair, protocol: str, ignore_below: int) -> SegmentationStatistics:
+def _sequence_values(pair: SequencePair, protocol: str, ignore_below: int) -> dict[str, Any]:
     offsets = pair.truth.frame_offsets
     spans = [slice(int(a), int(b)) for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
     truths = [pair.truth.part[span] for span in spans]
@@ -108,10 +120,8 @@ def _sequence_statistics(pair: SequencePair, protocol: str, ignore_below: int) -
         Frame(ids, pair.predicted.part[span], pair.parts.probability[span])
         for ids, span in zip(truths, spans, strict=True)
     ]
-    try:
-        return segmentation_update(frames, ignore_below=ignore_below, protocol=protocol)
-    except DataError as error:
-        raise DataError(f"{pair.truth.name!r}: {error}") from None
+    found = segmentation_update(frames, ignore_below=ignore_below, protocol=protocol)
+    return {"label": pair.truth.label, "statistics": vars(found)}
 
 
 def compressed_over_pairs(frames: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.evaluate.results import LeftOut, counted_split, list_names
-from dpcli.runtime.progress import Progress
 from dpcli.store import CloudSequence, CloudsReader, PartsReader, PartsSample
 
 
@@ -24,7 +23,7 @@ class SequencePair:
 
 
 class PairedSequences:
-    """Yields the sequences of a parts file that count, each beside its truth, in the order of the parts file.
+    """Gives the sequences of a parts file that count, each beside its truth, in the order of the parts file.
 
     split: only sequences of this split of the truth; "all" every one; None = "test" if there are any. Sequences on
     one side only are an error, with `intersect` they are left out and listed. fields: what the truth needs; instead:
@@ -106,15 +105,13 @@ class PairedSequences:
         if names:
             self.left_out.append(LeftOut(reason, names))
 
-    def __iter__(self) -> Iterator[SequencePair]:
-        """Yields one sequence at a time, so that one is in memory. DataError at the first point in which the two files differ."""
-        with Progress("evaluate", len(self.rows), "sequence") as progress:
-            for own, other in self.rows:
-                truth = self.truth.read(other, fields=self.fields)
-                predicted = self.predicted.read(own, fields=("part",))
-                self._check_points(truth, predicted)
-                yield SequencePair(truth, predicted, self.predicted.read_parts(own))
-                progress.advance()
+    def pair(self, place: int) -> SequencePair:
+        """Returns the sequence at a place of `rows`. DataError at the first point in which the two files differ."""
+        own, other = self.rows[place]
+        truth = self.truth.read(other, fields=self.fields)
+        predicted = self.predicted.read(own, fields=("part",))
+        self._check_points(truth, predicted)
+        return SequencePair(truth, predicted, self.predicted.read_parts(own))
 
     def _check_points(self, truth: CloudSequence, predicted: CloudSequence) -> None:
         where = f"{self.predicted.path}: {truth.name!r} has"
@@ -147,3 +144,10 @@ class PairedSequences:
 
 def _point(xyz: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.7g}" for value in xyz.tolist()) + ")"
+
+
+def named_truth(truth: str | Path | None) -> str | Path:
+    """Returns the truth that a parts file needs. UsageError where none was named."""
+    if truth is None:
+        raise UsageError("--truth FILE is missing: the clouds file with the truth; only kept statistics need none")
+    return truth

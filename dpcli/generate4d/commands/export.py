@@ -22,7 +22,7 @@ from dpcli.runtime.seeds import generator
 from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
 
-_SPLATS = ("ply", "splat")  # one file for a file's name, one a frame for a folder's
+_SPLATS = ("ply", "splat", "compressed.ply", "spz")  # one file for a file's name, one a frame for a folder's
 _TABLES = ("cameras", "metrics")  # one .json each
 _CLOUD_OPACITY = 0.3  # least opacity of a point of a cloud, where nothing else is asked for
 
@@ -76,8 +76,8 @@ def _export_clouds(
 
 
 def _is_single(form: Format, output: Path) -> bool:
-    """Returns whether that is one .ply or .splat, or was meant to be: such a suffix makes no folder."""
-    return form in _SPLATS and output.suffix.lower() in (".ply", ".splat", ".json")
+    """Returns whether that is one file for players, or was meant to be: such a suffix makes no folder."""
+    return form in _SPLATS and output.suffix.lower() in (".ply", ".splat", ".spz", ".json")
 
 
 def _export_files(
@@ -86,7 +86,7 @@ def _export_files(
     kind, single = form.partition("-")[0], _is_single(form, output)
     if form in _TABLES and output.suffix.lower() != ".json":
         raise UsageError(f"-o {output}: expected a name that ends in .json")
-    if single and output.suffix.lower() != f".{kind}":
+    if single and not output.name.lower().endswith(f".{kind}"):
         raise UsageError(f"-o {output}: expected a name that ends in .{kind}, or a folder for one file a frame")
     if (form in _TABLES or single) and output.exists() and not force:
         raise UsageError(f"{output}: exists already; --force replaces it")

@@ -66,7 +66,10 @@ def fit_scene(
             return
         targets = _load(path, config, supervision)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)
-        prior, shape = _load_prior(supervision, targets, device), guide(supervision.prior, targets)
+        prior, shape = (
+            _load_prior(supervision, targets, device),
+            guide(supervision.prior, targets, supervision.prior_model),
+        )
         optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize, shape)
         model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
         scene = to_scene(model, targets, metrics)

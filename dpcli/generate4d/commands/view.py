@@ -13,9 +13,19 @@ from dpcli.store.gaussians import read_scene, scene_origin
 
 
 def view_scene(
-    scene_file: str, output: Path, *, title: str | None, min_opacity: float, fps: float | None, force: bool
+    scene_file: str,
+    output: Path,
+    *,
+    clip: Path | None,
+    title: str | None,
+    min_opacity: float,
+    fps: float | None,
+    force: bool,
 ) -> None:
-    """Writes one self-contained HTML page of a scene. Raises UsageError for a name that isn't .html or that exists."""
+    """Writes one self-contained HTML page of a scene, with the pictures of the clip it was fitted to where that is given.
+
+    Raises UsageError for a name that isn't .html or that exists, DataError for a clip of another length.
+    """
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"-o {output}: expected a name that ends in .html")
     if output.exists() and not force:
@@ -23,5 +33,5 @@ def view_scene(
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
     scene = keep_opaque(scene, min_opacity)
-    size = write_page(scene, output, title=title or str(root["source"]) or "scene", history=history, fps=fps)
+    size = write_page(scene, output, title=title or str(root["source"]) or "scene", history=history, fps=fps, clip=clip)
     log.info(f"{output}: {scene.num_gaussians} Gaussians, {scene.num_frames} frames, {size / 2**20:.1f} MiB")

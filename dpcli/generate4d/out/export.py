@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
 from dpcli.runtime.whole_file import check_replaced, whole_file, write_whole
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
-_SINGLE = {"ply": write_splat_ply, "splat": write_splat}
+_SINGLE = {"ply": write_splat_ply, "splat": write_splat, "compressed.ply": write_compressed_ply, "spz": write_spz}
 
 
 def opaque_indices(scene: GaussianScene, min_opacity: float) -> np.ndarray:
@@ -44,8 +45,11 @@ def keep_opaque(scene: GaussianScene, min_opacity: float) -> GaussianScene:
 def export_file(
     scene: GaussianScene, path: Path, form: str, *, time: float | None = None, axes: str = "player"
 ) -> None:
-    """Writes one .ply or .splat: the canonical Gaussians, or those at `time` seconds. Raises DataError when it can't."""
-    _SINGLE[form](path, Splats.of(scene, time, axes))
+    """Writes one .ply, .splat, .compressed.ply or .spz: the canonical Gaussians, or those at `time` seconds.
+
+    An .spz has y up, as the scene, whatever the axes. Raises DataError when it can't be written.
+    """
+    _SINGLE[form](path, Splats.of(scene, time, "keep" if form == "spz" else axes))
 
 
 def export_sequence(
@@ -69,7 +73,7 @@ def export_sequence(
         raise UsageError(f"{taken[0]}: exists already; --force replaces it")
     if folder.is_file():
         raise UsageError(f"{folder}: is a file, expected a folder for the frames")
-    check_replaced(folder, ("frame*.ply", "frame*.splat", "cameras.json", "metrics.json"))
+    check_replaced(folder, ("frame*.ply", "frame*.splat", "frame*.spz", "cameras.json", "metrics.json"))
     times = scene.time.tolist() if times is None else list(times)
     width = max(4, len(str(len(times))))
     names = [f"frame{number:0{width}d}.{form}" for number in range(1, len(times) + 1)]

@@ -4,5 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-Format = Literal["ply", "ply-sequence", "splat", "splat-sequence", "clouds", "cameras", "metrics"]
-Axes = Literal["player", "keep"]  # x right, y down, z forward; or as in the scene, y up
+Format = Literal[
+    "ply", "ply-sequence", "splat", "splat-sequence", "compressed.ply", "spz", "clouds", "cameras", "metrics"
+]
+Axes = Literal[
+    "player", "keep"
+]  # as players take it: x right, y down, z forward (spz: y up, z back); or as in the scene, y up

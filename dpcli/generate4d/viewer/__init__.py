@@ -15,18 +15,26 @@ from dpcli.draw.page.assemble import SHARED, STYLE, as_base64, as_json, filled, 
 from dpcli.draw.palette import part_colors
 from dpcli.generate4d.out.camera_paths import clip_rate, own_rate
 from dpcli.generate4d.out.picture_colors import WEIGHTS
+from dpcli.generate4d.viewer.input_sheet import input_sheet
 from dpcli.ops.cameras import orbit_of
+from dpcli.standard_streams import printable
 from dpcli.store.gaussians import GaussianScene
 
-SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "app.js")
+SCRIPTS = ("scene.js", "webgl.js", "canvas.js", "trails.js", "app.js")
 _POSITIONS, _TURNS, _BYTE = 65535, 127, 255  # steps of a coordinate in the box, of a quaternion's number, of a fraction
 
 
 def write_page(
-    scene: GaussianScene, path: Path, *, title: str, history: Sequence[dict] = (), fps: float | None = None
+    scene: GaussianScene,
+    path: Path,
+    *,
+    title: str,
+    history: Sequence[dict] = (),
+    fps: float | None = None,
+    clip: Path | None = None,
 ) -> int:
-    """Write the page; returns its size in bytes. DataError when it can't be written. fps: frames of the clip per second,
-    None = as videos play it (`clip_rate`).
+    """Writes the page and returns its size in bytes; DataError when it can't be written. fps: frames of the clip per second,
+    None = as videos play it (`clip_rate`). clip: the views file whose pictures the page shows beside the scene.
 
     Positions are rounded to 1/65535 of the box around all frames, quaternions to 1/127, colors, opacities and weights
     to 1/255; color terms that depend on the direction are left out. Equal scenes give equal bytes.
@@ -34,10 +42,11 @@ def write_page(
     arrays = packed(scene)
     blob = b"".join(values.tobytes() for values in arrays.values())
     header = describe(scene, arrays, title=title, history=history, fps=fps or clip_rate(scene))
+    header["input"] = input_sheet(clip, scene) if clip else None
     page = filled(
         source_text("page.html", __package__),
         {
-            "TITLE": html.escape(title),
+            "TITLE": html.escape(printable(title)),
             "STYLE": source_text(STYLE),
             "HEADER": as_json(header),
             "DATA": as_base64(blob),

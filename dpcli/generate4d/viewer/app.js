@@ -1,15 +1,24 @@
 // The page: state, camera, controls. The part after # in the address sets the state, such as
-// #time=0.5&color=part&azimuth=40&elevation=10&radius=2&background=black&play=0&panel=1&controls=0&renderer=2d
-// (seconds, degrees).
+// #time=0.5&color=part&azimuth=40&elevation=10&radius=2&target=0,0.1,0&background=black&trails=1&turn=1&bounce=1&play=0&panel=1&controls=0&renderer=2d
+// (seconds, degrees). `l` writes such an address.
 
 const GROUNDS = { white: [255, 255, 255], gray: [118, 122, 130], black: [12, 14, 18] };
+const COLORS = ["appearance", "part", "rigid", "depth"];
+const FLAGS = ["trails", "turn", "bounce"];
+const KEYS = [
+  ["space", "play or stop"], ["← →", "one frame back, on"], ["1 2 3 4", "appearance, parts, rigid weight, depth"], ["t", "trajectories"],
+  ["o", "the input picture"], ["a", "turn by itself"], ["p", "back and forth, or round and round"], ["b", "background"], ["+ −", "nearer, farther"],
+  ["r", "the input's view"], ["f", "full screen"], ["l", "copy a link to this view"], ["s", "save a picture"], ["? i", "this panel"],
+  ["drag", "turn"], ["wheel, pinch", "zoom"], ["shift-drag, two fingers", "move"], ["double click, double tap", "turn around that point"],
+];
 
 class App extends Stage {
   constructor(header, scene) {
     super($("canvas"), header.camera.fovy, scene.timeline);
     Object.assign(this, { header, scene, hidden: new Set() });
-    Object.assign(this.state, { color: "appearance", background: "white", ...this.home() });
+    Object.assign(this.state, { color: "appearance", background: "white", turn: false, trails: false, input: true, ...this.home() });
     this.painter = this.painterOf(this.canvas);
+    this.trails = new Trails($("trails"), scene);
     this.fillHead();
     this.listen();
     this.readAddress();
@@ -34,9 +43,64 @@ class App extends Stage {
   readAddress() {
     const given = addressed(), values = super.readAddress();
     if (GROUNDS[given.get("background")]) values.background = given.get("background");
-    if (["appearance", "part", "rigid"].includes(given.get("color"))) values.color = given.get("color");
+    if (COLORS.includes(given.get("color"))) values.color = given.get("color");
+    for (const flag of FLAGS) if (given.has(flag)) values[flag] = given.get(flag) === "1";
+    const target = (given.get("target") || "").split(",").map(Number);
+    if (target.length === 3 && target.every(Number.isFinite)) values.target = target;
     if (given.has("panel")) $("panel").hidden = given.get("panel") !== "1";
     this.change(values);
+  }
+
+  // The address that shows what is shown now.
+  get address() {
+    const { state } = this, short = (value) => String(Number(value.toFixed(4)));
+    const values = { time: short(state.time), color: state.color, azimuth: short(state.azimuth / DEGREE), elevation: short(state.elevation / DEGREE),
+      radius: short(state.radius), target: state.target.map(short).join(","), background: state.background };
+    for (const flag of FLAGS) if (state[flag]) values[flag] = "1";
+    return `${location.href.split("#")[0]}#${new URLSearchParams(values).toString().replaceAll("%2C", ",")}`;
+  }
+
+  copyLink() {
+    history.replaceState(null, "", this.address);
+    const copied = navigator.clipboard ? navigator.clipboard.writeText(this.address) : Promise.reject();
+    copied.then(() => this.tell("link copied"), () => this.tell("the address is a link to this view"));
+  }
+
+  // The picture as it is drawn, trajectories in it, without the controls.
+  savePicture() {
+    this.draw();
+    const copy = made("canvas", "", { width: this.canvas.width, height: this.canvas.height }), context = copy.getContext("2d");
+    for (const layer of [this.canvas, this.trails.canvas]) context.drawImage(layer, 0, 0);
+    copy.toBlob((blob) => {
+      const link = made("a", "", { href: URL.createObjectURL(blob), download: `${this.header.title.replace(/[^\w.-]+/g, "_")}.png` });
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    });
+  }
+
+  tell(text) {
+    $("told").textContent = text;
+    $("told").hidden = false;
+    clearTimeout(this.telling);
+    this.telling = setTimeout(() => { $("told").hidden = true; }, 2000);
+  }
+
+  toggleFullScreen() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else if (root.requestFullscreen) root.requestFullscreen().catch(() => this.tell("this browser refuses full screen here"));
+    else this.tell("this browser has no full screen");
+  }
+
+  // A double click or tap: turns around the Gaussian that is seen there, or goes home where nothing is.
+  pointedAt(x, y) {
+    const ratio = this.canvas.width / this.canvas.clientWidth, point = this.scene.seenAt(x * ratio, y * ratio, this.camera, this.hidden);
+    if (point) this.lookAt(point);
+    else this.goHome();
+  }
+
+  clock(time) {
+    const [frame, , later] = this.timeline.between(time), { frames } = this.header;
+    return `${Math.min(frame + Math.round(later), frames - 1) + 1} / ${frames} · ${time.toFixed(2)} s`;
   }
 
   fillHead() {
@@ -62,13 +126,15 @@ class App extends Stage {
     add("h2", "Commands");
     for (const entry of header.history) add("code", entry.command);
     add("h2", "Keys");
-    add("p", "space plays · ← → step · 1 2 3 color · b background · + − zoom · r resets · i this panel. Drag turns, wheel or pinch zooms, shift-drag or two fingers move.");
+    panel.append(tableOf(KEYS));
   }
 
   change(values) {
     const state = Object.assign(this.state, values);
     root.toggleAttribute("data-dark", state.background !== "white");
     for (const button of document.querySelectorAll("[data-color]")) button.setAttribute("aria-pressed", button.dataset.color === state.color);
+    for (const button of document.querySelectorAll("[data-flag]")) button.setAttribute("aria-pressed", state[button.dataset.flag]);
+    $("bounce").textContent = state.bounce ? "⇄" : "↻";
     if (this.legendOf !== state.color) this.fillLegend(state.color);
     super.change({});
   }
@@ -78,11 +144,12 @@ class App extends Stage {
     this.legendOf = color;
     legend.hidden = color === "appearance";
     legend.replaceChildren();
-    if (color === "rigid") {
-      const ramp = made("div", "", { id: "ramp" }), ends = made("div", "", { id: "ends" });
+    const ends = { rigid: ["free", "with its part"], depth: ["far", "near"] }[color];
+    if (ends) {
+      const ramp = made("div", "", { id: "ramp" }), words = made("div", "", { id: "ends" });
       ramp.style.background = `linear-gradient(90deg, ${weights.map((rgb) => `rgb(${rgb})`)})`;
-      ends.innerHTML = "<b>free</b><b>with its part</b>";
-      legend.append(ramp, ends);
+      words.append(...ends.map((word) => made("b", word)));
+      legend.append(ramp, words);
     }
     if (color === "part") for (const part of parts) legend.append(this.partButton(part));
   }
@@ -105,6 +172,20 @@ class App extends Stage {
     const { state, scene, camera } = this;
     scene.moveTo(state.time);
     this.painter.draw(scene, scene.sorted(camera.forward, this.hidden), scene.colors(state.color), camera, GROUNDS[state.background]);
+    this.trails.draw(state.trails, camera, this.hidden);
+    this.drawInput();
+  }
+
+  // The clip's picture of the frame shown; the sheet holds all, row by row.
+  drawInput() {
+    const { input } = this.header, card = $("input");
+    card.hidden = !input || !this.state.input || !this.sheet.complete;
+    if (card.hidden) return;
+    Object.assign(card, { width: input.width, height: input.height });
+    const [frame, , later] = this.timeline.between(Math.min(this.state.time, this.timeline.end));
+    const shown = Math.min(frame + Math.round(later), this.header.frames - 1);
+    const { width, height, columns } = input, column = shown % columns, row = Math.floor(shown / columns);
+    card.getContext("2d").drawImage(this.sheet, column * width, row * height, width, height, 0, 0, width, height);
   }
 
   listen() {
@@ -114,14 +195,25 @@ class App extends Stage {
     $("home").onclick = () => this.goHome();
     $("about").onclick = () => { $("panel").hidden = !$("panel").hidden; };
     for (const button of document.querySelectorAll("[data-color]")) button.onclick = () => this.change({ color: button.dataset.color });
+    for (const button of document.querySelectorAll("[data-flag]")) button.onclick = () => this.flip(button.dataset.flag);
+    $("link").onclick = () => this.copyLink();
+    $("save").onclick = () => this.savePicture();
+    $("full").onclick = () => this.toggleFullScreen();
+    this.sheet = new Image();
+    this.sheet.onload = () => this.wake();
+    if (this.header.input) this.sheet.src = this.header.input.sheet;
     window.addEventListener("hashchange", () => this.readAddress());
     listenToKeys(() => ({
       " ": () => this.toggle(), ArrowLeft: () => this.step(-1), ArrowRight: () => this.step(1),
       1: () => this.change({ color: "appearance" }), 2: () => this.change({ color: "part" }), 3: () => this.change({ color: "rigid" }),
-      b: () => this.nextGround(), r: () => this.goHome(), i: () => $("about").click(),
+      4: () => this.change({ color: "depth" }), t: () => this.flip("trails"), o: () => this.flip("input"), a: () => this.flip("turn"),
+      p: () => this.flip("bounce"), f: () => this.toggleFullScreen(), l: () => this.copyLink(), s: () => this.savePicture(),
+      b: () => this.nextGround(), r: () => this.goHome(), i: () => $("about").click(), "?": () => $("about").click(),
       "+": () => this.zoom(0.9), "=": () => this.zoom(0.9), "-": () => this.zoom(1 / 0.9),
     }));
   }
+
+  flip(flag) { this.change({ [flag]: !this.state[flag] }); }
 
   nextGround() {
     const names = Object.keys(GROUNDS);

@@ -65,6 +65,7 @@ class Scene {
       if (d < low) low = d;
       if (d > high) high = d;
     }
+    this.reach = [low, high];
     const factor = 65535 / Math.max(high - low, 1e-9);
     buckets.fill(0);
     for (let i = 0; i < count; i++) {
@@ -82,17 +83,40 @@ class Scene {
     return order.subarray(0, shown);
   }
 
-  // r g b a (0..255) of all Gaussians.
+  // The nearest Gaussian that covers a pixel, as a point [x, y, z]; null where none does. `moveTo` and `sorted` have run.
+  seenAt(x, y, camera, hidden) {
+    const { mean, part, color, count, scale } = this, { rotation: R, shift, focal, width, height } = camera;
+    let nearest = Infinity, found = null;
+    for (let i = 0; i < count; i++) {
+      if (hidden.has(part[i]) || color[3 * count + i] < 76) continue;  // fainter than 0.3
+      const [a, b, c] = mean.subarray(3 * i, 3 * i + 3), depth = R[6] * a + R[7] * b + R[8] * c + shift[2];
+      if (depth < 0.02 || depth >= nearest) continue;
+      const u = width / 2 + focal * (R[0] * a + R[1] * b + R[2] * c + shift[0]) / depth;
+      const v = height / 2 + focal * (R[3] * a + R[4] * b + R[5] * c + shift[1]) / depth;
+      const reach = Math.max(3, focal * Math.max(scale[i], scale[count + i], scale[2 * count + i]) / depth);
+      if (Math.hypot(u - x, v - y) < reach) [nearest, found] = [depth, [a, b, c]];
+    }
+    return found;
+  }
+
+  // Where Gaussian i is at a frame.
+  placeAt(i, frame) {
+    const { count, position, header } = this;
+    return header.low.map((low, axis) => low + header.extent[axis] / 65535 * position[(3 * frame + axis) * count + i]);
+  }
+
+  // r g b a (0..255) of all Gaussians; of depth: as `sorted` measured it.
   colors(kind) {
-    const { count, color, part, header } = this, out = this.rgba || (this.rgba = new Uint8ClampedArray(4 * count));
+    const { count, color, part, header, along } = this, out = this.rgba || (this.rgba = new Uint8ClampedArray(4 * count));
     const byPart = new Map(header.parts.map((one) => [one.id + 1, one.color]));
-    const [a, b, w] = this.timeline.between(this.now);
+    const [a, b, w] = this.timeline.between(this.now), [low, high] = this.reach;
     for (let i = 0; i < count; i++) {
       let rgb;
       if (kind === "part") rgb = byPart.get(part[i]);
       else if (kind === "rigid") {
         rgb = ramped(header.weights, ((1 - w) * this.weight[a * count + i] + w * this.weight[b * count + i]) / 255);
-      } else rgb = [color[i], color[count + i], color[2 * count + i]];
+      } else if (kind === "depth") rgb = ramped(header.weights, (high - along[i]) / Math.max(high - low, 1e-9));
+      else rgb = [color[i], color[count + i], color[2 * count + i]];
       out[4 * i] = rgb[0]; out[4 * i + 1] = rgb[1]; out[4 * i + 2] = rgb[2]; out[4 * i + 3] = color[3 * count + i];
     }
     return out;

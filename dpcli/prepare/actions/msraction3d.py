@@ -10,10 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, reading
+from dpcli.prepare.actions.mat5 import read_mat5
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
+from dpcli.store.file import refuse_claim
+from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = (
     "high arm wave",
@@ -76,7 +79,7 @@ def read_mat(path: Path) -> np.ndarray:
     """Reads a MATLAB file with a variable ``depth`` (H,W,T), version 5 or 7.3, as depth (T,H,W), C order."""
     with path.open("rb") as file:
         is_hdf5 = b"MATLAB 7.3" in file.read(20)
-    depth = _read_mat73(path) if is_hdf5 else _read_mat5(path)
+    depth = _read_mat73(path) if is_hdf5 else read_mat5(path, "depth")
     if depth.dtype.kind not in "uif":
         raise DataError(f"{path}: 'depth' has type {depth.dtype}; expected numbers")
     if depth.ndim == 2:  # MATLAB drops a trailing axis of length one
@@ -89,28 +92,15 @@ def read_mat(path: Path) -> np.ndarray:
     return np.ascontiguousarray(depth.transpose(2, 0, 1))
 
 
-def _read_mat5(path: Path) -> np.ndarray:
-    from scipy.io import loadmat, whosmat
-
-    try:
-        content = loadmat(path, variable_names=["depth"])
-    except Exception as error:  # scipy raises many kinds on damaged files: zlib.error, TypeError, IndexError...
-        raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
-    if "depth" not in content:
-        raise DataError(f"{path}: no variable 'depth'; found {[v[0] for v in whosmat(path)] or 'none'}")
-    return content["depth"]
-
-
 def _read_mat73(path: Path) -> np.ndarray:
     import h5py
 
-    try:
-        with h5py.File(path, "r") as file:
-            if not isinstance(file.get("depth"), h5py.Dataset):
-                raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
-            return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
-    except OSError as error:
-        raise DataError(f"{path}: not a readable MATLAB 7.3 file, perhaps truncated ({error})") from None
+    check_heaps(path)
+    with reading(f"{path}, a MATLAB 7.3 file"), h5py.File(path, "r") as file:
+        if not isinstance(file.get("depth"), h5py.Dataset):
+            raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
+        refuse_claim(file["depth"], path)
+        return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:

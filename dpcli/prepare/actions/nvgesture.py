@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import path_inside
 from dpcli.prepare.decode.depth_files import read_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
@@ -150,12 +151,14 @@ class NvGesture:
                 where.rsplit("/", 1)[-1], self.raw, split, problem=f"{where}: {error}; found {line.strip()[:80]!r}"
             )
         relative = Path(entry.path)
-        path = self.raw / relative / f"{entry.stream}.avi"
         subject = SUBJECT.fullmatch(relative.name)
         name = f"{'/'.join(relative.parts[-2:])}@{entry.start}"
-        problem = "" if path.is_file() else f"{where}: names {path}, which does not exist"
-        if relative.is_absolute() or ".." in relative.parts:
-            problem = f"{where}: the path {entry.path} leaves the data folder"
+        path, problem = self.raw, ""
+        try:
+            path = path_inside(self.raw, self.raw, f"{entry.path}/{entry.stream}.avi")
+            problem = "" if path.is_file() else f"{where}: names {path}, which does not exist"
+        except DataError as error:
+            problem = f"{where}: {error}"
         return Item(
             name,
             path,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS
+from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
 from dpcli.prepare.reader import natural_key, require_folder
 
 
@@ -49,7 +49,7 @@ def load_shape(path: Path, up: str) -> Shape:
 
     try:
         options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-        mesh = trimesh.load(path, force="mesh", process=False, **options)
+        mesh = trimesh.load(path, force="mesh", process=False, resolver=files_inside(path, path.parent), **options)
         triangles = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces, np.int64)]
     except Exception as error:  # the readers of eight formats raise many kinds on damaged files
         raise DataError(f"{path}: not a readable mesh ({type(error).__name__}: {error})") from None

@@ -12,6 +12,7 @@ from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 
 MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
+_PACKAGES = ("package://", "model://")  # of ROS and Gazebo: the folder of the robot, or one above it
 
 
 def geometry_triangles(path: Path, geometry: Any, root: Path | None, notes: Counter) -> np.ndarray:
@@ -54,10 +55,11 @@ def resolve(path: Path, name: str, root: Path | None) -> Path:
     if not name:
         raise DataError(f"{path}: a mesh without a filename; name its file")
     name = name.replace("\\", "/")  # written on Windows
-    plain = name.split("://", 1)[1] if "://" in name else name
-    tails = [plain, plain.split("/", 1)[1]] if name.startswith("package://") and "/" in plain else [plain]
+    in_package = name.startswith(_PACKAGES)
+    plain = name.split("://", 1)[1] if in_package else name
+    tails = [plain, plain.split("/", 1)[1]] if in_package and "/" in plain else [plain]
     folders = [path.parent]
-    if "://" in name and not name.startswith("file://"):
+    if in_package:
         above = list(path.resolve().parents)[1:4]
         folders += [folder for folder in above if root is None or folder.is_relative_to(root.resolve())]
     places = [_joined(path, root, folder, tail) for folder in folders for tail in tails]
@@ -81,7 +83,7 @@ def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
         raise DataError(f"{path}: its mesh {name} is of an unknown format; expected one of {' '.join(MESH_FORMATS)}")
     try:
         options = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
-        mesh = trimesh.load(file, force="mesh", process=False, resolver=_resolver(file, root), **options)
+        mesh = trimesh.load(file, force="mesh", process=False, resolver=files_inside(file, root), **options)
         if mesh.vertices.shape[1:] != (3,):
             raise ValueError(f"its vertices have {mesh.vertices.shape[1]} coordinates, expected 3")
         if len(mesh.faces) and mesh.faces.max() >= len(mesh.vertices):
@@ -91,8 +93,8 @@ def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
         raise DataError(f"{path}: its mesh {name} cannot be read ({type(error).__name__}: {error})") from None
 
 
-def _resolver(file: Path, root: Path | None) -> Any:
-    """Returns what trimesh asks for the buffers and pictures of a mesh: files inside ``root`` alone."""
+def files_inside(file: Path, root: Path | None) -> Any:
+    """Returns what trimesh asks for the buffers and pictures of a mesh: files inside ``root`` alone (None: any)."""
     from trimesh.resolvers import FilePathResolver
 
     class _Inside(FilePathResolver):

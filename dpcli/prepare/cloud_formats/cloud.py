@@ -63,12 +63,9 @@ def named_axes(path: Path, names: Sequence[str]) -> tuple[list[int], str] | None
 
 
 def as_points(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns three columns (N) as (N,3): f32 where all are, else f64, which holds every other type's meters."""
+    """Returns three columns (N) as (N,3), by columns: f32 where all are, else f64, which holds every other type's meters."""
     kind = np.float32 if all(c.dtype.kind == "f" and c.dtype.itemsize <= 4 for c in columns) else np.float64
-    points = np.empty((len(columns[0]), 3), kind)
-    for axis, column in enumerate(columns):
-        points[:, axis] = column
-    return points
+    return np.array(columns, kind).T
 
 
 def kept_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str]) -> dict[str, np.ndarray]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import struct
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,8 +24,7 @@ _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 
 def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the points, with colors as stored: 16 bits, some of which hold bytes. Raises DataError when damaged."""
-    import laspy
-
+    laspy = _load_laspy()
     _check_sizes(path)
     try:
         las = laspy.read(path)
@@ -37,7 +38,30 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     if color is not None and not color.any():
         color = None  # the point format has room for colors that nobody filled in
     extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if name in keep}, keep) if keep else {}
-    return Cloud(np.asarray(las.xyz, np.float64), color, _unit(las), extra)
+    return Cloud(_scaled(las), color, _unit(las), extra)
+
+
+def _load_laspy() -> ModuleType:
+    """Returns laspy without the client of web addresses that it loads where there is one: that takes four times as long."""
+    hidden = not {"laspy", "requests"} & sys.modules.keys()
+    if hidden:
+        sys.modules["requests"] = None  # type: ignore[assignment]  # an import of it fails at once
+    try:
+        import laspy
+    finally:
+        if hidden:
+            del sys.modules["requests"]
+    return laspy
+
+
+def _scaled(las: Any) -> np.ndarray:
+    """Returns the coordinates f64 (N,3), by columns: laspy's own `xyz` makes them one by one and copies them twice."""
+    points = np.empty((3, len(las.points)))
+    for row, name, scale, offset in zip(points, "XYZ", las.header.scales, las.header.offsets):
+        row[:] = las[name]
+        row *= scale
+        row += offset
+    return points.T
 
 
 def _check_sizes(path: Path) -> None:

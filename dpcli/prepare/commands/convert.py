@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dpcli.prepare.dask_cluster import cluster_executor
 from dpcli.prepare.pipeline import Conversion, Report, convert
 from dpcli.prepare.reader import Reader
+from dpcli.runtime.machines.dask_cluster import cluster_executor
 from dpcli.store.pipes import output_file
 
 

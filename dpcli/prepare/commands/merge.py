@@ -1,25 +1,23 @@
-"""Several clouds files into one: the shards of one conversion, or sources that have nothing in common."""
+"""Several files into one: the shards of one run, whatever it made, or clouds of sources that have nothing in common."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.path_names import short_names
 from dpcli.prepare.commands.copy_samples import Copy, copy_samples
 from dpcli.prepare.commands.sources import OpenFiles, Source, read_source
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Report, count_samples
-from dpcli.prepare.shards import shard_of
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.store import CloudSequence, CloudsReader
+from dpcli.store.file import file_kind
 from dpcli.store.pipes import refuse_repeats
 from dpcli.store.writing.already_made import already_made
-
-_OPEN = 64  # files held open at a time; shards are read in turn, and there may be a thousand
+from dpcli.store.writing.join_shards import join_shards
 
 
 def merge(
@@ -32,19 +30,19 @@ def merge(
     force: bool = False,
     resume: bool = True,
 ) -> Report:
-    """Joins clouds files, one sample in memory at a time; running again continues where a stopped or killed run ended.
+    """Joins files, one sample in memory at a time; running again continues where a stopped or killed run ended.
 
-    All shards of one conversion become, byte for byte, the file of a single run: order restored, provenance the
-    whole's. Other files follow one another as given; their class lists must agree unless `labels` maps them.
+    All shards of one run become, byte for byte, the file of a single run: order restored, provenance the whole's. Other
+    clouds files follow one another as given; their class lists must agree unless `labels` maps them.
     prefix: names become FILE/NAME, FOLDER/NAME for files of one name. resume: off where nobody could run it again
     (a pipe); saves the journal's disk space. UsageError: missing, repeated or mixed shards, `output` or what a stopped
     run left of it is there and another; DataError: classes, units or fields that disagree, a name twice; Stopped after
     a stop signal.
     """
     refuse_repeats([*inputs, output])
+    if labels is None and not prefix and (_no_clouds(inputs) or all(read_source(path).shard for path in inputs)):
+        return _merge_shards(inputs, output, force, resume)
     sources = [read_source(path) for path in inputs]
-    if all(source.shard for source in sources) and labels is None and not prefix:
-        return _merge_shards(sources, output, force, resume)
     for source in sources:
         if source.shard:
             log.warn(
@@ -56,69 +54,16 @@ def merge(
     return _merge_unlike(sources, output, labels or LabelMap(), compression, force, resume)
 
 
-def _merge_shards(sources: list[Source], output: Path, force: bool, resume: bool) -> Report:
-    entry = _whole_entry(sources)
-    places: dict[int, tuple[Source, int]] = {}
-    lost: dict[int, tuple[str, str]] = {}
-    for source in sources:
-        written, skipped = source.positions or ([], [])
-        if (len(written), len(skipped)) != (len(source.names), len(source.skipped)):
-            raise DataError(f"{source.path}: its positions don't fit its samples; make this shard again")
-        places |= {place: (source, index) for index, place in enumerate(written)}
-        lost |= dict(zip(skipped, source.skipped))
-    total = entry["config"].get("items", len(places) + len(lost))
-    if sorted([*places, *lost]) != list(range(total)):
-        raise DataError(f"{output}: the shards hold {len(places) + len(lost)} of {total} places; make them again")
-    if not places:
-        raise DataError(f"{output}: all {len(sources)} shards are empty; their samples were all skipped")
-    first = next(source for source in sources if source.names)
-    samples = [(*places[place], None) for place in sorted(places)]
-    skipped, compression = [lost[place] for place in sorted(lost)], str(entry["config"].get("compression", "none"))
-    copy = Copy(
-        output=output,
-        pattern=first,
-        names=[source.sample_name(index) for source, index, _ in samples],
-        provenance=entry,
-        task="prepare merge",
-        skipped=skipped,
-        compression=compression,
-        force=force,
-        resume=resume,
-    )
-    return _write_samples(copy, samples)
+def _no_clouds(inputs: Sequence[Path]) -> bool:
+    return any(file_kind(path) != "clouds" for path in inputs)
 
 
-def _whole_entry(sources: list[Source]) -> dict[str, Any]:
-    """Returns the provenance that all shards share. Raises UsageError unless they are the pieces of one whole."""
-    entries = [shard_of(source.provenance[-1])[1] for source in sources]  # type: ignore[index]
-    first = sources[0]
-    for source, entry in zip(sources, entries):
-        different = [key for key in ("config", "seed", "version") if entry.get(key) != entries[0].get(key)]
-        if different or source.shard.count != first.shard.count:  # type: ignore[union-attr]
-            what = _differing_facts(entries[0], entry) if different else f"{first.shard} and {source.shard}"
-            raise UsageError(f"{source.path}: is a shard of another conversion than {first.path} ({what})")
-    count, seen = first.shard.count, {}  # type: ignore[union-attr]
-    for source in sources:
-        index = source.shard.index  # type: ignore[union-attr]
-        if index in seen:
-            raise UsageError(f"{source.path}: is shard {source.shard}, as {seen[index]} is; each shard once")
-        seen[index] = source.path
-    missing = [f"{index}/{count}" for index in range(count) if index not in seen]
-    if missing:
-        more = f" and {len(missing) - 8} more" if len(missing) > 8 else ""
-        raise UsageError(
-            f"--shard {', '.join(missing[:8])}{more}: missing; convert {'them' if missing[1:] else 'it'} first"
-        )
-    return entries[0]
-
-
-def _differing_facts(one: dict[str, Any], other: dict[str, Any]) -> str:
-    flat = [
-        {**entry.get("config", {}), "seed": entry.get("seed"), "version": entry.get("version")}
-        for entry in (one, other)
-    ]
-    keys = [key for key in {**flat[0], **flat[1]} if flat[0].get(key) != flat[1].get(key)]
-    return ", ".join(f"{key} {flat[0].get(key)} and {flat[1].get(key)}" for key in keys[:3])
+def _merge_shards(inputs: Sequence[Path], output: Path, force: bool, resume: bool) -> Report:
+    there = output.exists() and not force
+    join_shards(inputs, output, force=force, resume=resume)
+    if there:
+        log.info(f"{output}: already complete, made of the same files (--force makes it again)")
+    return count_samples(Report(was_complete=there), output)
 
 
 def _merge_unlike(

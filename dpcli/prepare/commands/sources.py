@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
-from dpcli.prepare.shards import Shard, shard_of
+from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.file import file_kind, read_positions
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import natural_key
+from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, one_series, upright
 from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES, look_at_video, video_frames
+from dpcli.runtime.progress import log
 
 _LISTED = 6  # files at most in a message
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
@@ -43,10 +45,15 @@ class Frames:
         return (animation_frames if is_image_file(self.path) else video_frames)(self.path, wanted)
 
 
-def open_frames(path: Path) -> Frames:
-    """Opens the frames of a folder, video or GIF. Raises DataError when there are none or they cannot be decoded."""
+def open_frames(path: Path, pattern: str = "") -> Frames:
+    """Opens the frames of a folder, video or GIF; pattern: which images of a folder are frames.
+
+    Raises DataError when there are none or they cannot be decoded, UsageError at a pattern for what is no folder.
+    """
     if path.is_dir():
-        return _open_folder(path)
+        return _open_folder(path, pattern)
+    if pattern and path.exists():
+        raise UsageError(f"--pattern {pattern}: chooses among the images of a folder; {path} is a file")
     if not path.is_file():
         raise DataError(
             f"{path}: no such file or folder; expected frames: a folder of images, a video or an animated image"
@@ -97,14 +104,21 @@ def _telling_columns(stems: Sequence[str]) -> list[list[int]]:
     return [column for column in columns if len(set(column)) > 1] or columns[-1:]
 
 
-def _open_folder(folder: Path) -> Frames:
+def _open_folder(folder: Path, pattern: str) -> Frames:
     paths = image_paths(folder)
-    if not paths:
+    if paths and pattern:
+        chosen = choose_series(folder, [path.name for path in paths], pattern=pattern)
+        if chosen is None:
+            raise DataError(f"{folder}: no images whose names fit --pattern '{pattern}', such as {paths[0].name}")
+        for line in about_series([(str(folder), replace(chosen, numbered=False))]):  # gaps are told with the frames
+            log.info(line)
+        paths = [path for path in paths if path.name in chosen.names]
+    elif not paths:
         _refuse_videos(folder)
         inside = sorted(p.name for p in folder.iterdir() if p.is_dir())[:3]
         hint = f"; it has folders ({', '.join(inside)}): name one of them" if inside else ""
         raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){hint}")
-    paths = one_series(folder, paths)
+    paths = paths if pattern else one_series(folder, paths, option="--pattern")
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.path_names import utf8_path
-from dpcli.prepare.decode.video_streams import VideoStream, ffmpeg
+from dpcli.prepare.decode.video_streams import VideoStream, ffmpeg_reading
 
 _STAMP = re.compile(rb"\bpts_time:(\S+)")
 _NEUTRAL = 0.02  # how far a color may be from gray, as a share of its range: what lossy codecs make of gray
@@ -48,10 +47,10 @@ def deep_frames(path: Path, stream: VideoStream) -> Iterator[tuple[np.ndarray, f
 
 
 def _command(path: Path, stream: VideoStream, pixel_format: str) -> list[str]:
-    source = ["-threads", "1", "-noautorotate", "-i", f"file:{utf8_path(path, 'ffmpeg')}"]
+    source = ffmpeg_reading(path, "-threads", "1", "-noautorotate")
     taken = ["-map", f"0:v:{stream.place}", "-vf", "showinfo=checksum=0", "-fps_mode", "passthrough"]
     raw = ["-f", "rawvideo", "-pix_fmt", pixel_format, "-"]
-    return [ffmpeg(), "-hide_banner", "-nostdin", "-nostats", *source, *taken, *raw]
+    return [*source, *taken, *raw]
 
 
 def _color_values(stream: VideoStream) -> int:

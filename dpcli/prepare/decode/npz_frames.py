@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.decode.safe_pickle import ArrayUnpickler
+from dpcli.prepare.decode.safe_pickle import load_arrays
 
 _MOST_BYTES = 1 << 31  # of a member unpacked; 300 frames of 40,000 points in float64 take 0.3 GB
 
@@ -50,7 +50,7 @@ def _read_array(stream: io.BytesIO) -> np.ndarray:
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     _, _, dtype = header(stream)
     if dtype.hasobject:
-        return ArrayUnpickler(stream, encoding="latin1").load()
+        return load_arrays(stream)
     stream.seek(0)
     return np.lib.format.read_array(stream, allow_pickle=False)
 
@@ -75,4 +75,4 @@ def _frame(path: Path, key: str, t: int, frame: object) -> np.ndarray:
     points = frame[:, :3]
     if points.dtype.kind == "f" and not np.isfinite(points).all():
         raise DataError(f"{path}: frame {t} of {key} holds NaN or infinity; expected finite coordinates")
-    return points.astype(np.float32)
+    return np.array(points, np.float32)  # a plain array, whatever the pickle's

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
+from dpcli.runtime.clips.video_frames import VIDEO_FORMATS
 
 _STREAM = re.compile(r"\s*Stream #0:\d+.*?: (Video|Audio|Subtitle|Data|Attachment): (.*)")
 _TITLE = re.compile(r"\s+(?:title|handler_name)\s*: (.*)")
@@ -58,17 +59,19 @@ class VideoStream:
         return ", ".join(part for part in (self.pixel_format, f"{self.width}x{self.height}", self.title) if part)
 
 
-def ffmpeg() -> str:
-    """Returns the ffmpeg program that comes with imageio-ffmpeg."""
+def ffmpeg_reading(path: Path, *options: str) -> list[str]:
+    """Returns the command of the ffmpeg that comes with imageio-ffmpeg up to its input, a file that names no others."""
     import imageio_ffmpeg
 
-    return imageio_ffmpeg.get_ffmpeg_exe()
+    quiet = ["-hide_banner", "-nostdin", "-nostats", "-format_whitelist", VIDEO_FORMATS]
+    return [imageio_ffmpeg.get_ffmpeg_exe(), *quiet, *options, "-i", f"file:{utf8_path(path, 'ffmpeg')}"]
 
 
 def video_streams(path: Path) -> list[VideoStream]:
     """Returns the video streams of a file, pictures of its cover left out; none when ffmpeg can't read it."""
-    command = [ffmpeg(), "-hide_banner", "-nostdin", "-i", f"file:{utf8_path(path, 'ffmpeg')}"]
-    told = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL).stderr.decode("utf-8", "replace")
+    told = subprocess.run(ffmpeg_reading(path), capture_output=True, stdin=subprocess.DEVNULL).stderr.decode(
+        "utf-8", "replace"
+    )
     found: list[VideoStream] = []
     of_video = False
     for line in told.splitlines():

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import path_inside
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import is_beside, is_hidden
 
@@ -125,6 +126,9 @@ def open_recording(path: Path) -> Iterator[Recording]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise UsageError("recordings of robots need rosbags: pip install 'dpc-toolkit[recordings]'") from None
+    if path.is_dir():  # metadata.yaml names files of the folder; they may be links
+        for one in path.iterdir():
+            path_inside(path, path, one.name)
     with _damage_named(path):
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()

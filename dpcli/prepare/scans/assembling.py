@@ -12,7 +12,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import UNITS
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets
-from dpcli.prepare.scans.cleaning import clean
+from dpcli.prepare.scans.cleaning import clean, ends_of
 from dpcli.store import CloudSequence
 from dpcli.store.schema import kept_name
 
@@ -59,7 +59,8 @@ def assemble(
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
     notes |= {**dropped, **converted}
     frames = [clouds[t].points for t in kept]
-    ends = tuple(end / divisor for end in _ends(frames))
+    each = np.array([ends_of(frame) for frame in frames])
+    ends = each[:, 0].min(0) / divisor, each[:, 1].max(0) / divisor
     points, shift = _joined(frames, divisor, ends)
     if shift is not None:
         notes[SHIFTED] = 1
@@ -79,13 +80,6 @@ def assemble(
     return Sample(sequence, notes)
 
 
-def _ends(frames: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the least and the greatest x, y and z of frames (N,3), f64 (3) each; NumPy is slow along short rows."""
-    low = [[frame[:, axis].min() for axis in range(3)] for frame in frames]
-    high = [[frame[:, axis].max() for axis in range(3)] for frame in frames]
-    return np.min(np.array(low, np.float64), axis=0), np.max(np.array(high, np.float64), axis=0)
-
-
 def _joined(
     frames: list[np.ndarray], divisor: float, ends: tuple[np.ndarray, ...]
 ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -96,7 +90,8 @@ def _joined(
     """
     far = max(np.abs(end).max() for end in ends) > _FAR_AWAY
     if divisor == 1 and not far:
-        return np.concatenate(frames, dtype=np.float32, casting="same_kind"), None
+        points = np.empty((sum(map(len, frames)), 3), np.float32)  # by rows, where frames lie by columns
+        return np.concatenate(frames, out=points, casting="same_kind"), None
     points = np.concatenate(frames, dtype=np.float64) / divisor
     corner = np.floor(points[: len(frames[0])].min(0)) if far else np.zeros(3)
     return (points - corner).astype(np.float32), corner if far else None

@@ -25,10 +25,11 @@ def clean(clouds: Sequence[Cloud]) -> dict[str, int]:
     found: Counter[str] = Counter()
     origins = []
     for cloud in clouds:
-        finite = np.isfinite(cloud.points)
-        if not finite.all():
-            found[NOT_FINITE] += _drop(cloud, ~finite.all(1))
-        found[IMPOSSIBLE] += _drop(cloud, _impossible(cloud.points))
+        ends = ends_of(cloud.points)
+        if not np.isfinite(ends).all():  # a number that isn't finite is an end
+            found[NOT_FINITE] += _drop(cloud, ~np.isfinite(cloud.points).all(1))
+            ends = ends_of(cloud.points)
+        found[IMPOSSIBLE] += _drop(cloud, _impossible(cloud.points, float(np.abs(ends).max())))
         zero = cloud.points[:, 0] == 0
         origins.append(zero & (cloud.points[:, 1:] == 0).all(1) if zero.any() else zero)
     if any(np.count_nonzero(own) > 1 for own in origins) or _far_from_origin(clouds, origins):
@@ -43,10 +44,19 @@ def _drop(cloud: Cloud, bad: np.ndarray) -> int:
     return count
 
 
-def _impossible(points: np.ndarray) -> np.ndarray:
+def ends_of(points: np.ndarray) -> np.ndarray:
+    """Returns the least and the greatest x, y and z of points (N,3), f64 (2,3), zeros of none; NumPy is slow along short
+    rows.
+    """
+    if not len(points):
+        return np.zeros((2, 3))
+    return np.array([[column.min() for column in points.T], [column.max() for column in points.T]], np.float64)
+
+
+def _impossible(points: np.ndarray, farthest: float) -> np.ndarray:
     equal = (points[:, 0] == points[:, 1]) & (points[:, 1] == points[:, 2])
     stand_in = equal & np.isin(points[:, 0], _STAND_INS) if equal.any() else equal
-    if len(points) and max(points.max(), -points.min()) > _FARTHEST:
+    if farthest > _FARTHEST:
         return stand_in | (np.abs(points) > _FARTHEST).any(1)
     return stand_in
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
+from dpcli.path_names import path_inside
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes
@@ -52,7 +53,11 @@ def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     """Returns options and digests of everything read, for provenance."""
     _check(options)
     views, times = _grid(path)
-    config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
+    config = {
+        key: str(value) if isinstance(value, Path) else value
+        for key, value in asdict(options).items()
+        if key != "pattern"
+    }
     config["input_digest"] = digest_of(view.paths[time] for view in views for time in times)
     masks = [view.masks[time] for view in views for time in times if time in view.masks]
     return {**config, "mask_digest": digest_of(masks)} if masks else config
@@ -60,8 +65,10 @@ def transforms_config(path: Path, options: VideoOptions) -> dict[str, Any]:
 
 def _check(options: VideoOptions) -> None:
     options.check()
-    if options.views or options.mask:
-        raise UsageError("--views and --mask belong to clips without cameras; transforms_*.json lists all views itself")
+    if options.views or options.mask or options.pattern:
+        raise UsageError(
+            "--views, --mask and --pattern belong to clips without cameras; transforms_*.json lists all views itself"
+        )
 
 
 def transforms_clip(path: Path, options: VideoOptions) -> Clip:
@@ -135,6 +142,8 @@ def _collect(path: Path, role: str, views: dict[bytes, _View], times: set[float]
         try:
             pose, image = _pose(where, frame["transform_matrix"]), _image(path.parent, str(frame["file_path"]))
             time = float(frame["time"])
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from None
         except KeyError as error:
             hint = " (a still scene? 4D needs the time of every frame)" if error.args == ("time",) else ""
             raise DataError(f"{where}: no {error.args[0]!r}{hint}") from None
@@ -183,14 +192,11 @@ def _pose(where: str, matrix: Any) -> np.ndarray:
 
 
 def _image(folder: Path, name: str) -> Path:
-    path = folder / name
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise DataError(f"{folder}: {name} lies outside the folder")
-    candidates = [path, *(path.with_name(path.name + suffix) for suffix in (".png", ".jpg", ".webp"))]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise DataError(f"{path}: named by transforms_*.json, but there is no such image")
+    for suffix in ("", ".png", ".jpg", ".webp"):
+        path = path_inside(folder, folder, name + suffix)
+        if path.is_file():
+            return path
+    raise DataError(f"{folder / name}: named by transforms_*.json, but there is no such image")
 
 
 def _intrinsics(view: _View, width: int, height: int) -> np.ndarray:

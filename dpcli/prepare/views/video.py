@@ -40,6 +40,7 @@ class VideoOptions:
     fps: float | None = None
     on_error: str = "stop"
     name: str = ""
+    pattern: str = ""
     elevation: float = 0.0
     radius: float = DEFAULT_RADIUS
     fovy: float = float(np.rad2deg(DEFAULT_FOVY))
@@ -79,7 +80,7 @@ def video_clip(path: Path, options: VideoOptions) -> Clip:
     Raises DataError on frames that can't be used; the log says what was chosen.
     """
     options.check()
-    frames = open_frames(path)
+    frames = open_frames(path, options.pattern)
     cutter, wanted, crop, size = _plan_clip(frames, options)
     given, cameras = find_given_views(frames, wanted, options)
     all_cameras = [options.camera(), *cameras]
@@ -113,7 +114,9 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     """Returns options and digests of everything read, for provenance: equal configurations give equal files."""
     options.check()
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
-    config["input_digest"] = digest_of(open_frames(path).files)
+    if not options.pattern:
+        del config["pattern"]
+    config["input_digest"] = digest_of(open_frames(path, options.pattern).files)
     if options.mask:
         config["mask_digest"] = digest_of(image_paths(require_folder(options.mask, "a mask per frame")))
     if options.views:

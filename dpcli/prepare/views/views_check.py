@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.path_names import path_inside
 from dpcli.prepare.decode.color_frames import Frames, open_frames
 from dpcli.prepare.reader import Item, require_folder
 from dpcli.prepare.views.artemis_files import Motion, declared_frames, find_motion, read_intrinsics, read_poses
@@ -47,7 +48,11 @@ class ArtemisIndex:
         return []
 
     def _problem(self, name: str, declared: int, cameras: int) -> str:
-        if not (self.animal / "img" / name).is_dir():
+        try:
+            folder = path_inside(self.animal / "img", self.animal / "img", name)
+        except DataError as error:
+            return f"{self.animal / 'sequences'}: {error}"
+        if not folder.is_dir():
             return f"img/{name}: missing" + (f"; sequences tells of its {declared} frames" if declared else "")
         try:
             motion = find_motion(self.animal, name)
@@ -103,7 +108,7 @@ class ClipIndex:
         if is_transforms(self.clip):
             transforms_config(self.clip, self.options)  # finds every picture that the lists name
             return [Item(clip_name(self.clip), self.clip)]
-        frames = open_frames(self.clip)
+        frames = open_frames(self.clip, self.options.pattern)
         if self.options.mask:
             find_masks(frames, self.options.mask)
         find_given_views(frames, spread_frames(len(frames), self.options.frames), self.options)

@@ -21,11 +21,12 @@ def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image
     return ImageOps.exif_transpose(image)
 
 
-def one_series(folder: Path, paths: Sequence[Path]) -> list[Path]:
+def one_series(folder: Path, paths: Sequence[Path], option: str = "") -> list[Path]:
     """Returns the images of the one series that `paths` hold, in their order; images without fellows are named and left out.
 
-    Names belong to one series where they differ in numbers alone. Raises DataError, which names them, when two or more
-    series lie in the folder: they are several objects, or color beside depth.
+    Names belong to one series where they differ in numbers alone. option: the one that chooses a series, if any.
+    Raises DataError, which names them, when two or more series lie in the folder: they are several objects, or color
+    beside depth.
     """
     series: dict[str, list[Path]] = defaultdict(list)
     for path in paths:
@@ -34,9 +35,10 @@ def one_series(folder: Path, paths: Sequence[Path]) -> list[Path]:
     if len(several) > 1:
         found = ", ".join(f"{_pattern(name, own)} ({len(own)} images)" for name, own in list(several.items())[:_NAMED])
         first = next(iter(several.values()))[0]
+        choose = f"Name one: {option} '{re.sub('[0-9]+', '*', first.name)}', or move" if option else "Move"
         raise DataError(
             f"{folder}: images of {len(several)} series: {found}\n"
-            f"Move each into a folder of its own and name the one you want: the one that {first.name} belongs to, or another"
+            f"{choose} each into a folder of its own and name the one you want: the one that {first.name} belongs to, or another"
         )
     if len(several) == 1 and len(series) > 1:
         kept = next(iter(several.values()))

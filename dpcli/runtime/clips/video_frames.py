@@ -15,6 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
+from dpcli.runtime.clips import wide_color
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
@@ -22,10 +23,14 @@ VIDEO_SUFFIXES = (
     *(".wmv", ".flv", ".ogv", ".3gp", ".y4m"),
 )
 # Formats of playlists aren't among them: they name other files, which nobody meant to be read.
-_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,dv,mxf,nut"
+# files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
+VIDEO_FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
+    "dv,mxf,nut"
+)
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
-_HDR = {16: "PQ", 18: "HLG"}  # transfer functions, by their number in H.273
+_HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
 _MATRICES = (1, 4, 5, 6, 7, 9)  # in H.273: BT.709, FCC, BT.601 (two), SMPTE 240M, BT.2020
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
@@ -88,9 +93,11 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
 
 def _is_transparent(frame) -> bool:  # av.VideoFrame
     """Returns whether any pixel can be seen through: some writers fill an alpha channel that nobody asked for."""
-    if not any(component.is_alpha for component in frame.format.components):
-        return False
-    return bool(frame.reformat(format="rgba").to_ndarray()[..., 3].min() < 255)
+    return _has_alpha(frame) and bool(_levels(frame, frame.width, {})[..., 3].min() < 255)
+
+
+def _has_alpha(frame) -> bool:
+    return any(component.is_alpha for component in frame.format.components)
 
 
 def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
@@ -98,7 +105,7 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
 
     name = "file:" + utf8_path(path, "FFmpeg")
     try:
-        container = av.open(name, options={"format_whitelist": _FORMATS}, metadata_errors="replace")
+        container = av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError):
         raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown kind)") from None
     streams = [one for one in container.streams.video if not one.disposition & one.disposition.attached_pic]
@@ -154,7 +161,7 @@ def _packets(path: Path) -> int:
     """Returns how many whole packets of the video lie in the file, also those before and after what plays."""
     import av
 
-    options = {"format_whitelist": _FORMATS, "ignore_editlist": "1"}
+    options = {"format_whitelist": VIDEO_FORMATS, "ignore_editlist": "1"}
     with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
         stream = next(one for one in container.streams.video if not one.disposition & one.disposition.attached_pic)
         try:
@@ -194,19 +201,41 @@ def _tell_display(path: Path, frame, stream) -> None:
         log.info(f"{path}: turned by {frame.rotation % 360} degrees, as it plays")
     if int(frame.color_trc) in _HDR:
         log.warn(
-            f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): without tone mapping its colors are paler than they "
-            "play; convert it to SDR first, or record without HDR"
+            f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): tone-mapped to SDR as ITU-R BT.2390 has it; players "
+            "differ in this, so convert it to SDR first where colors must be theirs"
         )
+    elif wide_color.is_wide(0, int(frame.color_primaries)):
+        log.info(f"{path}: colors of a wide gamut; converted to sRGB")
 
 
 def _rgba(frame, aspect) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
     """Returns u8 (H,W,4) of a decoded frame as it is shown: full range, square pixels, turned."""
     width = round(frame.width * aspect) if aspect and aspect != 1 else frame.width
-    options = {} if frame.format.is_rgb else {"src_colorspace": _matrix(frame), "dst_color_range": _FULL_RANGE}
-    if options and not frame.format.name.startswith("gray"):
+    options = {"threads": 1}  # more convert strips of their own: other rounding at other numbers of cores
+    if not frame.format.is_rgb:
+        options |= {"src_colorspace": _matrix(frame), "dst_color_range": _FULL_RANGE}
+    if not frame.format.is_rgb and not frame.format.name.startswith("gray"):
         options["src_color_range"] = int(frame.color_range) or (_FULL_RANGE if "yuvj" in frame.format.name else 1)
-    picture = frame.reformat(width, frame.height, "rgba", **options).to_ndarray()
+    transfer, primaries = int(frame.color_trc), int(frame.color_primaries)
+    if wide_color.is_wide(transfer, primaries):
+        deep = frame.reformat(width, frame.height, "rgba64le", **options).to_ndarray()
+        rgb, alpha = wide_color.to_srgb(deep[..., :3], transfer, primaries), deep[..., 3:] >> 8
+        picture = np.concatenate((rgb, alpha.astype(np.uint8)), axis=-1)
+    else:
+        picture = _levels(frame, width, options)
     return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90)))
+
+
+def _levels(frame, width: int, options: dict[str, int]) -> np.ndarray:
+    """Returns u8 (H,W,4) of a frame, opaque where it has no alpha.
+
+    FFmpeg's fast way from 4:2:0 and 4:2:2 to four bytes a pixel leaves the last columns of most widths unwritten, whatever
+    memory held: so three bytes are asked for, and planes where there is alpha.
+    """
+    if not _has_alpha(frame):
+        rgb = frame.reformat(width, frame.height, "rgb24", **options).to_ndarray()
+        return np.dstack((rgb, np.full(rgb.shape[:2], 255, np.uint8)))
+    return frame.reformat(width, frame.height, "rgba" if frame.format.is_rgb else "gbrap", **options).to_ndarray()
 
 
 def _matrix(frame) -> int:

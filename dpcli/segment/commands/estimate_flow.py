@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,19 +10,19 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from dpcli.errors import DataError, DpcError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device, cpu_count
-from dpcli.runtime.pool import ordered_map
-from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.machines.shards import describe_shard
+from dpcli.runtime.machines.spread import ALONE, Spread
+from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import SegmentStream, generator
-from dpcli.runtime.signals import stop_requested
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.segment.flow.estimators import METHODS, estimate_flow, find_estimator
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, input_file, output_file
 from dpcli.store.sequence import POINT_FIELDS
 from dpcli.store.writing.already_made import WORK, already_made
+from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 REACH = 99  # percentile of norms that stands for the largest: a few wrong matches must not decide the scale
 _NO_MOTION = 1e-9  # of the cloud's reach: below this flow is rounding, and no factor makes it a cloud
@@ -53,6 +52,8 @@ class FlowOfSequence:
     def __call__(self, numbered: tuple[int, CloudSequence]) -> CloudSequence:
         """Returns some points of each frame of a sequence, and their flow; its number in the file chooses the points."""
         index, sequence = numbered
+        if self.flow not in METHODS:
+            choose_device(self.device)  # a worker multiplies matrices by the library that the command itself chose
         drawn = draw_points(sequence, self.points, generator(self.seed, SegmentStream.FLOW_POINTS, index))
         whole = [sequence.frame(t) for t in range(sequence.num_frames)]
         drawn.scene_flow = sequence_flow(drawn, whole, self.flow, self.device)
@@ -145,24 +146,23 @@ def estimate_flow_of_file(
     split: str,
     seed: int,
     device: str,
-    jobs: int | None,
     force: bool,
+    spread: Spread = ALONE,
 ) -> EstimatedFlow:
     """Writes the flow of a clouds file; running again continues where a stopped or killed run ended.
 
-    flow, points, as_points: see `FlowOfSequence`. jobs: processes, None for as many as pay.
+    flow, points, as_points: see `FlowOfSequence`. spread: who works on which sequences.
     """
     weights = find_estimator(flow)
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         chosen = sequences_of_split(reader, split, data)
-        size = EstimatedFlow(len(chosen), int(reader.frame_counts[chosen].sum()))
         config = {"flow": "estimator" if weights else flow, "points": points, "as_points": as_points, "split": split}
         inputs = {"clouds": path} | ({"flow": weights} if weights else {})
-        history = [*reader.provenance, provenance.record(config, seed, inputs)]
+        entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         device = str(choose_device(device)) if weights else "cpu"
-        work = FlowOfSequence(flow, points, as_points, seed, device)
-        if force or not _already_there(target, history[-1]):
+        work = FlowOfSequence(str(weights.resolve()) if weights else flow, points, as_points, seed, device)
+        if force or not _already_there(target, entry):
             keep_freed_memory()
             with CloudsWriter(
                 target,
@@ -170,20 +170,21 @@ def estimate_flow_of_file(
                 length_unit=reader.length_unit,
                 seed=seed,
                 source=reader.path.name if data != "-" else "stdin",
-                provenance=history,
+                provenance=[*reader.provenance, entry],
                 fields=work.fields(reader.fields),
                 force=force,
                 resume=output != "-",
             ) as writer:
-                _estimate_sequences(reader, chosen, work, writer, _choose_processes(jobs, work, size.frames))
-    return size
+                _estimate_sequences(reader, chosen, work, writer, spread)
+        with CloudsReader(target) as made:
+            for line in skipped_lines(made.skipped):
+                log.warn(line)
+            return EstimatedFlow(len(made), int(made.frame_counts.sum()))
 
 
-def _choose_processes(jobs: int | None, work: FlowOfSequence, frames: int) -> int:
-    """Returns how many processes work: one for each core where rigid bodies are found, which takes one core, else one."""
-    if work.device != "cpu":
-        return 1  # one process on an accelerator
-    return jobs or (cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1)
+def _worthwhile_processes(work: FlowOfSequence, frames: int) -> int:
+    """Returns how many processes pay: one for each core where rigid bodies are found, which takes one core, else one."""
+    return cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1
 
 
 def _already_there(target: Path, entry: dict) -> bool:
@@ -196,25 +197,19 @@ def _already_there(target: Path, entry: dict) -> bool:
 
 
 def _estimate_sequences(
-    reader: CloudsReader, chosen: list[int], work: FlowOfSequence, writer: CloudsWriter, jobs: int
+    reader: CloudsReader, chosen: list[int], work: FlowOfSequence, writer: CloudsWriter, spread: Spread
 ) -> None:
     """Writes the flow of the sequences that an earlier run has not written."""
-    done = len(writer.written_names)
     read = [name for name in work.fields(reader.fields) if name in reader.fields and name != "scene_flow"]
-    todo = ((index, reader.read(index, fields=read)) for index in chosen[done:])
-    with (
-        stop_requested() as stop,
-        Progress("segment estimate-flow", len(chosen), "sequence") as bar,
-        closing(ordered_map(work, todo, jobs)) as results,
-    ):
-        bar.skip(done)
-        try:
-            for _, result in results:
-                if isinstance(result, Exception):
-                    raise result
-                writer.write(result)
-                bar.advance(1, frames=result.num_frames)
-                stop.check(f"{len(writer)} of {len(chosen)} sequences are kept beside the output")
-        except DpcError as error:
-            writer.keep = not isinstance(error, DataError)  # a lost worker says nothing about what is written
-            raise
+
+    def write(place: int, sequence: CloudSequence) -> dict[str, float]:
+        writer.write(sequence)
+        return {"frames": sequence.num_frames}
+
+    def load(place: int) -> tuple[int, CloudSequence]:
+        return chosen[place], reader.read(chosen[place], fields=read)
+
+    names, words = [reader.names[i] for i in chosen], Wording("segment estimate-flow", "sequence", "estimated")
+    taken = ItemPass(writer, names, words, spread.shard)
+    with spread.workers(_worthwhile_processes(work, int(reader.frame_counts[chosen].sum()))) as workers:
+        taken.run(work, load, write, workers)

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
+from dpcli.runtime.machines.once_per_process import OncePerProcess
+from dpcli.runtime.machines.shards import describe_shard
+from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.mixed_precision import wanted
-from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
+from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.model_file import default_model
-from dpcli.segment.prediction import Estimate, predict_parts
+from dpcli.segment.prediction import predict_parts
 from dpcli.segment.prediction_settings import PredictSettings, Refinement
 from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segmenter
 from dpcli.segment.sequence_splits import sequences_of_split
-from dpcli.store import CloudsReader, input_file, output_file
-from dpcli.store.parts import PartsReader, PartsWriter
+from dpcli.store import CloudSequence, CloudsReader, input_file, output_file
+from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
+from dpcli.store.sequence import OF_PARTS
 from dpcli.store.writing.already_made import WORK, already_made
+from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 _ROWS = 8  # sequences in a picture
 
@@ -44,6 +50,24 @@ class Drawings:
                 check_target(path, option, kinds)
 
 
+@dataclass(frozen=True)
+class PartsOfSequence:
+    """Finds the parts of one sequence; picklable, for worker processes."""
+
+    segmenter: OncePerProcess[Segmenter]
+    flow: str
+    refinement: Refinement
+    seed: int
+
+    def __call__(self, numbered: tuple[int, CloudSequence]) -> tuple[CloudSequence, PartsSample]:
+        """Returns a sequence with its parts, and what else is said of it; its number in the file chooses the points."""
+        index, sequence = numbered
+        estimate = partial(estimate_flow_both_ways, method=self.flow)
+        labels, sample = predict_parts(sequence, index, self.segmenter.get(), estimate, self.refinement, self.seed)
+        sequence.part = labels
+        return sequence, sample
+
+
 def predict_file(
     data: str,
     output: str,
@@ -54,13 +78,17 @@ def predict_file(
     seed: int,
     device: str,
     force: bool,
+    spread: Spread = ALONE,
 ) -> int:
     """Writes the parts of a clouds file and draws them; returns the number of sequences.
 
-    model: a trained network, None for the shipped one. Running again continues where a stopped run ended.
+    model: a trained network, None for the shipped one. spread: who works on which sequences. Running again continues
+    where a stopped run ended.
     """
     drawings.check()
     segmenter = _open_segmenter(settings, model, device, seed)
+    place = model and str(Path(model).resolve() if Path(model).exists() else model)  # workers may stand elsewhere
+    open_segmenter = partial(_open_segmenter, settings, place, device, seed)
     refinement = settings.refinement
     if not isinstance(segmenter, NetworkSegmenter):
         refinement = replace(refinement, split_bodies=False)
@@ -68,15 +96,21 @@ def predict_file(
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         sequences = sequences_of_split(reader, settings.input.split, data)
-        estimator = find_estimator(settings.input.flow)
+        flow = _choose_flow(settings, reader)
+        estimator = find_estimator(flow)
         said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
-        if settings.classical.method is not None:
+        if settings.classical.classical:
             said["classical"] = settings.classical.used()
+        elif settings.classical.method == "multibody":
+            said["multibody"] = asdict(settings.multibody)
         config = {"settings": said, **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
-        history = [*reader.provenance, provenance.record(config, seed, inputs)]
-        fields = [name for name in reader.fields if name not in ("part", "pose")]
-        if force or not _already_there(target, history[-1]):
+        entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
+        once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
+        flow = str(estimator.resolve() if estimator else flow)
+        work = PartsOfSequence(once, flow, refinement, seed)
+        fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
+        if force or not _already_there(target, entry):
             with PartsWriter(
                 target,
                 num_parts=segmenter.slots,
@@ -84,30 +118,49 @@ def predict_file(
                 length_unit=reader.length_unit,
                 seed=seed,
                 source=reader.path.name if data != "-" else "stdin",
-                provenance=history,
+                provenance=[*reader.provenance, entry],
                 fields=[*fields, "part"],
                 force=force,
-                resume=True,
+                resume=output != "-",
             ) as writer:
-                estimate = partial(estimate_flow_both_ways, method=str(estimator or settings.input.flow))
-                _predict_sequences(reader, sequences, segmenter, estimate, refinement, seed, writer, fields)
-        _draw(target, drawings)
-    return len(sequences)
+                _predict_sequences(reader, sequences, work, writer, fields, spread)
+        return _close(target, drawings)
 
 
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:
     """Returns the segmenter that the options ask for. Raises UsageError for options that contradict one another."""
     classical, chosen = settings.classical, choose_device(device)
-    if classical.method is None:
+    if classical.method == "network":
         return NetworkSegmenter.load(model or default_model(), chosen, wanted(settings.precision.amp, chosen))
     if model is not None:
         raise UsageError(f"--model {model}: --method {classical.method} uses no network; give one of both")
+    if classical.method == "multibody":
+        return MultibodySegmenter(settings.multibody, settings.input.flow in ("auto", "tracks"))
     points = settings.refinement.points
     if classical.parts is not None and classical.parts > points:
         raise UsageError(
             f"--parts {classical.parts}: more than the {points} points of a frame that are divided (--points)"
         )
     return ClassicalSegmenter(classical, seed)
+
+
+def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
+    """Returns the estimator of flow between frames, which multibody needs none of.
+
+    Raises UsageError for a flow that the method can't use, or tracks that the file lacks.
+    """
+    flow, method = settings.input.flow, settings.classical.method
+    if flow == "tracks" and method != "multibody":
+        raise UsageError(
+            f"--flow tracks: --method {method} doesn't read tracks; leave --method out, or give --flow icp"
+        )
+    if flow == "tracks" and "track" not in reader.fields:
+        raise UsageError(f"--flow tracks: {reader.path} has no field track; leave --flow out, and motions are searched")
+    if flow not in ("auto", "tracks", "icp") and method == "multibody":
+        raise UsageError(
+            f"--flow {flow}: multibody finds the motions itself; add --method network or a classical one, or leave it out"
+        )
+    return "icp" if flow in ("auto", "tracks") else flow
 
 
 def _already_there(target: Path, entry: dict) -> bool:
@@ -122,30 +175,35 @@ def _already_there(target: Path, entry: dict) -> bool:
 def _predict_sequences(
     reader: CloudsReader,
     sequences: list[int],
-    segmenter: Segmenter,
-    estimate: Estimate,
-    options: Refinement,
-    seed: int,
+    work: PartsOfSequence,
     writer: PartsWriter,
     fields: list[str],
+    spread: Spread,
 ) -> None:
     """Writes the parts of the sequences that an earlier run has not written."""
-    done = set(writer.written_names)
-    with Progress("segment predict", len(sequences), "sequence") as bar, stop_requested() as stop:
-        bar.skip(len(done))
-        for index in sequences:
-            if reader.names[index] in done:
-                continue
-            sequence = reader.read(index, fields=fields)
-            try:
-                labels, sample = predict_parts(sequence, index, segmenter, estimate, options, seed)
-            except Exception as error:
-                writer.keep = not isinstance(error, DataError)  # too little memory says nothing about the others
-                raise
-            sequence.part = labels
-            writer.write(sequence, sample.probability, sample.pairs, sample.motion, sample.flow)
-            bar.advance(1, frames=sequence.num_frames)
-            stop.check(f"{len(writer)} sequences are kept beside the output")
+
+    def write(place: int, done: tuple[CloudSequence, PartsSample]) -> dict[str, float]:
+        sequence, sample = done
+        writer.write(sequence, sample.probability, sample.pairs, sample.motion, sample.flow)
+        return {"frames": sequence.num_frames}
+
+    def load(place: int) -> tuple[int, CloudSequence]:
+        return sequences[place], reader.read(sequences[place], fields=fields)
+
+    names = [reader.names[index] for index in sequences]
+    taken = ItemPass(writer, names, Wording("segment predict", "sequence", "divided"), spread.shard)
+    with spread.workers() as workers:
+        taken.run(work, load, write, workers)
+
+
+def _close(target: Path, drawings: Drawings) -> int:
+    """Draws what was written and tells what was passed over; returns the number of sequences."""
+    with PartsReader(target) as made:
+        for line in skipped_lines(made.skipped):
+            log.warn(line)
+        if len(made):
+            _draw(target, drawings)
+        return len(made)
 
 
 def _draw(target: Path, drawings: Drawings) -> None:

@@ -66,9 +66,17 @@ class AtomicFile:
         else:
             self.failed(kind, error, trace)
 
-    def problem(self, error: BaseException) -> DpcError | None:
-        """Returns a DpcError for a write that found no room, None when `error` is something else."""
-        return disk_full(self.target, error, "nothing was left under that name. Free space, then run again")
+    def problem(self, error: BaseException | None, kept: str = "") -> DpcError | None:
+        """Returns a DpcError for a write that found no room, None when `error` is something else.
+
+        kept: what stays for a run that continues, in words.
+        """
+        advice = (
+            f"{kept}. Make room for that once more and for the rest, then run the same command again to continue"
+            if kept
+            else "nothing was left under that name. Free space, then run again"
+        )
+        return disk_full(self.target, error, advice)
 
     def flush(self) -> None:
         """Hands everything to the system, and let the disk start on it: else `commit` waits for all of it at the end."""
@@ -80,17 +88,23 @@ class AtomicFile:
                 os.posix_fadvise(self.handle, self._written_out, size - self._written_out, os.POSIX_FADV_DONTNEED)
             self._written_out = size
 
-    def commit(self) -> None:
-        """Closes the file, brings it to the disk and renames it; DpcError when that fails."""
+    def commit(self, kept: str = "") -> None:
+        """Closes the file, brings it to the disk and renames it; DpcError when that fails.
+
+        kept: as `problem`; with it the unfinished file stays when there was no room.
+        """
         try:
             self.file.flush()
             self.file.close()
             put_in_place(self.part, self.target)
         except (OSError, RuntimeError) as error:
-            worded = self.problem(error)
+            worded = self.problem(error, kept)
             if worded is not None:
                 self._let_go()
-            self.discard()
+            if worded is None or not kept:
+                self.discard()
+            else:
+                self._close()
             raise worded or DpcError(f"{self.target}: could not be finished ({error})") from None
 
     def discard(self) -> None:
@@ -105,17 +119,13 @@ class AtomicFile:
             pass
 
     def failed(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-        keep: bool = False,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, kept: str = ""
     ) -> None:
-        """Discards after an exception, or `keep` the part unfinished; re-raise a failed write in words."""
-        worded = self.problem(error) if error is not None else None
+        """Discards after an exception, or keeps the part unfinished where `kept` says why; re-raises a failed write in words."""
+        worded = self.problem(error, kept)
         if worded is not None:
             self._let_go()
-        if keep:
+        if kept:
             self._close()
         else:
             self.discard()

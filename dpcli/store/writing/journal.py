@@ -15,6 +15,7 @@ import struct
 import time
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -124,7 +125,8 @@ class Journal:
     def keep(self) -> None:
         """Closes the file, for a later run; the HDF5 file must stay, too."""
         if self._file >= 0:
-            self._sync()
+            with suppress(OSError):  # a full disk: what didn't reach it fails its checksum
+                self._sync()
             self.close()
 
     def close(self) -> None:

@@ -15,7 +15,8 @@ from typing import Any
 
 from dpcli.config_diff import differences
 from dpcli.errors import DpcError, Stopped, UsageError
-from dpcli.store.file import write_root
+from dpcli.runtime.whole_file import DiskFull, disk_full
+from dpcli.store.file import write_positions, write_root, write_skipped
 from dpcli.store.writing.atomic_file import AtomicFile
 from dpcli.store.writing.journal import Journal, Placed, data_suffix, journal_path, second_path
 
@@ -24,13 +25,16 @@ class ResumableWriter(ABC):
     """Context manager that writes `path` through a file beside it renamed when whole.
 
     Leaving the block without an exception finishes the file; an exception leaves nothing. With `resume=True` what was
-    written survives a stop (Stopped, KeyboardInterrupt, or any exception once `keep` is set) and a kill at any moment:
-    the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
+    written survives a stop (Stopped, KeyboardInterrupt, a full disk, or any exception once `keep` is set) and a kill at any
+    moment: the next writer with the same provenance continues, and `written_names` lists what is already there. Until the file
     is whole that takes a journal (`.NAME.part`). Raises UsageError when `path` exists, or what another provenance kept for
     it, and `force` is off.
 
+    Set before the block ends: `skipped`, (name, reason) of samples left out, and `positions` of a shard (see
+    write_positions), both kept in the file; a shard may be empty.
+
     A subclass has its own state ready before it calls this constructor, which opens the file and has `_create` and, to
-    continue, `_write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
+    continue, `write_again` called. It calls `_record` for each sample that is written, and writes the rest in `_complete`.
     """
 
     kind = ""
@@ -50,6 +54,8 @@ class ResumableWriter(ABC):
         if Path(path).exists() and not force:
             raise UsageError(f"{path}: exists already; --force replaces it")
         self.path, self.resume, self.keep = Path(path), resume, False
+        self.skipped: list[tuple[str, str]] = []
+        self.positions: tuple[Sequence[int], Sequence[int]] | None = None
         self.class_names, self._root = list(class_names), {"length_unit": length_unit, "source": source, "seed": seed}
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self.written_names: list[str] = []
@@ -65,7 +71,7 @@ class ResumableWriter(ABC):
         """Makes the data sets that a subclass fills as samples come; none for one that writes them all in `_complete`."""
 
     @abstractmethod
-    def _write_again(self, given: list[Any]) -> str:
+    def write_again(self, given: list[Any]) -> str:
         """Writes a sample as `_record` was told of it, and returns its name."""
 
     @abstractmethod
@@ -115,7 +121,7 @@ class ResumableWriter(ABC):
         self._journal = Journal(second_path(before.path), self._about())
         self._journal.begin(self._atomic.part, self._atomic.handle)
         for given in before.samples():
-            self.written_names.append(self._write_again(given))
+            self.written_names.append(self.write_again(given))
         self._journal.replace(before)
 
     def _give_up(self, before: Journal | None) -> None:
@@ -146,13 +152,17 @@ class ResumableWriter(ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Removes all but, after a stop, the journal and the file it points into."""
-        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep
-        kept = bool(self._journal and stopped and len(self))
+        stopped = isinstance(error, (Stopped, KeyboardInterrupt)) or self.keep or disk_full(self.path, error)
+        kept = self._kept() if stopped else ""
         if hasattr(self, "_atomic"):
             try:
-                self._atomic.failed(kind, error, trace, keep=kept)
+                self._atomic.failed(kind, error, trace, kept)
             finally:
-                self._leave_journal(kept)
+                self._leave_journal(bool(kept))
+
+    def _kept(self) -> str:
+        """Returns what a run that continues finds, in words; "" where that is nothing."""
+        return f"the {len(self)} samples done are kept" if self._journal and len(self) else ""
 
     def _leave_journal(self, kept: bool) -> None:
         if self._journal and kept:
@@ -163,14 +173,19 @@ class ResumableWriter(ABC):
     def _finish(self) -> None:
         try:
             self._complete()
+            write_skipped(self._file, self.skipped)
+            write_positions(self._file, self.positions)
+            self._file.flush()
             # last, since a stream knows only at its end how many frames its provenance has to name
             write_root(self._file, self.kind, class_names=self.class_names, provenance=self.provenance, **self._root)
         except BaseException as error:
             self._leave(type(error), error, None)
             raise
         try:
-            self._atomic.commit()
-        except DpcError:  # the HDF5 file is gone, and with it what the journal points to
-            self._leave_journal(kept=False)
+            self._atomic.commit(self._kept())
+        except (
+            DpcError
+        ) as error:  # unless the disk was full, the HDF5 file is gone, and with it what the journal points to
+            self._leave_journal(isinstance(error, DiskFull) and bool(self._kept()))
             raise
         self._leave_journal(kept=False)

@@ -31,7 +31,7 @@ from dpcli.classify.stream.read_ahead import ReadAhead
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor, Window
 from dpcli.classify.video_scores import batches, predict_videos
 from dpcli.cli.app import main
-from dpcli.cli.classify.predict import predict
+from dpcli.cli.classify import predict as command
 from dpcli.cli.classify.predict_stream import cloud_files
 from dpcli.cli.classify.stream_lines import Lines
 from dpcli.errors import DataError, Stopped, UsageError
@@ -343,6 +343,11 @@ def run(*words: object) -> int:
     with pytest.raises(SystemExit) as ended:
         main(["classify", "predict", *map(str, words)])
     return ended.value.code
+
+
+def predict(data: str, model: str, output: str | None = None, **options: object) -> None:
+    """The command as a function, for the errors that it raises."""
+    command.predict(data=data, model=model, output=output, **{"jobs": None, "shard": "", "dask": "", **options})
 
 
 def rows(text: str) -> list[dict]:

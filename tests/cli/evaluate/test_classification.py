@@ -106,7 +106,7 @@ def test_a_class_name_is_text_not_markup(tmp_path: Path) -> None:
     with ScoresWriter(path, class_names=["[red]a|b", "c"]) as writer:
         writer.write("x", np.array([1.0, 0]), label=0)
     assert "[red]a|b" in run(path).stdout
-    assert "[red]a\\|b" in run(path, "--markdown").stdout
+    assert r"\[red\]a\|b" in run(path, "--markdown").stdout
 
 
 def test_truth_replaces_labels_and_splits(scores: Path, tmp_path: Path) -> None:

@@ -217,7 +217,7 @@ def test_a_truth_without_good_poses_is_explained(tmp_path, truths) -> None:
     truths[1].pose[1, 2] = np.nan
     broken = write_truth(tmp_path / "nan.h5", truths)
     result = run(parts, "--truth", broken)
-    assert isinstance(result.exception, DataError) and f"{broken}: 's1': a true pose of frame" in str(result.exception)
+    assert isinstance(result.exception, DataError) and f"s1: {broken}: a true pose of frame" in str(result.exception)
     truths[1].part[3] = 9
     few = write_truth(tmp_path / "few.h5", truths)
     assert "part 9, but there are poses of 4 parts" in str(run(parts, "--truth", few).exception)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.commands.export import export_scene
 from dpcli.generate4d.out.export import as_sequence, export_sequence, keep_opaque
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.store import CloudsReader, PartsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
 from tests.support.scenes import HINGE, SWING, toy_scene
@@ -289,3 +290,13 @@ def test_an_export_flows_into_the_segmenter(dpc, scene_file, tmp_path):
         assert reader.provenance[0]["command"] == "dpc generate4d fit toy.h5"
         assert reader.provenance[1]["command"].startswith("dpc generate4d export")
         assert predicted.num_points == reader.num_points == 1000
+
+
+@pytest.mark.parametrize("form", ["ply", "splat"])
+def test_the_command_leaves_nothing_but_numbered_frames_in_the_folder(dpc, scene_file, tmp_path, form):
+    """SuperSplat plays a folder where every name is NAME NUMBER.ply, and else loads all frames on top of each other."""
+    done = dpc("generate4d", "export", scene_file, "--as", form, "-o", tmp_path / "frames")
+    assert done.returncode == 0, done.stderr
+    names = sorted(path.name for path in (tmp_path / "frames").iterdir())
+    assert len(names) > 1 and all(re.fullmatch(rf"\D*\d+\.{form}", name) for name in names)
+    assert {path.name for path in tmp_path.iterdir()} >= {"frames", "frames_cameras.json"}

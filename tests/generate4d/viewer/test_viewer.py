@@ -20,7 +20,7 @@ from dpcli.generate4d.out.render import Look, Renderer
 from dpcli.generate4d.viewer import packed, write_page
 from dpcli.ops.cameras import DEFAULT_FOVY, orbit_pose, pinhole
 from dpcli.store.gaussians import write_scene
-from tests.support.browser import needs_browser, open_page
+from tests.support.browser import PRESSED, needs_browser, open_page
 from tests.support.scenes import toy_scene
 
 WIDTH, HEIGHT = 420, 320
@@ -193,3 +193,31 @@ def test_the_command(tmp_path):
     for name, says in (("s.html", "--force"), ("s.htmx", "ends in .html")):
         refused = CliRunner().invoke(app, [words[0], "-o", str(tmp_path / name)])
         assert isinstance(refused.exception, UsageError) and says in str(refused.exception)
+
+
+@needs_browser
+def test_keys_work_whatever_has_the_focus(page, tmp_path):
+    """Space plays once and presses no button; sliders and menus keep their arrows, and Enter presses buttons."""
+    script = """
+    new MutationObserver((_, watch) => {
+      if (root.dataset.state !== "ready" || root.dataset.told) return;
+      watch.disconnect();
+      const told = [];
+      for (const where of ["#slider", "#speed", "#home", "#play", "#canvas"]) {
+        app.change({ play: false, color: "appearance" });
+        told.push(where, pressed(where, " "), app.state.play, pressed(where, "2"), app.state.color);
+        const ground = app.state.background;
+        told.push(pressed(where, "b"), app.state.background !== ground);
+        told.push(pressed(where, "r"), pressed(where, "ArrowRight"), pressed(where, "Enter"));
+      }
+      root.dataset.told = told.join(" ");
+    }).observe(root, { attributes: true });
+    """
+    opened = tmp_path / "opened.html"
+    text = page.read_text(encoding="utf-8")
+    opened.write_text(text.replace("</body>", f"<script>{PRESSED}{script}</script></body>"), encoding="utf-8")
+    shown = show(opened, "play=0&controls=1&time=0", tmp_path)
+    told = re.search(r'<html[^>]*data-told="([^"]*)"', shown.page)
+    arrows = {"#slider": "false", "#speed": "false", "#home": "true", "#play": "true", "#canvas": "true"}
+    right = [f"{where} true true true part true true true {own} false" for where, own in arrows.items()]
+    assert told and told[1] == " ".join(right)

@@ -19,7 +19,7 @@ from dpcli.prepare.commands import sources
 from dpcli.prepare.commands.merge import merge, read_source
 from dpcli.prepare.label_map import LabelMap
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.shards import Shard, shard_of
+from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import ROOT, ToyReader, dpc
 
@@ -161,12 +161,13 @@ def test_the_command(two, tmp_path):
 SLOW = """
 import sys, time
 from pathlib import Path
-from dpcli.prepare.commands.merge import OpenFiles, merge
-read = OpenFiles.read
-def slowly(self, path, index):
+from dpcli.prepare.commands.merge import merge
+from dpcli.store import CloudsReader
+read = CloudsReader.read
+def slowly(self, index):
     time.sleep(0.05)
-    return read(self, path, index)
-OpenFiles.read = slowly
+    return read(self, index)
+CloudsReader.read = slowly
 sys.argv = ["dpc", "prepare", "merge"]
 merge([Path(word) for word in FILES], Path(OUT), prefix=True)
 """
@@ -201,7 +202,7 @@ def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkey
         assert journal.stat().st_size > kept and not out.exists()
         kept = journal.stat().st_size
     read = []
-    monkeypatch.setattr(module.OpenFiles, "read", counting(module.OpenFiles.read, read))
+    monkeypatch.setattr(CloudsReader, "read", counting(CloudsReader.read, read))
     report = merge(paths, out, prefix=not shards)
     assert report.written == total == (23 if shards else 24) and 0 < len(read) < total
     assert out.read_bytes() == whole.read_bytes()
@@ -209,20 +210,20 @@ def test_killed_and_run_again_it_ends_with_the_bytes_of_one_run(tmp_path, monkey
 
 
 def counting(read, calls: list):
-    return lambda self, path, index: calls.append((path, index)) or read(self, path, index)
+    return lambda self, index: calls.append((self.path, index)) or read(self, index)
 
 
 def stopped_after(count: int, monkeypatch, *arguments, **options) -> None:
     """merge, ended by Ctrl-C before it reads sample `count`."""
-    calls, read = [], module.OpenFiles.read
+    calls, read = [], CloudsReader.read
 
-    def interrupted(self, path, index):
+    def interrupted(self, index):
         if len(calls) == count:
             raise KeyboardInterrupt
-        return counting(read, calls)(self, path, index)
+        return counting(read, calls)(self, index)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(module.OpenFiles, "read", interrupted)
+        patch.setattr(CloudsReader, "read", interrupted)
         merge(*arguments, **options)
 
 
@@ -260,14 +261,14 @@ def test_what_a_stopped_run_of_other_work_left(two, tmp_path, monkeypatch):
 
 
 def test_a_signal_stops_it_politely(two, tmp_path, monkeypatch):
-    read = module.OpenFiles.read
+    read = CloudsReader.read
 
-    def signaled(self, path, index):
+    def signaled(self, index):
         if index == 1:
             os.kill(os.getpid(), signal.SIGTERM)
-        return read(self, path, index)
+        return read(self, index)
 
     with monkeypatch.context() as patch, pytest.raises(Stopped, match="SIGTERM; 2 of 3 samples are kept"):
-        patch.setattr(module.OpenFiles, "read", signaled)
+        patch.setattr(CloudsReader, "read", signaled)
         merge(two[:1], tmp_path / "all.h5")
     assert merge(two[:1], tmp_path / "all.h5").written == 3

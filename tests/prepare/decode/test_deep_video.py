@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from imageio_ffmpeg import get_ffmpeg_exe
 
 from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.decode.depth_files import read_depth_video, rising_times
-from dpcli.prepare.decode.video_streams import ffmpeg, video_streams
+from dpcli.prepare.decode.video_streams import video_streams
 
 RNG = np.random.default_rng(0)
 LOSSLESS = {
@@ -46,7 +47,19 @@ def encode(path: Path, frames: np.ndarray, pixel_format: str, codec: str, *optio
     big = pixel_format.endswith("be")
     data = frames.astype(frames.dtype.newbyteorder(">" if big else "<")).tobytes()
     source = ["-f", "rawvideo", "-pix_fmt", pixel_format, "-s", f"{frames.shape[2]}x{frames.shape[1]}", "-r", str(rate)]
-    command = [ffmpeg(), "-v", "error", "-y", *source, "-i", "-", *options, "-c:v", codec, *LOSSLESS.get(codec, ())]
+    command = [
+        get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-y",
+        *source,
+        "-i",
+        "-",
+        *options,
+        "-c:v",
+        codec,
+        *LOSSLESS.get(codec, ()),
+    ]
     if codec == "rawvideo":
         command += ["-strict", "-1"]
     subprocess.run([*command, str(path)], input=data, check=True)
@@ -109,7 +122,7 @@ def two_streams(path: Path, second: np.ndarray, *titles: str) -> Path:
     color = ["-f", "lavfi", "-i", f"testsrc=s=64x48:r=10:d={len(second) / 10}", "-i", str(path.with_name("depth.mkv"))]
     named = [part for k, title in enumerate(titles) for part in (f"-metadata:s:v:{k}", f"title={title}")]
     streams = ["-map", "0:v", "-map", "1:v", "-c:v:0", "mjpeg", "-pix_fmt:v:0", "yuvj420p", "-c:v:1", "copy"]
-    subprocess.run([ffmpeg(), "-v", "error", "-y", *color, *streams, *named, str(path)], check=True)
+    subprocess.run([get_ffmpeg_exe(), "-v", "error", "-y", *color, *streams, *named, str(path)], check=True)
     return path
 
 
@@ -124,7 +137,7 @@ def test_two_streams_that_may_both_be_depth_are_listed(tmp_path):
     for name in ("a", "b"):
         encode(tmp_path / f"{name}.mkv", frames_of(16), "gray16le", "ffv1")
     both = ["-i", str(tmp_path / "a.mkv"), "-i", str(tmp_path / "b.mkv"), "-map", "0", "-map", "1", "-c", "copy"]
-    subprocess.run([ffmpeg(), "-v", "error", *both, str(tmp_path / "both.mkv")], check=True)
+    subprocess.run([get_ffmpeg_exe(), "-v", "error", *both, str(tmp_path / "both.mkv")], check=True)
     with pytest.raises(DataError, match="holds 2 video streams .*none is called depth"):
         read_depth_video(tmp_path / "both.mkv")
 

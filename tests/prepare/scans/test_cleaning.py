@@ -11,7 +11,7 @@ from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
 from dpcli.prepare.scans.cleaning import AT_ORIGIN, IMPOSSIBLE, NOT_FINITE, clean
 from dpcli.prepare.scans.clouds import CloudFolders
-from dpcli.prepare.shards import Shard
+from dpcli.runtime.machines.shards import Shard
 from dpcli.store import CloudsReader
 
 POINTS = np.random.default_rng(1).uniform(0.5, 2, (20, 3))

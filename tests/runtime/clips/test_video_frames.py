@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
 from dpcli.prepare.views.matting import read_mask
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
@@ -158,8 +158,27 @@ def test_two_series_of_a_folder_are_named(pictures, tmp_path):
     for frame in range(3):
         for name in ("anya_rgba_{:03d}.png", "luigi_rgba_{:03d}.png"):
             Image.open(pictures / f"{frame}.png").save(tmp_path / name.format(frame))
-    with pytest.raises(DataError, match="images of 2 series: anya_rgba_.*luigi_rgba_"):
+    with pytest.raises(
+        DataError, match=r"(?s)images of 2 series: anya_rgba_.*luigi_rgba_.*--pattern 'anya_rgba_\*\.png'"
+    ):
         open_frames(tmp_path)
+
+
+@pytest.mark.parametrize("pattern, names", [("luigi_*", "luigi_0 luigi_2 luigi_10"), ("*_2.png", "anya_2 luigi_2")])
+def test_a_pattern_says_which_images_are_the_clip(pictures, tmp_path, capfd, pattern, names):
+    for number in (0, 2, 10):
+        for name in ("anya", "luigi"):
+            Image.open(pictures / "0.png").save(tmp_path / f"{name}_{number}.png")
+    frames = open_frames(tmp_path, pattern)
+    assert frames.names == tuple(f"{name}.png" for name in names.split())
+    assert "left out: " in capfd.readouterr().err
+
+
+def test_a_pattern_that_chooses_nothing_is_told(pictures, tmp_path):
+    with pytest.raises(DataError, match=r"no images whose names fit --pattern 'b_\*', such as 0.png"):
+        open_frames(pictures, "b_*")
+    with pytest.raises(UsageError, match="chooses among the images of a folder"):
+        open_frames(pictures / "0.png", "b_*")
 
 
 def test_a_folder_of_videos_lists_them(pictures, tmp_path):

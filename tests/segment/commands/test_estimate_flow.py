@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from dpcli.errors import DataError, Stopped, UsageError
+from dpcli.runtime.machines.spread import Spread
 from dpcli.runtime.seeds import SegmentStream, generator
 from dpcli.segment.commands import estimate_flow as module
 from dpcli.segment.commands.estimate_flow import (
@@ -70,8 +71,8 @@ def estimate(data: object, output: object, **options) -> EstimatedFlow:
         "split": "all",
         "seed": 0,
         "device": "cpu",
-        "jobs": 1,
         "force": False,
+        "spread": Spread(jobs=1),
     }
     return estimate_flow_of_file(str(data), str(output), **{**given, **options})
 

@@ -14,7 +14,7 @@ from torch.nn.functional import batch_norm, linear
 from dpcli.classify.network.backbones.frame_graph import frame_graph, pool_edges
 from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.network.layers import SharedLayers
+from dpcli.classify.network.layers import ClipLinear, SharedLayers
 from dpcli.classify.network.sync_norm import SyncNorm
 from dpcli.errors import UsageError
 from dpcli.ops import gather_points
@@ -25,11 +25,14 @@ _EPS = 1e-3
 
 
 class Dense(nn.Module):
-    """Computes a linear layer, batch norm over all rows and ReLU. A single row has no statistics: it gets the running ones."""
+    """Computes a linear layer, batch norm over all rows and ReLU. A single row has no statistics: it gets the running ones.
 
-    def __init__(self, inputs: int, width: int) -> None:
+    linear: the layer's class, ClipLinear where rows are clips.
+    """
+
+    def __init__(self, inputs: int, width: int, linear: type[nn.Linear] = nn.Linear) -> None:
         super().__init__()
-        self.linear, self.norm = nn.Linear(inputs, width), nn.BatchNorm1d(width, eps=_EPS)
+        self.linear, self.norm = linear(inputs, width), nn.BatchNorm1d(width, eps=_EPS)
 
     def forward(self, values: Tensor) -> Tensor:
         """Returns (...,width) for values (...,C)."""
@@ -91,9 +94,9 @@ class DenseHead(nn.Module):
 
     def __init__(self, inputs: int, widths: tuple[int, ...], classes: int, dropout: float) -> None:
         super().__init__()
-        self.hidden = nn.ModuleList(Dense(a, b) for a, b in zip((inputs, *widths), widths))
+        self.hidden = nn.ModuleList(Dense(a, b, ClipLinear) for a, b in zip((inputs, *widths), widths))
         self.dropout = nn.Dropout(dropout)
-        self.classify = nn.Linear(widths[-1], classes)
+        self.classify = ClipLinear(widths[-1], classes)
 
     def forward(self, values: Tensor) -> Tensor:
         """Returns the logits (B,classes) of features (B,inputs)."""
@@ -188,8 +191,8 @@ class InputTransform(nn.Module):
         super().__init__()
         first, second, third, *hidden = widths
         self.edges, self.point = SharedLayers(3, (first, second)), Dense(second, third)
-        self.hidden = nn.Sequential(*(Dense(a, b) for a, b in zip((third, *hidden), hidden)))
-        self.matrix = nn.Linear((third, *hidden)[-1], 9)
+        self.hidden = nn.Sequential(*(Dense(a, b, ClipLinear) for a, b in zip((third, *hidden), hidden)))
+        self.matrix = ClipLinear((third, *hidden)[-1], 9)
 
     def forward(self, points: Tensor, idx: Tensor) -> Tensor:
         """Points (B,N,3), neighbors (B,N,K) -> points (B,N,3) times the matrix."""

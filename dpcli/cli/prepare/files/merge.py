@@ -12,7 +12,10 @@ from dpcli.cli.prepare.options import Compression
 
 
 def merge(
-    inputs: Annotated[list[Path], typer.Argument(help="Files to join: all shards of one conversion, or any others.")],
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(help="Files to join: all shards of one run (of prepare, predict ...), or any clouds."),
+    ],
     output: Output,
     labels: Annotated[
         Path | None, typer.Option("--labels", help="TOML or JSON: which class of which file becomes which.")
@@ -26,7 +29,7 @@ def merge(
     compression: Compression = "none",
     force: Force = False,
 ) -> None:
-    """Join files of clouds: the shards of one conversion in their order, or unlike sources with a label map.
+    """Join files: the shards of one run, whatever it wrote, in their order; or clouds of unlike sources with a label map.
 
     Shards keep the compression that they were made with.
     """

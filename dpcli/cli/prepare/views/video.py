@@ -10,7 +10,7 @@ import typer
 
 from dpcli.cli.options import Force, Seed
 from dpcli.cli.prepare.conversion import print_check
-from dpcli.cli.prepare.options import BadFrame, Border, Check, FileOrPipe, FramesAtMost, PictureSize
+from dpcli.cli.prepare.options import BadFrame, Border, Check, FileOrPipe, FramesAtMost, Pattern, PictureSize
 from dpcli.cli.prepare.views.writing import write_views
 
 
@@ -27,6 +27,7 @@ class PictureOptions:
     fps: Annotated[float | None, typer.Option("--fps", help="Frames per second. Default: the file's, else 16.")] = None
     on_error: BadFrame = "stop"
     name: Annotated[str, typer.Option("--name", help="Name of the object. Default: the input's.")] = ""
+    pattern: Pattern = ""
 
 
 @dataclass(frozen=True)

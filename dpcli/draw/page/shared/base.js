@@ -8,6 +8,12 @@ function fail(message) {
   $("error").hidden = false;
   root.dataset.state = "error";
 }
+
+// Says for a while, or until "" is said, what the reader should know.
+function warn(message) {
+  $("error").textContent = message;
+  $("error").hidden = !message;
+}
 window.addEventListener("error", (event) => fail(event.message));
 window.addEventListener("unhandledrejection", (event) => fail(event.reason && event.reason.message || event.reason));
 

@@ -1,11 +1,12 @@
 // WebGL 2: a context that is built again after the browser took it away, programs, attributes.
 
 // Throws "no WebGL 2" where there is none. `build` sets up programs and buffers, now and after each loss; then `drawn` is called.
+// Meanwhile the page says so.
 function glContext(canvas, options, build, drawn) {
   const gl = canvas.getContext("webgl2", options);
   if (!gl) throw new Error("no WebGL 2");
-  canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
-  canvas.addEventListener("webglcontextrestored", () => { build(gl); drawn(); });
+  canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); warn("the graphics card was taken away; the picture comes back with it"); });
+  canvas.addEventListener("webglcontextrestored", () => { build(gl); warn(""); drawn(); });
   build(gl);
   return gl;
 }

@@ -1,4 +1,4 @@
-// Time: which frames are near a moment, playing in a loop, the bar with play, slider, clock and speed.
+// Time: which frames are near a moment, playing round and round or back and forth, the bar with play, slider, clock and speed.
 
 class Timeline {
   // times: of the frames, rising. rate: how much time passes per second. tail: how long the last frame is shown.
@@ -18,6 +18,14 @@ class Timeline {
     return this.start + ((time - this.start + seconds * this.rate) % (this.end - this.start + this.tail));
   }
 
+  // The time reached back and forth, and the direction (1, -1) that playing has then.
+  bounced(time, seconds, direction) {
+    const next = time + direction * seconds * this.rate;
+    if (next > this.end) return [Math.max(2 * this.end - next, this.start), -1];
+    if (next < this.start) return [Math.min(2 * this.start - next, this.end), 1];
+    return [next, direction];
+  }
+
   stepped(time, direction) {
     const { times } = this, [a, , w] = this.between(time);
     const next = direction > 0 ? a + 1 : w > 1e-6 ? a : a - 1;
@@ -25,11 +33,14 @@ class Timeline {
   }
 }
 
-// Holds `state` (time, play, speed); those who extend it draw in `draw` and may say more in `change`.
+const CALM = matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+// Holds `state` (time, play, speed, bounce); those who extend it draw in `draw` and may say more in `change`.
 class Player {
   constructor(timeline) {
     this.timeline = timeline;
-    this.state = { time: timeline.start, play: this.moves && !matchMedia("(prefers-reduced-motion: reduce)").matches, speed: 1 };
+    this.direction = 1;
+    this.state = { time: timeline.start, play: this.moves && !CALM, speed: 1, bounce: false };
   }
 
   get moves() { return this.timeline.times.length > 1; }
@@ -68,13 +79,22 @@ class Player {
 
   frame(now) {
     this.awake = false;
-    const { state } = this;
-    if (state.play) {
-      const passed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
-      this.last = now;
-      this.change({ time: this.timeline.after(state.time, passed * state.speed) });
-    } else this.last = null;
+    const passed = Math.min((now - (this.last ?? now)) / 1000, 0.25);
+    this.last = this.busy ? now : null;
+    if (this.busy) this.advance(passed);
     this.draw();
     ready();
+  }
+
+  // Whether something moves by itself.
+  get busy() { return this.state.play; }
+
+  advance(seconds) {
+    const { state, timeline } = this, passed = seconds * state.speed;
+    if (!state.play) return;
+    if (!state.bounce) return this.change({ time: timeline.after(state.time, passed) });
+    const [time, direction] = timeline.bounced(Math.min(state.time, timeline.end), passed, this.direction);
+    this.direction = direction;
+    this.change({ time });
   }
 }

@@ -1,4 +1,6 @@
-// A camera that orbits: drag turns, wheel or pinch zooms, shift-drag or two fingers move.
+// A camera that orbits: drag turns and lets it coast, wheel or pinch zooms, shift-drag or two fingers move.
+
+const COAST = 6, IDLE = 0.02, TURN = 20 * Math.PI / 180;  // 1/s that coasting fades by; radians/s: too slow to see, turning by itself
 
 // Right-handed world, y up; azimuth 0 looks from +z, positive towards +x. Camera axes: x right, y down, z forward.
 function cameraOf(state, fovy, canvas) {
@@ -19,7 +21,7 @@ const asColumns = (R) => [R[0], R[3], R[6], R[1], R[4], R[7], R[2], R[5], R[8]];
 class Stage extends Player {
   constructor(canvas, fovy, timeline) {
     super(timeline);
-    Object.assign(this, { canvas, fovy });
+    Object.assign(this, { canvas, fovy, spin: [0, 0], pace: [0, 0] });
   }
 
   get camera() { return cameraOf(this.state, this.fovy, this.canvas); }
@@ -49,10 +51,45 @@ class Stage extends Player {
     this.wake();
   }
 
+  get busy() { return super.busy || this.state.turn || this.glide || Math.hypot(...this.spin) > IDLE; }
+
+  advance(seconds) {
+    const [across, up] = this.spin, { azimuth, elevation } = this.state;
+    if (this.glide) this.approach(seconds);
+    if (this.state.turn || across || up) this.change({
+      azimuth: azimuth + (across + (this.state.turn ? TURN : 0)) * seconds, elevation: elevation + up * seconds,
+    });
+    const left = Math.exp(-COAST * seconds);
+    this.spin = Math.hypot(across, up) * left > IDLE ? [across * left, up * left] : [0, 0];
+    super.advance(seconds);
+  }
+
+  // Moves what the camera turns around to a point, quickly first, then slowly.
+  lookAt(point) {
+    if (CALM) return this.change({ target: point });
+    this.glide = point;
+    this.wake();
+  }
+
+  approach(seconds) {
+    const target = mixed(this.state.target, this.glide, 1 - Math.exp(-2 * COAST * seconds));
+    const far = Math.hypot(...target.map((value, k) => value - this.glide[k]));
+    if (far < 1e-3 * this.state.radius) this.glide = null;
+    this.change({ target });
+  }
+
   zoom(factor) { this.change({ radius: this.state.radius * factor }); }
-  goHome() { this.change(this.home()); }
+
+  goHome() {
+    Object.assign(this, { spin: [0, 0], glide: null });
+    this.change(this.home());
+  }
+
+  // A double click or tap at a place of the canvas (CSS pixels).
+  pointedAt() { this.goHome(); }
 
   pan(dx, dy) {
+    this.pace = [0, 0];
     const { camera } = this, step = this.state.radius / camera.focal * this.canvas.width / this.canvas.clientWidth;
     this.change({ target: this.state.target.map((value, k) => value - step * (dx * camera.right[k] + dy * camera.down[k])) });
   }
@@ -63,20 +100,22 @@ class Stage extends Player {
       canvas.setPointerCapture(event.pointerId);
       canvas.classList.add("moving");
       pointers.set(event.pointerId, [event.clientX, event.clientY]);
+      Object.assign(this, { spin: [0, 0], pace: [0, 0], glide: null, moved: event.timeStamp });
     });
     canvas.addEventListener("pointermove", (event) => this.drag(event, pointers));
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => {
       pointers.delete(event.pointerId);
+      if (!pointers.size) this.letGo(event.timeStamp);
       canvas.classList.toggle("moving", pointers.size > 0);
     });
     canvas.addEventListener("wheel", (event) => { event.preventDefault(); this.zoom(Math.exp(event.deltaY * 0.001)); }, { passive: false });
-    canvas.addEventListener("dblclick", () => this.goHome());
+    canvas.addEventListener("dblclick", (event) => this.pointedAt(event.offsetX, event.offsetY));
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     new ResizeObserver(() => this.fitCanvas()).observe(canvas);
   }
 
   drag(event, pointers) {
-    const before = pointers.get(event.pointerId), { azimuth, elevation, radius } = this.state;
+    const before = pointers.get(event.pointerId), { radius } = this.state;
     if (!before) return;
     const now = [event.clientX, event.clientY], dx = now[0] - before[0], dy = now[1] - before[1];
     if (pointers.size === 2) {
@@ -84,7 +123,21 @@ class Stage extends Player {
       this.change({ radius: radius * span(before) / Math.max(span(now), 1) });
       this.pan(dx / 2, dy / 2);
     } else if (event.shiftKey || event.buttons > 1) this.pan(dx, dy);
-    else this.change({ azimuth: azimuth - dx * 0.008, elevation: elevation + dy * 0.008 });
+    else this.orbit(event.timeStamp, -dx * 0.008, dy * 0.008);
     pointers.set(event.pointerId, now);
+  }
+
+  // The camera coasts on unless the pointer was held still first.
+  letGo(now) {
+    if (!CALM && now - this.moved < 60) this.spin = this.pace;
+    this.wake();
+  }
+
+  // Turns by radians across and up, and remembers how fast.
+  orbit(now, across, up) {
+    const seconds = Math.max((now - this.moved) / 1000, 0.004), { azimuth, elevation } = this.state;
+    this.moved = now;
+    this.pace = [across / seconds, up / seconds];
+    this.change({ azimuth: azimuth + across, elevation: elevation + up });
   }
 }

@@ -545,3 +545,16 @@ def test_names_that_are_no_backbone(name, message):
 def test_widths_of_another_backbone_are_refused(backbone):
     with pytest.raises(UsageError, match=f"backbone = {backbone}: widths = .*expected numbers like"):
         Kinet(KinetConfig(backbone=backbone))
+
+
+@pytest.mark.parametrize("backbone", ["pointnet2", "dgcnn", "spidercnn"])
+def test_a_clip_is_scored_alike_to_the_bit_whatever_is_beside_it(backbone):
+    """Else a video's scores would hang on the batch."""
+    torch.manual_seed(0)
+    changes = {"num_classes": 7, "num_frames": 4, **backbone_changes("tiny", backbone)}
+    network = Kinet(PRESETS["tiny"]["network"].changed(**changes)).eval()
+    clips = torch.randn(5, 4, network.config.points_per_frame, 3) * 0.3
+    with torch.inference_mode():
+        whole = torch.stack(network(clips))
+        for size in (1, 2, 3):
+            assert torch.equal(whole, torch.cat([torch.stack(network(some)) for some in clips.split(size)], 1)), size

@@ -1,4 +1,4 @@
-"""Reading samples on many machines: Dask distributed as an Executor for `convert`."""
+"""Work on many machines: Dask distributed as an Executor for `ordered_map`."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from dpcli.errors import DpcError, UsageError
 from dpcli.runtime.progress import log
 
 _CONNECT_SECONDS = 30
-_TRIES = 3  # a sample whose worker is lost is read again elsewhere; one that takes so many workers down ends the run
+_TRIES = 3  # an item whose worker is lost is worked on again elsewhere; one that takes more workers down is lost
 
 
 @contextmanager
 def cluster_executor(address: str, jobs: int) -> Iterator[tuple[Executor, int]]:
-    """Yields an executor on a Dask cluster and how many samples it reads at a time.
+    """Yields an executor on a Dask cluster and how many items it works on at a time.
 
     address: `local` starts `jobs` processes on this machine, anything else is a running scheduler, `tcp://host:8786`.
-    Its workers need the same dpc and see the raw data under the same path; they write nothing. A worker that is lost
-    costs only time. DpcError: no answer, no worker, or a sample that loses every worker that reads it.
+    Its workers need the same dpc and see the files that an item names under the same path; they write nothing. A worker
+    that is lost costs only time. DpcError: no answer, or no worker.
     """
     try:
         import dask
-        from distributed import Client, KilledWorker, LocalCluster
+        from distributed import Client, LocalCluster
         from distributed.comm import CommClosedError
     except ImportError:
         raise UsageError("--dask needs Dask distributed: pip install 'dpc-toolkit[cluster]'") from None
@@ -41,10 +41,6 @@ def cluster_executor(address: str, jobs: int) -> Iterator[tuple[Executor, int]]:
                 cluster = LocalCluster(jobs, threads_per_worker=1, dashboard_address=None, silence_logs=50)
             with Client(cluster or address, timeout=_CONNECT_SECONDS, set_as_default=False) as client:
                 yield client.get_executor(), _slots(client, address)
-        except KilledWorker as error:
-            raise DpcError(
-                f"{error.task}: was lost with {_TRIES + 1} workers, one after another; run again to continue"
-            ) from None
         except (CommClosedError, TimeoutError, OSError) as error:
             if isinstance(error, OSError) and not isinstance(error, (TimeoutError, ConnectionError)):
                 raise
@@ -61,5 +57,5 @@ def _slots(client: object, address: str) -> int:
     client.wait_for_workers(1, timeout=_CONNECT_SECONDS)  # type: ignore[attr-defined]
     threads = client.nthreads()  # type: ignore[attr-defined]
     slots = sum(threads.values())
-    log.info(f"Dask {address}: {len(threads)} workers, {slots} samples at a time")
+    log.info(f"Dask {address}: {len(threads)} workers, {slots} items at a time")
     return slots

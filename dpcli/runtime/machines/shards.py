@@ -1,4 +1,4 @@
-"""One data set in pieces: `--shard i/n` converts every n-th sample, and any cut gives the same samples."""
+"""One list of items in pieces: `--shard i/n` takes every n-th one, and any cut gives the same results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dpcli.errors import UsageError
 
 @dataclass(frozen=True)
 class Shard:
-    """Names piece `index` (from 0) of `count`: the samples at places index, index + count, ... of the whole list.
+    """Names piece `index` (from 0) of `count`: the items at places index, index + count, ... of the whole list.
 
     `count` is a logical number, whatever machines there are, so that a failed piece can be made again alone.
     """
@@ -28,7 +28,7 @@ class Shard:
         return cls(int(match[1]), int(match[2]))
 
     def places(self, total: int) -> range:
-        """Returns which of `total` samples are its own.
+        """Returns which of `total` items are its own.
 
         >>> list(Shard.parse("1/3").places(8))
         [1, 4, 7]

@@ -1,0 +1,40 @@
+"""Options that say who works on the items of a command: processes, a shard of them, a cluster."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from dpcli.runtime.machines.spread import Spread
+
+Shard = Annotated[
+    str,
+    typer.Option(
+        "--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them."
+    ),
+]
+Dask = Annotated[
+    str, typer.Option("--dask", metavar="ADDRESS", help="Work on a Dask cluster: tcp://HOST:PORT, or local.")
+]
+
+
+@dataclass(frozen=True)
+class SpreadOptions:
+    """Says who works on which samples; no byte of the whole depends on it."""
+
+    jobs: Annotated[
+        int | None,
+        typer.Option("--jobs", min=1, help="Processes. Default: as many CPUs as pay, one on an accelerator."),
+    ] = None
+    shard: Shard = ""
+    dask: Dask = ""
+
+    @property
+    def spread(self) -> Spread:
+        """The choice as the commands take it. UsageError for a shard that is none."""
+        from dpcli.runtime.machines import shards, spread
+
+        return spread.Spread(self.jobs, shards.Shard.parse(self.shard) if self.shard else None, self.dask)

@@ -1,0 +1,128 @@
+"""The pass of an evaluation over the sequences of a parts file: spread over processes and machines, and kept in a file."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dpcli.errors import DataError, UsageError
+from dpcli.evaluate.results import LeftOut
+from dpcli.evaluate.segmentation.truth_pairing import PairedSequences, SequencePair
+from dpcli.runtime import provenance
+from dpcli.runtime.machines.shards import describe_shard
+from dpcli.runtime.machines.spread import ALONE, Spread
+from dpcli.runtime.progress import log
+from dpcli.store import PartsReader
+from dpcli.store.file import file_kind
+from dpcli.store.statistics import StatisticsReader, StatisticsWriter
+from dpcli.store.writing.already_made import WORK, already_made
+from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
+
+Measure = Callable[[SequencePair], dict[str, Any]]
+_REFUSAL = "holds something else than these statistics ({differences}); write to another file, or --force to replace it"
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Says who evaluates which sequences, and the file in which what they counted is kept, None for no file."""
+
+    output: Path | None = None
+    spread: Spread = ALONE
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        if self.spread.shard and self.output is None:
+            raise UsageError(
+                f"--shard {self.spread.shard}: -o FILE is missing; its statistics are merged with those of the other shards"
+            )
+
+
+NOT_KEPT = Keeping()
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Holds what was counted: the evaluation's choices and facts, and for each sequence its name and values."""
+
+    about: dict[str, Any]
+    class_names: list[str]
+    length_unit: str
+    names: list[str]
+    rows: list[dict[str, Any]]
+
+    @property
+    def left_out(self) -> list[LeftOut]:
+        """The samples that don't count."""
+        return [LeftOut(reason, names) for reason, names in self.about["left_out"]]
+
+
+def read_counted(path: str | Path, task: str) -> Counted | None:
+    """Returns what a statistics file holds, None where `path` is another kind. Raises DataError where it is of another task."""
+    if file_kind(path) != "statistics":
+        return None
+    reader = StatisticsReader(path)
+    about = reader.provenance[-1].get("config", {})
+    if about.get("task") != task or "shard" in about:
+        what = (
+            f"shard {about['shard']} of an evaluation" if "shard" in about else f"an evaluation of {about.get('task')}"
+        )
+        raise DataError(f"{path}: holds {what}, expected the whole of one of {task}; dpc prepare merge joins shards")
+    return _counted(reader)
+
+
+def count_sequences(paired: PairedSequences, measure: Measure, about: dict[str, Any], keeping: Keeping) -> Counted:
+    """Returns what `measure`, which must be picklable, counts of every sequence that counts, or of a shard of them.
+
+    about: the choices behind the numbers. With a file a stopped or killed evaluation goes on; raises UsageError when the
+    file holds something else, and Stopped after a stop signal.
+    """
+    with tempfile.TemporaryDirectory(prefix="dpc-") as folder:
+        kept = keeping.output is not None
+        target = keeping.output if keeping.output is not None else Path(folder) / "statistics.h5"
+        left_out = [[entry.reason, entry.names] for entry in paired.left_out]
+        about = {**about, "split": paired.split, "truth": str(paired.truth.path), "left_out": left_out}
+        inputs = {"parts": paired.predicted.path, "truth": paired.truth.path} if kept else None
+        entry = describe_shard(provenance.record(about, 0, inputs), keeping.spread.shard)
+        if not kept or keeping.force or not already_made(target, entry, StatisticsReader, _REFUSAL, WORK):
+            with StatisticsWriter(
+                target,
+                class_names=paired.truth.class_names,
+                length_unit=paired.truth.length_unit,
+                source=paired.predicted.path.name,
+                provenance=[*paired.predicted.provenance, entry],
+                force=keeping.force,
+                resume=kept,
+            ) as writer:
+                _run(paired, measure, writer, keeping.spread)
+        return _counted(StatisticsReader(target))
+
+
+def _run(paired: PairedSequences, measure: Measure, writer: StatisticsWriter, spread: Spread) -> None:
+    names = [paired.predicted.names[own] for own, _ in paired.rows]
+
+    def write(place: int, values: dict[str, Any]) -> dict[str, float]:
+        writer.write(names[place], values)
+        return {}
+
+    taken = ItemPass(writer, names, Wording("evaluate", "sequence", "evaluated"), spread.shard)
+    with spread.workers() as workers:
+        taken.run(measure, paired.pair, write, workers)
+
+
+def _counted(reader: StatisticsReader) -> Counted:
+    for line in skipped_lines(reader.skipped):
+        log.warn(line)
+    about = reader.provenance[-1]["config"]
+    about["left_out"] = [*about["left_out"], *([reason, [name]] for name, reason in reader.skipped)]
+    rows = [reader.read(index) for index in range(len(reader.names))]
+    return Counted(about, reader.class_names, reader.length_unit, reader.names, rows)
+
+
+def made_by(path: str | Path) -> list[dict[str, Any]]:
+    """Returns the commands that led to a parts file, or to the parts file that statistics were counted in."""
+    if file_kind(path) == "statistics":
+        return StatisticsReader(path).provenance[:-1]
+    return PartsReader(path).provenance

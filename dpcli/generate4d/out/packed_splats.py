@@ -1,0 +1,67 @@
+"""Gaussians in the packed files of players: SuperSplat's `.compressed.ply` and Niantic's `.spz`. gsply is an extra."""
+
+from __future__ import annotations
+
+import gzip
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.generate4d.out.splat_files import Splats
+from dpcli.runtime.whole_file import write_whole
+
+_FINE_BITS, _FINE_REACH, _COARSE_BITS = (
+    16,
+    120.0,
+    12,
+)  # of 24 bits a coordinate: steps of 1/65536 up to 128 units, or 1/4096
+
+
+def write_compressed_ply(path: Path, splats: Splats) -> None:
+    """Writes one .compressed.ply: chunks of 256 Gaussians, 16 bytes each and the chunk's ranges.
+
+    Raises DataError when it can't be written or gsply is not installed.
+    """
+    gsply = _gsply(path)
+    write_whole(path, _written(lambda place: gsply.plywrite(place, _data(gsply, splats), compressed=True), ".ply"))
+
+
+def write_spz(path: Path, splats: Splats) -> None:
+    """Writes one .spz of version 3: 24 bits a coordinate, a byte for each size, color and opacity, 4 for the orientation.
+
+    The format's axes are x right, y up, z back, as the scene's own are. Raises DataError when it can't be written or gsply
+    is not installed.
+    """
+    gsply = _gsply(path)
+    bits = _FINE_BITS if np.abs(splats.mean).max() < _FINE_REACH else _COARSE_BITS
+    packed = _written(lambda place: gsply.write_spz(place, _data(gsply, splats), fractional_bits=bits), ".spz")
+    write_whole(path, gzip.compress(gzip.decompress(packed), mtime=0))  # equal scenes give equal bytes
+
+
+def _gsply(path: Path) -> Any:
+    try:
+        import gsply
+    except ImportError:
+        raise DataError(f"{path}: gsply is needed to write it; pip install 'dpc-toolkit[splats]'") from None
+    return gsply
+
+
+def _data(gsply: Any, splats: Splats) -> Any:
+    rest = splats.sh[:, 1:] if splats.sh.shape[1] > 1 else None
+    arrays = (splats.mean, splats.log_scale, splats.quaternion, splats.opacity_logit, splats.sh[:, 0], rest)
+    means, scales, quaternions, opacities, colors, terms = (
+        None if values is None else np.ascontiguousarray(values, np.float32) for values in arrays
+    )
+    return gsply.GSData.from_arrays(means, scales, quaternions, opacities, colors, terms, format="ply")
+
+
+def _written(write: Callable[[Path], None], suffix: str) -> bytes:
+    """Returns the bytes of the file that a function writes at a place of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / f"scene{suffix}"
+        write(place)
+        return next(Path(folder).iterdir()).read_bytes()

@@ -1,0 +1,113 @@
+"""MATLAB files of version 5, one array of numbers at a time, by the published layout (MathWorks, MAT-File Format).
+
+Every length is checked against the bytes that are there: compiled readers end the process at some damaged files.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+
+_HEADER = 128
+_NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # as stored
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}  # as meant
+_MATRIX, _COMPRESSED = 14, 15
+_COMPLEX = 8  # flag
+_BEGIN = 4096  # bytes of a compressed array in which its name and shape are
+_MOST = 1 << 31  # bytes of one array
+
+Element = tuple[int, bytes]  # type, content
+
+
+class _Damaged(ValueError):
+    """Says what in the bytes is not as it should be."""
+
+
+def read_mat5(path: Path, name: str) -> np.ndarray:
+    """Reads the variable ``name``, an array of real numbers of any shape, as MATLAB means it.
+
+    Raises DataError when it is absent, something else, or damaged; also for files of version 4.
+    """
+    data = path.read_bytes()
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise DataError(f"{path}: not a MATLAB file of version 5 or 7.3, perhaps truncated; save it with -v7")
+    found = []
+    try:
+        for kind, content in _elements(data[_HEADER:], order):
+            called, values = _variable(path, kind, content, order, name)
+            if values is not None:
+                return values
+            found += [called] if called else []
+    except (_Damaged, zlib.error) as error:
+        raise DataError(f"{path}: not a readable MATLAB file, perhaps truncated ({error})") from None
+    raise DataError(f"{path}: no variable {name!r}; found {found or 'none'}")
+
+
+def _elements(data: bytes, order: str) -> Iterator[Element]:
+    """Yields the elements that follow one another; a short one has its content in its head."""
+    at = 0
+    while at < len(data):
+        if at + 8 > len(data):
+            raise _Damaged(f"{len(data) - at} bytes after the last variable")
+        kind, size = np.frombuffer(data, order + "u4", 2, at).tolist()
+        start, short = at + 8, kind >> 16
+        if short:
+            kind, size, start = kind & 0xFFFF, short, at + 4
+        if size > (4 if short else len(data) - start):
+            raise _Damaged(f"an element of {size} bytes, of which {len(data) - start} are left")
+        yield kind, data[start : start + size]
+        at = at + 8 if short else start + size + (0 if kind == _COMPRESSED else -size % 8)
+
+
+def _variable(path: Path, kind: int, content: bytes, order: str, wanted: str) -> tuple[str, np.ndarray | None]:
+    """Returns the name of a variable, and its values where it is the one that is wanted."""
+    begin = zlib.decompressobj().decompress(content, _BEGIN) if kind == _COMPRESSED else content
+    if kind == _COMPRESSED:
+        kind = int(np.frombuffer(begin, order + "u4", 1)[0]) if len(begin) >= 8 else 0
+        begin = begin[8:]
+    if kind != _MATRIX:
+        return "", None
+    flags, shape, name, used = _head(begin, order)
+    if name != wanted:
+        return name, None
+    dtype = np.dtype(order + _CLASSES.get(flags & 0xFF, "V0"))
+    if dtype.kind == "V" or flags >> 8 & _COMPLEX:
+        raise DataError(f"{path}: {wanted!r} is text, or of another type; expected numbers")
+    count = math.prod(shape)
+    if count * dtype.itemsize > _MOST:
+        raise _Damaged(f"{wanted!r} of shape {shape} takes more than {_MOST} bytes")
+    if begin is not content:
+        content = zlib.decompressobj().decompress(content, 8 + used + 8 + 8 * count)[8:]
+    stored, raw = next(_elements(content[used:], order), (0, b""))
+    if stored not in _NUMBERS:
+        raise _Damaged(f"{wanted!r} has no numbers")
+    values = np.frombuffer(raw[: len(raw) - len(raw) % np.dtype(_NUMBERS[stored]).itemsize], order + _NUMBERS[stored])
+    if len(values) != count:
+        raise _Damaged(f"{wanted!r} of shape {shape} has {len(values)} numbers")
+    return name, values.astype(dtype.newbyteorder("=")).reshape(shape, order="F")
+
+
+def _head(data: bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
+    """Returns flags, shape and name of a matrix, and how many bytes these take."""
+    parts: list[Any] = []
+    at = 0
+    for _ in range(3):
+        tag = np.frombuffer(data[at : at + 8].ljust(8, b"\0"), order + "u4", 2).tolist()
+        size = 8 if tag[0] >> 16 else 8 + tag[1] + -tag[1] % 8
+        parts.append(next(_elements(data[at : at + size], order), (0, b""))[1])
+        at += size
+    flags, shape, name = parts
+    if len(flags) < 8 or len(shape) < 8 or len(shape) % 4 or len(shape) > 128:
+        raise _Damaged("a matrix without type or shape")
+    sides = tuple(np.frombuffer(shape, order + "i4").tolist())
+    if min(sides) < 0:
+        raise _Damaged(f"a matrix of shape {sides}")
+    return int(np.frombuffer(flags, order + "u4", 1)[0]), sides, name.decode("latin1"), at

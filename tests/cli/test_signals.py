@@ -1,0 +1,142 @@
+"""Signals at any moment of any command: one sentence, the exit code of the table, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.store import ScoresWriter
+from tests.support.prepare_helpers import ROOT
+
+CODES = {signal.SIGINT: 130, signal.SIGTERM: 75, signal.SIGUSR1: 75}
+SAID = {
+    signal.SIGINT: "dpc: error: interrupted",
+    signal.SIGTERM: "stopped by SIGTERM",
+    signal.SIGUSR1: "stopped by SIGUSR1",
+}
+COMMANDS = {
+    "info": ["info", "s.h5"],
+    "evaluate": ["evaluate", "classification", "s.h5", "--split", "all"],
+    "profile": ["classify", "profile", "--model", "msraction3d-16"],
+    "prepare": ["prepare", "synthetic", "gestures", "--videos-per-class", "400", "-o", "o.h5", "--jobs", "1"],
+}
+# Python's own start is over and the command's has just begun: what a test can wait for
+STARTED = """
+import os, sys
+import dpcli.signal_exit as signals
+from dpcli.__main__ import main
+watch = signals.watch_signals
+def told():
+    watch()
+    os.write(1, b"x")
+signals.watch_signals, sys.argv = told, ["dpc", *sys.argv[1:]]
+main()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    with ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer:
+        for n in range(40):
+            writer.write(f"v{n}", np.eye(2)[n % 2], label=n // 20, split="test")
+    return tmp_path
+
+
+def start(folder: Path, words: list[str], **options: object) -> subprocess.Popen:
+    process = subprocess.Popen(
+        [sys.executable, "-c", STARTED, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.DEVNULL,
+        **options,
+    )
+    assert process.stdout.read(1) == b"x"
+    return process
+
+
+@pytest.mark.parametrize(
+    ("command", "number"),
+    [(command, number) for command in COMMANDS for number in CODES if command == "profile" or number != signal.SIGUSR1],
+)
+def test_a_signal_at_any_moment_is_a_sentence(folder, command, number):
+    """From the first line on, while libraries load, at work, at the end."""
+    ended = 0
+    for wait in (0, 0.02, 0.1, 0.4, 1.0):
+        process = start(folder, COMMANDS[command])
+        time.sleep(wait)
+        process.send_signal(number)
+        _, told = process.communicate(timeout=120)
+        said = told.decode()
+        assert "Traceback" not in said and "Exception" not in said and "a bug" not in said, said
+        if process.returncode == 0:
+            continue  # it was done before
+        ended += 1
+        assert process.returncode == CODES[number], (wait, said)
+        assert SAID[number] in said and said.count("dpc: error:") == 1, (wait, said)
+        assert not (folder / "o.h5").exists()
+    assert ended >= 2
+
+
+def test_what_a_command_keeps_in_tmpdir_goes_with_it(folder):
+    (folder / "tmp").mkdir()
+    words = ["prepare", "synthetic", "gestures", "--videos-per-class", "400", "-o", "-", "--jobs", "1"]
+    for wait in (0.05, 1.5):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dpcli", *words],
+            cwd=folder,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(folder / "tmp")},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        time.sleep(wait)
+        process.terminate()
+        process.communicate(timeout=120)
+        assert list((folder / "tmp").iterdir()) == []
+
+
+def test_a_signal_that_is_ignored_stays_ignored(folder):
+    """As under nohup, or in the background of a script."""
+    process = start(folder, COMMANDS["info"], preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
+    process.send_signal(signal.SIGINT)
+    told, _ = process.communicate(timeout=60)
+    assert process.returncode == 0 and b"scores" in told
+
+
+def test_one_signal_ends_a_wait_for_a_pipe(folder):
+    """Nobody writes into it."""
+    reading, writing = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dpcli", "info", "-"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=reading,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    time.sleep(1.5)
+    process.terminate()
+    _, told = process.communicate(timeout=20)
+    os.close(reading), os.close(writing)
+    assert process.returncode == 75 and b"stopped by SIGTERM" in told
+
+
+def test_a_second_signal_ends_it_at_once(folder):
+    code = (
+        "import time, sys, os\nfrom dpcli import signal_exit as s\ns.watch_signals(); s.set_working(True)\n"
+        "try:\n os.write(1, b'x'); time.sleep(60)\nexcept KeyboardInterrupt:\n os.write(1, b'y'); time.sleep(60)"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    for letter in (b"x", b"y"):
+        assert process.stdout.read(1) == letter
+        process.terminate()
+    _, told = process.communicate(timeout=20)
+    assert process.returncode == 75 and told == b"dpc: error: stopped by SIGTERM; run the same command again\n"

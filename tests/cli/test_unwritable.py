@@ -1,0 +1,134 @@
+"""Places nobody may write to: the same sentence and exit code in every command, before any work."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
+from tests.support.prepare_helpers import ROOT
+
+COMMANDS = [
+    "prepare clouds raw -o ro/a.h5",
+    "prepare synthetic gestures --frames 4 --size 32 -o ro/a.h5",
+    "prepare synthetic animal --size 16 --frames 2 -o ro/v.h5",
+    "prepare merge c.h5 -o ro/m.h5",
+    "prepare split c.h5 -o ro/d",
+    "classify train c.h5 -o ro/t",
+    "classify predict c.h5 --model msraction3d-16 -o ro/p.h5",
+    "segment predict c.h5 -o ro/p.h5",
+    "segment predict c.h5 -o p.h5 --picture ro/p.png",
+    "segment train c.h5 -o ro/s",
+    "segment estimate-flow c.h5 -o ro/e.h5",
+    "generate4d fit c.h5 -o ro/f",
+    "generate4d render c.h5 -o ro/r.mp4",
+    "generate4d export c.h5 -o ro/r.ply",
+    "generate4d view c.h5 -o ro/r.html",
+    "info c.h5 --picture ro/i.png",
+    "info c.h5 --page ro/i.html",
+    "evaluate classification s.h5 --split all --picture ro/c.png",
+    "evaluate report s.h5 -o ro/r.md",
+    "prepare merge c.h5 -o ro/there.h5 --force",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("unwritable")
+    (root / "ro").mkdir()
+    (root / "raw").mkdir()
+    np.save(root / "raw" / "0.npy", np.ones((3, 3), np.float32))
+    for path in (root / "c.h5", root / "ro" / "there.h5"):
+        with CloudsWriter(path) as writer:
+            writer.write(CloudSequence.from_frames("a", [np.ones((4, 3), np.float32)] * 2))
+    with ScoresWriter(root / "s.h5", class_names=["a", "b"]) as writer:
+        for n in range(4):
+            writer.write(f"v{n}", np.eye(2)[n % 2], label=n // 2, split="test")
+    return root
+
+
+def in_read_only(folder: Path, lines: list[str]) -> str:
+    """Runs commands where `ro` is a read-only file system; returns what they say, each with its exit code."""
+    commands = "\n".join(f'"{sys.executable}" -m dpcli {line} 2>&1; echo "code $?"' for line in lines)
+    script = f'set -e; mount --bind "$D/ro" "$D/ro"; mount -o remount,ro,bind "$D/ro"; cd "$D"; set +e\n{commands}'
+    done = subprocess.run(
+        ["unshare", "-rm", "sh", "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**os.environ, "D": str(folder), "PYTHONPATH": str(ROOT)},
+    )
+    if done.returncode != 0 and "code" not in done.stdout:
+        pytest.skip(f"this machine lets nobody mount a file system of their own: {done.stderr}")
+    return done.stdout
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare")
+def test_a_read_only_file_system_is_said_alike(folder):
+    said = in_read_only(folder, COMMANDS).split("code ")
+    for line, told, after in zip(COMMANDS, said, said[1:], strict=False):
+        lines = told.strip().split("\n")
+        assert "the folder " in lines[-1] and "can't be written to (the file system is read-only)" in lines[-1], (
+            line,
+            told,
+        )
+        assert after.startswith("3\n"), (line, told)
+    assert len(said) == len(COMMANDS) + 1
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare")
+def test_what_is_complete_needs_no_room(folder, dpc):
+    """The same work on a file that is there is not written again."""
+    assert dpc("prepare", "clouds", "raw", "-o", "ro/made.h5", cwd=folder).returncode == 0
+    said = in_read_only(folder, ["prepare clouds raw -o ro/made.h5"])
+    assert "already complete" in said and said.endswith("code 0\n")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "prepare merge absent.h5 -o m.h5",
+        "prepare split absent.h5 -o d",
+        "info absent.h5",
+        "classify train absent.h5 -o t",
+    ],
+)
+def test_an_input_that_is_not_there_is_bad_data_everywhere(folder, dpc, line):
+    done = dpc(*line.split(), cwd=folder)
+    assert done.returncode == 3 and b"absent.h5: no such file" in done.stderr
+
+
+@pytest.mark.parametrize("size", ["0k", "16k", "600k"])
+def test_a_full_tmpdir_is_named(folder, tmp_path, size):
+    """Pipes are kept there on both sides; 0k: not even a folder can be made."""
+    room = "-o size=64k,nr_inodes=1" if size == "0k" else f"-o size={size}"
+    script = (
+        f'set -e; mount -t tmpfs {room} none "$TMPDIR"; set +e; cd "$D"\n'
+        f'"{sys.executable}" -m dpcli prepare synthetic gestures --videos-per-class 40 -o - | cat > "$OUT"; ls -A "$TMPDIR"\n'
+    )
+    done = subprocess.run(
+        ["unshare", "-rm", "bash", "-c", script],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={
+            **os.environ,
+            "D": str(folder),
+            "TMPDIR": str(tmp_path),
+            "OUT": str(folder / "out"),
+            "PYTHONPATH": str(ROOT),
+        },
+    )
+    if "mount" in done.stderr or "unshare" in done.stderr:
+        pytest.skip("this machine lets nobody mount a file system of their own")
+    if size == "0k":  # then Python takes the next place of its list, such as /tmp
+        assert "Traceback" not in done.stderr and "a bug" not in done.stderr
+        return
+    assert "TMPDIR" in done.stderr and "no space left" in done.stderr and "set TMPDIR to" in done.stderr, done.stderr
+    assert str(tmp_path) in done.stderr and done.stdout == "" and "Traceback" not in done.stderr

@@ -1,0 +1,211 @@
+"""Clips of any legal kind, written by PyAV, OpenCV, imageio and Pillow, read back: pictures, their number and times."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import av
+import cv2
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from dpcli.prepare.decode.color_frames import open_frames
+
+RATES = [Fraction(24000, 1001), Fraction(25), Fraction(30), Fraction(25, 2), Fraction(60), Fraction(30000, 1001)]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One way to store a clip: `error` bounds the mean difference of levels, `step` divides both sides."""
+
+    codec: str
+    pixels: str
+    containers: str
+    error: float = 0.0
+    step: int = 1
+    options: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def has_alpha(self) -> bool:
+        return any(component.is_alpha for component in av.VideoFormat(self.pixels).components)
+
+
+Clip = tuple[Kind, str, Fraction, tuple[int, int], list[int]]  # how, in what, frames a second, size, ticks of frames
+EXACT = [
+    *(Kind("ffv1", p, "mkv avi nut") for p in ("bgr0", "bgra")),
+    *(Kind("ffv1", p, "mkv nut") for p in ("gbrp10le", "gbrp16le", "rgb48le", "rgba64le")),
+    *(Kind("png", p, "mov avi") for p in ("rgb24", "rgba", "rgb48be", "rgba64be")),
+    *(Kind("qtrle", p, "mov") for p in ("rgb24", "argb")),
+    *(Kind("rawvideo", p, "nut") for p in ("rgb24", "bgr24", "rgba", "bgra", "gbrp")),
+    Kind("rawvideo", "bgr24", "avi"),
+    Kind("rawvideo", "rgb24", "mov", step=2),  # FFmpeg's own writer leaves rows of odd length unpadded there
+    *(Kind("utvideo", p, "avi nut") for p in ("gbrp", "gbrap")),
+    *(Kind("huffyuv", p, "avi nut") for p in ("rgb24", "bgra")),
+    *(Kind("ffvhuff", p, "avi nut") for p in ("rgb24", "bgra", "gbrp10le", "gbrap")),
+    *(Kind("magicyuv", p, "avi nut") for p in ("gbrp", "gbrap")),
+    *(Kind("ffv1", p, "mkv avi nut", error) for p, error in (("gray", 0.0), ("gray16le", 1), ("gray10le", 1))),
+    Kind("libx264rgb", "bgr24", "mp4 mkv mov", options=(("qp", "0"), ("preset", "ultrafast"))),
+    Kind("libvpx-vp9", "gbrp", "webm mkv mp4", options=(("lossless", "1"), ("deadline", "realtime"))),
+]
+FINE = (("crf", "8"), ("preset", "ultrafast"))
+CLOSE = [
+    *(Kind("ffv1", p, "mkv avi nut", 4, 2) for p in ("yuv444p", "yuv422p", "yuv420p", "yuva420p", "yuva444p")),
+    *(Kind("ffv1", p, "mkv nut", 3, 2) for p in ("yuv420p10le", "yuv444p12le", "yuva444p10le", "yuv422p16le")),
+    *(Kind("ffv1", p, "mkv nut", 5, 1) for p in ("yuv444p", "yuv420p", "yuva444p")),
+    *(Kind("utvideo", p, "avi nut", 4, 2) for p in ("yuv420p", "yuv422p", "yuv444p")),
+    *(Kind("libx264", p, "mp4 mov mkv ts flv", 4, 2, FINE) for p in ("yuv420p", "yuv422p", "yuvj420p")),
+    *(Kind("libx264", p, "mp4 mkv", 4, 2, FINE) for p in ("yuv444p", "yuv420p10le", "yuv444p10le")),
+    *(Kind("libvpx-vp9", p, "webm mkv mp4", 5, 1, (("crf", "8"), ("b:v", "0"))) for p in ("yuv420p", "yuv444p")),
+    Kind("libvpx-vp9", "yuva420p", "webm mkv", 5, 2, (("crf", "8"), ("auto-alt-ref", "0"))),
+    Kind("libvpx", "yuv420p", "webm mkv", 6, 1, (("crf", "4"), ("b", "4000000"))),
+    Kind("libvpx", "yuva420p", "webm mkv", 6, 2, (("crf", "4"), ("b", "4000000"), ("auto-alt-ref", "0"))),
+    *(Kind("prores_ks", p, "mov mkv", 4, 2) for p in ("yuv422p10le", "yuv444p10le", "yuva444p10le")),
+    *(Kind("mjpeg", p, "avi mov mkv", 5, 2, (("qscale", "2"),)) for p in ("yuvj420p", "yuvj422p", "yuvj444p")),
+    Kind("jpeg2000", "rgb24", "mov mkv avi", 5, 2),
+    Kind("mpeg4", "yuv420p", "mp4 avi mkv mov", 6, 2, (("b", "8000000"),)),
+    Kind("mpeg2video", "yuv420p", "mpg mkv", 6, 2, (("b", "8000000"),)),
+    Kind("wmv2", "yuv420p", "wmv avi", 6, 2, (("b", "8000000"),)),
+    Kind("flv", "yuv420p", "flv", 6, 2, (("b", "8000000"),)),
+]
+STAMPED = ("mkv", "mp4", "mov", "webm", "nut", "flv")  # containers that keep a time for each frame
+UNSTEADY = ("ffv1", "png", "qtrle", "rawvideo", "utvideo", "libx264", "libvpx-vp9", "mjpeg")
+
+
+def pictures(count: int, width: int, height: int, alpha: bool, gray: bool = False) -> np.ndarray:
+    """Smooth colors that move, u8 (T,H,W,4); where asked for, half transparent on the left."""
+    y, x = np.mgrid[:height, :width]
+    t = np.arange(count)[:, None, None]
+    made = np.full((count, height, width, 4), 255, np.uint8)
+    for channel, (a, b, c) in enumerate(((5, 1, 9), (1, 5, 6), (3, 3, 13))):
+        made[..., channel] = 128 + 100 * np.sin((a * x / width + b * y / height) / 4 + c * t / count / 2 + channel)
+    if gray:
+        made[..., :3] = made[..., :1]
+    if alpha:
+        made[..., 3] = 127 + 128 * (x >= width // 2)
+    return made
+
+
+def write(path: Path, kind: Kind, rgba: np.ndarray, rate: Fraction, ticks: list[int]) -> None:
+    """Writes frames at `ticks` of a clock that ticks `rate` times a second."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.options))
+        stream.height, stream.width, stream.pix_fmt = *rgba.shape[1:3], kind.pixels
+        stream.codec_context.time_base = 1 / rate
+        for picture, tick in zip(rgba, ticks):
+            frame = av.VideoFrame.from_ndarray(picture, "rgba").reformat(format=kind.pixels, threads=1)
+            frame.pts, frame.time_base = tick, 1 / rate
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+@st.composite
+def clips(draw, kinds: list[Kind]) -> Clip:
+    kind = draw(st.sampled_from(kinds))
+    container = draw(st.sampled_from(kind.containers.split()))
+    width, height = (kind.step * draw(st.integers(32 // kind.step, 70 // kind.step)) for _ in range(2))
+    rate = draw(st.sampled_from([r for r in RATES if kind.codec != "mpeg2video" or r != 12.5]))
+    ticks = list(range(draw(st.integers(2, 7))))
+    if container in STAMPED and kind.codec in UNSTEADY and draw(st.booleans()):
+        ticks = np.cumsum([0, *(draw(st.integers(1, 5)) for _ in ticks[1:])]).tolist()
+    return kind, container, rate, (width, height), ticks
+
+
+def check(clip: Clip) -> None:
+    kind, container, rate, size, ticks = clip
+    rgba = pictures(len(ticks), *size, kind.has_alpha, kind.pixels.startswith("gray"))
+    with TemporaryDirectory() as folder:
+        path = Path(folder, f"clip.{container}")
+        write(path, kind, rgba, rate, ticks)
+        frames = open_frames(path)
+        read = np.stack(list(frames.read(range(len(frames)))))
+    assert_like(read, rgba, kind.error)
+    np.testing.assert_allclose(frames.times, [float(tick / rate) for tick in ticks], atol=2e-3)
+
+
+def assert_like(read: np.ndarray, rgba: np.ndarray, error: float) -> None:
+    """Pictures u8 (T,H,W,4) that are equal, or differ by `error` in the mean, and nowhere along a whole row or column."""
+    assert read.shape == rgba.shape
+    off = np.abs(read.astype(int) - rgba)
+    assert off.mean(axis=(1, 2)).max() <= error
+    assert max(off.mean(axis=1).max(), off.mean(axis=2).max()) <= 8 * error
+
+
+@settings(max_examples=120, deadline=None)
+@given(clips(EXACT))
+def test_what_is_stored_exactly_is_read_exactly(clip):
+    check(clip)
+
+
+@settings(max_examples=120, deadline=None)
+@given(clips(CLOSE))
+def test_what_is_stored_nearly_is_read_nearly(clip):
+    check(clip)
+
+
+CV2_CODES = {"FFV1": ("avi mkv", 0.0), "MJPG": ("avi mov mkv", 5), "mp4v": ("mp4 mov", 6), "XVID": ("avi", 6)}
+CV2_CODES |= {"VP80": ("webm", 6), "VP90": ("webm", 6), "HFYU": ("avi", 6), "PNG ": ("avi mov", 0.0)}
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(sorted(CV2_CODES)), st.integers(12, 35), st.integers(12, 35), st.sampled_from(RATES), st.data())
+def test_what_opencv_writes(code, half_width, half_height, rate, data):
+    containers, error = CV2_CODES[code]
+    rgba = pictures(data.draw(st.integers(2, 7)), 2 * half_width, 2 * half_height, False)
+    with TemporaryDirectory() as folder:
+        path = Path(folder, f"clip.{data.draw(st.sampled_from(containers.split()))}")
+        writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*code), float(rate), rgba.shape[2:0:-1])
+        assert writer.isOpened()
+        for picture in rgba:
+            writer.write(np.ascontiguousarray(picture[..., 2::-1]))
+        writer.release()
+        frames = open_frames(path)
+        read = np.stack(list(frames.read(range(len(frames)))))
+    assert_like(read, rgba, error)
+    np.testing.assert_allclose(frames.times, np.arange(len(rgba)) / float(rate), atol=2e-3)
+
+
+BY_IMAGEIO = {"a.mp4": {}, "a.mkv": {}, "a.mov": {}, "a.avi": {}}
+BY_IMAGEIO |= {f"{pixels}.{suffix}": {"codec": "libx265", "output_params": ["-pix_fmt", pixels, "-x265-params", "crf=8"]}
+               for pixels in ("yuv420p", "yuv420p10le", "yuv444p12le") for suffix in ("mp4", "mkv")}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BY_IMAGEIO)
+def test_what_imageio_writes(tmp_path, name):
+    rgba = pictures(5, 50, 34, False)
+    words = {"plugin": "FFMPEG", "fps": 12.5, "quality": 9, "macro_block_size": 1} | BY_IMAGEIO[name]
+    imageio.imwrite(tmp_path / name, rgba[..., :3], **words)
+    frames = open_frames(tmp_path / name)
+    read = np.stack(list(frames.read(range(len(frames)))))
+    assert_like(read, rgba, 6)
+    np.testing.assert_allclose(frames.times, np.arange(5) / 12.5, atol=2e-3)
+
+
+ANIMATIONS = {
+    "PNG": ({}, 0.0),
+    "WEBP": ({"lossless": True, "exact": True}, 0.0),
+    "GIF": ({"disposal": 2}, 12),
+    "AVIF": ({"quality": 95, "subsampling": "4:4:4"}, 5),
+}
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(sorted(ANIMATIONS)), st.integers(24, 60), st.integers(24, 60), st.booleans(), st.data())
+def test_what_pillow_writes(form, width, height, alpha, data):
+    options, error = ANIMATIONS[form]
+    rgba = pictures(data.draw(st.integers(2, 6)), width, height, alpha and form != "GIF")
+    lasting = [10 * data.draw(st.integers(2, 30)) for _ in rgba]
+    images = [Image.fromarray(picture) for picture in rgba]
+    with TemporaryDirectory() as folder:
+        path = Path(folder, f"clip.{'apng' if form == 'PNG' else form.lower()}")
+        images[0].save(path, form, save_all=True, append_images=images[1:], duration=lasting, loop=0, **options)
+        frames = open_frames(path)
+        read = np.stack(list(frames.read(range(len(frames)))))
+    assert_like(read, rgba, error)
+    np.testing.assert_allclose(frames.times, np.cumsum([0, *lasting[:-1]]) / 1000, atol=2e-3)

@@ -1,0 +1,126 @@
+"""Heaps of texts at which libhdf5 never ends: found before it reads them, in every command; good files pass at once."""
+
+from __future__ import annotations
+
+import struct
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.prepare.scans.modelnet40 import read_file
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
+from dpcli.store.heap_check import check_heaps
+
+
+def clouds(path: Path) -> Path:
+    with CloudsWriter(path, class_names=["a", "b"]) as writer:
+        for n in range(5):
+            writer.write(CloudSequence.from_frames(f"sample {n}", [np.ones((9, 3), np.float32)] * 2, label=n % 2))
+    return path
+
+
+def heaps(data: bytes) -> list[int]:
+    found, at = [], data.find(b"GCOL")
+    while at >= 0:
+        found.append(at)
+        at = data.find(b"GCOL", at + 1)
+    return found
+
+
+def zeroed(path: Path, heap: int, keep: int) -> None:
+    """Overwrites a heap with zeros behind its first `keep` objects, as a lost block of a disk does."""
+    data = bytearray(path.read_bytes())
+    start, at = heaps(data)[heap], 16
+    size = struct.unpack_from("<Q", data, start + 8)[0]
+    for _ in range(keep):
+        at += 16 + -(-struct.unpack_from("<Q", data, start + at + 8)[0] // 8) * 8
+    data[start + at : start + size] = bytes(size - at)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("command", "keep"),
+    [
+        ("info F", 0),
+        ("evaluate segmentation F --truth F", 1),
+        ("segment predict F -o o.h5", 2),
+        ("evaluate report F -o r.html", 3),
+        ("prepare merge F -o m.h5", 4),
+    ],
+)
+def test_a_zeroed_heap_is_a_damaged_file(tmp_path, dpc, command, keep):
+    zeroed(clouds(tmp_path / "F"), 0, keep)
+    started = time.monotonic()
+    done = dpc(*command.split(), cwd=tmp_path, timeout=60)
+    assert done.returncode == 3 and b"F: the HDF5 file is damaged (its heap of texts" in done.stderr, done.stderr
+    assert time.monotonic() - started < 30
+
+
+def test_every_heap_is_looked_at(tmp_path):
+    path = clouds(tmp_path / "c.h5")
+    whole = path.read_bytes()
+    for number in range(len(heaps(whole))):
+        path.write_bytes(whole)
+        zeroed(path, number, 1)
+        with pytest.raises(DataError, match="its heap of texts"):
+            CloudsReader(path)
+    path.write_bytes(whole)
+    assert len(CloudsReader(path).names) == 5
+
+
+def test_lengths_of_other_widths_are_refused(tmp_path):
+    path = clouds(tmp_path / "c.h5")
+    data = bytearray(path.read_bytes())
+    data[13 if data[8] < 2 else 9] = 4
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="damaged"):
+        check_heaps(path)
+
+
+def test_other_files_of_hdf5_are_looked_at_too(tmp_path):
+    """Those that prepare reads, and one that begins behind a block of text, as MATLAB's do."""
+    for name, block in (("ply_data_train0.h5", 0), ("a.mat", 512)):
+        path = tmp_path / name
+        with h5py.File(path, "w", userblock_size=block) as file:
+            file.create_dataset("data", data=np.ones((2, 3)))
+            file.create_dataset("names", data=np.array(["a", "b"], object), dtype=h5py.string_dtype())
+        check_heaps(path)
+        zeroed(path, 0, 0)
+        with pytest.raises(DataError, match="its heap of texts"):
+            check_heaps(path)
+    with pytest.raises(DataError, match="its heap of texts"):
+        read_file(tmp_path / "ply_data_train0.h5", "data")
+
+
+def test_the_letters_of_a_heap_in_data_are_data(tmp_path):
+    values = np.frombuffer(b"GCOL" * 3000 + b"GCOL\x02\0\0\0" * 50, np.uint8)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["values"] = values
+    check_heaps(tmp_path / "a.h5")
+
+
+def test_what_is_no_hdf5_passes_to_who_opens_it(tmp_path):
+    for content in (b"x", b"GCOL\x01\0\0\0" + bytes(5000)):
+        (tmp_path / "a.h5").write_bytes(content)
+        check_heaps(tmp_path / "a.h5")
+
+
+def test_a_good_file_pays_milliseconds(tmp_path):
+    """64 MB of points; the bound is generous, for busy machines."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["points"] = np.random.default_rng(0).random((2 << 20, 4))
+    check_heaps(tmp_path / "a.h5")
+    started = time.perf_counter()
+    check_heaps(tmp_path / "a.h5")
+    assert time.perf_counter() - started < 0.3
+
+
+def test_scores_with_many_names_pass(tmp_path):
+    with ScoresWriter(tmp_path / "s.h5", class_names=["a", "b"]) as writer:
+        for n in range(3000):
+            writer.write(f"video number {n}", np.eye(2)[n % 2], label=0)
+    check_heaps(tmp_path / "s.h5")
