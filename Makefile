@@ -20,7 +20,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.2
+.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.1 table-5.2
 .PHONY: prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
@@ -36,6 +36,7 @@ help:
 	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/reproduce.md says more of all of these"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
+	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, five rows and those of the thesis; hours"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
 	@echo "make fuzz [SEED=1 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
@@ -173,8 +174,14 @@ table-4.1: $(READY)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
 	$(BIN)/python -m dpcli.reproduce.table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
 
-# Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files. Stopped, it goes on where it was.
+# Table 5.1 on ARTEMIS' animals (ARTEMIS names their folder) or on animated meshes; T51: words for the program.
 MESHES ?=
+ARTEMIS ?=
+table-5.1: $(READY)
+	$(if $(MESHES)$(ARTEMIS),,$(error make table-5.1 needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
+	$(BIN)/python -m dpcli.reproduce.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
+
+# Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files. Stopped, it goes on where it was.
 table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
 	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2

@@ -12,10 +12,10 @@ TOP_K = 5
 CLASSIFICATION_METRICS = ("accuracy", f"top{TOP_K}_accuracy", "balanced_accuracy", "macro_f1")
 SEGMENTATION_METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 MOTION_METRICS = ("epe3d", "accs", "accr", "outlier", "part_rotation", "part_displacement")
-PICTURE_METRICS = ("psnr", "psnr_foreground", "ssim", "ms_ssim")
+PICTURE_METRICS = ("psnr", "psnr_foreground", "ssim", "ms_ssim", "silhouette_iou")
 FRECHET_METRICS = ("fvd", "fid_vid_r3d50", "fid_vid_inception")
 LEARNED_METRICS = ("lpips", "clip", "clip_spherical", "clip_views", "clip_temporal", *FRECHET_METRICS, "warping")
-SCENE_METRICS = ("parts", "tracks")
+SCENE_METRICS = ("parts", "tracks", "surface")
 VIDEO_METRICS = (*PICTURE_METRICS, *LEARNED_METRICS, *SCENE_METRICS)
 LOWER_IS_BETTER = frozenset(
     {"epe3d", "outlier", "part_rotation", "part_displacement", "lpips", "clip_spherical", "fvd", "warping"}

@@ -1,6 +1,7 @@
-"""The settings of a fit: sizes, steps, weights of losses, learning rates, and the presets `thesis`, `quick` and `tiny`.
+"""The settings of a fit: sizes, steps, weights of losses, learning rates, and the presets `thesis`, `quick`, `fast` and `tiny`.
 
-`thesis` follows appendix C of the thesis, `quick` suits two CPU cores, `tiny` is a trial of some seconds.
+`thesis` follows appendix C of the thesis, `quick` suits two CPU cores, `fast` is a look within two minutes on them, `tiny`
+a trial of some seconds.
 """
 
 from __future__ import annotations
@@ -159,6 +160,20 @@ FIT_PRESETS = {
         rate_mean=(2e-3, 2e-4),
         rate_network=(2e-3, 2e-4),
         rate_rigid=2e-3,
+        rate_scale=0.01,
+        grow_share=0.15,
+    ),
+    "fast": FitConfig(
+        dense_steps=40,
+        sparse_steps=460,
+        batch=2,
+        gaussians=5000,
+        most_gaussians=8000,
+        width=96,
+        depth=4,
+        rate_mean=(2e-3, 5e-4),
+        rate_network=(3e-3, 3e-4),
+        rate_rigid=3e-3,
         rate_scale=0.01,
         grow_share=0.15,
     ),

@@ -21,7 +21,7 @@ _AVERAGED = 8  # steps that the log's averages go on with after each row
 
 
 class FitRun:
-    """Runs a `SceneOptimizer` to its last step. `preview(model)` is called after each fifth of the steps."""
+    """Runs a `SceneOptimizer` to its last step. `preview(model)` is called at the start and after each fifth of the steps."""
 
     def __init__(
         self,
@@ -42,7 +42,7 @@ class FitRun:
         Raises DpcError when the loss is no longer finite, Stopped after a signal, once the state is saved.
         """
         state = self.folder.load_state()
-        self._restore(state) if state is not None else self.optimizer.start()
+        self._restore(state) if state is not None else self._start()
         started = time.monotonic()
         with Progress("fit", self.steps, "step") as bar:
             bar.skip(self.optimizer.step)
@@ -57,6 +57,11 @@ class FitRun:
                 self.stop.check(f"saved at step {step}")
         self.folder.draw_curves()
         return self.optimizer.model
+
+    def _start(self) -> None:
+        self.optimizer.start()
+        if self.preview is not None:
+            self.preview(self.optimizer.model)
 
     def _restore(self, state: dict) -> None:
         self.seconds, self.recent = state["spent"], state["recent"]

@@ -28,6 +28,7 @@ from dpcli.runtime.seeds import Generate4DStream, torch_seed
 _REFRESH_EVERY = 50  # steps between two searches for neighbors
 _CARRIERS = 2048  # of the dense stage's Gaussians that the losses on parts and shape look at
 _PRIOR_SIZE = 256  # pixels at most of the pictures that a prior judges
+_SHAPE_FOREGROUND = 1.0  # weight of silhouettes beside colors, which a prior knows less well
 _FIRST_OPACITY = {"sphere": 0.05, "hull": 0.5, "inflate": 0.8}  # a surface hides what is behind it, a volume is all fog
 _SMALLEST, _LARGEST = 1e-4, 0.4  # of a Gaussian, scene units: what a picture can tell
 
@@ -183,7 +184,7 @@ class SceneOptimizer:
         rendered, alpha, _ = self.model.render(instant, poses, intrinsics, size, size, background)
         first, last = config.shape
         weight = first * (last / first) ** (self.step / max(config.steps - 1, 1))
-        return config.reconstruction * weight * picture_loss(rendered, alpha, truth, background, config.foreground)
+        return config.reconstruction * weight * picture_loss(rendered, alpha, truth, background, _SHAPE_FOREGROUND)
 
     def _backgrounds(self, count: int, rng: torch.Generator) -> Tensor:  # [count, 3]
         """Returns backgrounds, each black or white, so that neither color can pass for transparency."""

@@ -183,7 +183,7 @@ def _settings(words: Sequence[str]) -> list[tuple[str, int]]:
 
 
 def cut(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Returns a program's own words, and those after `--`, which go to `dpc classify train`."""
+    """Returns a program's own words, and those after `--`, which go to the `dpc` command that it runs."""
     words = list(sys.argv[1:] if argv is None else argv)
     where = words.index("--") if "--" in words else len(words)
     return words[:where], words[where + 1 :]

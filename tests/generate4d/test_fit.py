@@ -217,7 +217,7 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
     done = dpc_here(*words, "--picture", tmp_path / "later.png")
     assert done.returncode == 0 and b"finished" in done.stderr and scene.read_bytes() == before
     first, later = (imageio.imread(tmp_path / name).astype(int) for name in ("first.png", "later.png"))
-    assert first.shape == (5 * SIZE, 5 * SIZE, 3) and np.abs(first - later).max() <= 1
+    assert first.shape == (9 * SIZE, 5 * SIZE, 3) and np.abs(first - later).max() <= 1
 
 
 def test_a_picture_that_cannot_be_written_costs_no_fit(tmp_path, dpc_here, monkeypatch):

@@ -63,7 +63,7 @@ def video(
             metavar="NAME,...",
             parser=lambda text: ",".join(parse_video_metrics(text)),
             help=f"Some of {', '.join(VIDEO_METRICS)}. Default: psnr, ssim, and what the files allow of psnr_foreground, "
-            "parts and tracks.",
+            "silhouette_iou, parts, tracks and surface.",
         ),
     ] = None,
     intersect: Intersect = False,
@@ -77,7 +77,7 @@ def video(
     intervals: IntervalOptions,
     output: PictureOptions,
 ) -> None:
-    """Evaluate a video or a 4D scene: PSNR, SSIM, LPIPS, CLIP, FVD, warping error, and a scene's parts and tracks."""
+    """Evaluate a video or a 4D scene: PSNR, SSIM, LPIPS, CLIP, FVD, warping error, and a scene's parts, tracks and surface."""
     from dpcli.evaluate.commands.video import run_video
     from dpcli.evaluate.video.protocol import video_protocol
 

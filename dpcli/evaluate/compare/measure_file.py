@@ -25,7 +25,7 @@ from dpcli.store import CloudsReader, PartsReader, ScoresReader, file_kind
 _VIDEO_METRICS = tuple(
     name
     for name in VIDEO_METRICS
-    if name not in ("clip_views", "fid_vid_r3d50", "fid_vid_inception", "parts", "tracks")
+    if name not in ("clip_views", "fid_vid_r3d50", "fid_vid_inception", "parts", "tracks", "surface")
 )
 _VIDEO_FILES = ("views", "gaussians")
 _ROWS = 256

@@ -1,4 +1,4 @@
-"""Comparing two videos of one object: PSNR and SSIM of each view, learned metrics, and a scene's parts and tracks."""
+"""Comparing two videos of one object: PSNR and SSIM of each view, learned metrics, a scene's parts, tracks and surface."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ ROLES = ("reference", "test", "train")
 class VideoReport:
     """Holds metrics of each view, their means over views (of each role, of all), and a scene's parts and tracks.
 
-    names: of the metrics. missing: metrics that were asked for and not computed, and why. scene: "parts", "tracks":
-    scores of `part_discovery.py`. intervals: of the means over all views.
+    names: of the metrics. missing: metrics that were asked for and not computed, and why. scene: "parts", "tracks" and
+    "surface": scores of `part_discovery.py` and `surface.py`. intervals: of the means over all views.
     """
 
     protocol: VideoProtocol
@@ -165,34 +165,42 @@ def _choose_metrics(asked: Sequence[str] | None, predicted: Source, truth: Sourc
     """Returns the metrics to compute. DataError for those that these sources can't give."""
     scene = isinstance(predicted, SceneSource) and isinstance(truth, ViewsSource)
     fields = truth.reader.fields if scene else ()
+    silhouettes = truth.has_alpha and predicted.has_alpha
     possible = ["psnr", *(["psnr_foreground"] if truth.has_alpha else []), "ssim"]
-    possible += [name for name, key in zip(SCENE_METRICS, ("part", "track")) if key in fields]
+    possible += ["silhouette_iou"] if silhouettes else []
+    possible += [name for name, key in zip(SCENE_METRICS, ("part", "track", "track")) if key in fields]
     if asked is None:
         return possible
     for name in asked:
         if name == "psnr_foreground" and not truth.has_alpha:
             raise DataError(f"{truth.path}: no alpha, so nobody knows the object's pixels; leave out psnr_foreground")
+        if name == "silhouette_iou" and not silhouettes:
+            bare = predicted if truth.has_alpha else truth
+            raise DataError(f"{bare.path}: no alpha, so it has no silhouette; leave out silhouette_iou")
         if name in SCENE_METRICS and not scene:
             raise DataError(
                 f"--metrics {name} needs a gaussians file and a views file, not a {predicted.kind} and a {truth.kind}"
             )
         if name in SCENE_METRICS and name not in possible:
             raise DataError(
-                f"{truth.path}: no surface {name} in it; `dpc prepare animation`, artemis and synthetic "
+                f"{truth.path}: no surface {'points' if name == 'surface' else name} in it; `dpc prepare animation`, artemis and synthetic "
                 f"animal write them; leave {name} out of --metrics"
             )
     return list(asked)
 
 
 def _scene_scores(predicted: Source, truth: Source, names: Sequence[str], seed: int) -> dict[str, Any]:
-    """Returns the scores of a Gaussian scene's parts and tracks, where they are asked for."""
+    """Returns the scores of a Gaussian scene's parts, tracks and surface, where they are asked for."""
     if not set(names) & set(SCENE_METRICS):
         return {}
     from dpcli.evaluate.video.part_discovery import part_score, track_score
+    from dpcli.evaluate.video.surface import surface_score
 
     track, scores = truth.reader.track, {}
     if "parts" in names:
         scores["parts"] = part_score(predicted.scene, track[0], truth.reader.part, truth.header.time[0], seed=seed)
     if "tracks" in names:
         scores["tracks"] = track_score(predicted.scene, track, truth.header.time)
+    if "surface" in names:
+        scores["surface"] = surface_score(predicted.scene, track, truth.header.time, seed=seed)
     return scores

@@ -1,4 +1,4 @@
-"""PSNR and SSIM over the frames of a video: frames -> sufficient statistics -> metrics."""
+"""PSNR, SSIM and overlap of silhouettes over the frames of a video: frames -> sufficient statistics -> metrics."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ class PictureStatistics:
 
     frame i64 (F): its number. squared f64 (F), values i64 (F): sum of squared errors, and of how many values; inside,
     inside_values: the same over the object's pixels. data_range f64 (F). similarity f64 (F), windows i64 (F): sum of
-    SSIM, and over how many windows; multi_scale f64 (F): MS-SSIM. NaN or 0 windows where a metric wasn't asked for.
+    SSIM, and over how many windows; multi_scale f64 (F): MS-SSIM. overlap, union i64 (F): pixels in both silhouettes, in
+    either. NaN, 0 windows or an empty union where a metric wasn't asked for.
     """
 
     frame: np.ndarray
@@ -30,6 +31,8 @@ class PictureStatistics:
     similarity: np.ndarray
     windows: np.ndarray
     multi_scale: np.ndarray
+    overlap: np.ndarray
+    union: np.ndarray
 
     def __add__(self, other: PictureStatistics) -> PictureStatistics:
         """Returns the statistics of both sets of frames together."""
@@ -41,13 +44,15 @@ class PictureMetrics:
     """Holds means over frames; psnr in dB. NaN = undefined or not asked for.
 
     pixels: of one frame. exact: frames without any error, which count as PSNR_CAP. without_object: frames whose mask is
-    empty, which psnr_foreground leaves out. worst: frame of the largest squared error, -1 = none has any.
+    empty, which psnr_foreground leaves out; silhouette_iou leaves out those in which both are. worst: frame of the largest
+    squared error, -1 = none has any.
     """
 
     psnr: float
     psnr_foreground: float
     ssim: float
     ms_ssim: float
+    silhouette_iou: float
     frames: int
     pixels: int
     object_pixels: int
@@ -64,10 +69,14 @@ def picture_update(
     data_range: float = 1.0,
     similarity_range: float | None = None,
     mask: np.ndarray | None = None,  # u8 (H,W)
+    predicted_mask: np.ndarray | None = None,  # u8 (H,W)
     border: str = "valid",
     metrics: Iterable[str] = ("psnr", "ssim"),
 ) -> PictureStatistics:
-    """Returns the statistics of one frame. Without a mask the object's share is empty. similarity_range: SSIM's, if it has its own."""
+    """Returns the statistics of one frame. Without a mask the object's share is empty. similarity_range: SSIM's, if it has its own.
+
+    predicted_mask: the predicted object; without it the silhouettes' union is empty.
+    """
     from dpcli.evaluate.video.image_kernels import squared_errors  # it imports numba
 
     inside = np.zeros(truth.shape[1:], np.uint8) if mask is None else mask
@@ -75,6 +84,8 @@ def picture_update(
     own = data_range if similarity_range is None else similarity_range
     whole, _, windows = similarity(predicted, truth, own, border) if "ssim" in metrics else (0.0, 0.0, 0)
     many = multi_scale(predicted, truth, own, border) if "ms_ssim" in metrics else np.nan
+    other = np.zeros_like(inside) if predicted_mask is None else predicted_mask
+    either = 0 if predicted_mask is None else int((inside | other).sum())
     found = (
         frame,
         squared,
@@ -85,8 +96,10 @@ def picture_update(
         whole,
         windows,
         many,
+        int((inside & other).sum()),
+        either,
     )
-    types = (np.int64, float, np.int64, float, np.int64, float, float, np.int64, float)
+    types = (np.int64, float, np.int64, float, np.int64, float, float, np.int64, float, np.int64, np.int64)
     return PictureStatistics(*(np.array([value], kind) for value, kind in zip(found, types, strict=True)))
 
 
@@ -112,6 +125,7 @@ def picture_compute(found: PictureStatistics) -> PictureMetrics:
         psnr_foreground=mean_defined(objects),
         ssim=mean_defined(divide(found.similarity, found.windows)),
         ms_ssim=mean_defined(found.multi_scale),
+        silhouette_iou=mean_defined(divide(found.overlap, found.union)),
         frames=len(each),
         pixels=int(found.values[0] // 3) if len(each) else 0,
         object_pixels=int(found.inside_values.sum() // 3),

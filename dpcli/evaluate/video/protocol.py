@@ -126,21 +126,28 @@ def _resized(image: np.ndarray, side: int | None, nearest: bool = False) -> np.n
 def score_frame(
     frame: int, predicted: Picture, truth: Picture, protocol: VideoProtocol, metrics: Sequence[str]
 ) -> PictureStatistics:
-    """Returns the statistics of one frame. The mask of psnr_foreground is the truth's object, alpha of one half or more."""
+    """Returns the statistics of one frame. An object is where alpha is one half or more; psnr_foreground: the truth's."""
     ours, theirs = comparable(predicted, protocol), comparable(truth, protocol)
-    mask = _resized(truth.mask(), protocol.size, nearest=True) if "psnr_foreground" in metrics else None
+    silhouettes = "silhouette_iou" in metrics
+    mask = _mask(truth, protocol) if silhouettes or "psnr_foreground" in metrics else None
+    other = _mask(predicted, protocol) if silhouettes else None
     peak = own = protocol.data_range
     if protocol.data_range is None:
         peak = float(np.ptp(theirs)) or np.nan  # a frame of one color has no range, so no PSNR
         own = max(float(np.ptp(ours)), float(np.ptp(theirs)))
     if not own:
         metrics = [name for name in metrics if name not in ("ssim", "ms_ssim")]
-    options = {"data_range": peak, "similarity_range": own, "mask": mask, "border": protocol.border}
+    options = {"data_range": peak, "similarity_range": own, "border": protocol.border}
+    options |= {"mask": mask, "predicted_mask": other}
     if not protocol.gray:
         return picture_update(frame, ours, theirs, metrics=metrics, **options)
     found = picture_update(frame, ours, theirs, metrics=(), **options)
     gray = picture_update(frame, _luminance(ours), _luminance(theirs), metrics=metrics, **options)
     return replace(found, similarity=gray.similarity, windows=gray.windows, multi_scale=gray.multi_scale)
+
+
+def _mask(picture: Picture, protocol: VideoProtocol) -> np.ndarray:
+    return _resized(picture.mask(), protocol.size, nearest=True)
 
 
 def _luminance(colors: np.ndarray) -> np.ndarray:
@@ -181,6 +188,7 @@ def describe_protocol(protocol: VideoProtocol) -> dict[str, Any]:
         "psnr": f"of each frame over all its values, at most {PSNR_CAP:g} dB",
         "psnr_foreground": "psnr over the pixels where the truth's alpha is at least one half",
         "ssim": f"Gaussian window 11x11, sigma 1.5, {of}, mean over {borders[protocol.border]}",
+        "silhouette_iou": "pixels in both objects over pixels in either, alpha of one half or more",
         "ms_ssim": "5 scales; weights .0448 .2856 .3001 .2363 .1333",
         "mean": "over the frames of a view, then over views",
     }

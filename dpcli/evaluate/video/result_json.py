@@ -7,13 +7,14 @@ from dataclasses import asdict
 from typing import Any
 
 from dpcli.evaluate.choices import PICTURE_METRICS
-from dpcli.evaluate.proportions import divide
+from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.results import intervals_json, left_out_json, none_if_nan, samples_json
 from dpcli.evaluate.video.comparison import VideoReport, view_values
 from dpcli.evaluate.video.frame_pass import ViewScore
 from dpcli.evaluate.video.learned.base import TITLES as LEARNED_TITLES
 from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
 from dpcli.evaluate.video.protocol import describe_protocol
+from dpcli.evaluate.video.surface import CAMERAS, MOST_POINTS, SurfaceScore
 from dpcli.evaluate.video.tables import UNITS
 
 
@@ -35,6 +36,7 @@ def video_json(report: VideoReport, source: str) -> dict[str, Any]:
         "denominators": _denominators(report),
         "samples": samples_json("views", names),
         "intervals": intervals_json(report.resampling, "views", len(names), report.intervals),
+        **_surface_intervals(report),
         "left_out": left_out_json(report.left_out),
         "not_computed": report.missing,
         "notes": report.notes,
@@ -56,12 +58,24 @@ def _metrics(report: VideoReport) -> dict[str, Any]:
         metrics["per_view_learned"] = {name: _defined(s.per_view) for name, s in learned.items() if s.per_view}
         metrics["of_the_truth"] = _defined({n: s.truth for n, s in learned.items() if s.truth is not None})
     for name, score in report.scene.items():
-        metrics[name] = _parts_json(score) if isinstance(score, PartScore) else _tracks_json(score)
+        metrics[name] = _SCENE_JSON[name](score)
     return metrics
+
+
+def _surface_intervals(report: VideoReport) -> dict[str, Any]:
+    """Returns the intervals of the surface's means under a name of their own: frames are resampled there, not views."""
+    if "surface" not in report.scene:
+        return {}
+    score = report.scene["surface"]
+    ends = score.intervals(report.resampling)
+    return {"surface_intervals": intervals_json(report.resampling, "frames", len(score.chamfer), ends)}
 
 
 def _units(report: VideoReport) -> dict[str, str]:
     units = {name: UNITS.get(name, "1") for name in report.names if name in (*UNITS, *LEARNED_TITLES)}
+    if "surface" in report.scene:
+        shares = dict.fromkeys(report.scene["surface"].values(), "fraction")
+        units |= shares | {"chamfer": report.length_unit, "diameter": report.length_unit}
     if "tracks" in report.scene:
         units |= {
             "epe": report.length_unit,
@@ -83,6 +97,8 @@ def _denominators(report: VideoReport) -> dict[str, Any]:
     counts |= {name: score.counts for name, score in report.learned.items()}
     for name, score in report.scene.items():
         counts[name] = {key: value for key, value in asdict(score).items() if isinstance(value, int)}
+    if "surface" in report.scene:
+        counts["surface"]["frames"] = len(report.scene["surface"].chamfer)
     return counts
 
 
@@ -90,6 +106,7 @@ def _scene_choices(report: VideoReport) -> dict[str, str]:
     words = {
         "parts": f"{PART_NEIGHBORS} nearest Gaussians of opacity >= {SOLID:g}, weight opacity / distance, first frame",
         "tracks": f"first frame's points carried by {TRACK_NEIGHBORS} nearest Gaussians, mean over points and later frames",
+        "surface": f"{CAMERAS} cameras around, alpha of one half or more, at most {MOST_POINTS} points a frame",
     }
     return {name: words[name] for name in report.scene}
 
@@ -118,6 +135,14 @@ def _tracks_json(score: TrackScore) -> dict[str, Any]:
         for name, error in (("epe", score.epe), ("epe_no_motion", score.static))
     }
     return _defined({"epe": score.epe, "epe_no_motion": score.static, **shares, "diameter": score.diameter})
+
+
+def _surface_json(score: SurfaceScore) -> dict[str, Any]:
+    means = {name: mean_defined(each) for name, each in score.values().items()}
+    return _defined(means | {"diameter": score.diameter})
+
+
+_SCENE_JSON = {"parts": _parts_json, "tracks": _tracks_json, "surface": _surface_json}
 
 
 def _defined(values: Mapping[str, float]) -> dict[str, float | None]:

@@ -8,7 +8,8 @@ from dataclasses import asdict
 import numpy as np
 
 from dpcli.evaluate.choices import PICTURE_METRICS
-from dpcli.evaluate.proportions import divide
+from dpcli.evaluate.metric_titles import title_of
+from dpcli.evaluate.proportions import divide, mean_defined
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import UNDEFINED, TextTable, four_digit_ends, four_digits, resampling_note
 from dpcli.evaluate.video.comparison import VideoReport, view_values
@@ -18,13 +19,20 @@ from dpcli.evaluate.video.learned.base import LearnedScore
 from dpcli.evaluate.video.part_discovery import PART_NEIGHBORS, SOLID, TRACK_NEIGHBORS, PartScore, TrackScore
 from dpcli.evaluate.video.protocol import describe_protocol
 from dpcli.evaluate.video.psnr import PSNR_CAP
+from dpcli.evaluate.video.surface import CAMERAS, MOST_POINTS, SHARES, SurfaceScore
 
-TITLES = {"psnr": "PSNR (dB)", "psnr_foreground": "PSNR on object (dB)", "ssim": "SSIM", "ms_ssim": "MS-SSIM"}
-UNITS = {"psnr": "dB", "psnr_foreground": "dB", "ssim": "1", "ms_ssim": "1"}
+TITLES = {
+    "psnr": "PSNR (dB)",
+    "psnr_foreground": "PSNR on object (dB)",
+    "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
+    "silhouette_iou": "IoU of silhouettes",
+}
+UNITS = {name: "dB" if name.startswith("psnr") else "1" for name in TITLES}
 
 
 def video_tables(report: VideoReport) -> list[TextTable]:
-    """Returns a row for each view, each role with more than one view, and all; then parts and tracks where they were asked for."""
+    """Returns a row for each view, each role with more than one view, and all; then what was asked for of a scene."""
     made = [_picture_table(report)] if report.views else []
     if report.learned or report.missing:
         made.append(_learned_table(report))
@@ -34,6 +42,8 @@ def video_tables(report: VideoReport) -> list[TextTable]:
         made.append(_part_table(report.scene["parts"]))
     if "tracks" in report.scene:
         made.append(_track_table(report.scene["tracks"], report.length_unit))
+    if "surface" in report.scene:
+        made.append(_surface_table(report))
     return made
 
 
@@ -114,6 +124,17 @@ def _track_table(score: TrackScore, unit: str) -> TextTable:
     return TextTable("Surface tracks", header, rows)
 
 
+def _surface_table(report: VideoReport) -> TextTable:
+    score, unit = report.scene["surface"], report.length_unit
+    ends = score.intervals(report.resampling)
+    titles = {"chamfer": f"Chamfer distance{f' ({unit})' if unit else ''}", "chamfer_of_diameter": "Chamfer / diameter"}
+    rows = [
+        [titles.get(name, title_of(name)), four_digits(mean_defined(each)), four_digit_ends(ends[name]) if ends else ""]
+        for name, each in score.values().items()
+    ]
+    return TextTable("Surface", ["metric", "mean", f"{100 * report.resampling.confidence:.4g} % interval"], rows)
+
+
 def _percent(error: float, diameter: float) -> str:
     share = float(divide(error, diameter))
     return UNDEFINED if np.isnan(share) else f"{100 * share:.2f} %"
@@ -140,9 +161,21 @@ def video_notes(report: VideoReport) -> list[str]:
             f"later frames; diameter {four_digits(report.scene['tracks'].diameter)} {report.length_unit}".rstrip()
             + " (diagonal of the bounding box in the first frame)."
         )
+    if "surface" in report.scene:
+        lines.append(_surface_note(report.scene["surface"]))
     if report.intervals:
         lines += resampling_note(report.resampling, "views", len(view_values(report)[0]))
     return [*lines, *(left_out_note(entry) for entry in report.left_out)]
+
+
+def _surface_note(score: SurfaceScore) -> str:
+    reach = " and ".join(f"{100 * share:g} %" for share in SHARES)
+    unseen = f" {score.unseen} frames in which the scene shows nothing: F-score 0, no distance." if score.unseen else ""
+    return (
+        f"Surface: what {CAMERAS} cameras around see of the scene (alpha of one half or more), at most {MOST_POINTS} points "
+        f"a frame, against {score.points} true points; F-score within {reach} of the diameter {four_digits(score.diameter)}; "
+        f"mean over {len(score.chamfer)} frames, which the intervals resample.{unseen}"
+    )
 
 
 def _picture_notes(report: VideoReport) -> list[str]:

@@ -18,6 +18,8 @@ from dpcli.ops.cameras import orbit_of, orbit_pose
 from dpcli.ops.splatting.rasterization import rasterization
 from dpcli.store.gaussians import SH_C0, GaussianScene
 
+_SIDES = (60, 120, 180, -120, -60)  # degrees from the reference camera
+
 
 @dataclass
 class _Instants:
@@ -63,7 +65,7 @@ def _instants_of_scene(scene: GaussianScene, frames: list[int]) -> _Instants:
 def write_preview(
     fitted: Model4D | GaussianScene, targets: Targets, path: Path, columns: int = 5, side: int = 128
 ) -> None:
-    """Writes a picture whose rows are input, render, parts, rigid weight, and a view from 60 degrees aside; columns: times."""
+    """Writes a picture whose rows are input, render, parts, rigid weight, and views from _SIDES; columns: times."""
     frames = spread_evenly(targets.num_frames, columns)
     shrink = max(targets.size[1] // side, 1)
     truth, intrinsics, poses = targets.at([targets.reference] * len(frames), frames, shrink)
@@ -78,16 +80,16 @@ def write_preview(
         _draw(instants, color, poses, intrinsics, size),
         _draw(instants, torch.from_numpy(parts / 255), poses, intrinsics, size),
         _draw(instants, torch.from_numpy(weights / 255), poses, intrinsics, size),
-        _draw(instants, color, _aside(targets).expand(len(frames), 4, 4), intrinsics, size),
+        *(_draw(instants, color, _aside(targets, turn).expand(len(frames), 4, 4), intrinsics, size) for turn in _SIDES),
     ]
     sheet = torch.cat([torch.cat(list(row), 1) for row in rows], 0)
     save_picture((sheet.clamp(0, 1) * 255).round().byte().numpy(), path)
 
 
-def _aside(targets: Targets) -> Tensor:  # [4, 4]
-    """Returns a camera to the side of the reference camera and above it, which no picture of a single view shows."""
+def _aside(targets: Targets, turn: float) -> Tensor:  # [4, 4]
+    """Returns a camera `turn` degrees about the upright from the reference camera, and above it."""
     azimuth, elevation, radius = orbit_of(targets.world_to_camera[targets.reference])
-    return torch.from_numpy(orbit_pose(azimuth + np.pi / 3, elevation + 0.3, radius))
+    return torch.from_numpy(orbit_pose(azimuth + np.deg2rad(turn), elevation + 0.3, radius))
 
 
 def _draw(instants: _Instants, colors: Tensor, poses: Tensor, intrinsics: Tensor, size: tuple[int, int]) -> Tensor:

@@ -11,14 +11,14 @@ from dpcli.generate4d.shape.layers import Camera, ShapeLayers, ShapePrior, point
 from dpcli.generate4d.shape.splats import Splats, splats_of
 from dpcli.generate4d.targets import Targets
 
-_SIDE = 128  # pixels at most of the pictures that a prior looks at
+SIDE = 128  # pixels at most of the pictures that a prior looks at in a fit
 
 
 class ShapeGuidance:
     """Holds the layers that a prior predicts for every frame of the reference view, ready to be drawn."""
 
-    def __init__(self, prior: ShapePrior, targets: Targets) -> None:
-        pictures, self.camera = reference_pictures(targets, _SIDE)
+    def __init__(self, prior: ShapePrior, targets: Targets, side: int = SIDE) -> None:
+        pictures, self.camera = reference_pictures(targets, side)
         self.name = prior.name
         self.layers = prior.layers(pictures, self.camera)
         self.splats: list[Splats] = [splats_of(frame, self.camera) for frame in self.layers]

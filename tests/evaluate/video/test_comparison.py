@@ -214,7 +214,8 @@ def test_small_pictures_and_wrong_metrics_are_said(said: Path, truth: Path) -> N
     assert parse_video_metrics("ssim, psnr") == ("psnr", "ssim") and parse_video_metrics(None) is None
     for wrong in ("psnr,lpip", "", ","):
         with pytest.raises(
-            UsageError, match="expected some of psnr,psnr_foreground,ssim,ms_ssim,lpips,.*,parts,tracks"
+            UsageError,
+            match="expected some of psnr,psnr_foreground,ssim,ms_ssim,silhouette_iou,lpips,.*,parts,tracks,surface",
         ):
             parse_video_metrics(wrong)
     with pytest.raises(DataError, match="--metrics parts needs a gaussians file and a views file, not a views file"):
@@ -318,6 +319,14 @@ def test_a_scene_is_rendered_at_the_truths_cameras_and_times(tmp_path: Path) -> 
     found = json.loads(run(scene, "--truth", views, "--json").stdout)
     assert all(view["psnr"] > 45 and view["ssim"] > 0.99 for view in found["metrics"]["per_view"])  # 8-bit rounding
     assert found["metrics"]["parts"]["adjusted_rand_index"] > 0.97 and found["metrics"]["tracks"]["epe"] < 1e-5
+    assert all(view["silhouette_iou"] > 0.98 for view in found["metrics"]["per_view"])
+    assert found["denominators"]["surface"] == {"points": 300, "unseen": 0, "frames": 5}
+    surface = found["metrics"]["surface"]
+    low, high = found["surface_intervals"]["metrics"]["f_score_2"]
+    assert 0 < low <= surface["f_score_2"] <= high <= 1 and surface["f_score_1"] <= surface["f_score_2"]
+    assert surface["chamfer_of_diameter"] == pytest.approx(surface["chamfer"] / surface["diameter"])
+    text = run(scene, "--truth", views, "--metrics", "surface").stdout
+    assert "F-score at 2 %" in text and "300 true points" in text
 
 
 def test_a_scene_that_stands_still_or_belongs_to_another_clip(tmp_path: Path) -> None:

@@ -167,7 +167,7 @@ def test_shards_merge_to_the_whole() -> None:
     rows = [picture_update(i, frames[2 * i], frames[2 * i + 1], mask=mask_of[i]) for i in range(7)]
     whole = picture_compute(picture_merge(rows))
     shards = picture_compute(picture_merge(rows[:3]) + picture_merge(rows[3:]))
-    assert replace(shards, ms_ssim=0) == replace(whole, ms_ssim=0)
+    assert replace(shards, ms_ssim=0, silhouette_iou=0) == replace(whole, ms_ssim=0, silhouette_iou=0)
     each = [psnr(*(np.moveaxis(f, 0, -1) for f in frames[2 * i : 2 * i + 2])) for i in range(7)]
     assert whole.psnr == pytest.approx(np.mean(each)) and whole.worst == int(np.argmin(each))
     assert whole.without_object == 1 and whole.object_pixels == 6 * int(mask.sum()) and whole.frames == 7
@@ -193,3 +193,14 @@ def test_wrong_ranges_and_values_are_said() -> None:
         ms_ssim(good, good)
     with pytest.raises(ValueError, match="valid or reflect"):
         ssim(good, good, border="same")
+
+
+def test_silhouettes_overlap_by_hand_and_empty_frames_do_not_count():
+    truth, said = np.zeros((3, 4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8)
+    truth[0, :2], said[0, 1:3] = 1, 1  # rows 0, 1 and rows 1, 2: a third
+    truth[1, :, :1] = 1  # nothing predicted: 0; the last frame is empty in both
+    blank = np.zeros((3, 4, 4), np.float32)
+    rows = [picture_update(i, blank, blank, mask=truth[i], predicted_mask=said[i], metrics=("psnr",)) for i in range(3)]
+    assert picture_compute(picture_merge(rows)).silhouette_iou == pytest.approx((1 / 3 + 0) / 2)
+    unasked = picture_compute(picture_update(0, blank, blank, mask=truth[0], metrics=("psnr",)))
+    assert np.isnan(unasked.silhouette_iou)
