@@ -21,7 +21,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.2
-.PHONY: table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
+.PHONY: prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
@@ -37,7 +37,8 @@ help:
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
-	@echo "make fuzz [SEED=0 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
+	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
+	@echo "make fuzz [SEED=1 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
 	@echo "make soak [MINUTES=60]        a long stream, 60,000 samples, 256 shards: speed, memory and open files stay as they are"
 	@echo "make kills [KILLS=100]        kill -9 at random moments of ten commands: each must end as if nothing had happened"
 	@echo "make clean                    remove .venv, demo/ and caches"
@@ -177,6 +178,14 @@ MESHES ?=
 table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
 	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2
+
+# The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
+HELD_OUT := dpcli/reproduce/held_out_models.txt
+PRIOR ?= --set bfloat16=true
+prior: $(READY)
+	$(if $(MESHES),,$(error make prior needs MESHES=folder, a folder with the models of $(HELD_OUT) and many others below it))
+	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)
+	$(BIN)/python -m dpcli.reproduce.prior_sides "$(MESHES)" prior --models prior/run
 
 fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz.fuzz_files fuzz/files $(if $(SEED),--seed $(SEED)) $(if $(INPUTS),--inputs $(INPUTS)) \

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 _ADDRESS = re.compile(r"<([\w.]+) object at 0x[0-9a-fA-F]+>")
 
@@ -36,3 +38,21 @@ class Stopped(DpcError):
     """A signal asked to stop; what is done is saved and running again continues (exit code 75, EX_TEMPFAIL)."""
 
     exit_code = 75
+
+
+@contextmanager
+def reading(where: object) -> Iterator[None]:
+    """Turns whatever a library raises in the block into DataError that names `where`, the file or sample, and its type.
+
+    Our own errors pass, as do those of the system that carry a number (no such file, no permission, no room).
+    """
+    try:
+        yield
+    except DpcError:
+        raise
+    except Exception as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        said = (str(error).splitlines() or [""])[0][:200]
+        what = f"{type(error).__name__}: {said}" if said else type(error).__name__
+        raise DataError(f"{where}: damaged, or of another format ({what}); make or copy it again") from error

@@ -13,6 +13,7 @@ from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import check, setting
 
 Start = Literal["auto", "sphere", "inflate", "hull"]
+Prior = Literal["auto", "none", "inflated", "network", "views", "zero123"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,12 @@ class FitConfig:
 
     reconstruction: float = setting(5000.0, "Weight of the pictures' loss.", least=0)
     foreground: float = setting(0.1, "Weight of the silhouette, as a share of the reconstruction's.", least=0)
+    shape: tuple[float, float] = setting(
+        (1.0, 0.3),
+        "Weight of a shape prior's pictures from the sides, first and last, log-linear, as a share of the reconstruction's.",
+        above=0,
+    )
+    shape_size: int = setting(96, "Side of a shape prior's pictures, pixels.", least=16)
     views: float = setting(1.0, "Weight of given novel views, as a share of the reconstruction's.", least=0)
     augmentation: float = setting(1.0, "Weight of score distillation, eq. C.11.", least=0)
     identification: float = setting(1.0, "Weight of both losses that find parts.", least=0)
@@ -71,10 +78,9 @@ class FitConfig:
     )
     arap: float = setting(10.0, "Weight of the as-rigid-as-possible energy.", least=0)
     thickness: float = setting(
-        100.0, "Weight that keeps one view's depth where the silhouette's inflation put it.", least=0
+        1000.0, "Weight that keeps one view's depth where the start put it, unless a shape prior tells it.", least=0
     )
-    roundness: float = setting(10.0, "Weight against needles and discs.", least=0)
-    aspect: float = setting(2.0, "Longest axis of a Gaussian over its mean axis that `roundness` allows.", above=0)
+    aspect: float = setting(2.0, "Longest axis of a Gaussian over its mean axis, at most.", least=1)
 
     rate_mean: tuple[float, float] = setting((1e-2, 2e-4), "Rate of positions, first and last, log-linear.", above=0)
     rate_opacity: float = setting(0.05, "Rate of opacities.", least=0)
@@ -123,14 +129,17 @@ class FitConfig:
 class Supervision:
     """Holds what guides the sides of the object that nobody filmed. Raises UsageError for a value that is not legal."""
 
-    prior: Literal["none", "views", "zero123"] = setting(
-        "none",
-        "What is known beside the input view: nothing, the file's views of the role train, or a diffusion model.",
+    prior: Prior = setting(
+        "auto",
+        "What is known beside the input view: nothing, the inflated silhouette, a network of shapes, the file's views of "
+        "the role train, or a diffusion model; auto takes the network where it is sure, else the inflated silhouette.",
     )
     prior_model: str | None = setting(
-        None, "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded."
+        None,
+        "Model of --prior zero123: a local folder, or a hub's id, which is then downloaded; of network: other weights, a "
+        "file or a folder of train-prior.",
     )
-    regularize: bool = setting(True, "Keep the object from going flat by the losses `thickness` and `roundness`.")
+    regularize: bool = setting(True, "Keep the object from going flat by the loss `thickness` and the limit `aspect`.")
 
     def __post_init__(self) -> None:
         check(self)

@@ -19,14 +19,16 @@ from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
 from dpcli.generate4d.scene.control_points import ControlPoints
 from dpcli.generate4d.scene.identification import ball_neighbors, spatial_loss, temporal_loss
 from dpcli.generate4d.scene.initialization import choose_start, first_points, spread_seeds
-from dpcli.generate4d.scene.losses import arap_loss, picture_loss, roundness_loss, thickness_loss
+from dpcli.generate4d.scene.losses import arap_loss, picture_loss, thickness_loss
 from dpcli.generate4d.scene.model import Instant, Model4D
+from dpcli.generate4d.shape.guidance import ShapeGuidance
 from dpcli.generate4d.targets import Targets
 from dpcli.runtime.seeds import Generate4DStream, torch_seed
 
 _REFRESH_EVERY = 50  # steps between two searches for neighbors
 _CARRIERS = 2048  # of the dense stage's Gaussians that the losses on parts and shape look at
 _PRIOR_SIZE = 256  # pixels at most of the pictures that a prior judges
+_FIRST_OPACITY = {"sphere": 0.05, "hull": 0.5, "inflate": 0.8}  # a surface hides what is behind it, a volume is all fog
 _SMALLEST, _LARGEST = 1e-4, 0.4  # of a Gaussian, scene units: what a picture can tell
 
 
@@ -42,7 +44,8 @@ class StepResult:
 class SceneOptimizer:
     """Fits a `Model4D` to pictures with Adam, first its dense stage, then the sparse one (thesis 5.4.3.3).
 
-    prior: judges random new views (eq. C.11); None: none does. regularize: adds the losses on thickness and roundness.
+    prior: judges random new views (eq. C.11); shape: shows every frame from new sides; None: none does. regularize: keeps
+    one view's object from going flat (`thickness`, `aspect`).
     `start` or `restore` must be called before the first step.
     """
 
@@ -54,9 +57,10 @@ class SceneOptimizer:
         prior: Prior | None = None,
         device: torch.device | None = None,
         regularize: bool = True,
+        shape: ShapeGuidance | None = None,
     ) -> None:
         self.targets, self.config, self.seed = targets, config, seed
-        self.prior, self.regularize = prior, regularize
+        self.prior, self.regularize, self.shape = prior, regularize, shape
         self.device = device or torch.device("cpu")
         self.step = 0
         self.control_reference: Tensor | None = None  # [T, K, 3] p-bar of C.13
@@ -69,8 +73,8 @@ class SceneOptimizer:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(torch_seed(self.seed, Generate4DStream.FIRST_WEIGHTS))
             kind = choose_start(self.config, self.targets)
-            mean, color = first_points(kind, self.config, self.targets, rng)
-            gaussians = CanonicalGaussians(mean, color, opacity=0.05 if kind == "sphere" else 0.5)
+            mean, color = first_points(kind, self.config, self.targets, rng, self.shape)
+            gaussians = CanonicalGaussians(mean, color, opacity=_FIRST_OPACITY[kind])
             self.model = Model4D(gaussians, self.config)
             field = self.model.field
             if self.config.seeds:
@@ -94,6 +98,8 @@ class SceneOptimizer:
         loss, squared, notes = self._picture_terms(instant, views, frames, rng)
         if self.prior is not None:
             loss = loss + config.augmentation * self._prior_term(instant, frames, rng)
+        if self.shape is not None:
+            loss = loss + self._shape_term(instant, frames, rng)
         loss = loss + self._motion_terms(instant, frames)
         value = float(loss.detach())
         if not math.isfinite(value):
@@ -139,8 +145,7 @@ class SceneOptimizer:
         config = self.config
         truth, intrinsics, poses = (t.to(self.device) for t in self.targets.at(views, frames, self._shrink_factor()))
         height, width = truth.shape[1:3]
-        black = torch.rand(len(views), 1, generator=rng) < config.inversion
-        background = torch.where(black, torch.zeros(1, 3), torch.ones(1, 3)).to(self.device)
+        background = self._backgrounds(len(views), rng)
         rendered, alpha, notes = self.model.render(instant, poses, intrinsics, width, height, background)
         if notes["means2d"].requires_grad:
             notes["means2d"].retain_grad()
@@ -166,6 +171,25 @@ class SceneOptimizer:
         )
         return self.prior.loss(rendered, cameras, frames, self.step / self.config.steps, rng)
 
+    def _shape_term(self, instant: Instant, frames: list[int], rng: torch.Generator) -> Tensor:
+        """Returns the loss on the shape prior's pictures of the step's frames from random new sides."""
+        config, size = self.config, min(self.config.shape_size, *self.targets.size)
+        _, poses, intrinsics = (
+            part.to(self.device) if isinstance(part, Tensor) else part
+            for part in novel_cameras(self.targets, len(frames), size, rng)
+        )
+        background = self._backgrounds(len(frames), rng)
+        truth = self.shape.pictures(frames, poses, intrinsics, size)
+        rendered, alpha, _ = self.model.render(instant, poses, intrinsics, size, size, background)
+        first, last = config.shape
+        weight = first * (last / first) ** (self.step / max(config.steps - 1, 1))
+        return config.reconstruction * weight * picture_loss(rendered, alpha, truth, background, config.foreground)
+
+    def _backgrounds(self, count: int, rng: torch.Generator) -> Tensor:  # [count, 3]
+        """Returns backgrounds, each black or white, so that neither color can pass for transparency."""
+        black = torch.rand(count, 1, generator=rng) < self.config.inversion
+        return torch.where(black, torch.zeros(1, 3), torch.ones(1, 3)).to(self.device)
+
     def _motion_terms(self, instant: Instant, frames: list[int]) -> Tensor:
         """Returns the losses on what carries the Gaussians: parts, the drift of control points, shape over time."""
         config, motion, carriers = self.config, instant.motion, instant.carriers
@@ -183,15 +207,9 @@ class SceneOptimizer:
             total = total + config.control * drift.square().sum(-1).mean()
         if config.arap:
             total = total + config.arap * arap_loss(points, points + moved, self._neighbors)
-        return self._add_regularizers(total)
-
-    def _add_regularizers(self, total: Tensor) -> Tensor:
-        config, gaussians = self.config, self.model.gaussians
-        if self.regularize and self.targets.num_views == 1:
+        if self.regularize and self.targets.num_views == 1 and self.shape is None:
             axis = torch.from_numpy(self.targets.world_to_camera[self.targets.reference][2, :3]).float().to(self.device)
-            total = total + config.thickness * thickness_loss(gaussians, axis)
-        if self.regularize:
-            total = total + config.roundness * roundness_loss(gaussians, config.aspect)
+            total = total + config.thickness * thickness_loss(instant.mean, self.model.gaussians.anchor, axis)
         return total
 
     def _begin_sparse(self) -> None:
@@ -238,7 +256,11 @@ class SceneOptimizer:
     @torch.no_grad()
     def _clamp_gaussians(self) -> None:
         """Keeps sizes within what a picture can tell and colors within what it can show."""
-        self.model.gaussians.log_scale.clamp_(math.log(_SMALLEST), math.log(_LARGEST))
+        sizes = self.model.gaussians.log_scale.clamp_(math.log(_SMALLEST), math.log(_LARGEST))
+        if (
+            self.regularize
+        ):  # a needle along the line of sight is invisible in the one picture, a splinter in all others
+            torch.minimum(sizes, sizes.mean(1, keepdim=True) + math.log(self.config.aspect), out=sizes)
         self.model.gaussians.color.clamp_(0.0, 1.0)
 
     def _densify(self, rng: torch.Generator) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
+from dpcli.prepare.decode.folder_listing import why_unreadable
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.seeds import generator
@@ -12,15 +13,18 @@ def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[i
     """Returns the sample that the reader makes of an item, with its frames thinned.
 
     indexed: the item's place in the index, and the item. Its randomness depends on the seed and this place alone.
-    Raises Raises DataError when the item can't be read.
+    Raises DataError when the item can't be read, whatever its reader or a library below it raised.
     """
     index, item = indexed
     if item.problem:
         raise DataError(item.problem)
+    if reason := why_unreadable(item.path):
+        raise DataError(f"{item.path}: {reason}; it was not opened")
     rng = generator(seed, index)
     try:
-        sample = reader.read(item, rng)
+        with reading(item.path):
+            sample = reader.read(item, rng)
     except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
         raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
-    sample.sequence = thinning.apply(sample.sequence, rng)
+    sample.sequence = thinning.apply(sample.sequence, rng)  # our own code: what fails here is a bug
     return sample

@@ -52,7 +52,7 @@ def read_labels(path: Path) -> LabelTable:
         lines = [
             [cell.strip() for cell in row] for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
         ]
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
     numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
     header = list(_COLUMNS[:2])
@@ -108,7 +108,7 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
 def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:
     words = [record["label"] for record in records.values()]
     if all(_is_number(word) for word in words):
-        class_names = [str(k) for k in range(max(map(int, words)) + 1)]
+        class_names = [str(k) for k in range(_plausible(path, records) + 1)]
     elif any(_is_number(word) for word in words):
         raise DataError(f"{path}: some labels are numbers and some are words; use one kind")
     else:
@@ -125,6 +125,20 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         split = record.get("split", "")
         rows[name] = Row(label, int(subject), SPLIT_FOLDERS.get(split, split))
     return LabelTable(path, rows, class_names)
+
+
+def _plausible(path: Path, records: dict[str, dict[str, str]]) -> int:
+    """Returns the largest label, which makes as many class names; DataError when no table of that many lines could mean it."""
+    longest = max(
+        records.values(), key=lambda record: (len(record["label"].lstrip("-0")), record["label"].lstrip("-0"))
+    )
+    word, at_most = longest["label"], 10_000 + 100 * len(records)
+    if len(word.lstrip("-0")) > 18 or int(word) > at_most:
+        raise DataError(
+            f"{path}:{longest['line']}: label {word[:30]} claims more classes than a table of {len(records)} lines can mean,"
+            f" expected at most {at_most}; give words, or number the classes from 0"
+        )
+    return max(int(record["label"]) for record in records.values())
 
 
 def _is_number(word: str) -> bool:

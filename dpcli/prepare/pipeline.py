@@ -12,9 +12,11 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, reading
+from dpcli.path_names import as_utf8
 from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
+from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.device import cpu_count
@@ -124,6 +126,26 @@ def _fingerprint(path: Path) -> str:
         return ""
 
 
+def all_items(reader: Reader) -> tuple[list[Item], list[Item]]:
+    """Returns a reader's index, and an item with a problem for each entry below its folder that can't be opened.
+
+    So a dangling link or a FIFO named like data is skipped by name. Raises DataError when the index can't be made.
+    """
+    given = getattr(reader, "inputs", ()) or (getattr(reader, "raw", None),)
+    roots = [root for root in given if isinstance(root, Path)]
+    with reading(", ".join(map(str, roots)) or type(reader).__name__):
+        items = list(reader.items())
+    taken = {item.path for item in items}
+    odd = [(root, path, why) for root in roots if root.is_dir() for path, why in unreadable_entries(root, taken)]
+    used, extra = {item.name for item in items}, []
+    for root, path, why in odd:
+        name = as_utf8(path.relative_to(root).as_posix())
+        name = as_utf8(str(path)) if name in used else name
+        used.add(name)
+        extra.append(Item(name, path, problem=f"{as_utf8(str(path))}: {why}"))
+    return items, extra
+
+
 def convert(
     reader: Reader,
     output: Path,
@@ -141,10 +163,10 @@ def convert(
     UsageError when `output` was made another way and `force` is off, DataError when no sample is good, and Stopped
     after a stop signal, with what is done kept beside `output`.
     """
-    items = reader.items()
+    items, unread = all_items(reader)
     for line in reader.summary(items):
         log.info(line)
-    items = items[: conversion.limit]
+    items = [*items, *unread][: conversion.limit]
     config = configuration(reader, conversion.thinning, items, conversion.compression)
     provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()

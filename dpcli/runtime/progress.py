@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TextIO
 
 from dpcli.standard_streams import printable, rich_console
@@ -18,8 +20,22 @@ class _Log:
     def __init__(self) -> None:
         self.level = 1
         self.debug = False
+        self._said: set[str] | None = None
+
+    @contextmanager
+    def each_once(self, said: set[str]) -> Iterator[None]:
+        """Writes no text that is in `said`, to which it adds those it writes: for files that are read again and again."""
+        before, self._said = self._said, said
+        try:
+            yield
+        finally:
+            self._said = before
 
     def _write(self, text: str) -> None:
+        if self._said is not None:
+            if text in self._said:
+                return
+            self._said.add(text)
         lines = printable(text, kept="\n\t").replace("\n", "\n     ")  # no name can begin a message of its own
         sys.stderr.write(f"dpc: {lines}\n")
         sys.stderr.flush()

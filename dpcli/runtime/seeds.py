@@ -21,6 +21,7 @@ class PrepareStream(IntEnum):
     SPLIT = 5005  # which samples go to which split; key: the stratum
     OBJECT_SPLIT = 1 << 28  # which objects go to which split
     OBJECT_STUDY = 1 << 29  # poses in which an object is looked at, to find joints that move nothing
+    SHAPE_PICTURES = 1 << 27  # pictures that a shape prior learns from; key: the round
     MADE = 1 << 30  # a made subject (gestures) or object (articulated); key: its number
 
 
@@ -47,11 +48,13 @@ class SegmentStream(IntEnum):
 
 
 class Generate4DStream(IntEnum):
-    """The streams of `dpc generate4d fit`."""
+    """The streams of `dpc generate4d`."""
 
     FIRST_POINTS = 4001  # where the first Gaussians are
     FIRST_WEIGHTS = 4002  # the first weights of what is learned beside them
     STEP = 4003  # views, frames and cameras of a step; key: the step
+    SHAPE_WEIGHTS = 4101  # the first weights of a shape prior
+    SHAPE_STEP = 4102  # pictures of a step of its training; key: the step
 
 
 DRAWS_PER_STAGE = 100_000  # more epochs than a stage of training has: draws of two stages never share a number

@@ -14,6 +14,8 @@ from dpcli.ops import fps, three_nn_interpolate
 from dpcli.runtime.seeds import generator
 from dpcli.runtime.tuning import torch_threads
 from dpcli.segment.frame_pairs import choose_points, sequence_scale
+from dpcli.segment.multibody.segmenter import MultibodySegmenter
+from dpcli.segment.multibody.tracks import thin_tracks
 from dpcli.segment.network.slot_matching import carry_mask, match_slots_through_frames, one_hot
 from dpcli.segment.part_motions import Pairs, fit_part_motions, motion_in_input_units, part_flow, threads_for
 from dpcli.segment.prediction_settings import Refinement
@@ -38,6 +40,8 @@ class _Frames:
     thin: list[Tensor]
     scale: float
     center: np.ndarray
+    tracks: list[np.ndarray] | None = None  # of the whole frames
+    thin_tracks: list[np.ndarray] | None = None
 
 
 def predict_parts(
@@ -51,14 +55,15 @@ def predict_parts(
     leads from or to them stands still.
     """
     clouds = [np.float32(sequence.frame(t)) for t in range(sequence.num_frames)]
-    frames = _prepare_frames(clouds, index, options, seed)
+    tracks = _tracks_of(sequence) if isinstance(segmenter, MultibodySegmenter) and segmenter.by_tracks else None
+    frames = _prepare_frames(clouds, index, options, seed, tracks)
     reported, place = pairs_to_report(len(clouds), options.pairs), {t: n for n, t in enumerate(frames.numbers)}
     pairs = [(place[i], place[j]) for i, j in reported if i in place and j in place]
-    flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
-    masks = _refine_masks(frames.thin, flows, masks, options)
+    masks, motions = _find_masks_and_motions(frames, pairs, segmenter, estimate, options)
     full = [_carry_back(cloud, few, mask) for cloud, few, mask in zip(frames.whole, frames.thin, masks)]
+    full = full if frames.tracks is None else _agree_on_tracks(full, frames.tracks)
     labels = np.concatenate([mask.argmax(1).numpy() for mask in full]).astype(np.int16)
-    motion, flow = _find_motions(frames, masks, full, flows, pairs, options.icp)
+    motion, flow = _in_input_units(frames, masks, full, motions, pairs)
     if len(pairs) < len(reported):
         known = [(frames.numbers[i], frames.numbers[j]) for i, j in pairs]
         motion, flow = _add_still_pairs(reported, known, clouds, motion, flow)
@@ -77,15 +82,43 @@ def pairs_to_report(frames: int, pairs: str) -> Pairs:
     return [(t, t + 1) for t in range(frames - 1)]
 
 
-def _prepare_frames(clouds: list[np.ndarray], index: int, options: Refinement, seed: int) -> _Frames:
-    """Returns the frames that have points, centered, scaled, and thinned by draws of the sequence's own generator."""
+def _tracks_of(sequence: CloudSequence) -> list[np.ndarray] | None:
+    """Returns the identities i64 (N_t) of every frame's points; None without them, or where no two frames share any."""
+    if sequence.track is None:
+        return None
+    tracks = np.split(sequence.track, sequence.frame_offsets[1:-1])
+    return tracks if any(np.intersect1d(one, two).size for one, two in zip(tracks, tracks[1:])) else None
+
+
+def _prepare_frames(
+    clouds: list[np.ndarray], index: int, options: Refinement, seed: int, tracks: list[np.ndarray] | None = None
+) -> _Frames:
+    """Returns the frames that have points, centered, scaled, and thinned by draws of the sequence's own generator.
+
+    With tracks, all frames keep the same ones; a sequence with a frame of fewer than `_FEWEST` points goes without.
+    """
     filled = [cloud for cloud in clouds if len(cloud)]
     numbers = [t for t, cloud in enumerate(clouds) if len(cloud)] or [0]
-    center = np.float32(np.concatenate(filled or [np.zeros((1, 3))]).mean(0))
+    center = np.float32(np.concatenate(filled or [np.zeros((1, 3))]).mean(0, dtype=np.float64))
     scale = np.float32(sequence_scale(filled)) if options.normalize else np.float32(1)
     whole = [torch.from_numpy((clouds[t] - center) * scale) for t in numbers]
+    if tracks is not None:
+        own = [tracks[t] for t in numbers]
+        kept = thin_tracks([cloud.numpy() for cloud in whole], own, options.points)
+        if min(map(len, kept)) >= _FEWEST:
+            thin = [cloud[few] for cloud, few in zip(whole, kept)]
+            return _Frames(numbers, whole, thin, float(scale), center, own, [o[few] for o, few in zip(own, kept)])
     thin = [_thin(cloud, options.points, generator(seed, index, t)) for t, cloud in zip(numbers, whole)]
     return _Frames(numbers, whole, thin, float(scale), center)
+
+
+def _agree_on_tracks(masks: list[Tensor], tracks: list[np.ndarray]) -> list[Tensor]:
+    """Returns the masks (N_t,S) with the mean over all frames at the points of each track (N_t)."""
+    _, index, count = np.unique(np.concatenate(tracks), return_inverse=True, return_counts=True)
+    place = torch.from_numpy(index.reshape(-1))
+    total = torch.zeros(len(count), masks[0].shape[1]).index_add_(0, place, torch.cat(masks))
+    mean = total / torch.from_numpy(np.float32(count))[:, None]
+    return list(mean[place].split([len(mask) for mask in masks]))
 
 
 def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
@@ -96,6 +129,22 @@ def _thin(cloud: Tensor, most: int, rng: np.random.Generator) -> Tensor:
         return cloud if len(cloud) >= _FEWEST else cloud[choose_points(len(cloud), _FEWEST, rng)]
     some = cloud[np.sort(choose_points(len(cloud), min(len(cloud), _SPREAD * most), rng))]
     return some[fps(some[None], most)[0]]
+
+
+def _find_masks_and_motions(
+    frames: _Frames, pairs: Pairs, segmenter: Segmenter, estimate: Estimate, options: Refinement
+) -> tuple[list[Tensor], list[tuple[Tensor, Tensor]]]:
+    """Returns the masks (N_t,S) and for every pair the motions (S,3,3), (S,3).
+
+    They come from one explanation of all frames, or, pair by pair, from flows and the masks of single frames.
+    """
+    if isinstance(segmenter, MultibodySegmenter):
+        with torch_threads(1):
+            masks, motions = segmenter.explain(frames.thin, pairs, frames.thin_tracks)
+        return masks, [motions[pair] for pair in pairs]
+    flows, masks = _find_flows_and_masks(frames.thin, pairs, estimate, segmenter)
+    masks = _refine_masks(frames.thin, flows, masks, options)
+    return masks, fit_part_motions(frames.thin, masks, flows, pairs, options.icp)
 
 
 def _find_flows_and_masks(
@@ -163,13 +212,13 @@ def _carry_back(cloud: Tensor, thin: Tensor, mask: Tensor) -> Tensor:
     return spread / spread.sum(1, keepdim=True).clamp(min=1e-12)
 
 
-def _find_motions(
-    frames: _Frames, masks: list[Tensor], full: list[Tensor], flows: Flows, pairs: Pairs, steps: int
+def _in_input_units(
+    frames: _Frames, masks: list[Tensor], full: list[Tensor], motions: list[tuple[Tensor, Tensor]], pairs: Pairs
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Returns motions f32 (Q,S,4,4) in the input's own coordinates and the flow of all points, pair by pair."""
     slots, center = masks[0].shape[1], torch.from_numpy(frames.center)
     motion, flow = np.tile(np.eye(4, dtype=np.float32), (len(pairs), slots, 1, 1)), []
-    for q, ((i, _), own) in enumerate(zip(pairs, fit_part_motions(frames.thin, masks, flows, pairs, steps))):
+    for q, ((i, _), own) in enumerate(zip(pairs, motions)):
         flow.append(part_flow(frames.whole[i], full[i], own, frames.scale))
         motion[q] = motion_in_input_units(own, masks[i], frames.scale, center)
     return motion, flow

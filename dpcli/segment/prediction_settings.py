@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 from dpcli.runtime.settings.catalog import Catalog
 from dpcli.runtime.settings.fields import check, setting
 from dpcli.segment.baselines.settings import ClassicalSettings
+from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.network.config import Precision
 
 
@@ -16,9 +17,10 @@ class InputSettings:
     """Holds which sequences are divided, and how the flow between their frames is estimated."""
 
     flow: str = setting(
-        "icp",
-        "Flow between frames: icp (rigid bodies), nearest (point), or the file or folder of a trained estimator"
-        " (dpc segment flow).",
+        "auto",
+        "Flow between frames: icp (rigid bodies), nearest (point), the file or folder of a trained estimator (dpc segment"
+        " flow), or tracks (the points' own identities, method multibody); auto: tracks where the file has them, else"
+        " icp.",
     )
     split: str = setting("all", "Sequences of this split, or all.")
 
@@ -53,6 +55,13 @@ class PredictSettings(NamedTuple):
     classical: ClassicalSettings = ClassicalSettings()
     refinement: Refinement = Refinement()
     precision: Precision = Precision()
+    multibody: MultibodySettings = MultibodySettings()
 
 
-CATALOG = Catalog(input=InputSettings, classical=ClassicalSettings, refinement=Refinement, precision=Precision)
+CATALOG = Catalog(
+    input=InputSettings,
+    classical=ClassicalSettings,
+    refinement=Refinement,
+    precision=Precision,
+    multibody=MultibodySettings,
+)

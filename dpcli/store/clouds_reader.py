@@ -9,12 +9,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
 from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.schema import KEPT
-from dpcli.store.sequence import POINT_FIELDS, CloudSequence
+from dpcli.store.sequence import OF_PARTS, POINT_FIELDS, CloudSequence
 
-OPTIONAL = ("time", *POINT_FIELDS, "pose")
+OPTIONAL = ("time", *POINT_FIELDS, *OF_PARTS)
+_OF_FRAMES = ("time", *OF_PARTS)
 
 
 class CloudsReader:
@@ -67,7 +68,7 @@ class CloudsReader:
         self.shifts = self._read_shifts(file)
         self.fields = (*(key for key in OPTIONAL if key in file), *(key for key in file if key.startswith(KEPT)))
         for key in self.fields:
-            rows = frames if key in ("time", "pose") else self.num_points
+            rows = frames if key in _OF_FRAMES else self.num_points
             if len(file[key]) != rows:
                 raise DataError(f"{self.path}: {key} has {len(file[key])} rows, expected {rows}")
 
@@ -144,8 +145,12 @@ class CloudsReader:
         """Sequence `index`, or only some of its frames (repeats allowed), with all optional fields or those named.
 
         Touches only what it needs: one contiguous read from the first to the last frame asked for.
-        DataError when a value is NaN or infinite.
+        DataError when a value is NaN or infinite, or the file is damaged there.
         """
+        with reading(self.path):
+            return self._read(index, frames, fields)
+
+    def _read(self, index: int, frames: slice | Sequence[int] | None, fields: Sequence[str] | None) -> CloudSequence:
         first = int(self._sequence_offsets[index])
         count = int(self._sequence_offsets[index + 1]) - first
         wanted = (
@@ -162,7 +167,7 @@ class CloudsReader:
         sizes = np.diff(offsets) if picks is None else np.diff(offsets)[picks]
         values = {}
         for key in ("points", *(self.fields if fields is None else fields)):
-            if key in ("time", "pose"):
+            if key in _OF_FRAMES:
                 values[key] = self._set(key)[first + low : first + high][wanted - low]
             else:
                 values[key] = _pick(self._set(key)[span], offsets - offsets[0], picks)

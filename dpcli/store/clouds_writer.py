@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.store.file import STRING
 from dpcli.store.schema import KEPT, fields_of
-from dpcli.store.sequence import POINT_FIELDS, CloudSequence
+from dpcli.store.sequence import OF_PARTS, POINT_FIELDS, CloudSequence
 from dpcli.store.writing.journal import Placed
 from dpcli.store.writing.resumable_writer import ResumableWriter
 from dpcli.store.writing.whole_chunks import PlainChunks, chunk_writer
@@ -28,7 +28,7 @@ _PER_SAMPLE = {
     if field.shape == ("S",) and not field.optional
 }
 _INDEX = ("frame_offsets", "sequence_offsets", "time", *_PER_SAMPLE)  # small: written at once, at the end
-_FIELDS = ("time", *POINT_FIELDS, "pose")  # the order in which they are made, whoever names them: equal bytes
+_FIELDS = ("time", *POINT_FIELDS, *OF_PARTS)  # the order in which they are made, whoever names them: equal bytes
 _FLUSH_BYTES = 32 << 20  # a full disk is noticed while it can still be told; closing can't say it
 
 
@@ -37,7 +37,7 @@ class CloudsWriter(ResumableWriter):
 
     A file that was continued has the bytes it would have had. The journal is small beside uncompressed points, as large as
     the samples of a compressed file.
-    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, and kept columns,
+    `fields` names the optional ones the samples carry (time, color, part, track, scene_flow, pose, joint, and kept columns,
     `field_NAME`); a shift is written where a sample has one.
 
     >>> from dpcli.store import CloudSequence, CloudsReader
@@ -120,7 +120,7 @@ class CloudsWriter(ResumableWriter):
             dtype, shape = POINT_FIELDS.get(name, (np.float32, ()))
             chunks = (POINTS_PER_CHUNK, *shape)
             file.create_dataset(name, (0, *shape), dtype, maxshape=(None, *shape), chunks=chunks, **PACKED)
-        # pose is created with the first sample, which tells the number of parts
+        # pose and joint are created with the first sample, which tells the number of parts
 
     def write(self, sequence: CloudSequence) -> None:
         """Appends one sample. DataError when it is malformed, lacks a declared field, or repeats a name."""
@@ -146,11 +146,11 @@ class CloudsWriter(ResumableWriter):
         missing = [name for name in self.fields if sequence.value(name) is None]
         if missing:
             raise DataError(f"sample {sequence.name!r}: no {', '.join(missing)}, though the other samples have it")
-        if "pose" in self.fields and "pose" in self._file:
-            own, others = sequence.pose.shape[1], self._file["pose"].shape[1]
+        for name in OF_PARTS.keys() & self._file.keys():
+            own, others = getattr(sequence, name).shape[1], self._file[name].shape[1]
             if own != others:
                 raise DataError(
-                    f"sample {sequence.name!r}: pose has {own} parts, earlier samples have {others}; pad to the largest"
+                    f"sample {sequence.name!r}: {name} has {own} parts, earlier samples have {others}; pad to the largest"
                 )
 
     def _append_sequence(self, sequence: CloudSequence) -> None:
@@ -173,7 +173,7 @@ class CloudsWriter(ResumableWriter):
             else:
                 column.extend(values)
             return
-        if name == "pose" and name not in self._file:
+        if name in OF_PARTS and name not in self._file:
             shape = values.shape[1:]
             self._file.create_dataset(
                 name, (0, *shape), _FIELD[name].dtype, maxshape=(None, *shape), chunks=(64, *shape), **PACKED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,19 +11,33 @@ import h5py
 import numpy as np
 
 from dpcli import __version__
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
 from dpcli.path_names import as_utf8
 from dpcli.runtime.whole_file import refuse_pipe
 from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
+_PACKED_AT_MOST = 1100  # times that zlib makes anything smaller: 258 bytes in 2 bits, and headers
+_TEXTS = ("dpc_version", "command", "source", "length_unit", "name", "metrics")  # attributes, by what they hold
+_NUMBERS = ("seed", "skipped", "reference", "num_parts", "num_points")
 STRING = h5py.string_dtype("utf-8")
 
 _CACHE = 1 << 20  # bytes, HDF5's own choice
 
 
-def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CACHE) -> h5py.File:
+class StoreFile(h5py.File):
+    """An open file of the contract, whose block turns what HDF5 raises for damaged content into DataError."""
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: object) -> None:
+        path = self.filename if self.id.valid else "an HDF5 file"
+        super().__exit__(kind, error, trace)
+        if error is not None:
+            with reading(path):
+                raise error
+
+
+def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CACHE) -> StoreFile:
     """Opens a file of the contract for reading; HDF5 keeps at most `cache` bytes of chunks of each of its data sets.
 
     Raises DataError when it isn't HDF5, is truncated, is not ours, is of another schema or kind, or refers to data
@@ -40,29 +55,35 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CAC
         raise DataError(f"{path}: not an HDF5 file (starts with {magic!r}); `dpc prepare` makes them from raw data")
     check_heaps(path)
     try:
-        file = h5py.File(path, "r", rdcc_nbytes=cache)
-    except OSError as error:
+        file = StoreFile(path, "r", rdcc_nbytes=cache)
+    except Exception as error:
         raise DataError(_opening_problem(path, error)) from None
     try:
-        _check_root(file, path, kinds)
-        _refuse_outside(file, path)
-        _check_types(file, path)
+        with reading(path):
+            _check_root(file, path, kinds)
+            _refuse_outside(file, path)
+            _check_types(file, path)
     except BaseException:
         file.close()
         raise
     return file
 
 
-def _opening_problem(path: Path, error: OSError) -> str:
+def _opening_problem(path: Path, error: Exception) -> str:
     text = str(error)
     if "truncated" in text or "end of file" in text:
         return f"{path}: the HDF5 file is truncated ({path.stat().st_size} bytes are left); make or copy it again"
     if "lock" in text:
         return f"{path}: locked by a writer, or on a file system without locks (then set HDF5_USE_FILE_LOCKING=FALSE)"
-    return f"{path}: the HDF5 file is damaged ({text.splitlines()[0]}); make or copy it again"
+    return f"{path}: the HDF5 file is damaged ({text.splitlines()[0] if text else type(error).__name__}); make or copy it again"
 
 
 def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:
+    for name, value in file.attrs.items():
+        if (name in _TEXTS and not isinstance(value, str)) or (isinstance(value, str) and not _is_utf8(value)):
+            raise DataError(f"{path}: attribute {name} is {value!r:.80}, expected UTF-8 text; make the file again")
+        if name in _NUMBERS and (np.ndim(value) or not isinstance(value, (int, np.integer))):
+            raise DataError(f"{path}: attribute {name} is {value!r:.80}, expected a whole number; make the file again")
     kind, schema = file.attrs.get("dpc_kind"), file.attrs.get("dpc_schema")
     if kind is None or schema is None:
         raise DataError(f"{path}: an HDF5 file, but not one of dpc's (no dpc_kind attribute); see `dpc prepare --help`")
@@ -72,6 +93,11 @@ def _check_root(file: h5py.File, path: Path, kinds: Sequence[str]) -> None:
         raise DataError(
             f"{path}: holds {kind!r}, expected {' or '.join(repr(k) for k in kinds)}; `dpc info {path}` shows more"
         )
+
+
+def _is_utf8(text: str) -> bool:
+    """Returns whether a text has no lone surrogates, which is how h5py hands out bytes that are not UTF-8."""
+    return as_utf8(text) == text
 
 
 def _refuse_outside(file: h5py.File, path: Path) -> None:
@@ -93,8 +119,21 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
                 )
             elif item.dtype.kind not in "fiub" and h5py.check_string_dtype(item.dtype) is None:
                 raise DataError(f"{path}: {item.name} has type {item.dtype}, expected numbers or strings")
+            else:
+                refuse_claim(item, path)
 
     visit(file)
+
+
+def refuse_claim(item: h5py.Dataset, path: Path) -> None:
+    """Raises DataError for a data set of a shape that its stored bytes can't fill, before anybody makes room for it."""
+    stored = item.id.get_storage_size()
+    packed = item.chunks is not None and item.id.get_create_plist().get_nfilters() > 0
+    if math.prod(item.shape or ()) * item.dtype.itemsize > stored * (_PACKED_AT_MOST if packed else 1) and item.ndim:
+        raise DataError(
+            f"{path}: {item.name} claims {math.prod(item.shape)} values, {stored} bytes of a file of"
+            f" {path.stat().st_size} bytes can't hold them; make or copy it again"
+        )
 
 
 def _check_types(file: h5py.File, path: Path) -> None:
@@ -211,7 +250,15 @@ def write_root(
     class_names: Sequence[str],
     provenance: Sequence[dict],
 ) -> None:
-    """Writes root attributes, class names and provenance (docs/format.md). No clock time, so bytes repeat."""
+    """Writes root attributes, class names and provenance (docs/format.md). No clock time, so bytes repeat.
+
+    Raises DataError for a class name with NUL, which HDF5 can't hold.
+    """
+    for name in class_names:
+        if "\0" in name:
+            raise DataError(
+                f"{source}: the class name {name[:80]!r} holds NUL; expected text, copy the list of classes again"
+            )
     last = provenance[-1] if provenance else {}
     file.attrs.update(
         {

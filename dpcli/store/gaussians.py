@@ -17,6 +17,7 @@ from dpcli.store.schema import TABLES
 from dpcli.store.writing.atomic_file import AtomicFile
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
+_LARGEST_LOG_SCALE = 40  # so that a scale, and its square in a covariance, stay finite in float32
 _TOLERANCE = 1e-3  # of float32 unit quaternions, probabilities and rotations
 _PACKED = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
 _LETTERS = {"N": "Gaussians", "T": "frames", "S": "parts", "K": "control points", "V": "cameras", "B": "SH terms"}
@@ -144,6 +145,8 @@ class GaussianScene:
         """Yields what is wrong with values, given that types and shapes are right."""
         if self.sh.shape[1] not in (1, 4, 9, 16):
             yield f"sh has {self.sh.shape[1]} terms, expected 1, 4, 9 or 16 (degree 0 to 3)"
+        if self.log_scale.size and self.log_scale.max() > _LARGEST_LOG_SCALE:
+            yield f"log_scale holds {self.log_scale.max():g}, expected at most {_LARGEST_LOG_SCALE}: float32 ends there"
         if np.any(np.diff(self.time) <= 0):
             yield "time must rise from frame to frame"
         for key in _QUATERNIONS:
@@ -252,7 +255,7 @@ def read_scene(path: str | Path) -> GaussianScene:
             scene = GaussianScene(**arrays, size=size, reference=int(file.attrs["reference"]), metrics=metrics)
         except (TypeError, ValueError) as error:
             raise DataError(f"{path}: size, reference or metrics is damaged ({error}); fit again") from None
-    scene.validate(str(path))
+        scene.validate(str(path))
     return scene
 
 

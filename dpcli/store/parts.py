@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, reading
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.clouds_writer import PACKED, CloudsWriter
 from dpcli.store.schema import fields_of
@@ -212,6 +212,10 @@ class PartsReader(CloudsReader):
 
     def read_parts(self, index: int) -> PartsSample:
         """Reads what is said of sequence `index`; DataError when its values don't fit the sequence."""
+        with reading(self.path):
+            return self._read_parts(index)
+
+    def _read_parts(self, index: int) -> PartsSample:
         frames = self._frame_offsets[self._sequence_offsets[index] : self._sequence_offsets[index + 1] + 1]
         points = slice(int(frames[0]), int(frames[-1]))
         pairs = slice(*map(int, self._pair_offsets[index : index + 2]))

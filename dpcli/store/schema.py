@@ -86,6 +86,15 @@ _CLOUDS = (
         optional=True,
     ),
     Field(
+        "joint",
+        "f64",
+        ("F", "parts", 9),
+        "the joint above each part, in the frame's coordinates: parent part (-1: none), type (0 none, 1 revolute, 2"
+        " prismatic, 3 fixed, 4 free), direction of the axis x y z, a point on it x y z, value (radians or `length_unit`);"
+        " padded as `pose`",
+        optional=True,
+    ),
+    Field(
         "shift",
         "f64",
         ("S", 3),

@@ -136,7 +136,7 @@ class ScoresReader:
             self.scores, self.labels = file["scores"][:], file["label"][:]
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
             self.skipped, self.positions = read_skipped(file), read_positions(file)
-        self._check()
+            self._check()
 
     @property
     def stream_names(self) -> tuple[str, ...]:

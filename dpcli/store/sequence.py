@@ -15,6 +15,9 @@ POINT_FIELDS = {
     for one in TABLES["clouds"]
     if one.optional and one.shape[0] == "P" and not one.group and not one.name.startswith(KEPT)
 }  # name -> dtype, shape of one point
+OF_PARTS = {
+    one.name: one.shape[2:] for one in TABLES["clouds"] if one.shape[:2] == ("F", "parts")
+}  # name -> shape of what is said of one part in one frame
 
 
 @dataclass
@@ -24,7 +27,8 @@ class CloudSequence:
     points f32 (P,3) in the file's length unit; frame_offsets i64 (T+1), from 0 to P; label counts from 0, -1 = unknown;
     time f64 (T) seconds; color u8 (P,3); part i16 (P) rigid part; track i64 (P) identity of a point over frames;
     scene_flow f32 (P,3) true displacement to the next frame, in the last frame to the one before; for motion that no
-    pose tells; pose f64 (T,parts,4,4) part-to-world; shift f64 (3) what was taken off the original coordinates; extra:
+    pose tells; pose f64 (T,parts,4,4) part-to-world; joint f64 (T,parts,9) the joint above each part (docs/format.md says
+    the nine numbers); shift f64 (3) what was taken off the original coordinates; extra:
     columns of the raw data that were kept, f32 (P) each, by the name that the file has for them (`field_NAME`).
     """
 
@@ -41,6 +45,7 @@ class CloudSequence:
     track: np.ndarray | None = None
     scene_flow: np.ndarray | None = None
     pose: np.ndarray | None = None
+    joint: np.ndarray | None = None
     shift: np.ndarray | None = None
     extra: dict[str, np.ndarray] = field(default_factory=dict)
 
@@ -134,5 +139,8 @@ class CloudSequence:
             raise DataError(f"{where}: scene_flow holds NaN or infinity; drop the points whose motion is unknown")
         if self.time is not None and self.time.shape != (self.num_frames,):
             raise DataError(f"{where}: time has shape {self.time.shape}, expected ({self.num_frames},)")
-        if self.pose is not None and (self.pose.ndim != 4 or self.pose.shape[::3] != (self.num_frames, 4)):
-            raise DataError(f"{where}: pose has shape {self.pose.shape}, expected ({self.num_frames}, parts, 4, 4)")
+        for name, row in OF_PARTS.items():
+            values = getattr(self, name)
+            if values is not None and (len(values) != self.num_frames or values.shape[2:] != row):
+                expected = ", ".join(map(str, (self.num_frames, "parts", *row)))
+                raise DataError(f"{where}: {name} has shape {values.shape}, expected ({expected})")

@@ -10,7 +10,7 @@ from types import TracebackType
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, reading
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
@@ -277,10 +277,8 @@ class ViewsReader:
             raise DataError(
                 f"{self.path}: view {view}, frame {frame}; the file has {self.num_views} views, {self.num_frames} frames"
             )
-        try:
+        with reading(f"{self.path}: view {view}, frame {frame}"):
             return self._rgba[view, frame]
-        except OSError:
-            raise DataError(f"{self.path}: view {view}, frame {frame} is damaged; make the file again") from None
 
     @property
     def track(self) -> np.ndarray | None:
@@ -294,7 +292,8 @@ class ViewsReader:
 
     def _load_truth(self) -> tuple[np.ndarray | None, np.ndarray | None]:
         if self._truth is None:
-            track, part = (self.file[key][:] if key in self.fields else None for key in ("track", "part"))
+            with reading(self.path):
+                track, part = (self.file[key][:] if key in self.fields else None for key in ("track", "part"))
             try:
                 _check_truth(self.header.name, self.num_frames, track, part)
             except DataError as error:

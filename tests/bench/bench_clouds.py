@@ -17,7 +17,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 
 LOOP = """
 import sys, h5py, numpy as np
@@ -26,7 +26,7 @@ if sys.argv[1].endswith("las"):
     import laspy
     read = lambda path: laspy.read(path).xyz
 else:
-    from dpcli.prepare.decode.open3d_import import load_open3d
+    from dpcli.ops.open3d_import import load_open3d
     open3d = load_open3d()
     read = lambda path: np.asarray(open3d.io.read_point_cloud(str(path)).points)
 clouds = [read(path).astype(np.float32) for path in sorted(Path(sys.argv[1]).iterdir())]

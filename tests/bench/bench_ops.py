@@ -20,7 +20,7 @@ import torch
 
 from dpcli import ops
 from dpcli.errors import DpcError
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 from tests.support.ops_helpers import backend
 
 

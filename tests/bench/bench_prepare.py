@@ -103,7 +103,7 @@ def plain_nvgesture(items: list, points: int, output: Path) -> int:
 
 def sampled(cloud: np.ndarray, points: int) -> np.ndarray:
     """Open3D's farthest point sampling of one frame."""
-    from dpcli.prepare.decode.open3d_import import load_open3d
+    from dpcli.ops.open3d_import import load_open3d
 
     open3d = load_open3d()
     if len(cloud) <= points:

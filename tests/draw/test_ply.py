@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.draw.palette import part_colors
 from dpcli.draw.ply import write_ply, write_ply_frames
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.store import CloudSequence
 
 

@@ -40,7 +40,7 @@ def test_a_limit_on_gaussians_holds_from_the_start():
         ("partition=none", "partition = none: expected one of static, time"),
         ("most_gaussians=5", "most_gaussians = 5: expected at least 16"),
         ("rate_mean=0,1", "rate_mean = 0,1: expected numbers, each above 0"),
-        ("prior=magic", "prior = magic: expected one of none, views, zero123"),
+        ("prior=magic", "prior = magic: expected one of auto, none, inflated, network, views, zero123"),
         ("speed=3", "unknown setting speed"),
     ],
 )

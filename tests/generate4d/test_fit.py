@@ -94,6 +94,30 @@ def test_given_views_make_the_side_right(tmp_path, dpc_here, one_thread):
     assert values["views"] > values["none"] + 1.0, values
 
 
+def test_a_fit_of_one_view_stays_where_the_object_is(tmp_path, dpc_here):
+    """A ball seen once, which is a ball from the side as well, neither a cloud behind it nor a splinter."""
+    path = tmp_path / "ball.h5"
+    axis = (np.arange(SIZE) + 0.5 - SIZE / 2) / SIZE
+    mask = axis[:, None] ** 2 + axis**2 < 0.3**2
+    rgba = np.where(mask[..., None], np.uint8([200, 60, 20, 255]), np.uint8(0))
+    pose, lens = orbit_pose(0.5, 0.1), pinhole(DEFAULT_FOVY, SIZE, SIZE)
+    with ViewsWriter(
+        path, ViewsHeader("ball", lens[None], pose[None], np.zeros(1), ["reference"], 0, (SIZE, SIZE))
+    ) as w:
+        w.add(0, 0, rgba)
+    radius = 0.3 * SIZE / lens[0, 0] * 2
+    for prior in ("inflated", "none"):
+        scene = tmp_path / f"{prior}.h5"
+        done = dpc_here("generate4d", "fit", path, "-o", scene, "--preset", "tiny", "--prior", prior, *steps(60, 20))
+        assert done.returncode == 0, done.stderr
+        fitted = read_scene(scene)
+        solid = fitted.frame_mean[0][fitted.opacity > 0.3]
+        depth = solid @ pose[2, :3]
+        assert abs(depth.mean()) < 0.1 * radius and np.ptp(depth) == pytest.approx(2 * radius, rel=0.25), prior
+        longest = fitted.log_scale.max(1) - fitted.log_scale.mean(1)
+        assert longest.max() <= np.log(2) + 1e-4
+
+
 def test_a_stopped_fit_continues_to_the_same_scene(tmp_path, dpc):
     views = toy_views(tmp_path / "views.h5")
     options = ("--preset", "tiny", *steps(60, 60), "--device", "cpu")
@@ -133,6 +157,11 @@ def test_what_is_wrong_is_said(tmp_path, dpc_here):
     for code, words, arguments in (
         (3, "role 'train'", (views, "-o", tmp_path / "a.h5", "--prior", "views")),
         (3, "shows nothing", (blank, "-o", tmp_path / "a.h5")),
+        (
+            2,
+            "--prior-model nosuch: no such file",
+            (views, "-o", tmp_path / "a.h5", "--prior", "network", "--prior-model", "nosuch"),
+        ),
         (2, "prior = magic: expected one of", (views, "-o", tmp_path / "a.h5", "--prior", "magic")),
         (2, "preset = slow: expected one of", (views, "-o", tmp_path / "a.h5", "--preset", "slow")),
         (2, "--run FOLDER", (views, "-o", "-", "--preset", "tiny")),

@@ -143,7 +143,12 @@ def test_unreadable_files_are_bad_samples_and_bugs_are_not(tmp_path, monkeypatch
     monkeypatch.setattr(ToyReader, "read", missing)
     with pytest.raises(DataError, match="the first: secret.bin: Permission denied"):
         convert(ToyReader(), tmp_path / "a.h5")
-    monkeypatch.setattr(ToyReader, "read", lambda self, item, rng: 1 / 0)
+    with monkeypatch.context() as patched:
+        patched.setattr(ToyReader, "read", lambda self, item, rng: 1 / 0)
+        with pytest.raises(DataError, match="toy000: damaged.*ZeroDivisionError"):
+            convert(ToyReader(), tmp_path / "a.h5")
+    monkeypatch.undo()
+    monkeypatch.setattr(Thinning, "apply", lambda self, sequence, rng: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         convert(ToyReader(), tmp_path / "a.h5")
     assert list(tmp_path.iterdir()) == []

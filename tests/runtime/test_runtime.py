@@ -82,23 +82,6 @@ def test_a_worker_that_is_killed_once_costs_nothing(tmp_path):
     assert list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("number", [signal.SIGSEGV, signal.SIGABRT])
-def test_an_item_that_crashes_its_process_is_lost_alone(number):
-    items = [(x, number if x in (1, 6) else 0, "") for x in range(7)]
-    rows = list(ordered_map(crash, items, 2))
-    assert [item for item, _ in rows] == items
-    for (x, fatal, _), result in rows:
-        if fatal:
-            assert isinstance(result, LostWorker) and "the process that worked on it died" in str(result)
-        else:
-            assert result == x * x
-
-
-def test_an_item_whose_process_was_killed_is_done_again(tmp_path):
-    items = [(x, signal.SIGKILL if x == 5 else 0, str(tmp_path / "once") if x == 5 else "") for x in range(7)]
-    assert [result for _, result in ordered_map(crash, items, 3)] == [x * x for x in range(7)]
-
-
 def test_a_stop_signal_sets_the_flag_and_old_handlers_return():
     before = signal.getsignal(signal.SIGTERM)
     with stop_requested() as stop:

@@ -28,8 +28,9 @@ def write_clouds(path: Path) -> None:
     sequence.color, sequence.track = rng.integers(0, 255, (count, 3), np.uint8), np.arange(count)
     sequence.scene_flow, sequence.time = np.zeros((count, 3), np.float32), np.arange(sequence.num_frames) / 10
     sequence.pose = np.tile(np.eye(4), (sequence.num_frames, 4, 1, 1))
+    sequence.joint = np.zeros((sequence.num_frames, 4, 9))
     sequence.shift, sequence.extra = np.ones(3), {"field_NAME": np.zeros(count, np.float32)}
-    fields = ["time", "color", "part", "track", "scene_flow", "pose", "field_NAME"]
+    fields = ["time", "color", "part", "track", "scene_flow", "pose", "joint", "field_NAME"]
     with CloudsWriter(path, class_names=["a", "b"], fields=fields, provenance={"command": "dpc"}) as writer:
         writer.write(sequence)
         writer.skipped, writer.positions = [("bad", "why")], ([0], [1])

@@ -6,6 +6,7 @@ import typer
 
 from dpcli.cli.evaluate.classification import classification
 from dpcli.cli.evaluate.compare import compare
+from dpcli.cli.evaluate.joints import joints
 from dpcli.cli.evaluate.motion import motion
 from dpcli.cli.evaluate.report import report
 from dpcli.cli.evaluate.runs import runs
@@ -15,7 +16,7 @@ from dpcli.cli.evaluate.weights import app as weights
 from dpcli.cli.help_groups import SectionedGroup
 
 SECTIONS = {
-    "One prediction against the truth": (classification, segmentation, motion, video),
+    "One prediction against the truth": (classification, segmentation, motion, joints, video),
     "Several predictions or results": (compare, runs, report),
 }  # heading in `dpc evaluate --help` -> its commands
 

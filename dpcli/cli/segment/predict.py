@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +12,7 @@ from dpcli.cli.option_groups import with_option_groups
 from dpcli.cli.options import Device, Force, Output, Picture, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.cli.spread_options import SpreadOptions
+from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 from dpcli.segment.prediction_settings import CATALOG, PredictSettings
 
@@ -26,9 +28,12 @@ def predict(
     model: Annotated[
         str | None,
         typer.Option(
-            "--model", help="A trained part network: file, training folder or shipped name. Default: the shipped one."
+            "--model", help="A trained part network to use: file, training folder or shipped name (--method network)."
         ),
     ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Use the shipped network, frame by frame: the same as --method network.")
+    ] = False,
     given: Given,
     picture: Picture = None,
     turntable: Annotated[
@@ -43,7 +48,7 @@ def predict(
     force: Force = False,
 ) -> None:
     """Find the parts of every point, the same through all frames, each part's rigid motion, and the flow between frames."""
-    settings = PredictSettings(**CATALOG.resolve(PredictSettings()._asdict(), given))
+    settings = PredictSettings(**CATALOG.resolve(PredictSettings()._asdict(), _choose_network(given, model, fast)))
     from dpcli.segment.commands.predict import Drawings, predict_file
 
     drawings = Drawings(picture, turntable, ply)
@@ -60,3 +65,13 @@ def predict(
     )
     if output != "-":
         typer.echo(f"{output}: parts of {sequences} sequences")
+
+
+def _choose_network(given: Given, model: str | None, fast: bool) -> Given:
+    """Returns what was given with the method network where `--model` or `--fast` ask for it and no method is named."""
+    named = given.values.get("method", "network")
+    if fast and named != "network":
+        raise UsageError(f"--fast: it means --method network, but --method {named} was given; leave one out")
+    if (model is None and not fast) or "method" in given.values:
+        return given
+    return replace(given, flags={**given.flags, "method": "network"})

@@ -20,6 +20,7 @@ from dpcli.generate4d.out.preview import write_preview
 from dpcli.generate4d.out.scene_writer import to_scene
 from dpcli.generate4d.priors.interface import Prior
 from dpcli.generate4d.scene.model import Model4D
+from dpcli.generate4d.shape.choice import guide
 from dpcli.generate4d.targets import Targets, load_targets
 from dpcli.ops.cameras import orbit_of
 from dpcli.runtime import provenance
@@ -65,8 +66,11 @@ def fit_scene(
             return
         targets = _load(path, config, supervision)
         folder = RunFolder(folder_path, record, force, columns=COLUMNS, curves=draw_curves)
-        prior = _load_prior(supervision, targets, device)
-        optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize)
+        prior, shape = (
+            _load_prior(supervision, targets, device),
+            guide(supervision.prior, targets, supervision.prior_model),
+        )
+        optimizer = SceneOptimizer(targets, config, seed, prior, chosen, supervision.regularize, shape)
         model, metrics = _optimize(optimizer, folder, CATALOG.to_toml(_groups(config, supervision), "generate4d fit"))
         scene = to_scene(model, targets, metrics)
         _write(output, scene, targets, provenance.record(record, seed, {"views": path}), seed, force)

@@ -1,7 +1,7 @@
-"""The first Gaussians of a fit: in a sphere, in the inflated silhouette of one view, or in the visual hull of several.
+"""The first Gaussians of a fit: in a sphere, on the surface of a shape prior, or in the visual hull of several views.
 
 A single view says nothing about depth: a fit that starts from a sphere settles on any shape with that picture, most of
-them flat. Inflation gives every silhouette point a thickness by its distance from the outline, as a drawing is read.
+them flat. A shape prior, at least the inflated silhouette, says where the surface may be.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from dpcli.errors import DataError
 from dpcli.generate4d.config import FitConfig
+from dpcli.generate4d.shape.guidance import ShapeGuidance, sample_surface
+from dpcli.generate4d.shape.silhouette import Inflated, ball_thickness
 from dpcli.generate4d.targets import Targets
 
 _ROUNDS, _CANDIDATES = 200, 20_000  # at most so many draws of so many points look for those inside a hull
@@ -25,16 +27,19 @@ def choose_start(config: FitConfig, targets: Targets) -> str:
 
 
 def first_points(
-    kind: str, config: FitConfig, targets: Targets, rng: np.random.Generator
+    kind: str, config: FitConfig, targets: Targets, rng: np.random.Generator, shape: ShapeGuidance | None = None
 ) -> tuple[Tensor, Tensor]:  # [N, 3], [N, 3]
-    """Returns positions and colors (0..1), f32, of the first Gaussians of the kind that `choose_start` returns."""
+    """Returns positions and colors (0..1), f32, of the first Gaussians of the kind that `choose_start` returns.
+
+    shape: whose surface `inflate` covers; None: that of the inflated silhouette.
+    """
     if kind == "sphere":
         points = sample_sphere(config.gaussians, config.start_radius, rng)
         return torch.from_numpy(points), torch.full((len(points), 3), 0.5)
-    reference, frame = targets.reference, targets.widest_frame()
+    frame = targets.widest_frame()
     if kind == "inflate":
-        camera = targets.intrinsics[reference], targets.world_to_camera[reference]
-        points, colors = inflate_silhouette(targets.picture(reference, frame), *camera, config.gaussians, rng)
+        shape = shape or ShapeGuidance(Inflated(), targets)
+        points, colors = sample_surface(shape.layers[frame], shape.camera, config.gaussians, rng)
     else:
         pictures = [targets.picture(view, frame) for view in range(targets.num_views)]
         points, colors = carve_hull(pictures, targets.intrinsics, targets.world_to_camera, config.gaussians, rng)
@@ -46,59 +51,6 @@ def sample_sphere(count: int, radius: float, rng: np.random.Generator) -> np.nda
     direction = rng.standard_normal((count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return (direction * radius * np.cbrt(rng.random((count, 1)))).astype(np.float32)
-
-
-def inflate_silhouette(
-    rgba: np.ndarray, intrinsics: np.ndarray, world_to_camera: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns positions and colors (count,3) f32 that fill a picture (H,W,4, 0..1) with round thickness.
-
-    The thickness is that of `ball_thickness`, half before and half behind the depth of the world's origin; colors are the
-    pixel's, on the far side as well. Raises DataError for an empty picture.
-    """
-    mask = rgba[..., 3] > 0.5
-    if not mask.any():
-        raise DataError(
-            "the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again"
-        )
-    half = ball_thickness(mask)
-    rows, columns = np.nonzero(mask)
-    share = half[rows, columns] / half[rows, columns].sum()
-    picked = rng.choice(len(rows), count, p=share)
-    pixel = np.stack([columns[picked] + rng.random(count), rows[picked] + rng.random(count)], 1)
-    middle = float(world_to_camera[2, 3])  # depth of the world's origin
-    depth = middle + half[rows[picked], columns[picked]] * rng.uniform(-1, 1, count) * middle / intrinsics[0, 0]
-    camera = np.stack(
-        [
-            (pixel[:, 0] - intrinsics[0, 2]) / intrinsics[0, 0] * depth,
-            (pixel[:, 1] - intrinsics[1, 2]) / intrinsics[1, 1] * depth,
-            depth,
-        ],
-        1,
-    )
-    world = (camera - world_to_camera[:3, 3]) @ world_to_camera[:3, :3]
-    return world.astype(np.float32), rgba[rows[picked], columns[picked], :3].astype(np.float32)
-
-
-def ball_thickness(mask: np.ndarray) -> np.ndarray:
-    """Returns half the thickness (H,W) in pixels of a silhouette that is the union of the balls of its medial axis.
-
-    A disc becomes a ball, a limb a rod. The thickness is at least half a pixel inside the mask and 0 outside.
-    """
-    from scipy import ndimage
-
-    distance = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
-    ridge = (distance > 0) & (distance >= ndimage.maximum_filter(distance, size=3) - 0.5)
-    squared = np.zeros(mask.shape)
-    for row, column in zip(*np.nonzero(ridge)):
-        radius = distance[row, column]
-        reach = int(radius)
-        top, left = max(row - reach, 0), max(column - reach, 0)
-        window = squared[top : row + reach + 1, left : column + reach + 1]
-        dy = np.arange(top, top + window.shape[0])[:, None] - row
-        dx = np.arange(left, left + window.shape[1]) - column
-        np.maximum(window, radius**2 - dy**2 - dx**2, out=window)
-    return np.where(mask, ndimage.gaussian_filter(np.sqrt(squared.clip(0.25)), 1.0), 0.0)
 
 
 def carve_hull(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dpcli.generate4d.scene.canonical_gaussians import CanonicalGaussians
 from dpcli.ops.rotations import nearest_rotation
 
 
@@ -38,15 +37,10 @@ def arap_loss(
     return (after - torch.einsum("bnij,nhj->bnhi", rotation, before)).square().sum(-1).mean()
 
 
-def roundness_loss(gaussians: CanonicalGaussians, aspect: float) -> Tensor:
-    """Returns how far the longest axes exceed `aspect` times the geometric mean of the three, as a log ratio, mean over N.
+def thickness_loss(moved: Tensor, anchor: Tensor, view_axis: Tensor) -> Tensor:  # [B, N, 3], [N, 3], [3]
+    """Returns the mean squared drift along the line of sight (unit vector) from where the start put each Gaussian.
 
-    Needles and discs along the line of sight look right in the one picture and wrong in all others.
+    Moved positions count, not canonical ones: a motion of all frames hides there as well, and away from the camera
+    everything looks smaller.
     """
-    log_scale = gaussians.log_scale
-    return (log_scale.max(1).values - log_scale.mean(1) - torch.tensor(aspect).log()).relu().mean()
-
-
-def thickness_loss(gaussians: CanonicalGaussians, view_axis: Tensor) -> Tensor:
-    """Returns the mean squared drift along the line of sight (unit vector (3)) from where the start put each Gaussian."""
-    return ((gaussians.mean - gaussians.anchor) @ view_axis).square().mean()
+    return ((moved - anchor) @ view_axis).square().mean()

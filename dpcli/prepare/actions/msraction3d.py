@@ -10,11 +10,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, reading
 from dpcli.prepare.actions.mat5 import read_mat5
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
+from dpcli.store.file import refuse_claim
 from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = (
@@ -95,13 +96,11 @@ def _read_mat73(path: Path) -> np.ndarray:
     import h5py
 
     check_heaps(path)
-    try:
-        with h5py.File(path, "r") as file:
-            if not isinstance(file.get("depth"), h5py.Dataset):
-                raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
-            return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
-    except OSError as error:
-        raise DataError(f"{path}: not a readable MATLAB 7.3 file, perhaps truncated ({error})") from None
+    with reading(f"{path}, a MATLAB 7.3 file"), h5py.File(path, "r") as file:
+        if not isinstance(file.get("depth"), h5py.Dataset):
+            raise DataError(f"{path}: no variable 'depth'; found {list(file) or 'none'}")
+        refuse_claim(file["depth"], path)
+        return file["depth"][()].T  # HDF5 lists MATLAB's axes in reverse
 
 
 def check_shape(path: Path, frames: int, height: int, width: int) -> None:

@@ -23,6 +23,7 @@ from dpcli.prepare.articulated.articulated_object import (
     sampling_weights,
     transform,
 )
+from dpcli.prepare.articulated.true_joints import true_joints
 from dpcli.prepare.meshes.surface_points import Camera, choose_on_surface, choose_visible, points_on
 from dpcli.prepare.reader import Sample
 from dpcli.runtime.seeds import PrepareStream, generator
@@ -112,7 +113,8 @@ def draw_sequence(
     """Draws one sequence of ``options.frames`` frames; ``known``: fields of the CloudSequence that the index holds.
 
     The object of frame 0 fits a sphere of diameter 1 about the origin; every frame's points are drawn independently.
-    pose f64 (F,pad_parts,4,4) takes a part's own frame to the frame's points; unused parts are the identity.
+    pose f64 (F,pad_parts,4,4) takes a part's own frame to the frame's points; unused parts are the identity. joint: as
+    `true_joints`.
     """
     obj = studied.obj
     locked = lock_some(obj, studied.locked, options.max_parts, rng)
@@ -123,11 +125,13 @@ def draw_sequence(
     scale, poses = _normalized(obj, obj.poses(values))
     poses = global_motions(options, rng)[:, None] @ poses
     clouds, ids = zip(*_frames(obj, scale, poses, part, options, rng), strict=True)
-    poses_of_parts = np.tile(np.eye(4), (options.frames, max(pad_parts, part.max() + 1), 1, 1))
+    padded = max(pad_parts, part.max() + 1)
+    poses_of_parts = np.tile(np.eye(4), (options.frames, padded, 1, 1))
     for body in reversed(range(obj.num_bodies)):  # the topmost body of a part comes last and stays
         if part[body] >= 0:
             poses_of_parts[:, part[body]] = poses[:, body]
-    sequence = CloudSequence.from_frames(name, list(clouds), part=list(ids), pose=poses_of_parts, **known)
+    joint = true_joints(obj, locked, values, poses, scale, padded)
+    sequence = CloudSequence.from_frames(name, list(clouds), part=list(ids), pose=poses_of_parts, joint=joint, **known)
     return Sample(sequence, _notes(studied, clouds, ids, options))
 
 

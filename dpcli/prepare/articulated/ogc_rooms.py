@@ -11,10 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.ogc_layout import RoomMotion, draw_layout
 from dpcli.prepare.articulated.ogc_meshes import Shape, areas, find_meshes, load_shape
-from dpcli.prepare.decode.open3d_import import load_open3d
 from dpcli.prepare.meshes.raycast import pixel_rays
 from dpcli.prepare.meshes.surface_points import SurfacePoints, choose_on_surface, points_on
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe

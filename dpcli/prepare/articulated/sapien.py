@@ -100,7 +100,7 @@ class Sapien:
     seed: int = 0
     allow_outside: bool = False
     length_unit: ClassVar[str] = "object diameter"
-    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose", "joint")
 
     def __post_init__(self) -> None:
         if self.pairs_per_object < 1:

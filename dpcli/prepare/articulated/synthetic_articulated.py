@@ -44,7 +44,7 @@ class SyntheticArticulated:
     split: SplitRule = SplitRule()
     seed: int = 0
     length_unit: ClassVar[str] = "object diameter"
-    fields: ClassVar[tuple[str, ...]] = ("part", "pose")
+    fields: ClassVar[tuple[str, ...]] = ("part", "pose", "joint")
 
     def __post_init__(self) -> None:
         for option in ("objects", "sequences_per_object"):

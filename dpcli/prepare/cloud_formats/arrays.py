@@ -15,6 +15,7 @@ _COLOR_KEYS = ("color", "colors", "rgb")
 _COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
 _BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
 _TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
+_ROOM, _PACKED_AT_MOST = 100 << 20, 50  # bytes that any archive may unpack to; and times its size beyond them
 _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coordinates
 
 
@@ -33,8 +34,11 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
     try:
         with np.load(path, allow_pickle=False) as archive:
+            _refuse_bomb(path, archive)
             arrays = {key: archive[key] for key in archive.files}
             arrays = {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # or bare bytes
+    except DataError:
+        raise
     except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
         raise DataError(f"{path}: not a readable .npz archive ({error})") from None
     key = next((k for k in _POINT_KEYS if k in arrays), None)
@@ -53,6 +57,13 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
         raise DataError(f"{path}: --keep-fields {missing[0]}: no such array of one number a point")
     cloud.extra = {name: columns[name].astype(np.float32) for name in keep}
     return cloud
+
+
+def _refuse_bomb(path: Path, archive: np.lib.npyio.NpzFile) -> None:
+    """Raises DataError for an archive that unpacks to far more than clouds do; coordinates pack a few times smaller."""
+    claimed, held = sum(info.file_size for info in archive.zip.infolist()), path.stat().st_size
+    if claimed > _ROOM + _PACKED_AT_MOST * held:
+        raise DataError(f"{path}: claims {claimed} bytes of arrays; a file of {held} bytes can't hold such clouds")
 
 
 def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud:

@@ -240,7 +240,7 @@ def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame (H,W), by its header."""
     try:
         return np.load(path, mmap_mode="r", allow_pickle=False).ndim == 2
-    except (ValueError, OSError, EOFError):
+    except Exception:  # a damaged header raises nearly anything; reading the file says so
         return False
 
 
@@ -256,8 +256,8 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
     """Reads a ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise DataError(f"{path}: not a readable .npy array ({error})") from None
+    except Exception as error:  # a damaged header raises nearly anything
+        raise DataError(f"{path}: not a readable .npy array ({type(error).__name__}: {error})") from None
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.dtype.kind not in "uif":

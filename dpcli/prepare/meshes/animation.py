@@ -70,6 +70,19 @@ def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:
         return bake(file, chosen, frames)
 
 
+def load_still(path: Path) -> AnimatedMesh:
+    """Reads a .glb or .gltf as it stands, as a mesh of one frame, in the file's own units."""
+    with _well_formed(path):
+        refuse_required(file := read_gltf(path))
+        return bake(file, None, 1)
+
+
+def names_of_clips(path: Path) -> tuple[str, ...]:
+    """Returns the names of a file's clips, none for a model that stands still. Raises DataError for a broken file."""
+    with _well_formed(path):
+        return tuple(clip_names(read_gltf(path)))
+
+
 def animation_clip(path: Path, clip: str | None, frames: int, filming: Filming, jobs: int = 1) -> Clip:
     """Returns the Clip that `film` makes of `load_animation`."""
     return film(load_animation(path, clip, frames), filming, jobs)

@@ -40,13 +40,15 @@ class _Piece:
     emission_uv: np.ndarray
 
 
-def bake(file: Gltf, clip: int, frames: int) -> AnimatedMesh:
-    """Bakes the scene's triangles at `frames` times of a clip; time counts from 0. Bones are the file's nodes.
+def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
+    """Bakes the scene's triangles at `frames` times of a clip (None: as it stands); time counts from 0. Bones are the
+    file's nodes.
 
     What has no skin hangs on its node. Points and lines are passed over. What is hidden at a time is a point then.
     Raises DataError when the file is broken.
     """
-    parent, curves = node_parents(file), read_clip(file, clip)
+    parent = node_parents(file)
+    curves = Clip("still", 0.0, 0.0, {}) if clip is None else read_clip(file, clip)
     time = curves.sample_times(frames)
     poses, shown = node_poses(file, parent, curves, time), node_visibility(file, parent, curves, time)
     visible = [node for node in _scene_nodes(file) if shown[:, node].any()]

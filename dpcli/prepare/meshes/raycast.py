@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material, Texture
 from dpcli.prepare.meshes.gltf_material import to_linear, to_srgb
 
@@ -61,6 +61,17 @@ class FrameCaster:
         image[rows, columns] = np.rint(255 * np.clip(straight, 0, 1)).astype(np.uint8)
         return image
 
+    def all_hits(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Returns every hit of rays f32 (N,6), the hits of a ray from near to far: ray i64 (H), rising, distance f32 (H),
+        triangle i64 (H), and the weights f32 (H,3) of its corners.
+        """
+        hits = self._scene.list_intersections(self._tensor(rays))
+        ray, distance = hits["ray_ids"].numpy().astype(np.int64), hits["t_hit"].numpy()
+        order = np.lexsort((distance, ray))
+        u, v = hits["primitive_uvs"].numpy()[order].T
+        triangle = hits["primitive_ids"].numpy()[order].astype(np.int64)
+        return ray[order], distance[order], triangle, np.stack([1 - u - v, u, v], axis=1)
+
     def _window(self, intrinsics: np.ndarray, pose: np.ndarray, size: tuple[int, int]) -> tuple[slice, slice]:
         """Returns rows and columns that the object can touch; the whole picture when some of it is behind the camera."""
         points = self.positions.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
@@ -85,7 +96,7 @@ class FrameCaster:
                 break
             triangle = hits["primitive_ids"].numpy()[hit].astype(np.int64)
             u, v = hits["primitive_uvs"].numpy()[hit].T
-            color = self._surface(triangle, np.stack([1 - u - v, u, v], axis=1), rays[:, 3:])
+            color = self.surface(triangle, np.stack([1 - u - v, u, v], axis=1), rays[:, 3:])
             result[left, :3] += (through * color[:, 3])[:, None] * color[:, :3]
             result[left, 3] += through * color[:, 3]
             through = through * (1 - color[:, 3])
@@ -96,7 +107,7 @@ class FrameCaster:
             rays[:, :3] += (distance[on] + _NUDGE)[:, None] * rays[:, 3:]
         return result
 
-    def _surface(self, triangle: np.ndarray, weights: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    def surface(self, triangle: np.ndarray, weights: np.ndarray, direction: np.ndarray) -> np.ndarray:
         """Returns sRGB and alpha f32 (N,4) of points on triangles, lit; direction: where the rays go."""
         mesh, corners = self.mesh, self.mesh.triangles[triangle]
         color = surface_color(mesh, mesh.material[triangle], corners, weights)

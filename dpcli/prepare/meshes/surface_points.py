@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 
 _IMAGE_SIDES = (96, 192, 384, 768)  # pixels: the first that sees enough points is taken
 

@@ -12,9 +12,10 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
 from dpcli.prepare.reader import Item, Sample, describe, natural_key, require_folder
 from dpcli.store import CloudSequence
+from dpcli.store.file import refuse_claim
 from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = (
@@ -67,17 +68,15 @@ _EXPECTED = "ply_data_train0.h5 ..., ply_data_test0.h5 ..., train_files.txt and 
 def read_file(path: Path, *names: str) -> list[np.ndarray]:
     """Reads data sets of an HDF5 file as arrays. Raises DataError when absent, damaged, or kept in another file."""
     check_heaps(path)
-    try:
-        with h5py.File(path, "r") as file:
-            for name in names:
-                if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                    found = ", ".join(sorted(file)) or "none"
-                    raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
-                if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
-                    raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
-            return [file[name][()] for name in names]
-    except OSError as error:
-        raise DataError(f"{path}: not a readable HDF5 file, perhaps truncated ({str(error).splitlines()[0]})") from None
+    with reading(path), h5py.File(path, "r") as file:
+        for name in names:
+            if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                found = ", ".join(sorted(file)) or "none"
+                raise DataError(f"{path}: no data set {name!r} of its own; found {found}")
+            if not isinstance(file[name], h5py.Dataset) or file[name].is_virtual or file[name].external:
+                raise DataError(f"{path}: {name} keeps its data elsewhere; expected a plain data set")
+            refuse_claim(file[name], path)
+        return [file[name][()] for name in names]
 
 
 @lru_cache(maxsize=1)  # 50 MB; its 2,048 shapes are read one after the other
@@ -91,7 +90,7 @@ def _clouds(path: Path) -> np.ndarray:
 def read_labels(path: Path) -> np.ndarray:
     """Returns labels i64 (N) of a file, from 0."""
     (label,) = read_file(path, "label")
-    if label.dtype.kind not in "iu" or label.size != len(label):
+    if label.dtype.kind not in "iu" or label.ndim == 0 or label.size != len(label):
         raise DataError(f"{path}: label is {label.dtype} {label.shape}; expected whole numbers (shapes, 1)")
     return label.reshape(-1).astype(np.int64)
 
@@ -146,7 +145,7 @@ class ModelNet40:
         if not problem:
             try:
                 labels = read_labels(path)
-            except DataError as error:
+            except (DataError, OSError) as error:
                 problem = str(error)
         if problem:
             return [Item(name, path or folder, homes[0] if homes else "", problem=problem)]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, reading
 
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
 
@@ -36,7 +36,7 @@ def animation_times(path: Path) -> tuple[float, ...]:
                 times.append(now)
                 now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
             moves = image.format in ("GIF", "PNG", "WEBP", "AVIF")
-    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+    except Exception as error:  # a damaged file raises nearly anything
         raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
@@ -47,7 +47,8 @@ def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """Yields frames by rising index, each u8 (H,W,4) with straight alpha."""
     from PIL import Image
 
-    with Image.open(path) as image:
+    with reading(path), Image.open(path) as image:
         for index in wanted:
             image.seek(index)
-            yield np.array(image.convert("RGBA"))
+            picture = np.array(image.convert("RGBA"))
+            yield picture

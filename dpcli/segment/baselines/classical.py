@@ -32,8 +32,8 @@ def classical_labels(
     by Ward linkage when the number is given. Equal work gives equal labels. Raises DataError on wrong shapes and
     non-finite values, ValueError where the settings name no method.
     """
-    if settings.method is None:
-        raise ValueError("the settings name no method")
+    if not settings.classical:
+        raise ValueError(f"{settings.method} names no method of clustering")
     _check_frames(frames, flows)
     settings = settings.resolved()
     import sklearn.cluster  # noqa: F401  (its threads must be there to be limited)

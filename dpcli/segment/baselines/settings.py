@@ -1,4 +1,4 @@
-"""The settings of the classical methods; nothing here needs torch, since `--help` reads it."""
+"""The choice of a method and the settings of the classical ones; nothing here needs torch, since `--help` reads it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,27 @@ _FEWEST = {"ssc": 2, "trajaffn": 1}
 
 @dataclass(frozen=True)
 class ClassicalSettings:
-    """Holds a classical method and its settings. Lengths are in diameters of the object.
+    """Holds the method and the settings of the classical ones. Lengths are in diameters of the object.
 
     dbscan: Ester et al., KDD 1996. ward: Ward, JASA 1963. ssc: sparse subspace clustering, Elhamifar and Vidal, TPAMI
     2013. trajaffn: trajectory affinities, Ochs, Malik and Brox, TPAMI 2014; the published affinity compares the flow
     itself, the residual, ours, finds more where the whole object turns.
     """
 
-    method: Literal["dbscan", "ward", "ssc", "trajaffn"] | None = setting(
-        None, "Classical method to use instead of the network."
+    method: Literal["multibody", "network", "dbscan", "ward", "ssc", "trajaffn"] = setting(
+        "multibody",
+        "Who says the parts: multibody (one set of rigid bodies explains all frames together), network (a trained part"
+        " network, frame by frame; --model or --fast choose it too), or a classical method.",
     )
     parts: int | None = setting(
-        None, "Number of parts that --method cuts each frame into; none: it finds one.", least=1
+        None, "Number of parts that a classical --method cuts each frame into; none: it finds one.", least=1
     )
     motion: Literal["auto", "none", "flow", "residual"] = setting(
         "auto",
         "What stands beside the coordinates: nothing, the flow, or the residual, which is the flow less the dominant"
         " rigid motion of the frame; auto: none for dbscan and ward, flow for ssc, residual for trajaffn.",
     )
-    max_parts: int = setting(8, "Most parts where --method finds their number.", least=1)
+    max_parts: int = setting(8, "Most parts where a classical --method finds their number.", least=1)
     smallest_cluster: float = setting(
         0.02, "Parts of a smaller share of a frame's points join their neighbor (--method).", least=0
     )
@@ -69,21 +71,25 @@ class ClassicalSettings:
         check(self)
         if self.method in ("ssc", "trajaffn") and self.motion == "none":
             raise UsageError(f"motion = none: --method {self.method} sees only motion; expected flow or residual")
-        legal = ("method", "parts", *_SHARED, *METHODS[self.method]) if self.method else ()
+        legal = ("method", "parts", *_SHARED, *METHODS[self.method]) if self.classical else ("method",)
         for field in dataclasses.fields(self):
             if getattr(self, field.name) != field.default and field.name not in legal:
                 raise UsageError(self._refuse(field.name))
 
+    @property
+    def classical(self) -> bool:
+        """Is true for a classical method."""
+        return self.method in METHODS
+
     def _refuse(self, name: str) -> str:
         """Returns why a setting that was changed can't be meant."""
         owners = [method for method, own in METHODS.items() if name in own] or list(METHODS)
-        if self.method is None:
-            return f"{name} belongs to --method {' or '.join(owners)}; the network finds its own number of parts"
+        if not self.classical:
+            return f"{name} belongs to --method {' or '.join(owners)}; {self.method} finds its own number of parts"
         return f"{name} belongs to --method {' or '.join(owners)}; {self.method} has {', '.join(METHODS[self.method])}"
 
     def used(self) -> dict[str, Any]:
         """Returns the settings that the method reads, by name, with those that are left to it resolved."""
-        assert self.method is not None
         own = {name: getattr(self, name) for name in ("method", "parts", *_SHARED, *METHODS[self.method])}
         if self.motion == "auto":
             own["motion"] = _MOTION[self.method]

@@ -20,6 +20,7 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
+from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.model_file import default_model
 from dpcli.segment.prediction import predict_parts
 from dpcli.segment.prediction_settings import PredictSettings, Refinement
@@ -27,6 +28,7 @@ from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segme
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsSample, PartsWriter
+from dpcli.store.sequence import OF_PARTS
 from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
@@ -94,17 +96,20 @@ def predict_file(
     with input_file(data) as path, output_file(output) as target:
         reader = CloudsReader(path)
         sequences = sequences_of_split(reader, settings.input.split, data)
-        estimator = find_estimator(settings.input.flow)
+        flow = _choose_flow(settings, reader)
+        estimator = find_estimator(flow)
         said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
-        if settings.classical.method is not None:
+        if settings.classical.classical:
             said["classical"] = settings.classical.used()
+        elif settings.classical.method == "multibody":
+            said["multibody"] = asdict(settings.multibody)
         config = {"settings": said, **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
-        flow = str(estimator.resolve() if estimator else settings.input.flow)
+        flow = str(estimator.resolve() if estimator else flow)
         work = PartsOfSequence(once, flow, refinement, seed)
-        fields = [name for name in reader.fields if name not in ("part", "pose")]
+        fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
         if force or not _already_there(target, entry):
             with PartsWriter(
                 target,
@@ -125,16 +130,37 @@ def predict_file(
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:
     """Returns the segmenter that the options ask for. Raises UsageError for options that contradict one another."""
     classical, chosen = settings.classical, choose_device(device)
-    if classical.method is None:
+    if classical.method == "network":
         return NetworkSegmenter.load(model or default_model(), chosen, wanted(settings.precision.amp, chosen))
     if model is not None:
         raise UsageError(f"--model {model}: --method {classical.method} uses no network; give one of both")
+    if classical.method == "multibody":
+        return MultibodySegmenter(settings.multibody, settings.input.flow in ("auto", "tracks"))
     points = settings.refinement.points
     if classical.parts is not None and classical.parts > points:
         raise UsageError(
             f"--parts {classical.parts}: more than the {points} points of a frame that are divided (--points)"
         )
     return ClassicalSegmenter(classical, seed)
+
+
+def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
+    """Returns the estimator of flow between frames, which multibody needs none of.
+
+    Raises UsageError for a flow that the method can't use, or tracks that the file lacks.
+    """
+    flow, method = settings.input.flow, settings.classical.method
+    if flow == "tracks" and method != "multibody":
+        raise UsageError(
+            f"--flow tracks: --method {method} doesn't read tracks; leave --method out, or give --flow icp"
+        )
+    if flow == "tracks" and "track" not in reader.fields:
+        raise UsageError(f"--flow tracks: {reader.path} has no field track; leave --flow out, and motions are searched")
+    if flow not in ("auto", "tracks", "icp") and method == "multibody":
+        raise UsageError(
+            f"--flow {flow}: multibody finds the motions itself; add --method network or a classical one, or leave it out"
+        )
+    return "icp" if flow in ("auto", "tracks") else flow
 
 
 def _already_there(target: Path, entry: dict) -> bool:

@@ -206,14 +206,14 @@ def icp_kernel(source, search, motion, steps, wide, narrow, share):
 
 
 @kernel
-def residual_kernel(source, search, motion, share, out):
-    """Computes squared residuals (n) of source (3,n) moved by motion, as f64 into `out`.
+def residual_kernel(source, search, motion, share, out, at):
+    """Computes squared residuals (n) of source (3,n) moved by motion, as f64 into `out`, and the nearest, i64 into `at`.
 
     A residual is (1 - share) plane distance^2 + share point distance^2.
     """
     cloud, normals, near, count = search[0], search[1], search[3], source.shape[1]
     moved, rounded = np.empty((3, count)), np.empty((3, count), np.float32)
-    at, far = np.empty(count, np.int64), np.empty(count, np.float32)
+    far = np.empty(count, np.float32)
     work = np.empty(max(cloud.shape[1], near.shape[2] * count), np.float32)
     for k in range(3):
         for i in range(count):
@@ -233,10 +233,10 @@ def hypotheses_kernel(source, search, motions, steps, wide, narrow, share, share
 
     out (H): the mean of d^2 / (d^2 + scale^2) afterwards, d^2 as in `residual_kernel` with `share_out`.
     """
-    squared = np.empty(source.shape[1])
+    squared, at = np.empty(source.shape[1]), np.empty(source.shape[1], np.int64)
     for h in range(len(motions)):
         icp_kernel(source, search, motions[h], steps, wide, narrow, share)
-        residual_kernel(source, search, motions[h], share_out, squared)
+        residual_kernel(source, search, motions[h], share_out, squared, at)
         out[h] = 0.0
         for i in range(len(squared)):
             out[h] += squared[i] / (squared[i] + scale * scale)

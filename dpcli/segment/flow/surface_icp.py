@@ -82,9 +82,13 @@ class Surface:
 
     def residuals(self, source: np.ndarray, motion: np.ndarray, share: float) -> np.ndarray:
         """Returns squared residuals (n) of source (3,n) f32, moved: point to plane, and `share` of point to point."""
-        out = np.empty(source.shape[1])
-        residual_kernel(source, self._search, motion, share, out)
-        return out
+        return self.match(source, motion, share)[0]
+
+    def match(self, source: np.ndarray, motion: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the squared residuals (n) of `residuals` and the nearest point's index i64 (n) of each."""
+        out, at = np.empty(source.shape[1]), np.empty(source.shape[1], np.int64)
+        residual_kernel(source, self._search, motion, share, out, at)
+        return out, at
 
     def covered_by(self, moved: np.ndarray, normals: np.ndarray, share: float) -> np.ndarray:
         """Returns squared residuals (N) of this cloud's points to another one, moved (n,3), with its normals (n,3)."""

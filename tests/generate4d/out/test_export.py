@@ -14,7 +14,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.commands.export import export_scene
 from dpcli.generate4d.out.export import as_sequence, export_sequence, keep_opaque
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
-from dpcli.prepare.decode.open3d_import import load_open3d
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.store import CloudsReader, PartsReader
 from dpcli.store.gaussians import GaussianScene, write_scene
 from tests.support.scenes import HINGE, SWING, toy_scene

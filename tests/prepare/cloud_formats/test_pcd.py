@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.cloud_formats.pcd import read_pcd
-from dpcli.prepare.decode.open3d_import import load_open3d
 
 quick = settings(
     max_examples=60, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from dpcli.errors import DataError, UsageError
+from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.decode.cloud_files import read_cloud
-from dpcli.prepare.decode.open3d_import import load_open3d
 from dpcli.prepare.scans.clouds import CloudFolders
 
 RNG = np.random.default_rng(0)

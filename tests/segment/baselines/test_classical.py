@@ -278,7 +278,7 @@ def test_settings_belong_to_methods() -> None:
         "residual",
     ]
     for values, message in (
-        ({"method": "kmeans"}, "method = kmeans: expected one of dbscan, ward, ssc, trajaffn"),
+        ({"method": "kmeans"}, "method = kmeans: expected one of multibody, network, dbscan, ward, ssc, trajaffn"),
         ({"method": "ward", "eps": 1.0}, "eps belongs to --method dbscan; ward has threshold, motion_weight"),
         ({"method": "dbscan", "eps": "far"}, "eps = far: expected a number"),
         ({"method": "dbscan", "eps": -1.0}, "eps = -1.0: expected a number above 0"),
@@ -286,7 +286,7 @@ def test_settings_belong_to_methods() -> None:
         ({"method": "dbscan", "min_points": 2.5}, "min_points = 2.5: expected a whole number"),
         ({"method": "ssc", "motion": "none"}, "motion = none: --method ssc sees only motion"),
         ({"method": "ward", "parts": 0}, "parts = 0: expected at least 1"),
-        ({"parts": 3}, "parts belongs to --method dbscan or ward or ssc or trajaffn; the network finds its own"),
+        ({"parts": 3}, "parts belongs to --method dbscan or ward or ssc or trajaffn; multibody finds its own"),
     ):
         with pytest.raises(UsageError, match=re.escape(message)):
             ClassicalSettings(**values)
@@ -303,5 +303,5 @@ def test_rejects() -> None:
     ):
         with np.errstate(invalid="ignore"), pytest.raises(DataError, match=message):
             classical_labels(frames, flows, ClassicalSettings(method="ward"), rng=rng)
-    with pytest.raises(ValueError, match="name no method"):
+    with pytest.raises(ValueError, match="names no method of clustering"):
         classical_labels([frame], {}, ClassicalSettings(), rng=rng)

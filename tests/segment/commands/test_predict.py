@@ -65,6 +65,11 @@ def test_too_little_memory_keeps_what_was_predicted(dpc_here, data, tmp_path, mo
         (("predict", "DATA", "-o", "OUT", "--model", "nowhere"), 2, b"no such file"),
         (("predict", "DATA", "-o", "OUT", "--method", "kmeans"), 2, b"dbscan, ward, ssc, trajaffn"),
         (("predict", "DATA", "-o", "OUT", "--parts", "3"), 2, b"parts belongs to --method"),
+        (("predict", "DATA", "-o", "OUT", "--fast", "--method", "ward"), 2, b"it means --method network"),
+        (("predict", "DATA", "-o", "OUT", "--model", "nowhere", "--method", "multibody"), 2, b"uses no network"),
+        (("predict", "DATA", "-o", "OUT", "--flow", "nearest"), 2, b"multibody finds the motions itself"),
+        (("predict", "DATA", "-o", "OUT", "--flow", "tracks"), 2, b"has no field track"),
+        (("predict", "DATA", "-o", "OUT", "--flow", "tracks", "--fast"), 2, b"read tracks"),
         (
             ("predict", "DATA", "-o", "OUT", "--method", "ward", "--pairs", "some"),
             2,

@@ -104,7 +104,7 @@ def test_the_loss_falls() -> None:
     assert np.mean(losses[-5:]) < 0.6 * np.mean(losses[:3])
 
 
-@pytest.mark.parametrize("words", [["--set", "amp=true"], []])
+@pytest.mark.parametrize("words", [["--fast", "--set", "amp=true"], []])
 def test_the_switch_reaches_the_file(dpc_here, tmp_path, words: list[str]) -> None:
     made = dpc_here(
         "prepare",

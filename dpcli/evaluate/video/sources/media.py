@@ -70,7 +70,9 @@ def _read_image(path: Path) -> tuple[np.ndarray, bool]:
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = "A" in image.getbands() or "transparency" in image.info
             return np.asarray(upright(image).convert("RGBA")), has_alpha
-    except (OSError, SyntaxError, ValueError) as error:
+    except DataError:
+        raise
+    except Exception as error:  # a damaged image raises nearly anything, and one of a vast size DecompressionBombError
         raise DataError(f"{path}: not a readable image ({error}); make it again") from None
 
 
@@ -83,7 +85,7 @@ class ArraySource(Source):
         self.path = path
         try:
             array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except (ValueError, OSError, EOFError) as error:
+        except Exception as error:  # a damaged header raises nearly anything
             raise DataError(f"{path}: not a readable .npy array ({error})") from None
         array = array[None] if array.ndim == 4 else array
         known = array.dtype == np.uint8 or array.dtype.kind == "f"

@@ -1,0 +1,47 @@
+"""`dpc generate4d train-prior`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dpcli.cli.options import Force, Seed
+from dpcli.cli.settings_options import options_of
+from dpcli.generate4d.shape.training.settings import CATALOG, PRESETS, ShapeTraining
+from dpcli.runtime.settings.catalog import Given
+
+EVERYDAY = ("held_out", "init", "steps", "size")
+
+
+@options_of(CATALOG, EVERYDAY, presets=PRESETS, preset="release")
+def train_prior(
+    output: Annotated[str, typer.Option("-o", "--output", help="Folder for weights, checkpoints, log and curves.")],
+    given: Given,
+    meshes: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Models (.glb, .gltf) or folders of them; none: made-up creatures alone."),
+    ] = None,
+    seed: Seed = 0,
+    jobs: Annotated[int, typer.Option("--jobs", min=1, help="Processes that make pictures; 1: between the steps.")] = 2,
+    force: Force = False,
+) -> None:
+    """Train the shape prior of `fit` on pictures of models, moving and still, and of made-up creatures.
+
+    Running again continues.
+    """
+    settings = ShapeTraining(**CATALOG.resolve(PRESETS[str(given.preset)], given))
+    from dpcli.generate4d.commands.train_prior import check_sizes, train_shape_prior
+    from dpcli.prepare.synthetic.shape_pictures import find_meshes, picture_sources
+
+    check_sizes(settings)
+    learned, held = find_meshes(meshes or [], settings.data.held_out)
+    sources = picture_sources(
+        learned, held, settings.schedule.size, seed, made=settings.data.made, moving=settings.data.moving
+    )
+    models = {"models": len(learned), "held_out": sorted(file.path.name for file in held)}
+    best = train_shape_prior(
+        output, settings, sources[0].make, sources[1].make, models, seed=seed, jobs=jobs, force=force
+    )
+    typer.echo(best)

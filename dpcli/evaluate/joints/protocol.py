@@ -1,0 +1,112 @@
+"""The joints protocol: every sequence of a parts file with joints beside the true joints of a clouds file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric, ratios_of_sums
+from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
+from dpcli.evaluate.proportions import divide
+from dpcli.evaluate.results import LeftOut
+from dpcli.evaluate.segmentation.truth_pairing import PairedSequences
+
+METRICS = ("type", "axis_within_5", "edge_f1", "axis_angle", "axis_position", "state_angle", "state_length")
+
+
+@dataclass
+class JointReport:
+    """Holds the metrics of all sequences and of those of each label.
+
+    metrics: shares 0..1 (type, axis_within_5, edge_f1), degrees (axis_angle, state_angle) and length_unit (axis_position,
+    state_length); NaN where nothing counts.
+    """
+
+    split: str
+    truth: str
+    length_unit: str
+    metrics: dict[str, float]
+    classes: dict[int, dict[str, float]]
+    class_names: list[str]
+    left_out: list[LeftOut]
+    names: list[str]
+    total: JointStatistics
+    counts: dict[int, JointStatistics]
+    resampling: Resampling
+    intervals: dict[str, Interval] = field(default_factory=dict)
+
+
+def evaluate_joints(
+    path: str | Path,
+    truth: str | Path,
+    *,
+    split: str | None = None,
+    intersect: bool = False,
+    resampling: Resampling | None = None,
+) -> JointReport:
+    """Returns the metrics of the joints that a parts file holds against those of a clouds file.
+
+    Raises DataError where one of the files has no joints, or no true joint is left to compare; other arguments and errors
+    are those of `PairedSequences`.
+    """
+    resampling = resampling or Resampling(0)
+    names, labels, found = [], [], []
+    with PairedSequences(path, truth, split=split, intersect=intersect, fields=("part", "joint")) as paired:
+        if "joint" not in paired.predicted.fields:
+            raise DataError(f"{path}: no joints in it; `dpc segment joints {path} -o joints.h5` finds them")
+        for place, (row, _) in enumerate(paired.rows):
+            pair = paired.pair(place)
+            joint = paired.predicted.read(row, fields=("joint",)).joint
+            names.append(pair.truth.name)
+            labels.append(pair.truth.label)
+            found.append(joint_statistics(pair.truth.part, pair.truth.joint, pair.predicted.part, joint))
+    total = sum(found, JointStatistics())
+    if not total.joints:
+        raise DataError(f"{truth}: no joint between two parts that are seen; nothing to compare")
+    counts = {
+        label: sum((one for own, one in zip(labels, found) if own == label), JointStatistics())
+        for label in sorted({label for label in labels if label >= 0})
+    }
+    return JointReport(
+        paired.split,
+        str(truth),
+        paired.truth.length_unit,
+        joint_metrics([total]),
+        {label: joint_metrics([one]) for label, one in counts.items()},
+        paired.truth.class_names,
+        paired.left_out,
+        names,
+        total,
+        counts,
+        resampling,
+        resampling.intervals(_weighted(found), len(found)),
+    )
+
+
+def _sums(found: Sequence[JointStatistics]) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Returns numerator and denominator of each metric for each of the statistics, f64 (n)."""
+    pairs = {
+        "type": [(one.types, one.joints) for one in found],
+        "axis_within_5": [(one.near, one.axes) for one in found],
+        "edge_f1": [(2 * one.edges, one.joints + one.predicted) for one in found],
+        "axis_angle": [(sum(one.angles), len(one.angles)) for one in found],
+        "axis_position": [(sum(one.distances), len(one.distances)) for one in found],
+        "state_angle": [(sum(one.turns), len(one.turns)) for one in found],
+        "state_length": [(sum(one.slides), len(one.slides)) for one in found],
+    }
+    tops, bottoms = ({key: np.array(rows, np.float64)[:, side] for key, rows in pairs.items()} for side in (0, 1))
+    return tops, bottoms
+
+
+def _weighted(found: Sequence[JointStatistics]) -> WeightedMetric:
+    return ratios_of_sums(*_sums(found))
+
+
+def joint_metrics(found: Sequence[JointStatistics]) -> dict[str, float]:
+    """Returns the metrics of statistics taken together; NaN where nothing counts."""
+    tops, bottoms = _sums(found)
+    return {key: float(divide(tops[key].sum(), bottoms[key].sum())) for key in METRICS}

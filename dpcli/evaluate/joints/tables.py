@@ -1,0 +1,115 @@
+"""The joints report as tables, notes and the object that `--json` prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from dpcli.evaluate.joints.metrics import JointStatistics
+from dpcli.evaluate.joints.protocol import METRICS, JointReport
+from dpcli.evaluate.results import intervals_json, left_out_json, left_out_note, none_if_nan, samples_json
+from dpcli.evaluate.segmentation.tables import class_rows
+from dpcli.evaluate.text_tables import TextTable, four_digit_ends, four_digits, percent, percent_ends, resampling_note
+
+_SHARES = ("type", "axis_within_5", "edge_f1")
+_NOTE = (
+    "Parts are matched over all frames at IoU 0.5. A joint that connects other parts, or none, has the wrong type and no "
+    "axis within 5 degrees. Axis angle, axis position (the least distance between the two axes of a hinge) and value "
+    "(since frame 0, mean over the frames): of the joints of the right type, in the coordinates of frame 0."
+)
+
+
+def _titles(unit: str) -> dict[str, str]:
+    of = f" ({unit})" if unit else ""
+    return {
+        "type": "type right",
+        "axis_within_5": "axis within 5 deg",
+        "edge_f1": "tree edges F1",
+        "axis_angle": "axis angle (deg)",
+        "axis_position": f"axis position{of}",
+        "state_angle": "value, hinges (deg)",
+        "state_length": f"value, slides{of}",
+    }
+
+
+def joint_tables(report: JointReport) -> list[TextTable]:
+    """Returns a row for each class and for all, and a table of the intervals."""
+    titles = _titles(report.length_unit)
+    pairs = {label: (report.classes[label], report.counts[label]) for label in report.classes}
+    rows = [
+        [title, str(counts.joints), *(_shown(key, metrics[key]) for key in METRICS)]
+        for title, (metrics, counts) in class_rows((report.metrics, report.total), pairs, report.class_names)
+    ]
+    main = TextTable("Joints", ["class", "true joints", *(titles[key] for key in METRICS)], rows)
+    if not report.intervals:
+        return [main]
+    ends = [
+        [
+            titles[key],
+            _shown(key, report.metrics[key]),
+            (percent_ends if key in _SHARES else four_digit_ends)(report.intervals.get(key)),
+        ]
+        for key in METRICS
+    ]
+    title = f"{100 * report.resampling.confidence:.4g} % interval"
+    return [main, TextTable("All sequences", ["metric", "value", title], ends)]
+
+
+def _shown(key: str, value: float) -> str:
+    return percent(value) if key in _SHARES else four_digits(value)
+
+
+def joint_notes(report: JointReport) -> list[str]:
+    """Returns sentences on what was counted and how, and what was left out."""
+    total = report.total
+    return [
+        f"Split {report.split!r}, truth: {report.truth}. {total.joints} true joints of {len(report.names)} sequences, "
+        f"{total.predicted} predicted, {total.edges} between the right parts.",
+        *resampling_note(report.resampling, "sequences", len(report.names)),
+        _NOTE,
+        *(left_out_note(entry, "sequences") for entry in report.left_out),
+    ]
+
+
+def joint_json(report: JointReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+    """Returns the report with its numbers under `metrics`, None where a number is undefined (0/0).
+
+    source: the parts file, as it was named. provenance: that of the file.
+    """
+    unit = report.length_unit
+    rows = [
+        {
+            "label": label,
+            "name": report.class_names[label] if label < len(report.class_names) else "",
+            **_numbers(metrics),
+            **_counts(report.counts[label]),
+        }
+        for label, metrics in report.classes.items()
+    ]
+    units = {**dict.fromkeys(_SHARES, "fraction"), "axis_angle": "degree", "axis_position": unit}
+    return {
+        "task": "joints",
+        "input": source,
+        "protocol": {"split": report.split, "truth": report.truth, "iou_threshold": 0.5, "axis_within": 5},
+        "metrics": _numbers(report.metrics) | {"per_class": rows},
+        "intervals": intervals_json(report.resampling, "sequences", len(report.names), report.intervals),
+        "samples": samples_json("sequences", report.names),
+        "units": units | {"state_angle": "degree", "state_length": unit},
+        "denominators": {"sequences": len(report.names), **_counts(report.total)},
+        "left_out": left_out_json(report.left_out),
+        "provenance": list(provenance),
+    }
+
+
+def _numbers(metrics: dict[str, float]) -> dict[str, float | None]:
+    return {key: none_if_nan(metrics[key]) for key in METRICS}
+
+
+def _counts(total: JointStatistics) -> dict[str, int]:
+    return {
+        "true_joints": total.joints,
+        "predicted_joints": total.predicted,
+        "joints_between_the_right_parts": total.edges,
+        "joints_of_the_right_type": total.types,
+        "true_axes": total.axes,
+    }

@@ -1,0 +1,85 @@
+"""Does the work of `dpc generate4d train-prior`; the options are in `cli/generate4d/train_prior.py`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dpcli.errors import UsageError
+from dpcli.generate4d.shape.model_file import load_shape_model
+from dpcli.generate4d.shape.network import ShapeNetwork
+from dpcli.generate4d.shape.training.learning_curves import COLUMNS, draw_curves
+from dpcli.generate4d.shape.training.rounds import MakeViews, make_round
+from dpcli.generate4d.shape.training.settings import CATALOG, ShapeTraining
+from dpcli.generate4d.shape.training.trainer import ShapeTrainer
+from dpcli.runtime import provenance
+from dpcli.runtime.progress import log
+from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.seeds import Generate4DStream, torch_seed
+from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import whole_file
+
+HELD_OUT_ROUND = 1 << 20  # the number of the round that validates: no training gets so far
+
+
+def train_shape_prior(
+    output: str,
+    settings: ShapeTraining,
+    learned: MakeViews,
+    held: MakeViews,
+    models: dict[str, Any],
+    *,
+    seed: int,
+    jobs: int,
+    force: bool,
+) -> Path:
+    """Trains on the pictures that `learned` makes and returns the file of the best weights, by the pictures of `held`.
+
+    models: what the pictures come from; a run continues only with the same. Raises UsageError where the settings don't
+    fit each other or the folder holds another run.
+    """
+    check_sizes(settings)
+    record = {name: asdict(group) for name, group in settings._asdict().items()}
+    record = json.loads(json.dumps({**record, "seed": seed, **models}))
+    folder = RunFolder(output, record, force, columns=COLUMNS, curves=draw_curves)
+    torch.manual_seed(torch_seed(seed, Generate4DStream.SHAPE_WEIGHTS))
+    model = _start(settings, folder)
+    notes = {"command": provenance.command_line(), "seed": seed, "trained_on": models}
+    keep_freed_memory()
+    with folder, stop_requested() as stop:
+        with whole_file(folder.file("settings.toml")) as part:
+            part.write_text(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
+        kept = make_round(held, settings.data.validation, HELD_OUT_ROUND)
+        weights = sum(value.numel() for value in model.parameters())
+        log.info(f"{weights:,} weights; {len(kept.rgba)} pictures for validation; {settings.schedule.steps} steps")
+        batch = kept.take(range(len(kept.rgba)))
+        trainer = ShapeTrainer(model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop)
+        return trainer.run()
+
+
+def check_sizes(settings: ShapeTraining) -> None:
+    """Raises UsageError where the pictures can't be halved as often as the network has levels."""
+    factor, size = 2 ** len(settings.network.widths), settings.schedule.size
+    if size % factor:
+        raise UsageError(
+            f"size = {size}: expected a multiple of {factor}, as the network has {len(settings.network.widths)} levels"
+        )
+
+
+def _start(settings: ShapeTraining, folder: RunFolder) -> ShapeNetwork:
+    """Returns a new network, or one with the weights of `init`. Raises UsageError where these are of another size."""
+    init = settings.data.init
+    if init is None:
+        return ShapeNetwork(settings.network)
+    folder.refuse_inside("init", Path(init))
+    found, _ = load_shape_model(init)
+    if found.config != settings.network:
+        raise UsageError(f"init = {init}: its network has another configuration; give the same network settings")
+    model = ShapeNetwork(settings.network)
+    model.load_state_dict(found.state_dict())
+    return model

@@ -1,0 +1,32 @@
+"""The sizes of the shape network; nothing here needs torch."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from dpcli.runtime.settings.fields import check, setting
+
+
+@dataclass(frozen=True)
+class ShapeConfig:
+    """Holds the sizes of a shape network."""
+
+    widths: tuple[int, ...] = setting(
+        (24, 64, 128, 192), "Channels of the levels; the first works at half of the pictures' size.", least=1
+    )
+    hidden: int = setting(128, "Width of the layers that name the angles.", least=1)
+    bins: int = setting(15, "Bins of each angle.", least=2)
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    def to_json(self) -> str:
+        """Returns the text that a weights file keeps."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> ShapeConfig:
+        """Returns the sizes that `to_json` wrote."""
+        values = json.loads(text)
+        return cls(**{**values, "widths": tuple(values["widths"])})

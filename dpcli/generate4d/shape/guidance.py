@@ -1,0 +1,69 @@
+"""A shape prior in a fit: where its first Gaussians are, and pictures of every frame from sides that nobody filmed."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.errors import DataError
+from dpcli.generate4d.shape.layers import Camera, ShapeLayers, ShapePrior, points_of
+from dpcli.generate4d.shape.splats import Splats, splats_of
+from dpcli.generate4d.targets import Targets
+
+_SIDE = 128  # pixels at most of the pictures that a prior looks at
+
+
+class ShapeGuidance:
+    """Holds the layers that a prior predicts for every frame of the reference view, ready to be drawn."""
+
+    def __init__(self, prior: ShapePrior, targets: Targets) -> None:
+        pictures, self.camera = reference_pictures(targets, _SIDE)
+        self.name = prior.name
+        self.layers = prior.layers(pictures, self.camera)
+        self.splats: list[Splats] = [splats_of(frame, self.camera) for frame in self.layers]
+
+    @property
+    def confidence(self) -> float:
+        """The median of the frames' confidence, 0..1."""
+        return float(np.median([frame.confidence for frame in self.layers]))
+
+    def pictures(self, frames: list[int], poses: Tensor, intrinsics: Tensor, size: int) -> Tensor:  # [B, S, S, 4]
+        """Returns the frames seen by square cameras, f32: color times alpha, and alpha; poses (B,4,4), intrinsics (B,3,3)."""
+        drawn = [
+            self.splats[frame].to(poses.device).draw(pose, matrix, size, size)
+            for frame, pose, matrix in zip(frames, poses, intrinsics)
+        ]
+        return torch.stack(drawn)
+
+
+def reference_pictures(targets: Targets, side: int) -> tuple[np.ndarray, Camera]:  # [T, 4, H, W]
+    """Returns the reference view f32 RGBA of straight color, 0..1, at most `side` pixels long, and its camera."""
+    shrink = max(1, round(max(targets.size) / side))
+    frames = list(range(targets.num_frames))
+    chosen, matrices, poses = targets.at([targets.reference] * len(frames), frames, shrink)
+    pictures = chosen.permute(0, 3, 1, 2).numpy()
+    pictures[:, :3] /= np.maximum(pictures[:, 3:], 1e-3)
+    return pictures.clip(0, 1), Camera(matrices[0].double().numpy(), poses[0].double().numpy())
+
+
+def sample_surface(
+    layers: ShapeLayers, camera: Camera, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns positions and colors (count,3) f32 on the layers' surface, spread by its area.
+
+    Points are moved by up to half a pixel along the surface. Raises DataError where no interval is present.
+    """
+    points = points_of(layers, camera)
+    if not len(points.position):
+        raise DataError(
+            "the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again"
+        )
+    ray = points.position + camera.world_to_camera[:3, :3].T @ camera.world_to_camera[:3, 3]
+    depth = ray @ camera.world_to_camera[2, :3]
+    facing = np.abs((ray * points.normal).sum(1)) / np.linalg.norm(ray, axis=1)
+    area = depth**2 / facing.clip(0.15)
+    picked = rng.choice(len(area), count, p=area / area.sum())
+    shift = rng.uniform(-0.5, 0.5, (count, 3)) * (depth[picked] / camera.intrinsics[0, 0])[:, None]
+    shift -= (shift * points.normal[picked]).sum(1, keepdims=True) * points.normal[picked]
+    return (points.position[picked] + shift).astype(np.float32), points.color[picked]

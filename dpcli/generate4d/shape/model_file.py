@@ -1,0 +1,45 @@
+"""The weights file of a shape network: half precision, with its configuration and what its confidence means."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.network import ShapeNetwork
+from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
+
+_FORMAT, _MAKER = "dpc-shape-1", "dpc generate4d train-prior"
+SHIPPED = Path(__file__).parent / "weights"
+DEFAULT = "creatures"  # the shipped network
+
+
+def save_shape_model(path: Path, model: ShapeNetwork, notes: dict[str, Any]) -> None:
+    """Writes the weights as float16; notes: a small JSON object, `size` and `confidence` among it."""
+    header = {"format": _FORMAT, "config": model.config.to_json(), "notes": json.dumps(notes, sort_keys=True)}
+    state = {name: value.half() if value.is_floating_point() else value for name, value in model.state_dict().items()}
+    save_weights(path, state, header)
+
+
+def find_shape_model(name: str | Path) -> Path:
+    """Returns the weights file that a name means: a file, a training folder or a shipped network. Raises UsageError."""
+    return find_weights(name, SHIPPED, _MAKER, "--prior-model")
+
+
+def load_shape_model(name: str | Path) -> tuple[ShapeNetwork, dict[str, Any]]:
+    """Returns a shape network in eval mode, and its notes. Raises DataError for a damaged file or one of another kind."""
+    path = find_shape_model(name)
+    return _read(path, path.stat().st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=1)
+def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
+    """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
+    tensors, header = load_weights(path, _FORMAT, _MAKER)
+    model = ShapeNetwork(ShapeConfig.from_json(header["config"]))
+    load_state(
+        model, {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}, path
+    )
+    return model.eval(), json.loads(header["notes"])

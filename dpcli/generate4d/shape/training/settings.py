@@ -1,0 +1,61 @@
+"""The settings of the training of a shape network, and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.runtime.settings.catalog import Catalog
+from dpcli.runtime.settings.fields import check, setting
+
+
+@dataclass(frozen=True)
+class ShapeSchedule:
+    """Holds how long a shape network learns, from pictures of which size, and how often it sees each."""
+
+    steps: int = setting(20_000, "Steps of the optimizer.", least=1)
+    batch: int = setting(64, "Pictures per step, in which the turn of the whole is learned.", least=1)
+    decoded: int = setting(16, "Pictures of each step in which the layers are learned, too: the easier part.", least=1)
+    size: int = setting(64, "Side of the pictures, pixels; a multiple of 2 to the number of levels.", least=16)
+    lr: float = setting(2e-3, "Largest learning rate; it falls to zero as a cosine.", above=0)
+    round: int = setting(1024, "Pictures that are made at a time; a training begins with four times as many.", least=1)
+    rounds: int = setting(24, "Rounds of pictures that are kept.", least=1)
+    reuse: int = setting(6, "Times that a picture is seen.", least=1)
+    bfloat16: bool = setting(False, "Matrix products in bfloat16: faster on processors that have it.")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@dataclass(frozen=True)
+class ShapeData:
+    """Holds what the pictures of a training show."""
+
+    made: float = setting(0.5, "Share of made-up creatures.", least=0, most=1)
+    moving: float = setting(0.35, "Share of models with animations; still models have the rest.", least=0, most=1)
+    held_out: str | None = setting(None, "A text file with models for validation alone, one path or its end a line.")
+    validation: int = setting(384, "Pictures of held-out models that choose the best weights.", least=1)
+    init: str | None = setting(None, "Weights to start from: a file or a folder of an earlier training.")
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+class ShapeTraining(NamedTuple):
+    """Holds all settings of a training."""
+
+    network: ShapeConfig
+    schedule: ShapeSchedule
+    data: ShapeData
+
+
+CATALOG = Catalog(network=ShapeConfig, schedule=ShapeSchedule, data=ShapeData)
+PRESETS = {
+    "release": {"network": ShapeConfig(), "schedule": ShapeSchedule(), "data": ShapeData()},
+    "tiny": {
+        "network": ShapeConfig(widths=(8, 16), hidden=16, bins=5),
+        "schedule": ShapeSchedule(steps=20, batch=4, decoded=2, size=16, round=16, rounds=2, reuse=4),
+        "data": ShapeData(validation=16),
+    },
+}

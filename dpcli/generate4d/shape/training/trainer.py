@@ -1,0 +1,176 @@
+"""The training of a shape network.
+
+A run can be stopped at any step and continued to the same weights: pictures come from the seed and their round's number,
+what a step draws of them from the seed and the step, and the state holds weights, their running mean, and optimizer.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dpcli.generate4d.shape.model_file import save_shape_model
+from dpcli.generate4d.shape.network import ShapeNetwork, inflated_layers
+from dpcli.generate4d.shape.training.confidence import calibrate
+from dpcli.generate4d.shape.training.losses import depth_error, gain_of, object_angles, shape_loss
+from dpcli.generate4d.shape.training.rounds import Batch, MakeViews, Window, open_window
+from dpcli.generate4d.shape.training.settings import ShapeSchedule
+from dpcli.runtime.mixed_precision import reduced_products
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.seeds import Generate4DStream, generator
+from dpcli.runtime.signals import StopRequest
+
+_WARM = 200  # steps until the learning rate is at its largest
+_GUESSED = 0.25  # of the pictures are decoded at the network's own angles
+_MEMORY = 0.999  # of the running mean of the weights
+
+
+class ShapeTrainer:
+    """Trains a network on rounds of pictures; `best.safetensors` has the running mean of least error on `held`.
+
+    Adam, cosine learning rate. Every `log_every` steps (None: 60 times in all) the log gets a row and the state is saved.
+    """
+
+    def __init__(
+        self,
+        model: ShapeNetwork,
+        folder: RunFolder,
+        schedule: ShapeSchedule,
+        make: MakeViews,
+        held: Batch,
+        notes: dict[str, Any],
+        *,
+        seed: int,
+        jobs: int,
+        stop: StopRequest,
+    ) -> None:
+        self.model, self.mean = model, deepcopy(model).eval()
+        self.folder, self.schedule, self.make, self.held = folder, schedule, make, held
+        self.notes, self.seed, self.jobs, self.stop = notes, seed, jobs, stop
+        self.log_every = max(1, schedule.steps // 60)
+        self.per_round = max(1, schedule.round * schedule.reuse // schedule.batch)
+        self.optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr, weight_decay=1e-4)
+        self.step, self.best, self.sums, self.spent = 0, float("inf"), {"steps": 0.0}, 0.0
+
+    def run(self) -> Path:
+        """Trains from wherever the folder's state says to the last step; returns the file of the best weights.
+
+        Raises Stopped when a stop was asked for, after saving.
+        """
+        state = self.folder.load_state()
+        if state is not None:
+            self._restore(state)
+        sizes = self.schedule
+        rounds = math.ceil(sizes.steps / self.per_round)
+        if self.step < sizes.steps:
+            at = self.step // self.per_round
+            with open_window(self.make, sizes.round, sizes.rounds, at, rounds, self.jobs) as window:
+                self._learn(window)
+        self.folder.draw_curves()
+        return self.folder.file("best.safetensors")
+
+    def _learn(self, window: Window) -> None:
+        fresh, started = True, time.monotonic()
+        with Progress("shape", self.schedule.steps, "step") as bar:
+            bar.skip(self.step)
+            while self.step < self.schedule.steps:
+                if fresh or self.step % self.per_round == 0:
+                    window.advance()
+                    fresh = False
+                self._one_step(window)
+                bar.note(loss=self.sums["loss"] / self.sums["steps"])
+                bar.advance(1)
+                if self.step % self.log_every == 0 or self.step == self.schedule.steps:
+                    self._end_interval(time.monotonic() - started)
+                    started = time.monotonic()
+                if self.stop.requested:
+                    self.spent += time.monotonic() - started
+                    self._save()
+                    self.stop.check(f"shape network saved at step {self.step}")
+
+    def _learning_rate(self) -> float:
+        """Returns the learning rate of the step."""
+        warm = min(1.0, (self.step + 1) / _WARM)
+        return self.schedule.lr * warm * 0.5 * (1 + math.cos(math.pi * self.step / self.schedule.steps))
+
+    def _one_step(self, window: Window) -> None:
+        """Learns from one batch and takes it into the running mean."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = self._learning_rate()
+        rng = generator(self.seed, Generate4DStream.SHAPE_STEP, self.step)
+        batch = window.draw(self.schedule.batch, rng)
+        guessed = torch.from_numpy(rng.random(min(self.schedule.decoded, self.schedule.batch)) < _GUESSED)
+        with reduced_products(torch.device("cpu"), self.schedule.bfloat16):
+            loss, parts = shape_loss(self.model, batch, guessed)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if torch.isfinite(torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)):
+            self.optimizer.step()
+        keep = min(_MEMORY, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for mean, now in zip(self.mean.state_dict().values(), self.model.state_dict().values()):
+                mean.lerp_(now, 1 - keep) if mean.is_floating_point() else mean.copy_(now)
+        for key, value in {"steps": 1.0, "loss": loss.detach(), **parts}.items():
+            self.sums[key] = self.sums.get(key, 0.0) + float(value)
+        self.step += 1
+
+    def _end_interval(self, seconds: float) -> None:
+        """Validates, writes a row of the log, and saves."""
+        steps = self.sums.pop("steps")
+        row = {"step": self.step, **{key: value / steps for key, value in self.sums.items()}}
+        measured, confidence = validate(self.mean, self.held)
+        row |= measured | {"learning_rate": self._learning_rate(), "seconds": round(self.spent + seconds, 2)}
+        log.detail(f"{row}")
+        self.folder.log(row)
+        self.sums, self.spent = {"steps": 0.0}, 0.0
+        notes = {**self.notes, "step": self.step, "size": self.schedule.size, "confidence": confidence, **measured}
+        if measured["validation_loss"] < self.best:
+            self.best = measured["validation_loss"]
+            save_shape_model(self.folder.file("best.safetensors"), self.mean, notes)
+        save_shape_model(self.folder.file("last.safetensors"), self.mean, notes)
+        self._save()
+        self.folder.draw_curves()
+
+    def _save(self) -> None:
+        networks = {"model": self.model.state_dict(), "mean": self.mean.state_dict()}
+        plain = {key: getattr(self, key) for key in ("step", "best", "sums", "spent")}
+        self.folder.save_state({**plain, **networks, "optimizer": self.optimizer.state_dict()})
+
+    def _restore(self, state: dict) -> None:
+        for key in ("step", "best", "sums", "spent"):
+            setattr(self, key, state[key])
+        for key in ("model", "mean", "optimizer"):
+            getattr(self, key).load_state_dict(state[key])
+        end = self.schedule.steps
+        self.folder.tell_continuing(f"step {self.step + 1} of {end}" if self.step < end else None)
+
+
+@torch.inference_mode()
+def validate(model: ShapeNetwork, held: Batch, batch: int = 64) -> tuple[dict[str, float], tuple[float, float]]:
+    """Returns measures of a network that names the angles itself, and slope and offset of its confidence.
+
+    validation_loss, validation_inflated: error of its layers and of the inflation's, sides of the picture;
+    validation_angle: mean error of the turn about the vertical, degrees.
+    """
+    model.eval()
+    errors, plain, turned, claimed, gained = [], [], [], [], []
+    for start in range(0, len(held.pictures), batch):
+        part = Batch(*(tensor[start : start + batch] for tensor in held))
+        encoded = model.encode(part.pictures)
+        angles = model.mean_angles(encoded.angles)
+        error = depth_error(model.decode(encoded, part.pictures, angles)[0], part.depth)
+        errors.append(error)
+        plain.append(depth_error(inflated_layers(part.pictures[:, 4]), part.depth))
+        turned.append((angles - object_angles(part.depth))[:, 0].abs().rad2deg())
+        claimed.append(encoded.gain)
+        gained.append(gain_of(error, part))
+    means = [float(torch.cat(parts).mean()) for parts in (errors, plain, turned)]
+    confidence = calibrate(torch.cat(claimed).numpy(), (torch.cat(gained) > 0).numpy().astype(np.float64))
+    return dict(zip(("validation_loss", "validation_inflated", "validation_angle"), means)), confidence

@@ -1,0 +1,196 @@
+"""Rounds of pictures with layers for the training of a shape prior: from models, moving or still, and made-up creatures.
+
+A round is made from the seed and its number alone, so that a training that goes on sees the pictures it would have seen.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError, UsageError
+from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, Material
+from dpcli.prepare.meshes.animation import load_animation, load_still, names_of_clips
+from dpcli.prepare.meshes.layered_views import LayeredViews, draw_views
+from dpcli.prepare.meshes.skinning import skin, vertex_normals
+from dpcli.prepare.synthetic.creature_mesh import make_skin
+from dpcli.prepare.synthetic.gait import bone_motion
+from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
+from dpcli.runtime.progress import log
+from dpcli.runtime.seeds import PrepareStream, generator
+
+_POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
+_PER_MESH = 6  # pictures of one mesh in a round
+_MOST_MISSES = 200  # models in a row that show nothing
+_SAID: set[str] = set()  # what was said of models in this process
+_MOST_TRIANGLES = 200_000  # larger models are passed over, since one would hold up all others
+
+
+@dataclass(frozen=True)
+class MeshFile:
+    """Names a model and its clips; none: it stands still."""
+
+    path: Path
+    clips: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PictureSource:
+    """Makes rounds of pictures. made, moving: shares of made-up creatures and of animated models, 0..1; still models have
+    the rest. A folder's share grows with the root of its number of models: many of them are alike.
+    """
+
+    files: tuple[MeshFile, ...]
+    size: int
+    seed: int
+    made: float = 0.5
+    moving: float = 0.35
+
+    def make(self, number: int, count: int) -> LayeredViews:
+        """Makes the `count` pictures of a round, in random order. Raises DataError where no model shows anything."""
+        rng = generator(self.seed, PrepareStream.SHAPE_PICTURES, number)
+        parts, have, misses = [], 0, 0
+        while have < count:
+            with log.each_once(_SAID):
+                mesh = self._draw_mesh(rng)
+            views = draw_views(_recolored(mesh, rng), _PER_MESH, self.size, rng) if mesh is not None else None
+            if views is not None and len(views.rgba):
+                parts.append(views)
+                have += len(views.rgba)
+            else:
+                misses += 1
+                if misses > _MOST_MISSES and not have:
+                    raise DataError(
+                        f"none of {misses} models drawn shows anything; are these {len(self.files)} models whole?"
+                    )
+        order = rng.permutation(have)[:count]
+        return LayeredViews(
+            np.concatenate([part.rgba for part in parts])[order], np.concatenate([part.depth for part in parts])[order]
+        )
+
+    def _draw_mesh(self, rng: np.random.Generator) -> AnimatedMesh | None:
+        """Draws a mesh in some poses; None where a model can't be read, which is said once per model."""
+        kind = rng.random()
+        moving = [file for file in self.files if file.clips]
+        still = [file for file in self.files if not file.clips]
+        if kind < self.made or not self.files:
+            return made_creature(rng)
+        if moving and (kind < self.made + self.moving or not still):
+            return _read(_draw_file(moving, rng), rng)
+        return _read(_draw_file(still, rng), rng)
+
+
+def picture_sources(
+    learned: Sequence[MeshFile], held: Sequence[MeshFile], size: int, seed: int, *, made: float, moving: float
+) -> tuple[PictureSource, PictureSource]:
+    """Returns the source to learn from and the one to validate on: held-out models alone, made-up creatures without any."""
+    return (
+        PictureSource(tuple(learned), size, seed, made, moving),
+        PictureSource(tuple(held), size, seed, made=0.0, moving=1.0),
+    )
+
+
+def find_meshes(places: Sequence[Path], held_out: str | None) -> tuple[list[MeshFile], list[MeshFile]]:
+    """Returns the models in files and folders, those to learn from and those that the text file `held_out` names.
+
+    A line of it is a path or the end of one; what follows # is not read. Raises DataError where a model can't be read,
+    a folder has none, or a line names none.
+    """
+    paths = [path for place in places for path in _models_in(place)]
+    if held_out and not Path(held_out).is_file():
+        raise UsageError(f"--held-out {held_out}: no such file")
+    text = Path(held_out).read_text() if held_out else ""
+    ends = [end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end]
+    for end in ends:
+        if not any(_ends_with(path, end) for path in paths):
+            raise DataError(
+                f"{held_out}: {end} is none of the {len(paths)} models; name paths, or ends of paths, below them"
+            )
+    files = [MeshFile(path, names_of_clips(path)) for path in paths]
+    held = [file for file in files if any(_ends_with(file.path, end) for end in ends)]
+    return [file for file in files if file not in held], held
+
+
+def _models_in(place: Path) -> list[Path]:
+    """Returns the models that a file or folder holds, in order."""
+    if place.is_file():
+        return [place]
+    if not place.is_dir():
+        raise UsageError(f"{place}: no such file or folder")
+    found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
+    if not found:
+        raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")
+    return found
+
+
+def _ends_with(path: Path, end: str) -> bool:
+    return ("/" + path.as_posix()).endswith("/" + end)
+
+
+def made_creature(rng: np.random.Generator) -> AnimatedMesh:
+    """Makes a creature of random plan in random poses."""
+    animal = wild_creature(rng)
+    body = make_skin(animal, rng, _CELLS)
+    moved = bone_motion(animal, wild_turns(animal, _POSES, rng), np.zeros((_POSES, 3)))
+    positions, normals = skin(
+        body.vertices, vertex_normals(body.vertices, body.triangles), body.bones, body.weights, moved
+    )
+    return AnimatedMesh(
+        name="creature",
+        time=np.arange(_POSES, dtype=float),
+        positions=positions,
+        normals=normals,
+        triangles=body.triangles,
+        material=np.zeros(len(body.triangles), np.int64),
+        materials=(Material(),),
+        color=body.color,
+        uv=np.zeros((len(body.vertices), 2), np.float32),
+        bones=body.bones,
+        weights=body.weights,
+        bone_pose=moved,
+        bone_parent=np.array([bone.parent for bone in animal.bones]),
+    )
+
+
+def _draw_file(files: Sequence[MeshFile], rng: np.random.Generator) -> MeshFile:
+    """Draws a model; each counts one over the root of the number of models in its folder."""
+    folders = [str(file.path.parent) for file in files]
+    number = Counter(folders)
+    weight = np.array([number[folder] ** -0.5 for folder in folders])
+    return files[int(rng.choice(len(files), p=weight / weight.sum()))]
+
+
+def _read(file: MeshFile, rng: np.random.Generator) -> AnimatedMesh | None:
+    """Reads a model in random poses of a random clip, sometimes stretched a little along its axes."""
+    clip = file.clips[int(rng.integers(len(file.clips)))] if file.clips else None
+    try:
+        mesh = load_still(file.path) if clip is None else load_animation(file.path, clip, _POSES)
+    except DataError as error:
+        log.warn(f"left out: {error}")
+        return None
+    if len(mesh.triangles) > _MOST_TRIANGLES:
+        log.warn(f"left out: {file.path}: {len(mesh.triangles):,} triangles, expected at most {_MOST_TRIANGLES:,}")
+        return None
+    stretch = np.exp(0.12 * rng.normal(size=3)).astype(np.float32)
+    return replace(mesh, positions=mesh.positions * stretch)
+
+
+def _recolored(mesh: AnimatedMesh, rng: np.random.Generator) -> AnimatedMesh:
+    """Returns the mesh with colors mixed, so that no color tells what a thing is; one time in three as it is."""
+    if rng.random() < 1 / 3:
+        return mesh
+    mix = rng.dirichlet([0.6] * 3, size=3)
+    gain = np.exp(0.3 * rng.normal(size=3))
+    materials = []
+    for material in mesh.materials:
+        color = np.array(material.color[:3])
+        if material.texture is None:
+            color = rng.random(3) if rng.random() < 0.5 else np.clip(mix @ color * gain, 0, 1)
+        else:
+            color = np.clip(color * gain, 0, 1.5)
+        materials.append(replace(material, color=(*map(float, color), material.color[3])))
+    return replace(mesh, materials=tuple(materials))

@@ -1,0 +1,122 @@
+"""Does the work of `dpc segment joints`; the options are in `cli/segment/joints.py`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime import provenance
+from dpcli.runtime.progress import Progress, log
+from dpcli.segment.kinematics.joints_picture import joints_picture
+from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
+from dpcli.segment.kinematics.urdf_writer import make_folder, tree_json, write_trees, write_urdf
+from dpcli.store import CloudSequence, input_file
+from dpcli.store.parts import PartsReader, PartsWriter
+
+SUFFIXES = (".h5", ".urdf", ".json")
+
+
+def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path | None, force: bool) -> Counter[str]:
+    """Finds the joints of the sequences of a parts file, or of one, and returns how many of each type there are.
+
+    output: `.h5`, a parts file that holds the joints too; `.urdf`, one object, with a folder of meshes beside it; `.json`;
+    a folder for a URDF of each sequence. picture: of the one, or the first. Raises UsageError for an output that exists
+    (without `force`) or can't hold what was asked for, DataError for a sequence whose motions are unknown.
+    """
+    if output.exists() and not force:
+        raise UsageError(f"{output}: exists already; --force replaces it")
+    with input_file(parts) as path, PartsReader(path) as reader:
+        chosen = _chosen(reader, sequence)
+        if output.suffix == ".urdf" and len(chosen) > 1:
+            raise UsageError(
+                f"-o {output}: one object, but {path.name} has {len(chosen)} sequences; name one with --sequence, or a folder"
+            )
+        counts: Counter[str] = Counter()
+        write = _WRITERS.get(output.suffix.lower(), _write_folder)
+        write(_trees(reader, chosen, counts, picture), output, reader, path, force)
+    return counts
+
+
+def _chosen(reader: PartsReader, sequence: str | None) -> list[int]:
+    if sequence is None:
+        return list(range(len(reader)))
+    if sequence not in reader.names:
+        shown = ", ".join(reader.names[:5])
+        raise UsageError(
+            f"--sequence {sequence}: not in {reader.path}; it has {shown}{', ...' if len(reader) > 5 else ''}"
+        )
+    return [reader.names.index(sequence)]
+
+
+Trees = Iterator[tuple[int, CloudSequence, KinematicTree]]
+
+
+def _trees(reader: PartsReader, chosen: list[int], counts: Counter[str], picture: Path | None) -> Trees:
+    with Progress("joints", len(chosen), "sequence") as progress:
+        for number, index in enumerate(chosen):
+            sequence = reader.read(index)
+            if not (sequence.part >= 0).any():
+                raise DataError(f"{reader.path}: {sequence.name!r} has no point in any part; predict its parts first")
+            tree = kinematic_tree(sequence, reader.read_parts(index))
+            counts.update(joint_counts(tree))
+            if picture is not None and number == 0:
+                joints_picture(picture, tree, sequence.name)
+            yield index, sequence, tree
+            progress.advance()
+
+
+def _write_parts(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+    """Writes the parts file again, with the joints as a further field."""
+    fields = [name for name in reader.fields if name != "joint"]
+    history = [*reader.provenance, provenance.record({}, 0, {"parts": path})]
+    with PartsWriter(
+        output,
+        num_parts=reader.num_parts,
+        class_names=reader.class_names,
+        length_unit=reader.length_unit,
+        source=path.name,
+        provenance=history,
+        fields=[*fields, "joint"],
+        force=force,
+    ) as writer:
+        for index, sequence, tree in trees:
+            sequence.joint = tree.as_field(sequence.num_frames, reader.num_parts)
+            said = reader.read_parts(index)
+            writer.write(sequence, said.probability, said.pairs, said.motion, said.flow)
+
+
+def _write_urdf(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+    for _, sequence, tree in trees:
+        write_urdf(output, tree, sequence.name)
+        log.info(f"{output}: {len(tree.points)} links; meshes in {output.stem}_meshes")
+
+
+def _write_json(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+    write_trees(output, [tree_json(tree, sequence.name, reader.length_unit) for _, sequence, tree in trees])
+
+
+def _write_folder(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
+    if output.suffix:
+        raise UsageError(f"-o {output}: expected a name that ends in {', '.join(SUFFIXES)}, or a folder")
+    make_folder(output)
+    objects, taken = [], set()
+    for index, sequence, tree in trees:
+        name = _file_name(sequence.name)
+        name = f"{name}_{index}" if name in taken else name
+        taken.add(name)
+        write_urdf(output / f"{name}.urdf", tree, sequence.name)
+        objects.append(tree_json(tree, sequence.name, reader.length_unit))
+    write_trees(output / "joints.json", objects)
+
+
+def _file_name(name: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in "-_." else "_" for letter in name).lstrip(".") or "object"
+
+
+_WRITERS: dict[str, Callable[[Trees, Path, PartsReader, Path, bool], None]] = {
+    ".h5": _write_parts,
+    ".urdf": _write_urdf,
+    ".json": _write_json,
+}

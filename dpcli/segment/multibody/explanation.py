@@ -1,0 +1,100 @@
+"""The explanation of a sequence: bodies with one label per point and one trajectory each, and the energy they cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.segment.multibody.frames import Frames, Trajectory
+from dpcli.segment.multibody.label_kernels import mean_field_kernel, support_kernel
+from dpcli.segment.multibody.settings import MultibodySettings
+
+_TEMPERATURES = np.geomspace(0.2, 0.03, 10)
+
+
+@dataclass
+class Body:
+    """Holds a trajectory with the costs (N) and nearest points (N,P) of all points under it (`Frames.explain`)."""
+
+    trajectory: Trajectory
+    cost: np.ndarray
+    nearest: np.ndarray
+
+
+@dataclass
+class Explanation:
+    """Holds bodies, the largest first, labels i64 (N), soft shares f32 (N,K) and the energy, a cost per point."""
+
+    bodies: list[Body]
+    label: np.ndarray
+    share: np.ndarray
+    energy: float
+    cost: np.ndarray  # (N,K) with the price of displacement
+
+
+def body_of(frames: Frames, trajectory: Trajectory) -> Body:
+    """Returns the body that moves along a trajectory."""
+    return Body(trajectory, *frames.explain(trajectory))
+
+
+def label_points(
+    frames: Frames, bodies: list[Body], settings: MultibodySettings, start: np.ndarray | None = None
+) -> Explanation:
+    """Returns the explanation by these bodies; start: labels (N) to begin at, none: the least cost of each point.
+
+    Labels come from mean field, from hot to cold.
+    """
+    cost = costs_of(frames, bodies, settings)
+    nearest = np.stack([body.nearest for body in bodies])
+    around = 0.5 * cost + 0.5 * cost[frames.neighbors].mean(1)
+    first = around.argmin(1) if start is None else start
+    share = np.eye(len(bodies), dtype=np.float32)[first] * 0.8 + np.float32(0.2 / len(bodies))
+    mean_field_kernel(cost, frames.neighbors, nearest, settings.border, settings.agreement, _TEMPERATURES, share)
+    return measure(frames, bodies, share, settings, cost)
+
+
+def costs_of(frames: Frames, bodies: list[Body], settings: MultibodySettings) -> np.ndarray:
+    """Returns the costs f32 (N,K) of all points under every body, with the price of displacement from the first."""
+    main = bodies[0].trajectory
+    far = [frames.displace(body.trajectory, main) for body in bodies[1:]]
+    away = np.stack([np.zeros(len(frames.points), np.float32), *far], 1)
+    return np.ascontiguousarray(np.stack([body.cost for body in bodies], 1) + settings.displacement * away, np.float32)
+
+
+def measure(
+    frames: Frames, bodies: list[Body], share: np.ndarray, settings: MultibodySettings, cost: np.ndarray
+) -> Explanation:
+    """Returns the explanation that soft shares (N,K) make, with the energy of their hard labels."""
+    label = share.argmax(1)
+    hard = np.eye(len(bodies), dtype=np.float32)[label]
+    support = np.empty((2, *hard.shape), np.float32)
+    support_kernel(hard, frames.neighbors, np.stack([body.nearest for body in bodies]), support)
+    rows = np.arange(len(label))
+    energy = cost[rows, label].mean(dtype=np.float64)
+    energy += settings.border * (1 - support[0, rows, label].mean(dtype=np.float64))
+    energy += settings.agreement * (1 - support[1, rows, label].mean(dtype=np.float64))
+    return Explanation(bodies, label, share, float(energy) + settings.body_price * len(bodies), cost)
+
+
+def without_empty(frames: Frames, found: Explanation, settings: MultibodySettings) -> Explanation:
+    """Returns the explanation with its bodies in order of size and without those that own no point."""
+    sizes = np.bincount(found.label, minlength=len(found.bodies))
+    order = [k for k in np.argsort(-sizes, kind="stable") if sizes[k]]
+    if order == list(range(len(found.bodies))):
+        return found
+    place = np.full(len(sizes), -1)
+    place[order] = np.arange(len(order))
+    return label_points(frames, [found.bodies[k] for k in order], settings, place[found.label])
+
+
+def refit(frames: Frames, found: Explanation, settings: MultibodySettings, own: bool, tight: float) -> Explanation:
+    """Returns the explanation with every body's motions fitted to its points of all frames.
+
+    own: onto the body's own points only, not onto whole frames. tight: last residual of the ICP, in spacings.
+    """
+    bodies = [
+        body_of(frames, frames.fit(body.trajectory, found.label == k, own, tight))
+        for k, body in enumerate(found.bodies)
+    ]
+    return label_points(frames, bodies, settings, found.label)

@@ -1,0 +1,128 @@
+"""The search for the bodies of a sequence: greedy growth by what a body explains, pruning, refits, and regrowth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.segment.multibody.explanation import Explanation, body_of, label_points, refit, without_empty
+from dpcli.segment.multibody.frames import Frames
+from dpcli.segment.multibody.hypotheses import Hypothesis, PairMotions, find_hypotheses, keep_different, search_regions
+from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.multibody.tracks import TrackedFrames, patch_hypotheses
+
+_TRIED = 4  # bodies tried on the whole per round
+_FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
+
+
+def explain_sequence(
+    clouds: list[np.ndarray], settings: MultibodySettings, tracks: list[np.ndarray] | None = None
+) -> Explanation:
+    """Returns the one explanation of all frames (n_t,3) f32, each of 9 points or more, of a sequence of diameter about 1.
+
+    tracks: the identity i64 (n_t) of each point, which makes correspondences exact; none: they are searched.
+    """
+    if tracks is None:
+        return Search(Frames(clouds), settings).run()
+    frames = TrackedFrames(clouds, tracks, settings.flexible)
+    return Search(frames, settings, patch_hypotheses(frames)).run()
+
+
+class Search:
+    """Searches the explanation of one sequence."""
+
+    def __init__(self, frames: Frames, settings: MultibodySettings, hypotheses: list[Hypothesis] | None = None) -> None:
+        self.frames, self.settings = frames, settings
+        self.motions: PairMotions = {}
+        if hypotheses is None:
+            hypotheses, self.motions = find_hypotheses(frames)
+        self.hypotheses = hypotheses
+        self.pool = [body_of(frames, one.trajectory) for one in self.hypotheses]
+
+    def run(self) -> Explanation:
+        """Returns the explanation: grown, pruned, its worst regions searched anew, and its motions tightened."""
+        found = self._grow(self._first())
+        found = self._prune(found)
+        for _ in range(self.settings.regrow if self.motions else 0):
+            better = self._regrow(found)
+            if better.energy >= found.energy - 1e-4:
+                break
+            found = better
+        return self._tighten(found)
+
+    def _first(self) -> Explanation:
+        """Returns the explanation by the one body that explains most."""
+        best = min(self.pool, key=lambda body: float(body.cost.mean()))
+        return self._fitted(label_points(self.frames, [best], self.settings))
+
+    def _fitted(self, found: Explanation) -> Explanation:
+        """Returns the explanation with motions refitted to whole frames, if that costs less."""
+        fitted = refit(self.frames, found, self.settings, *_FITS[0])
+        return self._clean(fitted if fitted.energy < found.energy else found)
+
+    def _clean(self, found: Explanation) -> Explanation:
+        return without_empty(self.frames, found, self.settings)
+
+    def _grow(self, found: Explanation) -> Explanation:
+        """Returns the explanation with further bodies, as long as the energy falls."""
+        while len(found.bodies) < self.settings.most_bodies:
+            tried = [
+                label_points(self.frames, [*found.bodies, self.pool[h]], self.settings)
+                for h in self._most_promising(found)
+            ]
+            if not tried:
+                break
+            best = self._fitted(min(tried, key=lambda one: one.energy))
+            if best.energy >= found.energy - 1e-6:
+                break
+            found = best
+        return found
+
+    def _most_promising(self, found: Explanation) -> list[int]:
+        """Returns the hypotheses by which connected points would save most, the best first."""
+        current = found.cost[np.arange(len(found.label)), found.label]
+        main, saved = found.bodies[0].trajectory, []
+        for body in self.pool:
+            away = self.settings.displacement * self.frames.displace(body.trajectory, main)
+            less = current - body.cost - away
+            saved.append(np.maximum(0.5 * less + 0.5 * less[self.frames.neighbors].mean(1) - 0.02, 0).mean())
+        order = np.argsort(np.negative(saved), kind="stable")[:_TRIED]
+        return [int(h) for h in order if saved[h] > 0]
+
+    def _prune(self, found: Explanation) -> Explanation:
+        """Returns the explanation without bodies that cost more than they save, the most needless one first."""
+        while len(found.bodies) > 1:
+            fewer = [self._without(found, k) for k in range(len(found.bodies))]
+            best = min(fewer, key=lambda one: one.energy)
+            if best.energy > found.energy:
+                break
+            found = self._clean(best)
+        return found
+
+    def _without(self, found: Explanation, k: int) -> Explanation:
+        """Returns the explanation without body k, whose points go to those that explain them best."""
+        rest = [body for j, body in enumerate(found.bodies) if j != k]
+        cost = np.delete(found.cost, k, 1)
+        start = np.where(found.label == k, cost.argmin(1), found.label - (found.label > k))
+        return label_points(self.frames, rest, self.settings, start)
+
+    def _regrow(self, found: Explanation) -> Explanation:
+        """Returns the explanation grown and pruned again, with hypotheses for what is explained badly now."""
+        current = found.cost[np.arange(len(found.label)), found.label]
+        own = [body.trajectory for body in found.bodies]
+        more = search_regions(self.frames, current, own, found.label, self.motions)
+        more = keep_different(self.frames, more, self._known(found))
+        self.hypotheses += more
+        self.pool += [body_of(self.frames, one.trajectory) for one in more]
+        return self._prune(self._grow(found))
+
+    def _known(self, found: Explanation) -> list[Hypothesis]:
+        """Returns all that is known as hypotheses: those of the pool, and the bodies."""
+        none = np.zeros((0, 3))
+        return [*self.hypotheses, *(Hypothesis(0, none, body.trajectory) for body in found.bodies)]
+
+    def _tighten(self, found: Explanation) -> Explanation:
+        """Returns the explanation with motions fitted ever tighter, onto the bodies' own points, where it costs less."""
+        for own, tight in _FITS[1:]:
+            fitted = refit(self.frames, found, self.settings, own, tight)
+            found = fitted if fitted.energy < found.energy else found
+        return self._clean(found)

@@ -1,0 +1,65 @@
+"""Errors of joints against numbers worked out by hand, whichever of two parts is called the child."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.evaluate.joints.metrics import JointStatistics, joint_statistics
+from dpcli.evaluate.joints.protocol import joint_metrics
+from dpcli.store.joints import AXIS, FIXED, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE, no_joints
+
+PART = np.repeat([0, 1, 2], 20)
+
+
+def joints(*rows, frames=2):
+    """The field of joints (child, parent, type, axis, point, values)."""
+    field = no_joints(frames, 3)
+    for child, parent, kind, axis, point, values in rows:
+        field[:, child, PARENT], field[:, child, TYPE] = parent, kind
+        field[:, child, AXIS], field[:, child, POINT], field[:, child, VALUE] = axis, point, values
+    return field
+
+
+TRUTH = joints((1, 0, REVOLUTE, (0, 0, 1), (1, 0, 0), (0.1, 0.6)), (2, 0, PRISMATIC, (1, 0, 0), (0, 0, 0), (0, 0.3)))
+
+
+def test_an_exact_answer_has_no_error_also_turned_round_and_renamed():
+    renamed = np.array([2, 0, 1])[PART]  # true 0 is predicted 2, and hangs on what was its child
+    turned = no_joints(2, 3)
+    turned[:, 2, PARENT], turned[:, 2, TYPE] = 0, REVOLUTE
+    turned[:, 2, AXIS], turned[:, 2, POINT], turned[:, 2, VALUE] = (0, 0, -1), (1, 0, 5), (0, 0.5)
+    turned[:, 1, PARENT], turned[:, 1, TYPE], turned[:, 1, AXIS], turned[:, 1, VALUE] = (
+        2,
+        PRISMATIC,
+        (-1, 0, 0),
+        (0, -0.3),
+    )
+    for part, field in ((PART, TRUTH), (renamed, turned)):
+        found = joint_metrics([joint_statistics(PART, TRUTH, part, field)])
+        assert (found["type"], found["edge_f1"], found["axis_within_5"]) == (1, 1, 1)
+        assert [found[key] for key in ("axis_angle", "axis_position", "state_angle", "state_length")] == pytest.approx(
+            [0, 0, 0, 0], abs=1e-6
+        )
+
+
+def test_errors_are_those_of_the_definition():
+    tilt = np.radians(8)
+    field = joints(
+        (1, 0, REVOLUTE, (0, np.sin(tilt), np.cos(tilt)), (1.2, 0, 0), (0, 0.4)),
+        (2, 1, PRISMATIC, (1, 0, 0), (0, 0, 0), (0, 0.3)),
+    )
+    found = joint_statistics(PART, TRUTH, PART, field)
+    assert (found.joints, found.predicted, found.edges, found.types, found.axes, found.near) == (2, 2, 1, 1, 2, 0)
+    assert found.angles == pytest.approx([8]) and found.distances == pytest.approx([0.2])
+    assert found.turns == pytest.approx([np.degrees(0.1) / 2]) and found.slides == []
+
+
+def test_wrong_types_and_unmatched_parts_count_as_missed():
+    wrong = joints((1, 0, FIXED, (0, 0, 0), (0, 0, 0), 0), (2, 0, PRISMATIC, (1, 0, 0), (0, 0, 0), (0, 0.1)))
+    assert joint_statistics(PART, TRUTH, PART, wrong).types == 1
+    merged = np.zeros(60, int)
+    found = joint_statistics(PART, TRUTH, merged, no_joints(2, 3))
+    assert (found.joints, found.edges, found.predicted) == (2, 0, 0)
+    total = found + JointStatistics(joints=2, types=2)
+    assert joint_metrics([total])["type"] == 0.5 and np.isnan(joint_metrics([found])["axis_angle"])

@@ -1,0 +1,84 @@
+"""`dpc generate4d train-prior` as its users run it: train on made-up creatures, stop, continue, mistakes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file
+
+from tests.support.commands import exit_code
+
+WORDS = ("--preset", "tiny", "--jobs", 1)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A training that nobody stopped."""
+    folder = tmp_path_factory.mktemp("prior") / "run"
+    assert exit_code("generate4d", "train-prior", "-o", folder, *WORDS) == 0
+    return folder
+
+
+def test_training_leaves_what_people_look_for(trained):
+    rows = json.loads((trained / "log.json").read_text())
+    assert rows[-1]["step"] == 20 and all(np.isfinite(row["validation_loss"]) for row in rows)
+    assert rows[0]["validation_inflated"] == rows[-1]["validation_inflated"] > 0
+    assert (trained / "curves.png").read_bytes()[:4] == b"\x89PNG" and (trained / "settings.toml").exists()
+    assert {value.dtype.itemsize for value in load_file(trained / "best.safetensors").values()} <= {2, 8}
+    with (trained / "log.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == len(rows)
+
+
+def test_a_stopped_run_ends_like_one_that_was_not(trained, tmp_path):
+    """SIGTERM saves and exits 75, kill -9 goes back to the last saved state; the weights are equal to the bit."""
+    folder = tmp_path / "stopped"
+    command = [str(w) for w in (sys.executable, "-m", "dpcli", "generate4d", "train-prior", "-o", folder, *WORDS)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[3])}
+    codes = []
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        before, deadline = _step(folder), time.time() + 200
+        while _step(folder) <= before + 3 and process.poll() is None and time.time() < deadline:
+            time.sleep(0.02)
+        process.send_signal(number)
+        codes.append(process.wait(timeout=200))
+    assert codes[0] in (75, 0) and codes[1] in (-9, 0)
+    assert subprocess.run(command, env=environment, capture_output=True, timeout=200).returncode == 0
+    ours, theirs = (load_file(place / "last.safetensors") for place in (folder, trained))
+    assert all(np.array_equal(ours[key], theirs[key]) for key in theirs)
+
+
+def _step(folder: Path) -> int:
+    """The last step in a run's log; 0 without one."""
+    path = folder / "log.json"
+    return json.loads(path.read_text())[-1]["step"] if path.exists() else 0
+
+
+def test_it_goes_on_from_weights_of_the_same_sizes_only(trained, tmp_path, capsys):
+    more = ("--init", trained, "--steps", 2)
+    assert exit_code("generate4d", "train-prior", "-o", tmp_path / "more", *WORDS, *more) == 0
+    wide = ("--set", "widths=8,24")
+    assert exit_code("generate4d", "train-prior", "-o", tmp_path / "wide", *WORDS, *more, *wide) == 2
+    assert "another configuration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("--set", "size=30"), 2, "size = 30: expected a multiple of 4"),
+        (("nosuch.glb",), 2, "nosuch.glb: no such file or folder"),
+        (("--held-out", "nosuch.txt"), 2, "nosuch.txt: no such file"),
+    ],
+)
+def test_mistakes_are_said(words, code, said, tmp_path, capsys):
+    assert exit_code("generate4d", "train-prior", *words, "-o", tmp_path / "run", *WORDS) == code
+    assert said in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,49 @@
+"""`--prior auto`, `inflated` and `network`: the network is taken where it is sure, and what is taken is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.generate4d.shape.choice import guide
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.model_file import save_shape_model
+from dpcli.generate4d.shape.network import ShapeNetwork
+from dpcli.generate4d.targets import Targets
+from dpcli.ops.cameras import orbit_pose, pinhole
+
+
+def _weights(path, offset: float) -> str:
+    """Weights whose confidence is 1 / (1 + exp(-offset)) whatever they see."""
+    torch.manual_seed(0)
+    model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=5)).eval()
+    save_shape_model(path, model, {"size": 16, "confidence": [0.0, offset]})
+    return str(path)
+
+
+@pytest.fixture
+def targets():
+    picture = torch.zeros(1, 2, 32, 32, 4)
+    picture[:, :, 8:24, 10:22] = 1
+    return Targets(
+        "box", picture.half(), pinhole(0.8, 32, 32)[None], orbit_pose(0.0, 0.0)[None], np.arange(2.0), reference=0
+    )
+
+
+@pytest.mark.parametrize(
+    ("prior", "offset", "name", "said"),
+    [
+        ("auto", 2.0, "network", "shape: network, confidence 0.88"),
+        ("auto", -2.0, "inflated", "the network is not sure of this object (0.12)"),
+        ("network", -2.0, "network", "shape: network, confidence 0.12"),
+        ("inflated", 2.0, "inflated", ""),
+    ],
+)
+def test_the_network_is_taken_where_it_is_sure(prior, offset, name, said, targets, tmp_path, capsys):
+    found = guide(prior, targets, _weights(tmp_path / "w.safetensors", offset))
+    assert found.name == name and said in capsys.readouterr().err
+
+
+def test_other_priors_have_no_shape(targets):
+    assert guide("none", targets) is None and guide("views", targets) is None

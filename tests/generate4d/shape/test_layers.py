@@ -1,0 +1,73 @@
+"""Layers of one picture: a ball from a disc, points and normals in the world, and what an empty frame gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.errors import DataError
+from dpcli.generate4d.shape.guidance import sample_surface
+from dpcli.generate4d.shape.layers import Camera, points_of
+from dpcli.generate4d.shape.silhouette import Flat, Inflated
+from dpcli.generate4d.shape.splats import splats_of
+from dpcli.ops.cameras import orbit_pose, pinhole
+
+
+def _disc(size: int, radius: float) -> np.ndarray:
+    axis = np.arange(size) + 0.5 - size / 2
+    picture = np.zeros((1, 4, size, size), np.float32)
+    picture[0, 3] = (axis[:, None] ** 2 + axis**2) < radius**2
+    picture[0, 0] = np.linspace(0, 1, size)
+    return picture
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 2.0])
+def test_a_disc_becomes_a_ball_about_the_origin_with_outward_normals(azimuth):
+    camera = Camera(pinhole(0.5, 96, 96), orbit_pose(azimuth, 0.3, 4.0))
+    points = points_of(Inflated().layers(_disc(96, 30), camera)[0], camera)
+    radius = 30 / camera.intrinsics[0, 0] * 4.0
+    distance = np.linalg.norm(points.position, axis=1)
+    assert np.median(distance) == pytest.approx(radius, rel=0.06) and np.abs(points.position.mean(0)).max() < 0.02
+    outward = (points.normal * points.position).sum(1) / distance
+    assert np.median(outward) > 0.97 and np.linalg.norm(points.normal, axis=1) == pytest.approx(1, abs=1e-5)
+    assert set(points.layer) == {0, 1}  # front and back of the one interval
+    assert points.color[:, 0] == pytest.approx(points.pixel[:, 1] / 95, abs=1e-6)
+
+
+def test_a_ball_of_splats_is_a_disc_from_every_side():
+    camera = Camera(pinhole(0.5, 96, 96), orbit_pose(0.0, 0.0, 4.0))
+    splats = splats_of(Inflated().layers(_disc(96, 30), camera)[0], camera)
+    truth = _disc(96, 30)[0, 3] > 0.5
+    for azimuth, elevation in ((0.0, 0.0), (1.57, 0.0), (3.14, 0.4), (0.8, -0.5)):
+        pose = torch.from_numpy(orbit_pose(azimuth, elevation, 4.0)).float()
+        seen = splats.draw(pose, torch.from_numpy(camera.intrinsics).float(), 96, 96)[..., 3].numpy() > 0.5
+        assert (seen & truth).sum() / (seen | truth).sum() > 0.82  # a cut-out has 0.1 from the side
+
+
+def test_points_drawn_from_a_ball_lie_on_it_evenly():
+    camera = Camera(pinhole(0.5, 96, 96), orbit_pose(1.0, 0.0, 4.0))
+    layers = Inflated().layers(_disc(96, 30), camera)[0]
+    points, colors = sample_surface(layers, camera, 4000, np.random.default_rng(0))
+    radius = 30 / camera.intrinsics[0, 0] * 4.0
+    assert np.median(np.linalg.norm(points, axis=1)) == pytest.approx(radius, rel=0.06)
+    depth = points @ camera.world_to_camera[2, :3] / radius
+    assert np.mean(np.abs(depth) < 0.5) == pytest.approx(0.5, abs=0.12)  # as much area in the middle as at both ends
+    empty = Inflated().layers(np.zeros((1, 4, 16, 16), np.float32), camera)[0]
+    with pytest.raises(DataError, match="shows nothing"):
+        sample_surface(empty, camera, 10, np.random.default_rng(0))
+
+
+def test_a_cut_out_is_flat_and_stands_at_the_origin():
+    camera = Camera(pinhole(0.5, 64, 64), orbit_pose(0.7, 0.0, 3.0))
+    points = points_of(Flat().layers(_disc(64, 20), camera)[0], camera)
+    depth = points.position @ camera.world_to_camera[2, :3]
+    assert np.abs(depth).max() == pytest.approx(0.015, rel=1e-3)
+
+
+def test_an_empty_frame_has_no_points():
+    camera = Camera(pinhole(0.5, 16, 16), orbit_pose(0, 0))
+    for prior in (Flat(), Inflated()):
+        layers = prior.layers(np.zeros((1, 4, 16, 16), np.float32), camera)[0]
+        assert len(points_of(layers, camera).position) == 0
+        assert not splats_of(layers, camera).draw(torch.eye(4), torch.eye(3), 8, 8).any()

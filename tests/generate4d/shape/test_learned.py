@@ -1,0 +1,90 @@
+"""The network as a prior: layers of the picture's size in order, at its border too, and what a wrong file says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.errors import DataError, UsageError
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.layers import Camera, points_of
+from dpcli.generate4d.shape.learned import Network
+from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
+from dpcli.generate4d.shape.network import ShapeNetwork
+from dpcli.generate4d.shape.silhouette import Inflated
+from dpcli.ops.cameras import orbit_pose, pinhole
+from dpcli.runtime.weights import save_weights
+
+CONFIG = ShapeConfig(widths=(4, 8), hidden=8, bins=5)
+
+
+@pytest.fixture
+def weights(tmp_path):
+    """A network that knows nothing yet and so inflates."""
+    torch.manual_seed(0)
+    model = ShapeNetwork(CONFIG).eval()
+    for layer in (model.out, model.name[-1]):
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.zeros_(layer.bias)
+    with torch.no_grad():
+        model.name[-1].bias[[3, 8]] = 20.0  # the middle bins: nothing is turned
+    save_shape_model(tmp_path / "shape.safetensors", model, {"size": 64, "confidence": [1.0, 0.0]})
+    return tmp_path / "shape.safetensors"
+
+
+def _disc(row: float, column: float, radius: float, size: int = 96) -> np.ndarray:
+    axis = np.arange(size) + 0.5
+    picture = np.zeros((4, size, size), np.float32)
+    picture[3] = (axis[:, None] - row) ** 2 + (axis - column) ** 2 < radius**2
+    picture[0] = 0.7 * picture[3]
+    return picture
+
+
+def _camera(size: int = 96) -> Camera:
+    return Camera(pinhole(0.5, size, size), orbit_pose(0.4, 0.1, 3.0))
+
+
+def test_without_knowledge_it_inflates(weights):
+    pictures, camera = np.stack([_disc(48, 48, 30), _disc(40, 60, 12)]), _camera()
+    for found, plain in zip(Network(str(weights)).layers(pictures, camera), Inflated().layers(pictures, camera)):
+        inside = plain.presence[0] > 0.5
+        unit = np.ptp(plain.depth[:2, inside])
+        assert np.abs(found.depth[:2] - plain.depth[:2])[:, inside].mean() < 0.05 * unit
+        assert found.confidence == pytest.approx(0.5) and np.array_equal(found.presence[0], plain.presence[0])
+        assert np.array_equal(found.color, plain.color)
+
+
+def test_layers_are_in_order_where_weights_are_random(tmp_path):
+    torch.manual_seed(1)
+    save_shape_model(tmp_path / "x.safetensors", ShapeNetwork(CONFIG).eval(), {"size": 32, "confidence": [0.0, 2.0]})
+    found = Network(str(tmp_path / "x.safetensors")).layers(np.stack([_disc(50, 40, 25)] * 3), _camera())
+    for layers in found:
+        assert (np.diff(layers.depth, axis=0) >= 0).all() and np.isfinite(layers.depth).all()
+        assert 0 <= layers.presence.min() and layers.presence.max() <= 1
+        assert len(points_of(layers, _camera()).position) >= 2 * (layers.presence[0] > 0.5).sum()
+    assert np.array_equal(found[0].depth, found[2].depth)
+
+
+@pytest.mark.parametrize("picture", [_disc(2, 90, 30), _disc(48, 48, 70), _disc(20, 20, 0.8)])
+def test_objects_at_the_border_all_over_and_of_one_pixel(weights, picture):
+    (found,) = Network(str(weights)).layers(picture[None], _camera())
+    assert found.depth.shape == (4, 96, 96) and np.isfinite(found.depth).all() and found.depth.min() > 0
+
+
+def test_empty_frames_have_no_presence(weights):
+    nothing = np.zeros((4, 96, 96), np.float32)
+    found = Network(str(weights)).layers(np.stack([nothing, _disc(48, 48, 20)]), _camera())
+    assert not found[0].presence.any() and found[0].confidence == 0 and found[1].presence.any()
+    assert not Network(str(weights)).layers(nothing[None], _camera())[0].presence.any()
+
+
+def test_wrong_files_are_said(weights, tmp_path):
+    with pytest.raises(UsageError, match="--prior-model nosuch: no such file"):
+        Network("nosuch")
+    (tmp_path / "cut.safetensors").write_bytes(weights.read_bytes()[:-100])
+    with pytest.raises(DataError, match="not a complete safetensors file"):
+        load_shape_model(tmp_path / "cut.safetensors")
+    save_weights(tmp_path / "other.safetensors", {"a": torch.zeros(1)}, {"format": "dpc-parts-1"})
+    with pytest.raises(DataError, match="format 'dpc-parts-1', expected 'dpc-shape"):
+        load_shape_model(tmp_path / "other.safetensors")

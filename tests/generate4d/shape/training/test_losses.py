@@ -1,0 +1,81 @@
+"""The angles of the whole, errors of layers and the confidence, against closed forms and brute force."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.generate4d.shape.config import ShapeConfig
+from dpcli.generate4d.shape.learned import choose_angles
+from dpcli.generate4d.shape.network import ShapeNetwork, tilted_plane
+from dpcli.generate4d.shape.training.confidence import calibrate, probability
+from dpcli.generate4d.shape.training.losses import depth_error, object_angles
+
+NONE = math.nan
+
+
+def _slab(across: float, down: float, thick: float = 0.1) -> torch.Tensor:
+    """The layers (1,4,40,40) of a slab turned by two angles, seen through a square window."""
+    middle = tilted_plane(torch.tensor([[across, down]]), 40)[0, 0]
+    layers = torch.full((1, 4, 40, 40), NONE)
+    window = slice(2, 38), slice(2, 38)
+    layers[0, 0][window], layers[0, 1][window] = middle[window] - thick / 2, middle[window] + thick / 2
+    return layers
+
+
+@pytest.mark.parametrize(("across", "down"), [(0.5, 0.0), (-0.8, 0.3), (0.0, -0.6)])
+def test_angles_of_a_turned_slab(across, down):
+    found = object_angles(_slab(across, down))[0]
+    assert found.tolist() == pytest.approx([across, down], abs=0.04)
+    mirrored = object_angles(_slab(across, down).flip(-1))[0]
+    assert mirrored.tolist() == pytest.approx([-found[0].item(), found[1].item()], abs=1e-5)
+
+
+def test_the_error_counts_the_layers_that_exist():
+    truth = _slab(0.0, 0.0)
+    assert depth_error(truth.nan_to_num() + 0.02, truth).item() == pytest.approx(0.02, rel=1e-4)
+    wrong = truth.nan_to_num()
+    wrong[:, 2:] = 9.0
+    assert depth_error(wrong, truth).item() == pytest.approx(0, abs=1e-6)
+
+
+def test_bins_hold_an_angle_between_the_nearest_two():
+    model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=7))
+    angles = torch.tensor([0.1, -2.0, 1.25])
+    target = model.angle_targets(angles)
+    assert target.sum(-1).tolist() == pytest.approx([1, 1, 1], abs=1e-5)
+    assert (target * model.centers).sum(-1).tolist() == pytest.approx([0.1, -1.25, 1.25], abs=1e-5)
+    found = model.mean_angles((target + 1e-9).log())
+    assert found.tolist() == pytest.approx([0.1, -1.25, 1.25], abs=1e-3)
+
+
+def test_a_clip_is_turned_as_all_paths_together_say_or_not_at_all():
+    model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=3))
+    logits = torch.from_numpy(np.random.default_rng(1).normal(size=(4, 2, 3)) * 2).float()
+    logits[:, 0, 2] += 12  # turned for sure; about the other axis nothing is
+    found = choose_angles(model, logits)
+    for axis in range(2):
+        own, shares = logits[:, axis].log_softmax(-1) / 4, np.zeros((4, 3))
+        for path in itertools.product(range(3), repeat=4):
+            worth = sum(own[t, k] for t, k in enumerate(path)) - sum(abs(a - b) for a, b in itertools.pairwise(path))
+            shares[range(4), path] += math.exp(worth)
+        shares /= shares.sum(1, keepdims=True)
+        mean = shares @ model.centers.numpy()
+        spread = np.sqrt((shares * (model.centers.numpy() - mean[:, None]) ** 2).sum(1))
+        assert found[:, axis].numpy() == pytest.approx(np.where(np.abs(mean) > spread, mean, 0), abs=1e-4)
+    assert (found[:, 0] > 0.5).all() and (found[:, 1] == 0).all()
+
+
+def test_confidence_is_the_share_that_was_better():
+    rng = np.random.default_rng(1)
+    claimed = rng.normal(size=4000)
+    better = rng.random(4000) < 1 / (1 + np.exp(-(1.5 * claimed - 0.4)))
+    slope, offset = calibrate(claimed, better.astype(float))
+    assert (slope, offset) == pytest.approx((1.5, -0.4), abs=0.15)
+    assert probability(0.0, slope, offset) == pytest.approx(1 / (1 + math.exp(0.4)), abs=0.04)
+    slope, offset = calibrate(claimed, np.ones(4000))  # always better: high, and finite
+    assert 0.9 < probability(0.0, slope, offset) <= 1 and np.isfinite([slope, offset]).all()

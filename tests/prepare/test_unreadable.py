@@ -1,0 +1,96 @@
+"""Input folders with what can't be opened or read: each is skipped by name, and the others go on."""
+
+import os
+import socket
+import subprocess
+import sys
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError, DpcError
+from dpcli.prepare.cloud_formats.arrays import read_npz
+from dpcli.prepare.convert_item import convert_item
+from dpcli.prepare.decode.folder_listing import unreadable_entries
+from dpcli.prepare.labels import read_labels
+from dpcli.prepare.reader import Item
+from dpcli.prepare.thinning import Thinning
+
+
+@dataclass(frozen=True)
+class _Raising:
+    error: BaseException
+
+    def read(self, item, rng):
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError("x"), IndexError("y"), RecursionError(), UnicodeDecodeError("u", b"", 0, 1, "z")]
+)
+def test_whatever_a_reader_raises_is_a_bad_sample_with_its_type(error):
+    with pytest.raises(DataError, match=f"v.bin.*{type(error).__name__}"):
+        convert_item(_Raising(error), Thinning(0), 0, (0, Item("v", Path("v.bin"))))
+
+
+def test_errors_of_our_own_pass_the_guard():
+    with pytest.raises(DpcError, match="^as it is$"):
+        convert_item(_Raising(DpcError("as it is")), Thinning(0), 0, (0, Item("v", Path("v.bin"))))
+
+
+def test_everything_that_cannot_be_opened_is_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a socket's path is short
+    (tmp_path / "good.npy").write_bytes(b"x")
+    (tmp_path / "gone.npy").symlink_to("nowhere")
+    (tmp_path / "round.npy").symlink_to("round.npy")
+    (tmp_path / "above").symlink_to(".")
+    (tmp_path / "folder.npy").mkdir()
+    os.mkfifo(tmp_path / "fifo.npy")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind("socket.npy")
+    (tmp_path / "null.npy").symlink_to("/dev/null")
+    found = {path.name: why for path, why in unreadable_entries(tmp_path, {tmp_path / "good.npy"})}
+    words = {"gone.npy": "missing", "round.npy": "circle", "above": "above it", "folder.npy": "a folder"}
+    words |= {"fifo.npy": "FIFO", "socket.npy": "socket", "null.npy": "device"}
+    assert found.keys() == words.keys()
+    assert all(word in found[name] for name, word in words.items())
+
+
+def test_prepare_skips_them_by_name(tmp_path):
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    depth = np.full((3, 6, 8), 900, np.uint16)
+    for name in ("v0.npy", "v1.npy"):
+        np.save(raw / name, depth)
+    (raw / "v2.npy").symlink_to("nowhere")
+    os.mkfifo(raw / "v3.npy")
+    words = ["prepare", "depth", str(raw), "-o", str(tmp_path / "o.h5"), "--jobs", "1"]
+    ended = subprocess.run([sys.executable, "-m", "dpcli", *words], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 0 and "2 skipped" in ended.stdout, ended.stderr
+    assert "v2.npy" in ended.stderr and "v3.npy" in ended.stderr
+
+
+@pytest.mark.parametrize("label", ["20000000", "9" * 4000, "2147483648"])
+def test_a_label_is_no_number_of_classes_until_it_is_plausible(tmp_path, label):
+    table = tmp_path / "l.csv"
+    table.write_text(f"name,label\na,0\nb,{label}\n")
+    with pytest.raises(DataError, match="l.csv:3: label .* claims"):
+        read_labels(table)
+
+
+@pytest.mark.parametrize("megabytes, keys", [(300, 1), (150, 3), (120, 4)])
+def test_an_archive_that_unpacks_to_far_more_is_refused(tmp_path, megabytes, keys):
+    bomb = tmp_path / "b.npz"
+    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
+        for key in range(keys):
+            with archive.open(f"a{key}.npy", "w") as member:
+                np.lib.format.write_array_header_1_0(
+                    member, {"descr": "|u1", "fortran_order": False, "shape": (megabytes << 20,)}
+                )
+                for _ in range(megabytes):
+                    member.write(bytes(1 << 20))
+    with pytest.raises(DataError, match="claims .* can't hold"):
+        read_npz(bomb)

@@ -1,0 +1,112 @@
+"""`dpc segment joints` and `dpc evaluate joints`, in a pipeline; the URDF in another program."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dpcli.store import CloudsReader, PartsReader, PartsWriter
+from dpcli.store.joints import VALUE
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory, dpc):
+    path = tmp_path_factory.mktemp("joints") / "objects.h5"
+    words = "--objects 4 --sequences-per-object 1 --kinds cabinet,laptop --points 384 --frames 5 --joint-step 0.4"
+    done = dpc("prepare", "synthetic", "articulated", "-o", path, *words.split())
+    assert done.returncode == 0, done.stderr
+    return path
+
+
+@pytest.fixture(scope="module")
+def parts(truth):
+    """What a segmenter would say that knows everything."""
+    path = truth.with_name("parts.h5")
+    with CloudsReader(truth) as reader:
+        count = reader.read(0).pose.shape[1]
+        with PartsWriter(
+            path, num_parts=count, class_names=reader.class_names, length_unit=reader.length_unit
+        ) as writer:
+            for index in range(len(reader)):
+                sequence = reader.read(index)
+                pose, pairs = sequence.pose, [(t, t + 1) for t in range(4)]
+                motion = [pose[j] @ np.linalg.inv(pose[i]) for i, j in pairs]
+                share = np.eye(count, dtype=np.float32)[sequence.part]
+                flow = [np.zeros((len(sequence.frame(i)), 3), np.float32) for i, _ in pairs]
+                writer.write(sequence, share, np.array(pairs), np.array(motion), flow)
+    return path
+
+
+def test_true_parts_give_true_joints(truth, parts, tmp_path, dpc_here):
+    found = dpc_here("segment", "joints", parts, "-o", tmp_path / "joints.h5", "--picture", tmp_path / "j.png")
+    assert found.returncode == 0, found.stderr
+    assert b"revolute" in found.stdout and (tmp_path / "j.png").stat().st_size > 5000
+    scored = dpc_here("evaluate", "joints", tmp_path / "joints.h5", "--truth", truth, "--split", "all", "--json")
+    assert scored.returncode == 0, scored.stderr
+    metrics = json.loads(scored.stdout)["metrics"]
+    assert metrics["type"] > 0.8 and metrics["axis_angle"] < 1 and metrics["state_angle"] < 0.5
+    shown = dpc_here("evaluate", "joints", tmp_path / "joints.h5", "--truth", truth, "--split", "all")
+    assert b"axis within 5 deg" in shown.stdout
+    with PartsReader(tmp_path / "joints.h5") as reader:
+        assert "joint" in reader.fields and reader.read(0).joint.shape[2] == 9
+
+
+def test_the_urdf_is_posed_as_the_points_are(parts, tmp_path, dpc_here):
+    """Link by link in yourdfpy: at a frame's joint values the meshes lie on that frame's points, up to the root's motion."""
+    from scipy.spatial import cKDTree
+    from yourdfpy import URDF
+
+    with PartsReader(parts) as reader:
+        name, sequence = reader.names[0], reader.read(0)
+    for output in ("object.urdf", "object.json"):
+        done = dpc_here("segment", "joints", parts, "-o", tmp_path / output, "--sequence", name)
+        assert done.returncode == 0, done.stderr
+    robot = URDF.load(str(tmp_path / "object.urdf"))
+    tree = json.loads((tmp_path / "object.json").read_text())[0]
+    values = {f"joint_{joint['child']}": joint["value"] for joint in tree["joints"] if "value" in joint}
+    assert values and set(robot.actuated_joint_names) == set(values)
+    for t in range(5):
+        robot.update_cfg({joint: value[t] for joint, value in values.items()})
+        root = np.array(tree["root_motion"][t])
+        corners = [
+            np.asarray(mesh.vertices) @ (root @ robot.scene.graph.get(node)[0])[:3, :3].T
+            + (root @ robot.scene.graph.get(node)[0])[:3, 3]
+            for node in robot.scene.graph.nodes_geometry
+            for mesh in [robot.scene.geometry[robot.scene.graph[node][1]]]
+        ]
+        far = cKDTree(np.concatenate(corners)).query(sequence.frame(t))[0]
+        assert np.median(far) < 0.02 and np.quantile(far, 0.95) < 0.06
+
+
+def test_a_folder_holds_one_object_for_each_sequence(parts, tmp_path, dpc_here):
+    done = dpc_here("segment", "joints", parts, "-o", tmp_path / "robots")
+    assert done.returncode == 0, done.stderr
+    with PartsReader(parts) as reader:
+        assert {path.stem for path in (tmp_path / "robots").glob("*.urdf")} == set(reader.names)
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["-o", "a.urdf"], 2, "name one with --sequence"),
+        (["-o", "a.urdf", "--sequence", "nobody"], 2, "--sequence nobody: not in"),
+        (["-o", "a.xml"], 2, "expected a name that ends in .h5, .urdf, .json, or a folder"),
+    ],
+)
+def test_mistakes_end_with_a_sentence(words, code, message, parts, tmp_path, dpc_here, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = dpc_here("segment", "joints", parts, *words)
+    assert done.returncode == code and message in done.stderr.decode()
+
+
+def test_files_without_joints_are_refused(parts, truth, dpc_here):
+    done = dpc_here("evaluate", "joints", parts, "--truth", truth, "--split", "all")
+    assert done.returncode == 3 and "dpc segment joints" in done.stderr.decode()
+
+
+def test_the_true_values_stand_in_the_file(truth):
+    with CloudsReader(truth) as reader:
+        joint = reader.read(0).joint
+    assert np.ptp(joint[..., VALUE], axis=0).max() > 0.05

@@ -1,0 +1,152 @@
+"""Joints found between parts: hinges and slides of made objects with their true motions, and poor input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.segment.kinematics.joint_fit import fit_joint
+from dpcli.segment.kinematics.kinematic_tree import kinematic_tree
+from dpcli.segment.kinematics.part_trajectories import part_trajectories
+from dpcli.store import CloudSequence, PartsSample
+from dpcli.store.joints import AXIS, FIXED, FREE, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, VALUE
+
+
+def about(axis, angle, point=(0, 0, 0)) -> np.ndarray:
+    """The turn (4,4) about a line, by SciPy."""
+    from scipy.spatial.transform import Rotation
+
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(angle * np.asarray(axis, float)).as_matrix()
+    motion[:3, 3] = np.asarray(point) - motion[:3, :3] @ point
+    return motion
+
+
+def along(axis, length) -> np.ndarray:
+    motion = np.eye(4)
+    motion[:3, 3] = length * np.asarray(axis, float)
+    return motion
+
+
+def made(poses, boxes, points=120, seed=0, pairs=None):
+    """A sequence of boxes (center, size) with poses (T,K,4,4), and what a perfect segmenter says of it."""
+    rng, clouds, ids = np.random.default_rng(seed), [], []
+    for pose in poses:
+        own = [rng.uniform(-0.5, 0.5, (points, 3)) * size + center for center, size in boxes]
+        clouds.append(np.concatenate([p @ m[:3, :3].T + m[:3, 3] for p, m in zip(own, pose)]).astype(np.float32))
+        ids.append(np.repeat(np.arange(len(boxes)), points).astype(np.int16))
+    sequence = CloudSequence.from_frames("made", clouds, part=ids)
+    pairs = pairs or [(t, t + 1) for t in range(len(poses) - 1)]
+    motion = np.array([poses[j] @ np.linalg.inv(poses[i]) for i, j in pairs], np.float32)
+    return sequence, PartsSample(np.zeros((len(sequence.points), len(boxes))), np.array(pairs), motion, [])
+
+
+def cabinet(frames=5, seed=1):
+    """A body, a door on it, a knob on the door, a drawer in the body; the whole is carried about."""
+    angles, slide, turn = np.linspace(0, 0.9, frames), np.linspace(0, 0.2, frames), np.linspace(0, 1.2, frames)
+    poses = []
+    for t in range(frames):
+        whole = about((0.6, 0, 0.8), 0.2 * t) @ along((1, 0, 0), 0.05 * t)
+        door = whole @ about((0, 0, 1), angles[t], (0.3, 0.3, 0))
+        poses.append(
+            [whole, door, door @ about((0, 1, 0), turn[t], (-0.2, 0.35, 0)), whole @ along((0, 1, 0), slide[t])]
+        )
+    boxes = [((0, 0, 0), (0.6, 0.6, 0.8)), ((0, 0.32, 0.1), (0.6, 0.04, 0.5)), ((-0.2, 0.38, 0), (0.12, 0.05, 0.04)),
+             ((0, 0.2, -0.3), (0.4, 0.3, 0.1))]  # fmt: skip
+    return *made(np.array(poses), boxes, seed=seed), angles, slide, turn
+
+
+def test_hinges_slides_and_the_tree_of_a_cabinet():
+    sequence, said, angles, slide, turn = cabinet()
+    field = kinematic_tree(sequence, said).as_field(5, 6)
+    edges = {frozenset((k, int(row[PARENT]))): k for k, row in enumerate(field[0]) if row[PARENT] >= 0}
+    assert set(edges) == {frozenset((0, 1)), frozenset((1, 2)), frozenset((0, 3))}
+    assert (field[:, 4:, PARENT] == -1).all()  # ids that the sequence lacks
+    for edge, kind, axis, point, value in (
+        ((0, 1), REVOLUTE, (0, 0, 1), (0.3, 0.3, 0), angles),
+        ((1, 2), REVOLUTE, (0, 1, 0), (-0.2, 0.35, 0), turn),
+        ((0, 3), PRISMATIC, (0, 1, 0), None, slide),
+    ):
+        rows = field[:, edges[frozenset(edge)]]
+        assert (rows[:, TYPE] == kind).all()
+        assert abs(rows[0, AXIS] @ axis) == pytest.approx(1, abs=1e-4)
+        np.testing.assert_allclose(np.abs(rows[:, VALUE]), value, atol=2e-3)
+        if point is not None:
+            off = np.cross(rows[0, POINT] - point, axis)
+            assert np.linalg.norm(off) < 1e-3
+    whole = about((0.6, 0, 0.8), 0.8) @ along((1, 0, 0), 0.2)
+    assert abs(field[4, edges[frozenset((0, 3))], AXIS] @ whole[:3, :3] @ [0, 1, 0]) == pytest.approx(1, abs=1e-4)
+
+
+def test_what_no_single_axis_explains_is_free_and_what_stands_still_is_fixed():
+    rng, points = np.random.default_rng(2), np.random.default_rng(0).uniform(-0.3, 0.3, (64, 3))
+    free = np.array(
+        [np.eye(4)] + [about(rng.normal(size=3) * 0.4, 1.0) @ along(rng.normal(size=3), 0.2) for _ in range(6)]
+    )
+    assert fit_joint(free, points, 0.003).kind == FREE
+    assert fit_joint(np.tile(np.eye(4), (7, 1, 1)), points, 0.003).kind == FIXED
+    noisy = np.array([along(rng.normal(size=3), 0.001) for _ in range(7)])
+    assert fit_joint(noisy, points, 0.003).kind == FIXED
+
+
+@pytest.mark.parametrize("kind", [REVOLUTE, PRISMATIC])
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_the_motions_moves_an_axis_little(kind, seed):
+    rng, points = np.random.default_rng(seed), np.random.default_rng(9).uniform(-0.3, 0.3, (64, 3))
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    value = np.linspace(0, 1.0, 8) * (1 if kind == REVOLUTE else 0.3)
+    moves = [about(axis, v, (0.2, 0.1, 0)) if kind == REVOLUTE else along(axis, v) for v in value]
+    noisy = np.array([along(rng.normal(size=3), 0.002) @ about(rng.normal(size=3), 0.005) @ m for m in moves])
+    noisy[0] = np.eye(4)
+    fit = fit_joint(noisy, points, 0.005)
+    assert fit.kind == kind and np.degrees(np.arccos(min(1, abs(fit.axis @ axis)))) < 3
+    np.testing.assert_allclose(fit.value * np.sign(fit.axis @ axis), value, atol=0.02)
+
+
+def test_one_part_has_no_joint_and_frames_apart_are_a_sentence():
+    alone = made(np.tile(np.eye(4), (3, 1, 1, 1)), [((0, 0, 0), (1, 1, 1))])
+    assert kinematic_tree(*alone).joints == []
+    apart = made(
+        np.tile(np.eye(4), (4, 2, 1, 1)), [((0, 0, 0), (1, 1, 1)), ((2, 0, 0), (1, 1, 1))], pairs=[(0, 1), (2, 3)]
+    )
+    with pytest.raises(DataError, match="no pair of frames leads to frame 2"):
+        kinematic_tree(*apart)
+
+
+def test_many_parts_two_frames_and_a_huge_place_make_a_tree():
+    rng = np.random.default_rng(4)
+    boxes = [(rng.uniform(-1, 1, 3), (0.2, 0.2, 0.2)) for _ in range(25)]
+    poses = np.array([[np.eye(4)] * 25, [about(rng.normal(size=3) * 0.1, 1) for _ in range(25)]])
+    poses[:, :, :3, 3] += 1e4
+    tree = kinematic_tree(*made(poses, boxes, points=20))
+    assert len(tree.joints) == 24 and {j.child for j in tree.joints} | {tree.root} == set(range(25))
+
+
+def test_a_part_that_vanishes_keeps_the_others_right():
+    sequence, said, angles, *_ = cabinet()
+    gone = (sequence.part == 2) & (np.repeat(np.arange(5), np.diff(sequence.frame_offsets)) >= 3)
+    sequence.take_points(*_without(sequence, gone))
+    field = kinematic_tree(sequence, said).as_field(5, 4)
+    door = 1 if field[0, 1, PARENT] == 0 else 0
+    np.testing.assert_allclose(np.abs(field[:, door, VALUE]), angles, atol=2e-3)
+
+
+def _without(sequence, gone):
+    rows = np.flatnonzero(~gone)
+    frame = np.repeat(np.arange(sequence.num_frames), np.diff(sequence.frame_offsets))[rows]
+    return rows, np.searchsorted(frame, np.arange(sequence.num_frames + 1))
+
+
+def test_motions_of_many_pairs_are_averaged():
+    sequence, said, *_ = cabinet()
+    pairs = [(i, j) for i in range(5) for j in range(5) if i != j]
+    rng, truth = np.random.default_rng(0), part_trajectories(sequence, said).motion
+    motion = np.array([truth[j] @ np.linalg.inv(truth[i]) for i, j in pairs])
+    for row in motion:
+        row[:] = [along(rng.normal(size=3), 0.01) @ one for one in row]
+    few = PartsSample(said.probability, np.array(pairs)[:4], motion[:4], [])  # 0 -> 1, 2, 3, 4
+    many = PartsSample(said.probability, np.array(pairs), motion, [])
+    apart = [np.abs(part_trajectories(sequence, one).motion - truth).mean() for one in (few, many)]
+    assert apart[1] < 0.75 * apart[0] and part_trajectories(sequence, many).disagreement.min() > 0.003

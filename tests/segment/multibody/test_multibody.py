@@ -1,0 +1,177 @@
+"""One explanation of all frames: parts and motions of made objects, exact tracks, the kernels, and poor input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.segment.multibody.frames import Frames, choose_partners, relative_motion
+from dpcli.segment.multibody.label_kernels import mean_field_kernel, support_kernel
+from dpcli.segment.multibody.search import explain_sequence
+from dpcli.segment.multibody.segmenter import MultibodySegmenter
+from dpcli.segment.multibody.settings import MultibodySettings
+from dpcli.segment.multibody.tracks import thin_tracks
+from dpcli.segment.prediction import predict_parts
+from dpcli.segment.prediction_settings import Refinement
+from dpcli.segment.training.trainer import rand_index
+from dpcli.store import CloudSequence
+
+
+def box_surface(rng, count, low, size):
+    """Points on the surface of a box, by area."""
+    size = np.asarray(size, float)
+    area = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
+    points, axis = rng.random((count, 3)), rng.choice(3, count, p=area / area.sum())
+    points[np.arange(count), axis] = rng.integers(0, 2, count)
+    return np.asarray(low) + points * size
+
+
+def turn(angle, axis, at):
+    """The motion (4,4) that turns about an axis through a point."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], float)
+    motion = np.eye(4)
+    motion[:3, :3] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    motion[:3, 3] = np.asarray(at) - motion[:3, :3] @ at
+    return motion
+
+
+def chest(seed=0, frames=4, points=320, unit=1.0, place=(0, 0, 0), keep=False):
+    """A chest whose lid opens by 17 degrees a frame, never closed, while all turns; drawn anew in each frame, or tracked (keep)."""
+    rng, clouds, parts, poses, tracks = np.random.default_rng(seed), [], [], [], []
+    few = points // 3
+    drawn = None
+    for t in range(frames):
+        whole = turn(0.1 * t, (0.0, 0.6, 0.8), (0.2, 0.1, 0.0))
+        lid = whole @ turn(-0.3 * (t + 1), (0.0, 1.0, 0.0), (0.0, 0.0, 0.3))
+        if drawn is None or not keep:
+            drawn = [box_surface(rng, points - few, (0, 0, 0), (0.5, 0.6, 0.29)),
+                     box_surface(rng, few, (0, 0, 0.3), (0.5, 0.6, 0.04))]  # fmt: skip
+        moved = [p @ m[:3, :3].T + m[:3, 3] for p, m in zip(drawn, (whole, lid))]
+        order = rng.permutation(points)[: points - 20 * (t % 2 if keep else 0)]
+        clouds.append(np.float32(np.concatenate(moved)[order] * unit + place))
+        parts.append(np.repeat([0, 1], [points - few, few])[order])
+        tracks.append(order)
+        poses.append(np.stack([whole, lid]))
+    fields = {"track": tracks} if keep else {}
+    return CloudSequence.from_frames("chest", clouds, part=parts, pose=np.stack(poses), **fields)
+
+
+def predicted(sequence, **options):
+    """Labels and sample of a sequence."""
+    return predict_parts(sequence, 0, MultibodySegmenter(MultibodySettings()), None, Refinement(**options), 0)
+
+
+def agreement(labels, sequence):
+    """The Rand index."""
+    return rand_index(torch.tensor(labels), torch.tensor(np.int64(sequence.part)))
+
+
+def test_parts_and_motions_of_a_chest_from_points_drawn_anew():
+    sequence = chest()
+    labels, sample = predicted(sequence, pairs="all")
+    assert agreement(labels, sequence) > 0.9
+    assert np.sort(np.bincount(labels))[-2:].sum() > 0.95 * len(labels)
+    for (i, j), motion in zip(sample.pairs, sample.motion):
+        truth = sequence.pose[j] @ np.linalg.inv(sequence.pose[i])
+        for part in range(2):
+            own = np.bincount(labels[sequence.part == part]).argmax()
+            points = sequence.frame(i)[np.split(sequence.part, sequence.frame_offsets[1:-1])[i] == part]
+            gap = points @ (motion[own] - truth[part])[:3, :3].T + (motion[own] - truth[part])[:3, 3]
+            # the lid is a thin plate of about 100 points a frame, which slides in its plane by up to two of their distances
+            assert np.linalg.norm(gap, axis=1).mean() < (0.025, 0.12)[part]
+
+
+@pytest.mark.parametrize(("unit", "place"), [(1e-3, (0, 0, 0)), (40.0, (5e4, -3e4, 100))])
+def test_units_and_places_change_nothing_much(unit, place):
+    labels, _ = predicted(chest(unit=unit, place=place))
+    assert agreement(labels, chest()) > 0.9
+
+
+def test_one_motion_stays_one_part():
+    rng = np.random.default_rng(1)
+    clouds = []
+    for t in range(3):
+        motion = turn(0.15 * t, (0.6, 0.0, 0.8), (0, 0, 0))
+        clouds.append(np.float32(box_surface(rng, 300, (0, 0, 0), (0.5, 0.3, 0.4)) @ motion[:3, :3].T))
+    labels, _ = predicted(CloudSequence.from_frames("box", clouds))
+    assert len(np.unique(labels)) == 1
+
+
+def test_tracks_are_exact_and_may_begin_and_end():
+    sequence = chest(keep=True, frames=5)
+    labels, _ = predicted(sequence, points=200)
+    assert agreement(labels, sequence) > 0.95
+    by_track = [set(labels[sequence.track == track]) for track in np.unique(sequence.track)]
+    assert all(len(own) == 1 for own in by_track)
+
+
+def test_thinned_tracks_are_the_same_in_all_frames():
+    rng = np.random.default_rng(2)
+    cloud = np.float32(rng.random((100, 3)))
+    tracks = [rng.permutation(100), rng.permutation(100)[:80], 50 + rng.permutation(100)]
+    clouds = [cloud[track % 100] for track in tracks]
+    kept = [set(track[few]) for track, few in zip(tracks, thin_tracks(clouds, tracks, 40))]
+    assert len(kept[0]) == 40 and kept[1] == kept[0] & set(tracks[1])
+    assert kept[0] & set(tracks[2]) <= kept[2] and len(kept[2]) <= 40 and any(track >= 100 for track in kept[2])
+
+
+@pytest.mark.parametrize(
+    "sizes", [(0, 0), (1, 1), (3, 200), (200, 5, 200), (0, 150, 150), (40, 40), (200,)], ids=lambda sizes: str(sizes)
+)
+def test_poor_input_gets_an_answer(sizes):
+    rng = np.random.default_rng(3)
+    sequence = CloudSequence.from_frames("poor", [np.float32(rng.random((n, 3))) for n in sizes])
+    labels, sample = predicted(sequence)
+    assert len(labels) == sum(sizes) and (labels >= 0).all() and np.isfinite(sample.motion).all()
+    assert [len(flow) for flow in sample.flow] == list(sizes[:-1])
+
+
+def test_points_in_one_place_and_far_apart_frames():
+    same = CloudSequence.from_frames("same", [np.zeros((50, 3), np.float32)] * 2)
+    assert set(predicted(same)[0]) == {0}
+    rng = np.random.default_rng(4)
+    apart = CloudSequence.from_frames("apart", [np.float32(rng.random((60, 3)) + 100 * t) for t in range(2)])
+    assert np.isfinite(predicted(apart)[1].motion).all()
+
+
+def test_most_bodies_is_kept_and_the_same_input_gives_the_same_answer():
+    clouds = [np.float32(chest().frame(t)) for t in range(3)]
+    one = explain_sequence(clouds, MultibodySettings(most_bodies=1))
+    assert len(one.bodies) == 1
+    first, second = (explain_sequence(clouds, MultibodySettings()) for _ in range(2))
+    assert first.energy == second.energy and (first.label == second.label).all() and first.energy < one.energy
+
+
+def test_kernels_agree_with_plain_numpy():
+    rng = np.random.default_rng(5)
+    share = np.float32(rng.dirichlet([1, 1, 1], 30))
+    neighbors, nearest = rng.integers(0, 30, (30, 4)), np.int32(rng.integers(0, 30, (3, 30, 2)))
+    out = np.empty((2, 30, 3), np.float32)
+    support_kernel(share, neighbors, nearest, out)
+    across = np.stack([share[nearest[k], k].mean(1) for k in range(3)], 1)
+    assert np.allclose(out[0], share[neighbors].mean(1), atol=1e-6) and np.allclose(out[1], across, atol=1e-6)
+    cost = np.float32(rng.random((30, 3)))
+    field = cost - 0.3 * out[0] - 0.2 * out[1]
+    wanted = np.exp(-field / 0.1)
+    wanted = 0.5 * share + 0.5 * wanted / wanted.sum(1, keepdims=True)
+    mean_field_kernel(cost, neighbors, nearest, 0.3, 0.2, np.array([0.1]), share)
+    assert np.allclose(share, wanted, atol=1e-5)
+
+
+def test_the_true_motion_explains_a_point_and_a_wrong_one_does_not():
+    sequence = chest()
+    frames = Frames([sequence.frame(t) for t in range(4)])
+    lid = sequence.part == 1
+    own, wrong = (frames.explain(sequence.pose[:, k, :3])[0][lid].mean() for k in (1, 0))
+    assert own < 0.75 * wrong
+    step = relative_motion(sequence.pose[:, 0, :3], 1, 3)
+    assert np.allclose(step, (sequence.pose[3, 0] @ np.linalg.inv(sequence.pose[1, 0]))[:3])
+
+
+def test_partners_are_equally_many_and_never_the_frame_itself():
+    for frames in (2, 3, 9, 40):
+        partners = [choose_partners(t, frames) for t in range(frames)]
+        assert {len(set(own)) for own in partners} == {min(6, frames - 1)}
+        assert all(t not in own for t, own in enumerate(partners))
