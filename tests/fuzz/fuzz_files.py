@@ -235,7 +235,9 @@ def write_case(bench: Bench, finding: Finding, number: int, count: int, folder: 
     place = folder / f"{number:03d}"
     place.mkdir(parents=True)
     shutil.copytree(bench.scratch / "in", place / "in", symlinks=True, ignore=_pipes)
-    (place / "cmd").write_text(f"dpc {' '.join(finding.case.words)}\n")
+    pipes = [one.relative_to(bench.scratch) for one in (bench.scratch / "in").rglob("*") if one.is_fifo()]
+    first = "".join(f"mkfifo '{one}'; " for one in pipes)
+    (place / "cmd").write_text(f"{first}dpc {' '.join(finding.case.words)}\n")
     ended = finding.ended
     about = f"{finding.cause}\n{count} inputs; {', '.join(f'{one.kind} {one.path}' for one in finding.damages)}\n"
     about += f"exit {ended.code}, {ended.seconds:.1f} s, {ended.memory >> 20} MB\n\n{ended.printed}\n{ended.said}"
