@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import typer
 from dpcli import __version__
 from dpcli.cli.help_groups import SectionedGroup
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
 from dpcli.signal_exit import INTERRUPTED, let_end, set_working, signal_outcome
 
@@ -265,7 +267,8 @@ def _run(command: Any, arguments: list[str]) -> Any:
 
     try:
         set_working(True)
-        code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
+        with regular_files_only() if arguments[:1] != ["classify"] else nullcontext():  # a stream may come by a FIFO
+            code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
         sys.stdout.flush()
         return code
     except SystemExit as ended:  # typer turns Ctrl-C and a closed pipe into this, silently

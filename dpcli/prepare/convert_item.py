@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dpcli.errors import DataError, reading
-from dpcli.prepare.decode.folder_listing import regular_files_only, why_unreadable
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.thinning import Thinning
+from dpcli.regular_files import regular_files_only, why_unreadable
 from dpcli.runtime.seeds import generator
 
 

@@ -16,7 +16,7 @@ from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import as_utf8
 from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.convert_item import convert_item
-from dpcli.prepare.decode.folder_listing import regular_files_only, unreadable_entries
+from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.thinning import Thinning
 from dpcli.runtime.device import cpu_count
@@ -133,7 +133,7 @@ def all_items(reader: Reader) -> tuple[list[Item], list[Item]]:
     """
     given = getattr(reader, "inputs", ()) or (getattr(reader, "raw", None),)
     roots = [root for root in given if isinstance(root, Path)]
-    with reading(", ".join(map(str, roots)) or type(reader).__name__), regular_files_only():
+    with reading(", ".join(map(str, roots)) or type(reader).__name__):
         items = list(reader.items())
     taken = {item.path for item in items}
     odd = [(root, path, why) for root in roots if root.is_dir() for path, why in unreadable_entries(root, taken)]

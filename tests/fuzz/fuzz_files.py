@@ -4,7 +4,7 @@
 
 makes tiny inputs in FOLDER/seeds (seeds.py), damages copies of them (damage.py), runs each command in a fork of this
 process on them (forks.py), and judges what came out (verdict.py): a trace, the sentence that asks for --debug, a signal,
-20 s of CPU or 60 on the clock, 200 MB more memory than with the undamaged input, an output half written, an error without a
+20 s of CPU or 30 on the clock, 200 MB more memory than with the undamaged input, an output half written, an error without a
 sentence, frames lost without a word, unprintable characters. One finding of each cause is made smaller (minimize.py)
 and written to FOLDER/findings: cmd, in/, said.txt. Prints the seed and the counts; exits with 1 if anything was found.
 
@@ -35,7 +35,7 @@ from tests.fuzz.seeds import cases, inputs_of, made_for, write_raw
 from tests.fuzz.verdict import cause, faults
 from tests.support.commands import exit_code
 
-LIMITS = Limits(seconds=60, cpu=20, memory=3 << 30, file=100 << 20)
+LIMITS = Limits(seconds=30, cpu=20, memory=3 << 30, file=100 << 20)
 SEEDS_LIMITS = Limits(seconds=300)
 TRIES, SECONDS = 60, 30  # at most, to make one finding smaller
 COLLECTED = "sys.modules"  # file of the names of modules that the undamaged runs loaded
