@@ -115,7 +115,8 @@ def make_seeds(folder: Path, chosen: list[list[str]]) -> None:
         if (folder / f"{name}.h5").is_file():
             shutil.copyfile(folder / f"{name}.h5", folder / f"{name}2.h5")
     line = "evaluate classification scores.h5 --split all --resamples 0 --json"
-    (folder / "result.json").write_text(forked(lambda: exit_code(*line.split()), SEEDS_LIMITS, folder).printed)
+    if (folder / "scores.h5").is_file():
+        (folder / "result.json").write_text(forked(lambda: exit_code(*line.split()), SEEDS_LIMITS, folder).printed)
 
 
 def _collecting(words: Sequence[str], modules: Path) -> int:

@@ -107,3 +107,13 @@ def test_a_pipe_inside_a_sample_is_not_opened(name, tmp_path):
     os.mkfifo(raw / "data" / "3_000001" / name)
     done = dpc("prepare", "ogc-dr", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
     assert done.returncode == 3 and f"{name}: a FIFO, expected a regular file" in done.stderr
+
+
+def test_a_pipe_inside_a_recording_is_not_opened(tmp_path):
+    """SQLite opens files by itself, where no guard of Python's sees it."""
+    from dpcli.prepare.recordings.recording import open_recording
+
+    (tmp_path / "metadata.yaml").write_text("")
+    os.mkfifo(tmp_path / "run.db3")
+    with pytest.raises(DataError, match="run.db3: a FIFO"), open_recording(tmp_path):
+        pass
