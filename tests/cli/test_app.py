@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 from dpcli.cli import app as cli
 from dpcli.errors import UsageError
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
-from tests.fuzz.fuzz_options import forked, is_bug, odd
+from tests.fuzz.forks import Limits, forked
+from tests.fuzz.fuzz_options import is_bug, odd
 
 
 def paths_of(group: typer.Typer) -> list[tuple[str, ...]]:
@@ -234,7 +235,9 @@ def test_the_search_for_bugs_tells_one_from_a_refusal():
         return 1
 
     for work in (lambda: 1 // 0, lambda: os.kill(os.getpid(), signal.SIGKILL), excused):
-        assert is_bug(*forked(work))
-    assert not is_bug(*forked(lambda: print("--lr nan: expected a finite number", file=sys.stderr) or 2))
+        ended = forked(work, Limits())
+        assert is_bug(ended.code, ended.said)
+    ended = forked(lambda: print("--lr nan: expected a finite number", file=sys.stderr) or 2, Limits())
+    assert not is_bug(ended.code, ended.said)
     tried = list(odd("evaluate runs a.h5 --confidence 0.9".split()))
     assert ["evaluate", "runs", "a.h5", "--confidence", "nan"] in tried and len(tried) > 20

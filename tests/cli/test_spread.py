@@ -27,7 +27,7 @@ COUNT = 7
 COMMANDS = {
     "scores": ("classify", "predict", "videos.h5", "--model", "model.safetensors", "--batch", "3"),
     "parts": ("segment", "predict", "videos.h5", "--method", "ward", "--flow", "nearest", "--points", "40"),
-    "network's parts": ("segment", "predict", "videos.h5", "--flow", "nearest", "--points", "40"),
+    "network's parts": ("segment", "predict", "videos.h5", "--fast", "--flow", "nearest", "--points", "40"),
     "flow": ("segment", "estimate-flow", "videos.h5", "--flow", "nearest", "--points", "20"),
 }
 

@@ -205,7 +205,7 @@ def test_damaged_truth_and_pixels_are_found_when_read(tmp_path):
     raw[where : where + 8] = b"\0" * 8
     path.write_bytes(raw)
     with ViewsReader(path) as reader:
-        with pytest.raises(DataError, match="view 0, frame 0 is damaged"):
+        with pytest.raises(DataError, match="view 0, frame 0: damaged"):
             reader.rgba(0, 0)
         with pytest.raises(DataError, match="3 views, 4 frames"):
             reader.rgba(3, 0)

@@ -15,8 +15,6 @@ from dpcli.prepare.actions.mat5 import read_mat5
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
-from dpcli.store.file import refuse_claim
-from dpcli.store.heap_check import check_heaps
 
 CLASS_NAMES = (
     "high arm wave",
@@ -94,6 +92,9 @@ def read_mat(path: Path) -> np.ndarray:
 
 def _read_mat73(path: Path) -> np.ndarray:
     import h5py
+
+    from dpcli.store.file import refuse_claim
+    from dpcli.store.heap_check import check_heaps
 
     check_heaps(path)
     with reading(f"{path}, a MATLAB 7.3 file"), h5py.File(path, "r") as file:

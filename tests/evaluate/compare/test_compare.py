@@ -181,7 +181,7 @@ def test_text_markdown_and_picture(run, scores, parts, tmp_path):
         tmp_path / "b.png",
         "--markdown",
     )
-    assert "| mIoU (%) |" in text and "EPE3D (m) ↓ |" in text and "< 0.001" in text
+    assert "| mIoU (%) |" in text and "EPE3D (m) ↓ |" in text and "&lt; 0.001" in text
     assert all((tmp_path / name).read_bytes()[:4] == b"\x89PNG" for name in ("a.png", "b.png"))
 
 

@@ -304,7 +304,7 @@ def test_modelnet40_files_that_disagree(tmp_path):
     assert report.written == 6 and len(report.skipped) == 6, reasons
     for words in (
         "label 40 of shape 0 is out of range; expected 0 to 39",
-        "train3.h5: not a readable HDF5 file",
+        "train3.h5: damaged, or of another format",
         "train4.h5: in neither list file",
         "ply_data_train9.h5: listed in train_files.txt, but not there",
         "no data set 'data' of its own",

@@ -413,7 +413,7 @@ def test_bytes_dont_depend_on_jobs(tmp_path):
         assert done.returncode == 0, done.stderr
         written.append(path)
     first, second = (CloudsReader(path) for path in written)
-    assert first.names == second.names and len(first) == 10 and first.fields == ("part", "pose")
+    assert first.names == second.names and len(first) == 10 and first.fields == ("part", "pose", "joint")
     for k in range(10):
         a, b = first.read(k), second.read(k)
         for name in ("points", "part", "pose", "frame_offsets"):

@@ -258,7 +258,7 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
     assert "its mesh meshes/cube.obj is missing" in done.stderr
     with CloudsReader(output) as reader:
         assert reader.class_names == ["Bad", "Good"] and reader.splits == ["test"] * 3
-        assert reader.names == ["Good_1_000", "Good_1_001", "Good_1_002"] and reader.fields == ("part", "pose")
+        assert reader.names == ["Good_1_000", "Good_1_001", "Good_1_002"] and reader.fields == ("part", "pose", "joint")
         assert reader.read(0).pose.shape == (2, 3, 4, 4)
     again = dpc(
         "prepare",

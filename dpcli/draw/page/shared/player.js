@@ -39,7 +39,7 @@ const CALM = matchMedia("(prefers-reduced-motion: reduce)").matches;
 class Player {
   constructor(timeline) {
     this.timeline = timeline;
-    this.direction = 1;
+    this.way = 1;
     this.state = { time: timeline.start, play: this.moves && !CALM, speed: 1, bounce: false };
   }
 
@@ -93,8 +93,8 @@ class Player {
     const { state, timeline } = this, passed = seconds * state.speed;
     if (!state.play) return;
     if (!state.bounce) return this.change({ time: timeline.after(state.time, passed) });
-    const [time, direction] = timeline.bounced(Math.min(state.time, timeline.end), passed, this.direction);
-    this.direction = direction;
+    const [time, direction] = timeline.bounced(Math.min(state.time, timeline.end), passed, this.way);
+    this.way = direction;
     this.change({ time });
   }
 }
