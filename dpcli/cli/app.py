@@ -39,6 +39,8 @@ ROOMS = {
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE = 141  # what a shell reports for SIGPIPE
+# What is wrong with a path that was given, rather than with the machine.
+_PLACES = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR)
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 
 
@@ -153,7 +155,7 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return DataError.exit_code
-    if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM) and error.filename:
+    if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return DataError.exit_code
     full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None

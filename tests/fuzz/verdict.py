@@ -69,7 +69,7 @@ def promised(folder: Path) -> int | None:
     """Frames that the containers below the folder claim in their own headers; None where one has no such claim."""
     total = 0
     for parent, _, names in os.walk(folder):
-        for name in names:
+        for name in (one for one in names if not one.startswith(".")):
             claim = _claim(Path(parent) / name)
             if claim is None:
                 return None
