@@ -15,6 +15,7 @@ COMMON = {
     "errors",
     "file_lock",
     "path_names",
+    "regular_files",
     "signal_exit",
     "standard_streams",
 }  # files that every room may import

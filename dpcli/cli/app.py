@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import typer
 from dpcli import __version__
 from dpcli.cli.help_groups import SectionedGroup
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
 from dpcli.signal_exit import INTERRUPTED, let_end, set_working, signal_outcome
 
@@ -37,6 +39,8 @@ ROOMS = {
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE = 141  # what a shell reports for SIGPIPE
+# What is wrong with a path that was given, rather than with the machine.
+_PLACES = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR)
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 
 
@@ -151,7 +155,7 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, FileNotFoundError) and error.filename is not None:
         log.error(f"{error.filename}: no such file or folder")
         return DataError.exit_code
-    if isinstance(error, OSError) and error.errno in (errno.EROFS, errno.EACCES, errno.EPERM) and error.filename:
+    if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return DataError.exit_code
     full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None
@@ -265,7 +269,8 @@ def _run(command: Any, arguments: list[str]) -> Any:
 
     try:
         set_working(True)
-        code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
+        with regular_files_only() if arguments[:1] != ["classify"] else nullcontext():  # a stream may come by a FIFO
+            code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
         sys.stdout.flush()
         return code
     except SystemExit as ended:  # typer turns Ctrl-C and a closed pipe into this, silently

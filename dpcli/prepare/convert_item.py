@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dpcli.errors import DataError, reading
-from dpcli.prepare.decode.folder_listing import why_unreadable
 from dpcli.prepare.reader import Item, Reader, Sample
 from dpcli.prepare.thinning import Thinning
+from dpcli.regular_files import regular_files_only, why_unreadable
 from dpcli.runtime.seeds import generator
 
 
@@ -22,7 +22,7 @@ def convert_item(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[i
         raise DataError(f"{item.path}: {reason}; it was not opened")
     rng = generator(seed, index)
     try:
-        with reading(item.path):
+        with reading(item.path), regular_files_only():
             sample = reader.read(item, rng)
     except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
         raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None

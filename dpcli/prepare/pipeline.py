@@ -122,7 +122,10 @@ def _fingerprint(path: Path) -> str:
         )
         last = next((path / name for name in reversed(names) if (path / name).is_file()), None)
         return f"{len(names)} {hashlib.sha256(os.fsencode('/'.join(names))).hexdigest()} {last.stat().st_size if last else 0}"
-    except OSError:  # an item that is made, or of a file beside others, or not there: reading it tells
+    except (
+        OSError,
+        ValueError,
+    ):  # an item that is made, or of a file beside others, or not there, or whose name holds NUL
         return ""
 
 

@@ -100,7 +100,7 @@ def refuse_repeats(names: Iterable[str | Path]) -> None:
     """Raises UsageError where two of the names, inputs and the output, are of one file."""
     seen: list[Path] = []
     for name in names:
-        path = Path(name).resolve()
+        path = Path(os.path.realpath(name))  # Path.resolve raises at a link in a circle, which opening names
         if str(name) != "-" and any(
             path == one or (path.exists() and one.exists() and path.samefile(one)) for one in seen
         ):

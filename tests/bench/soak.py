@@ -10,6 +10,7 @@ more than a tenth between the second tenth of the run and the last (the first lo
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import shutil
 import subprocess
@@ -97,7 +98,9 @@ def feed(pipe, frames: int) -> None:
     """Writes random clouds, FPS a second, never faster."""
     rng, began = np.random.default_rng(0), time.monotonic()
     for frame in range(frames):
-        np.save(pipe, rng.normal(size=(POINTS, 3)).astype(np.float32))
+        whole = io.BytesIO()
+        np.save(whole, rng.normal(size=(POINTS, 3)).astype(np.float32))
+        pipe.write(whole.getvalue())
         pipe.flush()
         time.sleep(max(0.0, began + frame / FPS - time.monotonic()))
     pipe.close()
@@ -133,7 +136,7 @@ def samples(folder: Path, asked: argparse.Namespace) -> bool:
     words = dpc("prepare", "clouds", raw, "-o", "many.h5", "--jobs", os.cpu_count() or 1, "--force")
     process = subprocess.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     looks = watch(process, lambda: _journaled(folder), 0.5)
-    return told(f"prepare, {asked.samples} samples, journaled bytes", looks)
+    return told(f"prepare, {asked.samples} samples, bytes", looks)
 
 
 def _journaled(folder: Path) -> int:
@@ -161,7 +164,7 @@ def shards(folder: Path, asked: argparse.Namespace) -> bool:
                 writer.write(CloudSequence.from_frames(f"{shard}-{sample}", frames, label=0))
     words = dpc("prepare", "merge", *paths, "-o", "merged.h5", "--force")
     process = subprocess.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return told(f"merge, {asked.shards} shards, journaled bytes", watch(process, lambda: _size(folder), 0.2))
+    return told(f"merge, {asked.shards} shards, bytes", watch(process, lambda: _size(folder), 0.2))
 
 
 def _size(folder: Path) -> int:

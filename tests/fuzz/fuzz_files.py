@@ -4,7 +4,7 @@
 
 makes tiny inputs in FOLDER/seeds (seeds.py), damages copies of them (damage.py), runs each command in a fork of this
 process on them (forks.py), and judges what came out (verdict.py): a trace, the sentence that asks for --debug, a signal,
-20 s of CPU or 60 on the clock, 200 MB more memory than with the undamaged input, an output half written, an error without a
+20 s of CPU or 30 on the clock, 200 MB more memory than with the undamaged input, an output half written, an error without a
 sentence, frames lost without a word, unprintable characters. One finding of each cause is made smaller (minimize.py)
 and written to FOLDER/findings: cmd, in/, said.txt. Prints the seed and the counts; exits with 1 if anything was found.
 
@@ -35,7 +35,7 @@ from tests.fuzz.seeds import cases, inputs_of, made_for, write_raw
 from tests.fuzz.verdict import cause, faults
 from tests.support.commands import exit_code
 
-LIMITS = Limits(seconds=60, cpu=20, memory=3 << 30, file=100 << 20)
+LIMITS = Limits(seconds=30, cpu=20, memory=3 << 30, file=100 << 20)
 SEEDS_LIMITS = Limits(seconds=300)
 TRIES, SECONDS = 60, 30  # at most, to make one finding smaller
 COLLECTED = "sys.modules"  # file of the names of modules that the undamaged runs loaded
@@ -115,7 +115,8 @@ def make_seeds(folder: Path, chosen: list[list[str]]) -> None:
         if (folder / f"{name}.h5").is_file():
             shutil.copyfile(folder / f"{name}.h5", folder / f"{name}2.h5")
     line = "evaluate classification scores.h5 --split all --resamples 0 --json"
-    (folder / "result.json").write_text(forked(lambda: exit_code(*line.split()), SEEDS_LIMITS, folder).printed)
+    if (folder / "scores.h5").is_file():
+        (folder / "result.json").write_text(forked(lambda: exit_code(*line.split()), SEEDS_LIMITS, folder).printed)
 
 
 def _collecting(words: Sequence[str], modules: Path) -> int:
@@ -235,7 +236,9 @@ def write_case(bench: Bench, finding: Finding, number: int, count: int, folder: 
     place = folder / f"{number:03d}"
     place.mkdir(parents=True)
     shutil.copytree(bench.scratch / "in", place / "in", symlinks=True, ignore=_pipes)
-    (place / "cmd").write_text(f"dpc {' '.join(finding.case.words)}\n")
+    pipes = [one.relative_to(bench.scratch) for one in (bench.scratch / "in").rglob("*") if one.is_fifo()]
+    first = "".join(f"mkfifo '{one}'; " for one in pipes)
+    (place / "cmd").write_text(f"{first}dpc {' '.join(finding.case.words)}\n")
     ended = finding.ended
     about = f"{finding.cause}\n{count} inputs; {', '.join(f'{one.kind} {one.path}' for one in finding.damages)}\n"
     about += f"exit {ended.code}, {ended.seconds:.1f} s, {ended.memory >> 20} MB\n\n{ended.printed}\n{ended.said}"

@@ -110,7 +110,11 @@ def inputs_of(words: list[str]) -> list[str]:
 
 def made_for(all_words: list[list[str]]) -> list[str]:
     """The lines of MADE whose files these commands are given, or whose files those lines are given."""
-    needed = {name.replace("2.h5", ".h5") for words in all_words for name in inputs_of(words)} | {"scores.h5"}
+    needed = {
+        name.replace("2.h5", ".h5").replace("result.json", "scores.h5")
+        for words in all_words
+        for name in inputs_of(words)
+    }
     lines = []
     for line in reversed(MADE.strip().splitlines()):
         words = line.split()

@@ -18,7 +18,7 @@ MORE_MEMORY = 200 << 20  # than the run on the undamaged input
 _LOSS = re.compile(
     r"(?<!\b0 )skipped|(?<!\b0 )dropped|left out|warning|instead of|lost|fewer|claims|says", re.IGNORECASE
 )
-_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x9b\u202e]|\\x1b")
+_CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x9b\u202e]")
 
 
 def faults(ended: Ended, seed: Ended, folder: Path) -> Iterator[str]:
@@ -69,7 +69,7 @@ def promised(folder: Path) -> int | None:
     """Frames that the containers below the folder claim in their own headers; None where one has no such claim."""
     total = 0
     for parent, _, names in os.walk(folder):
-        for name in names:
+        for name in (one for one in names if not one.startswith(".")):
             claim = _claim(Path(parent) / name)
             if claim is None:
                 return None

@@ -18,6 +18,7 @@ from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
 from dpcli.prepare.reader import Item
 from dpcli.prepare.thinning import Thinning
+from tests.support.prepare_helpers import dpc
 
 
 @dataclass(frozen=True)
@@ -94,3 +95,36 @@ def test_an_archive_that_unpacks_to_far_more_is_refused(tmp_path, megabytes, key
                     member.write(bytes(1 << 20))
     with pytest.raises(DataError, match="claims .* can't hold"):
         read_npz(bomb)
+
+
+@pytest.mark.parametrize("name", ["pc_01.npy", "pose_00.npy"])
+def test_a_pipe_inside_a_sample_is_not_opened(name, tmp_path):
+    """pose_00 is looked at while the folder is listed, pc_01 when the sample is read."""
+    from tests.prepare.articulated.test_ogc import make_room, write_raw
+
+    raw = write_raw(tmp_path / "raw", {"3_000001": make_room(0)[0]}, train=["3_000001"])
+    (raw / "data" / "3_000001" / name).unlink()
+    os.mkfifo(raw / "data" / "3_000001" / name)
+    done = dpc("prepare", "ogc-dr", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
+    assert done.returncode == 3 and f"{name}: a FIFO, expected a regular file" in done.stderr
+
+
+def test_a_pipe_inside_a_recording_is_not_opened(tmp_path):
+    """SQLite opens files by itself, where no guard of Python's sees it."""
+    from dpcli.prepare.recordings.recording import open_recording
+
+    (tmp_path / "metadata.yaml").write_text("")
+    os.mkfifo(tmp_path / "run.db3")
+    with pytest.raises(DataError, match="run.db3: a FIFO"), open_recording(tmp_path):
+        pass
+
+
+def test_a_list_that_names_nul_and_a_link_in_a_circle_are_no_bugs(tmp_path):
+    from tests.prepare.articulated.test_ogc import make_room, write_raw
+
+    raw = write_raw(tmp_path / "raw", {"3_000001": make_room(0)[0]}, train=["3_000001", "3\0"])
+    done = dpc("prepare", "ogc-dr", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
+    assert done.returncode == 0 and "1 sequences" in done.stdout and "1 skipped" in done.stdout, done.stderr
+    (tmp_path / "loop.h5").symlink_to("loop.h5")
+    done = dpc("prepare", "merge", tmp_path / "x.h5", tmp_path / "loop.h5", "-o", tmp_path / "y.h5")
+    assert done.returncode in (2, 3) and "loop.h5" in done.stderr and "a bug" not in done.stderr

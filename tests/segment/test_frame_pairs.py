@@ -57,3 +57,15 @@ def test_true_flow_of_loaded_pairs_maps_parts_onto_parts(data):
     for part in (0, 1):  # independent samples of the same solid: the same extent within sampling
         a, b = moved[pair.part[0] == part], pair.points[1][pair.part[1] == part]
         assert np.abs(a.mean(0) - b.mean(0)).max() < 0.08
+
+
+def test_a_pose_without_an_inverse_is_bad_data(tmp_path):
+    from tests.support.drawers import drawer
+
+    sequence = drawer("d", 0)
+    sequence.pose[1] = 0
+    with CloudsWriter(tmp_path / "d.h5", class_names=["drawer"], fields=["part", "pose"]) as writer:
+        writer.write(sequence)
+    with CloudsReader(tmp_path / "d.h5") as reader, pytest.raises(DataError, match="d: a pose is no rigid motion"):
+        source = PairSource(reader, [0], 20, 0)
+        source.load(source.pairs[0])

@@ -78,6 +78,26 @@ def _check_sizes(path: Path) -> None:
             f"{path}: truncated or damaged: its header says {records + late} records and points from byte {start} on, of"
             f" {size}"
         )
+    _check_points(path, head, start, size)
+
+
+def _check_points(path: Path, head: bytes, start: int, size: int) -> None:
+    """Raises DataError where the points, or the chunks of compressed ones, that a file counts have no room in it.
+
+    head: at least 227 bytes. The parsers set memory aside for all of them, and the compressed one ends the process.
+    """
+    form, length, count = struct.unpack_from("<BHI", head, 104)
+    if head[25] >= 4 and len(head) >= 255:
+        count = struct.unpack_from("<Q", head, 247)[0]
+    what, room = "points", (size - start) // max(length, 1)
+    if form & 0xC0:  # compressed: the first 8 bytes say where the table of chunks lies, whose second number counts them
+        with path.open("rb") as file:
+            file.seek(start)
+            file.seek(min(int.from_bytes(file.read(8), "little"), size))
+            table = file.read(8)
+        what, room, count = "chunks of points", size, int.from_bytes(table[4:], "little")
+    if count > room:
+        raise DataError(f"{path}: truncated or damaged: claims {count} {what}, which a file of {size} bytes can't hold")
 
 
 def _unit(las: Any) -> str:

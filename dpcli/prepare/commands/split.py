@@ -76,6 +76,8 @@ def splits_by_list(source: Source, path: Path) -> list[str]:
         rows = [[cell.strip() for cell in row] for row in csv.reader(path.read_text("utf-8-sig").splitlines()) if row]
     except FileNotFoundError:
         raise DataError(f"{path}: no such file; expected lines name,split") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path}: cannot be read as a CSV table ({error}); expected lines name,split") from None
     chosen: dict[str, str] = {}
     for number, row in enumerate(rows, 1):
         if row[:2] == ["name", "split"] and number == 1:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import os
-import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.regular_files import why_unreadable
 
 
 def leads_out(path: Path, root: Path) -> str:
@@ -30,24 +29,6 @@ def folder_files(folder: Path, root: Path, suffix: str) -> Iterator[tuple[str, P
             if entry.is_symlink() and (target := leads_out(Path(entry.path), root)):
                 raise DataError(f"{entry.path}: a link that leads out of the data, to {target}; copy the file here")
             yield entry.name, Path(entry.path)
-
-
-def why_unreadable(path: Path) -> str:
-    """Returns why a path must not be opened, "" where it may be: it is a file, a folder, or nothing that exists.
-
-    Opening a FIFO waits for ever, and a device has no end; a link to nowhere is told from a name that is missing.
-    """
-    try:
-        mode = os.stat(path).st_mode
-    except OSError as error:
-        if not os.path.islink(path):
-            return ""
-        return (
-            "a link in a circle" if error.errno == errno.ELOOP else f"a link to {os.readlink(path)}, which is missing"
-        )
-    kinds = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
-    kind = kinds.get(stat.S_IFMT(mode), "")
-    return f"{kind}, expected a regular file" if kind else ""
 
 
 def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, str]]:

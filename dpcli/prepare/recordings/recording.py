@@ -15,6 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import is_beside, is_hidden
+from dpcli.regular_files import why_unreadable
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
@@ -129,6 +130,8 @@ def open_recording(path: Path) -> Iterator[Recording]:
     if path.is_dir():  # metadata.yaml names files of the folder; they may be links
         for one in path.iterdir():
             path_inside(path, path, one.name)
+            if reason := why_unreadable(one):
+                raise DataError(f"{one}: {reason}; it was not opened")
     with _damage_named(path):
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,20 +72,8 @@ def draw_points(sequence: CloudSequence, points: int, rng: np.random.Generator) 
     rows = np.concatenate(keep).astype(np.int64)
     taken = {name: getattr(sequence, name)[rows] for name in POINT_FIELDS if getattr(sequence, name) is not None}
     offsets = np.concatenate([[0], np.cumsum([len(own) for own in keep])]).astype(np.int64)
-    return CloudSequence(
-        sequence.name,
-        sequence.points[rows],
-        offsets,
-        sequence.split,
-        sequence.label,
-        sequence.subject,
-        sequence.camera,
-        time=sequence.time,
-        pose=sequence.pose,
-        shift=sequence.shift,
-        extra={name: values[rows] for name, values in sequence.extra.items()},
-        **taken,
-    )
+    extra = {name: values[rows] for name, values in sequence.extra.items()}
+    return replace(sequence, points=sequence.points[rows], frame_offsets=offsets, extra=extra, **taken)
 
 
 def sequence_flow(drawn: CloudSequence, whole: list[np.ndarray], flow: str, device: str = "cpu") -> np.ndarray:

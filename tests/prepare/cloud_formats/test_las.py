@@ -107,3 +107,17 @@ def test_a_header_that_counts_what_is_not_there_is_refused_at_once(tmp_path, pla
     path.write_bytes(data)
     with pytest.raises(DataError, match="truncated or damaged: its header says"):
         read_las(path)
+
+
+@pytest.mark.parametrize(("suffix", "what"), [("las", "points"), ("laz", "chunks of points")])
+def test_counts_of_points_that_have_no_room_are_refused(tmp_path, suffix, what):
+    """The parser of LAZ sets memory aside for the chunks that a table counts, and ends the process without it."""
+    path = tmp_path / f"a.{suffix}"
+    make(0, np.random.default_rng(0).uniform(0, 1, (9, 3))).write(str(path))
+    data = bytearray(path.read_bytes())
+    start = int.from_bytes(data[96:100], "little")
+    place = 107 if suffix == "las" else int.from_bytes(data[start : start + 8], "little") + 4
+    data[place : place + 4] = (242_422_355).to_bytes(4, "little")
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=f"claims 242422355 {what}, which a file of {len(data)} bytes can't hold"):
+        read_las(path)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.commands.split import SplitChoice, draw_splits, split
+from dpcli.prepare.commands.split import SplitChoice, draw_splits, split, splits_by_list
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import dpc
 
@@ -172,3 +172,10 @@ def test_stopped_in_the_middle_it_goes_on_to_the_same_bytes(whole, tmp_path, mon
     assert sorted(path.name for path in (tmp_path / "twice").iterdir()) == ["test.h5", "train.h5"]
     for name in ("train.h5", "test.h5"):
         assert (tmp_path / "twice" / name).read_bytes() == (tmp_path / "once" / name).read_bytes()
+
+
+def test_a_list_in_another_encoding_is_named(tmp_path):
+    source = tmp_path / "list.csv"
+    source.write_bytes("name,split\nü,train\n".encode("utf-16"))
+    with pytest.raises(DataError, match="list.csv: cannot be read as a CSV table"):
+        splits_by_list(None, source)

@@ -26,6 +26,7 @@ from dpcli.segment.commands.estimate_flow import (
     flow_as_points,
 )
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.joints import no_joints
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SHIFT = np.array([0.04, -0.02, 0.01])
@@ -107,6 +108,9 @@ def test_points_are_drawn_with_their_fields_and_small_frames_stay_whole():
     assert all(rows[tuple(point)] == track for point, track in zip(drawn.points, drawn.track))
     assert len({tuple(p) for p in drawn.points}) == 25
     np.testing.assert_array_equal(draw_points(sequence, 0, np.random.default_rng(0)).points, sequence.points)
+    sequence.pose, sequence.joint = np.tile(np.eye(4), (3, 1, 1, 1)), no_joints(3, 1)
+    drawn = draw_points(sequence, 20, np.random.default_rng(0))
+    assert drawn.pose is sequence.pose and drawn.joint is sequence.joint
     flow = FlowOfSequence("nearest", points=20)((0, sequence)).scene_flow
     assert flow.shape == (25, 3) and not flow.any()  # toward the empty frame, and back to it
 
