@@ -140,7 +140,7 @@ def _json_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]
     try:
         lines = [line for line in path.read_text().splitlines() if line.strip()]
         objects = [json.loads(line) for line in lines]
-    except (UnicodeDecodeError, json.JSONDecodeError):
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         raise DataError(
             f"{source}: neither a file of this program nor JSON objects, one a line; expected what "
             "`dpc evaluate ... --json` prints"
