@@ -347,7 +347,9 @@ def run(*words: object) -> int:
 
 def predict(data: str, model: str, output: str | None = None, **options: object) -> None:
     """The command as a function, for the errors that it raises."""
-    command.predict(data=data, model=model, output=output, **{"jobs": None, "shard": "", "dask": "", **options})
+    unused = {"jobs": None, "shard": "", "dask": "", "segments": False, "shortest": None}
+    unused |= {"stream": False, "follow": None, "json_output": False, "page": None}
+    command.predict(data=data, model=model, output=output, **{**unused, **options})
 
 
 def rows(text: str) -> list[dict]:
