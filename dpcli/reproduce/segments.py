@@ -74,6 +74,7 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--pause", type=int, default=36, help="frames of a pause")
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(words)
+    given.folder.mkdir(parents=True, exist_ok=True)
     clouds = given.folder / "clouds.h5"
     dpc("prepare", "msraction3d", given.raw, "-o", clouds, "--points", 1024)
     rows = []

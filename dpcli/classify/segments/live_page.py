@@ -74,7 +74,7 @@ class LivePage:
 
     def _notes(self) -> list[str]:
         thinned = ((self._frames, "frames"), (self._made, "predictions"))
-        return [f"Every {one.every}th of the {what} is shown." for one, what in thinned if one.every > 1]
+        return [f"Of the {what} one in {one.every} is shown." for one, what in thinned if one.every > 1]
 
     def _rows(self, latency: np.ndarray) -> list[tuple[str, str]]:
         own = self.how.confidence

@@ -16,8 +16,8 @@ class LivePage extends PointsPage {
     this.lanes = $("lanes");
     this.lanes.onpointerdown = (event) => { this.lanes.setPointerCapture(event.pointerId); this.seek(event); };
     this.lanes.onpointermove = (event) => { if (event.buttons) this.seek(event); };
-    new ResizeObserver(() => { this.backdrop = null; this.wake(); }).observe(this.lanes);
     await super.start();
+    new ResizeObserver(() => { this.backdrop = null; this.wake(); }).observe(this.lanes);
   }
 
   // The prediction that was the newest at a frame of the stream; -1 before the first.
@@ -103,7 +103,7 @@ class LivePage extends PointsPage {
     title("actions");
     for (const [start, end, name] of this.live.segments) this.paintAction(pen, top, this.x(start), this.x(end), name, line, ink);
     top += ACTIONS + SPACE + 14;
-    title(this.live.threshold ? `confidence; below ${this.live.threshold.toFixed(2)} nothing happens` : "confidence");
+    title(`confidence, as it was said${this.live.threshold ? `; below ${this.live.threshold.toFixed(2)} nothing happens` : ""}`);
     this.paintSure(pen, top, line);
     top += SURE + SPACE + 14;
     title(`latency, at most ${Math.max(...this.live.latency).toFixed(0)} ms`);
