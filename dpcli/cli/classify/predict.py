@@ -69,7 +69,7 @@ def predict(
         raise UsageError("--batch must be at least 1 and --clips-per-video at least 0")
     from dpcli.classify.commands.predict import predict as run
 
-    result = run(task, clips_per_video or None, drop_short, batch, spread.spread)
+    result = run(task, clips_per_video or None, drop_short, batch, spread.spread, reject_below)
     if result.complete:
         typer.echo(f"{output}: complete")
     elif output != "-":
