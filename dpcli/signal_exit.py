@@ -77,9 +77,10 @@ def _handle(number: int, frame: FrameType | None) -> None:
         return
     code, said = signal_outcome() or (STOPPED, "stopped")
     try:
-        shown = "\x1b[?25h" if os.isatty(2) else ""  # a bar hides the cursor
-        os.write(2, f"{shown}dpc: error: {said}\n".encode())
-    except OSError:  # closed
+        stderr = sys.__stderr__.fileno() if sys.__stderr__ else 2
+        shown = "\x1b[?25h" if os.isatty(stderr) else ""  # a bar hides the cursor
+        os.write(stderr, f"{shown}dpc: error: {said}\n".encode())
+    except (OSError, ValueError):  # closed
         pass
     os._exit(code)
 
