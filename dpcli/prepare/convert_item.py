@@ -54,5 +54,6 @@ def _converted(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int
             sample = reader.read(item, rng)
     except OSError as error:  # unreadable, vanished, a failing disk: this sample is bad, the others may be good
         raise DataError(f"{error.filename or item.path}: {error.strerror or error}") from None
+    sample.sequence.validate_index()  # what a file or a list says of it
     sample.sequence = thinning.apply(sample.sequence, rng)  # our own code: what fails here is a bug
     return sample

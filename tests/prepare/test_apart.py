@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,9 +54,11 @@ def test_what_c_libraries_print_is_shown_to_debug_alone(tmp_path, dpc):
     for frame in range(2):
         depth = np.random.default_rng(frame).integers(1000, 2000, (12, 16)).astype(np.uint16)
         Image.fromarray(depth).save(tmp_path / "raw" / "a" / f"{frame}.png")
-    damaged = bytearray((tmp_path / "raw" / "a" / "1.png").read_bytes())
-    damaged[-20] ^= 255
-    (tmp_path / "raw" / "a" / "1.png").write_bytes(damaged)
+    data = bytearray((tmp_path / "raw" / "a" / "1.png").read_bytes())
+    start, end = data.index(b"IDAT"), data.index(b"IEND") - 8
+    data[start + 30 : start + 40] = bytes(10)  # nothing to be unpacked, but the checksum of the chunk is right
+    data[end : end + 4] = zlib.crc32(data[start:end]).to_bytes(4, "big")
+    (tmp_path / "raw" / "a" / "1.png").write_bytes(data)
     words = ("prepare", "depth", tmp_path / "raw", "--fov", 60, "-o", tmp_path / "o.h5")
     quiet, loud = dpc(*words), dpc(*words, "--debug")
     assert quiet.returncode == loud.returncode == 3
