@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dpcli.draw.reliability import WIDTH, Reliability, draw_reliability
 from dpcli.draw.sheet import save_figure
 
 if TYPE_CHECKING:
@@ -19,10 +20,13 @@ _LONGEST_NAME = 28  # characters of a class name on an axis
 _DARK_SHARE = 0.55  # of a row, above which a cell's number is white
 
 
-def draw_confusion(confusion: np.ndarray, class_names: Sequence[str], headline: str, path: Path) -> None:
+def draw_confusion(
+    confusion: np.ndarray, class_names: Sequence[str], headline: str, path: Path, reliability: Reliability | None = None
+) -> None:
     """Writes the picture of a matrix of counts, truth (rows) by prediction (columns), whole numbers (C,C).
 
-    Color is the share of the row's truth, the number in a cell the count. Raises DataError when it can't be written.
+    Color is the share of the row's truth, the number in a cell the count. reliability: to be drawn beside it. Raises
+    DataError when it can't be written.
     """
     from matplotlib.figure import Figure
 
@@ -30,16 +34,21 @@ def draw_confusion(confusion: np.ndarray, class_names: Sequence[str], headline: 
     side = max(_SMALLEST, _INCH_PER_CLASS * classes)
     titles = [_axis_title(label, name) for label, name in enumerate(class_names)]
     margin = 0.4 + 0.065 * max(len(title) for title in titles)  # inches for the names, at 7 points
-    figure = Figure(figsize=(side + margin + 1.0, side + margin + 0.7), layout="constrained")
-    axes = figure.add_subplot()
+    wide, high = side + margin + 1.0, side + margin + 0.7
+    more = WIDTH if reliability is not None else 0.0
+    figure = Figure(figsize=(wide + more, high), layout="constrained")
+    places = figure.subfigures(1, 2, width_ratios=(wide, more)) if more else [figure]
+    axes = places[0].add_subplot()
     shares = confusion / np.maximum(confusion.sum(axis=1, keepdims=True), 1)
     image = axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="equal")
     _number_cells(axes, confusion, shares, min(9.0, 0.32 * 72 * side / classes))
     _name_axes(axes, titles)
     axes.set_title(headline, fontsize=8 + side / 3, parse_math=False)
-    bar = figure.colorbar(image, ax=axes, fraction=0.04, pad=0.02, shrink=min(1.0, 4 / side))
+    bar = places[0].colorbar(image, ax=axes, fraction=0.04, pad=0.02, shrink=min(1.0, 4 / side))
     bar.set_label("share of the true class", fontsize=7)
     bar.ax.tick_params(labelsize=7)
+    if reliability is not None:
+        draw_reliability(reliability, places[1])
     save_figure(figure, path)
 
 

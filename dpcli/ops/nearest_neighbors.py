@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
 
@@ -17,7 +19,14 @@ from dpcli.ops.backend import (
     squared_distances,
 )
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
 _BUCKET_NS, _ROW_NS = 60, 6e3  # measured: per point, and per query with k = 16..32
+_LARGE = 16384  # points and queries from which a tree is faster than buckets, whose boxes every query looks at
+_TOGETHER = 1 << 13  # queries of a tree at a time, so that memory stays small
+_ROUNDING = 1e-6  # a squared distance in float32 is right to 5 roundings of 2^-24 of itself, ...
+_LEAST = 1e-37  # ... or, where squares fall below the normal numbers, to far less than this
 
 
 def knn(
@@ -32,9 +41,9 @@ def knn(
     Ties go to the lowest index.
     lengths: valid points per cloud; padding behind them is never found (but must be finite). Slots beyond a cloud's
     number of points repeat the nearest. Distances are float32 and carry no gradient: recompute them from the indices.
-    Backends: numba on CPU (buckets with bounding boxes; exact, ties included), torch elsewhere (all pairs, in blocks of
-    bounded memory); both give the same numbers. Raises ValueError on wrong shapes, non-finite coordinates, lengths out
-    of range.
+    Backends: numba on CPU (buckets with bounding boxes; exact, ties included; from 16,384 points and queries SciPy's k-d
+    tree, whose order is made exact), torch elsewhere (all pairs, in blocks of bounded memory); all give the same numbers.
+    Raises ValueError on wrong shapes, non-finite coordinates, lengths out of range.
 
     >>> line = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [3, 0, 0]]])
     >>> knn(torch.tensor([[[0.9, 0, 0]]]), line, 2)[1].tolist()
@@ -43,6 +52,8 @@ def knn(
     query, points, lengths = _checked(query, points, k, lengths)
     if chosen_backend(points.device) == "torch" or query.numel() == 0:
         return _knn_torch(query, points, k, lengths)
+    if min(query.shape[1], points.shape[1]) >= _LARGE:
+        return _knn_tree(query, points, k, lengths)
     return _knn_numba(query, points, k, lengths)
 
 
@@ -83,6 +94,50 @@ def _knn_numba(
     found = (order, valid, xyz, box, BUCKET, query.contiguous().numpy(), squared.numpy(), index.numpy())
     run_in_threads(knn_kernel, found, batch * rows, _ROW_NS)
     return squared, index
+
+
+def _knn_tree(
+    query: torch.Tensor, points: torch.Tensor, k: int, lengths: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns what `_knn_numba` does, from a k-d tree; rows of clouds too small for k, or with a tie, come from there."""
+    from scipy.spatial import cKDTree
+
+    batch, rows, _ = query.shape
+    squared, index = torch.empty((batch, rows, k)), torch.empty((batch, rows, k), dtype=torch.int64)
+    for b, length in enumerate([points.shape[1]] * batch if lengths is None else lengths.tolist()):
+        cloud, sure = points[b, :length], np.zeros(rows, bool)
+        tree = cKDTree(cloud.numpy()) if length > k else None
+        for first in range(0, rows if tree else 0, _TOGETHER):
+            some = slice(first, first + _TOGETHER)
+            own = query[b, some].numpy(), cloud.numpy(), squared[b, some].numpy(), index[b, some].numpy()
+            sure[some] = _fill_from_tree(tree, *own)
+        rest = torch.from_numpy(np.flatnonzero(~sure))
+        if len(rest):
+            own = _knn_numba(query[b : b + 1, rest], cloud[None], k, None)
+            squared[b, rest], index[b, rest] = own[0][0], own[1][0]
+    return squared, index
+
+
+def _fill_from_tree(
+    tree: cKDTree, query: np.ndarray, points: np.ndarray, squared: np.ndarray, index: np.ndarray
+) -> np.ndarray:
+    """Fills squared f32 (M,k) and index i64 (M,k); returns whether (M) no other point may belong there.
+
+    The tree measures in float64. A row is sure when its (k+1)-th point is farther than float32's roundings can hide.
+    """
+    far, found = tree.query(query, squared.shape[1] + 1, workers=torch.get_num_threads())
+    gap = points[found]
+    with np.errstate(over="ignore", under="ignore"):
+        gap -= query[:, None]
+        gap *= gap
+        near = (gap[..., 0] + gap[..., 1]) + gap[..., 2]
+    keys = near.view(np.int32).astype(np.int64)  # distance bits above, index below: as `ordered_keys`
+    keys <<= 32
+    keys |= found
+    keys.sort(1)
+    index[:] = keys[:, :-1] & 0xFFFFFFFF
+    squared.view(np.int32)[:] = keys[:, :-1] >> 32
+    return squared[:, -1].astype(np.float64) * (1 + _ROUNDING) + _LEAST < far[:, -1] ** 2 * (1 - _ROUNDING)
 
 
 def _knn_torch(

@@ -59,6 +59,35 @@ def test_kernel_equals_reference_on_many_buckets(kind: str, count: int, k: int) 
         assert torch.equal(ours, reference)
 
 
+@pytest.mark.parametrize("kind", ["random", "grid", "far"])
+@pytest.mark.parametrize("k", [1, 9])
+def test_large_clouds_equal_the_reference(kind: str, k: int) -> None:
+    """The tree of large clouds keeps the ties of the definition: a fine grid has them in nearly every row."""
+    rng = np.random.default_rng(k)
+    points, query = (cloud(rng, 2, 16384, kind=kind) for _ in range(2))
+    if kind == "grid":
+        points += rng.integers(0, 12, points.shape).astype(np.float32)
+    points[0, :3], query[0, :2] = points[0, 3:4], points[0, :2]  # copies
+    arguments = (torch.from_numpy(query), torch.from_numpy(points), k)
+    lengths = torch.tensor([16384, 5])  # a cloud with fewer points than k
+    rows = torch.arange(0, 16384, 64)
+    for more in ({}, {"lengths": lengths}):
+        ours = knn(*arguments, **more)
+        reference = knn_reference(arguments[0][:, rows], *arguments[1:], **more)
+        for own, other in zip(ours, reference, strict=True):
+            assert torch.equal(own[:, rows], other)
+
+
+def test_large_clouds_with_squares_that_overflow_or_vanish() -> None:
+    points = cloud(np.random.default_rng(6), 1, 16384, kind="random")
+    points[0, :2000] *= 1e30
+    points[0, 2000:4000] *= 1e-25
+    query, points = torch.from_numpy(points), torch.from_numpy(points.copy())
+    rows = torch.arange(0, 16384, 64)
+    for own, other in zip(knn(query, points, 4), knn_reference(query[:, rows], points, 4), strict=True):
+        assert torch.equal(own[:, rows], other)
+
+
 def test_agrees_with_scipy() -> None:
     rng = np.random.default_rng(3)
     points, query = cloud(rng, 5000, kind="random"), cloud(rng, 200, kind="random")

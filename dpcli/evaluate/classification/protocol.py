@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
+from dpcli.evaluate.classification.calibration import Calibration, are_probabilities, calibrate, calibration_weighted
 from dpcli.evaluate.classification.metrics import ClassificationMetrics, classification_metrics, classification_weighted
 from dpcli.evaluate.classification.truth_labels import TruthLabels, labels_in_file, match_labels
 from dpcli.evaluate.results import LeftOut, counted_split
@@ -23,7 +24,7 @@ class ClassificationReport:
     """Holds the metrics of every stream on the same samples; `streams` ends with the main scores.
 
     names, labels i (S): the samples that count; scores f (S,C): the main scores of them. intervals: by stream and
-    metric, empty without `resampling`.
+    metric, empty without `resampling`. calibration: by stream, None where the scores are no probabilities.
     """
 
     class_names: list[str]
@@ -36,6 +37,7 @@ class ClassificationReport:
     scores: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     resampling: Resampling = field(default_factory=lambda: Resampling(0))
     intervals: dict[str, dict[str, Interval]] = field(default_factory=dict)
+    calibration: dict[str, Calibration | None] = field(default_factory=dict)
 
     @property
     def main(self) -> ClassificationMetrics:
@@ -80,11 +82,17 @@ def evaluate_classification(
         labels=labels,
         scores=scores.scores[keep],
         resampling=resampling,
-        intervals={
-            name: resampling.intervals(classification_weighted(rows, labels), len(labels))
-            for name, rows in streams.items()
-        },
+        intervals={name: resampling.intervals(_metric(rows, labels), len(labels)) for name, rows in streams.items()},
+        calibration={name: calibrate(rows, labels) for name, rows in streams.items()},
     )
+
+
+def _metric(scores: np.ndarray, labels: np.ndarray) -> WeightedMetric:
+    """Returns all metrics of scores as functions of how often each sample counts."""
+    parts = [classification_weighted(scores, labels)]
+    if are_probabilities(scores):
+        parts.append(calibration_weighted(scores, labels))
+    return lambda counts: {key: value for part in parts for key, value in part(counts).items()}
 
 
 def _choose_samples(scores: ScoresReader, found: TruthLabels, split: str) -> tuple[np.ndarray, list[LeftOut]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
 from dpcli.evaluate.results import left_out_note
@@ -23,9 +24,21 @@ def classification_notes(report: ClassificationReport) -> list[str]:
     occur = f"{int((report.main.support > 0).sum())} of {len(report.class_names)} classes occur"
     lines = [f"{report.main.samples} samples of split {report.split!r}, {occur}; truth: {report.truth}."]
     lines += resampling_note(report.resampling, "samples", report.main.samples)
+    lines.append(_calibration_note(report))
     for entry in report.left_out:
         lines.append(left_out_note(entry, named="label" in entry.reason))
     return lines
+
+
+def _calibration_note(report: ClassificationReport) -> str:
+    """Returns a sentence that defines the calibration error, and says how much of it chance would make."""
+    found = report.calibration.get(list(report.streams)[-1])
+    if found is None:
+        return "No calibration error: the scores are no probabilities."
+    return (
+        f"Calibration error: mean |share right - probability| of the best class over {BINS} bins of equal width; "
+        f"{report.main.samples} perfectly calibrated samples would show {percent(found.by_chance)} on average."
+    )
 
 
 def _stream_table(report: ClassificationReport) -> TextTable:
@@ -39,11 +52,13 @@ def _stream_table(report: ClassificationReport) -> TextTable:
         *([f"top-{report.main.top_k}"] if top else []),
         "balanced accuracy",
         "macro F1",
+        "calibration error",
     ]
-    return TextTable("Accuracy", header, [_stream_row(name, values) for name, values in report.streams.items()])
+    rows = [_stream_row(name, values, report.calibration.get(name)) for name, values in report.streams.items()]
+    return TextTable("Accuracy", header, rows)
 
 
-def _stream_row(name: str, values: ClassificationMetrics) -> list[str]:
+def _stream_row(name: str, values: ClassificationMetrics, calibration: Calibration | None) -> list[str]:
     low, high = values.interval
     top = [] if values.top_accuracy is None else [percent(values.top_accuracy)]
     return [
@@ -54,6 +69,7 @@ def _stream_row(name: str, values: ClassificationMetrics) -> list[str]:
         *top,
         percent(values.balanced_accuracy),
         percent(values.macro_f1),
+        percent(calibration.error) if calibration else "-",
     ]
 
 
@@ -63,6 +79,7 @@ def _interval_tables(report: ClassificationReport) -> list[TextTable]:
         return []
     top = f"top{report.main.top_k}_accuracy"
     titles = {top: f"top-{report.main.top_k}", "balanced_accuracy": "balanced accuracy", "macro_f1": "macro F1"}
+    titles["calibration_error"] = "calibration error"
     if report.main.top_accuracy is None:
         titles.pop(top)
     rows = [

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, unnamed_columns, without
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
@@ -41,13 +41,15 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
         raise
     except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
         raise DataError(f"{path}: not a readable .npz archive ({error})") from None
-    key = next((k for k in _POINT_KEYS if k in arrays), None)
+    key = next((k for k in _POINT_KEYS if k in arrays), None) or _only_points(arrays)
+    if key is None and {"x", "y", "z"} <= arrays.keys():
+        return cloud_of_columns(path, {k: a for k, a in arrays.items() if a.shape == arrays["x"].shape}, keep)
     if key is None:
         raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called {' or '.join(_POINT_KEYS)}")
     cloud = _cloud_of_array(path, arrays[key], ())
-    color = next((arrays[k] for k in _COLOR_KEYS if k in arrays), None)
-    if color is not None:
-        rows = len(cloud.points)
+    color_key = next((k for k in _COLOR_KEYS if k in arrays), "")
+    if color_key:
+        color, rows = arrays[color_key], len(cloud.points)
         if color.dtype.kind not in "uif" or color.ndim != 2 or color.shape[0] != rows or color.shape[1] not in (3, 4):
             raise DataError(f"{path}: colors {color.dtype} {color.shape}; expected numbers {(rows, 3)}")
         cloud.color = color[:, :3]
@@ -56,7 +58,16 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     if missing:
         raise DataError(f"{path}: --keep-fields {missing[0]}: no such array of one number a point")
     cloud.extra = {name: columns[name].astype(np.float32) for name in keep}
+    cloud.unread += without(list(arrays), [key, color_key], keep)
     return cloud
+
+
+def _only_points(arrays: dict[str, np.ndarray]) -> str | None:
+    """Returns the name of the only array that can be points, numbers (N,3 or more); None when none or several can."""
+    others = (*_COLOR_KEYS, "normal", "normals")
+    numbers = {k: a for k, a in arrays.items() if a.dtype.kind in "uif" and k not in others}
+    found = [k for k, a in numbers.items() if a.ndim == 2 and a.shape[1] >= 3]
+    return found[0] if len(found) == 1 else None
 
 
 def _refuse_bomb(path: Path, archive: np.lib.npyio.NpzFile) -> None:
@@ -76,7 +87,8 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         raise DataError(f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (points, 3 or more)")
     if len(array) in (3, 4) and array.shape[1] > 16:
         raise DataError(f"{path}: array of shape {array.shape}; expected a row for each point: save its transpose (.T)")
-    return Cloud(array[:, :3].astype(np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64))
+    kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
+    return Cloud(array[:, :3].astype(kind), unread=unnamed_columns(4, array.shape[1]))
 
 
 def read_bin(path: Path, columns: int) -> Cloud:

@@ -18,7 +18,8 @@ class Cloud:
 
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
     coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
-    names of those that points and colors came from.
+    names of those that points and colors came from. unread: the names of those that nobody asked for. dropped: points
+    that the file itself says don't count, by reason.
     """
 
     points: np.ndarray
@@ -26,6 +27,8 @@ class Cloud:
     unit: str = ""
     extra: dict[str, np.ndarray] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    dropped: dict[str, int] = field(default_factory=dict)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keeps only some points: a mask bool (N), or indices."""
@@ -51,7 +54,24 @@ def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequen
     elif colors:
         color = unpack_rgb(columns[names[colors[0]]])
     used = tuple(names[place] for place in (*axes[0], *colors))
-    return Cloud(points, color, axes[1], kept_columns(path, columns, keep), used)
+    return Cloud(points, color, axes[1], kept_columns(path, columns, keep), used, without(names, used, keep))
+
+
+def without(names: Sequence[str], *others: Sequence[str]) -> tuple[str, ...]:
+    """Returns the names, in their order, that are in none of the others."""
+    known = {name for one in others for name in one}
+    return tuple(name for name in names if name not in known)
+
+
+def unnamed_columns(first: int, last: int) -> tuple[str, ...]:
+    """Returns how to call columns without names, counted from 1: "column 4 (no name)", for messages; none if last < first.
+
+    >>> unnamed_columns(4, 6), unnamed_columns(4, 3)
+    (('columns 4 to 6 (no names)',), ())
+    """
+    if last < first:
+        return ()
+    return (f"column {first} (no name)" if first == last else f"columns {first} to {last} (no names)",)
 
 
 def named_axes(path: Path, names: Sequence[str]) -> tuple[list[int], str] | None:

@@ -27,7 +27,8 @@ _MAP_NAMES = (("easting", "east"), ("northing", "north"), ("elevation", "height"
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("rf", "gf", "bf"))
 _PACKED = ("rgb", "rgba", "rgb24", "rgba32")
 _FRAME = re.compile(
-    r"#?(frame|scan|sweep|image|cloud)s?[ _.-]?(id|ids|no|nr|num|number|idx|index|count|counter|seq)?", re.IGNORECASE
+    r"#?(frame|scan|sweep|image|cloud)s?[ _.-]?(id|ids|no|nr|num|number|idx|index|count|counter|seq|#|№)?[.]?",
+    re.IGNORECASE,
 )
 
 

@@ -13,10 +13,17 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, without
+from dpcli.prepare.cloud_formats.column_names import UNITS
 
 _COLORS = ("red", "green", "blue")
-_UNIT_KEY = 3076  # of GeoTIFF: linear units of a projected system
+WITHHELD = "points that their file marks as withheld dropped"
+_ABOUT_RETURNS = (  # what every file has, and hardly anybody wants
+    "return_number number_of_returns synthetic key_point withheld overlap scanner_channel scan_direction_flag"
+    " edge_of_flight_line user_data scan_angle_rank scan_angle point_source_id"
+).split()
+_MODEL_KEY, _UNIT_KEY, _HEIGHT_UNIT_KEY = 1024, 3076, 4099  # of GeoTIFF: kind of system, linear units, those of heights
+_GEOGRAPHIC = 2  # the model of longitudes and latitudes
 _SIZES = struct.Struct("<HII")  # at byte 94: of the header, where the points begin, how many records lie between
 _RECORD, _LATE_RECORD = 54, 60  # bytes at least of a record before the points, and of one behind them
 _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
@@ -38,7 +45,17 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     if color is not None and not color.any():
         color = None  # the point format has room for colors that nobody filled in
     extra = kept_columns(path, {name: np.asarray(las[name]) for name in names if name in keep}, keep) if keep else {}
-    return Cloud(_scaled(las), color, _unit(las), extra)
+    unread = without(names, "XYZ", _COLORS, _ABOUT_RETURNS, keep)
+    unit, heights = _units(path, las)
+    points = _scaled(las)
+    if heights != unit:  # such as survey feet on the map and meters above sea
+        points[:, 2] *= UNITS[heights] / UNITS[unit]
+    cloud = Cloud(points, color, unit, extra, unread=unread)
+    withheld = np.asarray(las["withheld"]).astype(bool)
+    if withheld.any():
+        cloud.keep(~withheld)
+        cloud.dropped[WITHHELD] = int(withheld.sum())
+    return cloud
 
 
 def _load_laspy() -> ModuleType:
@@ -100,25 +117,52 @@ def _check_points(path: Path, head: bytes, start: int, size: int) -> None:
         raise DataError(f"{path}: truncated or damaged: claims {count} {what}, which a file of {size} bytes can't hold")
 
 
-def _unit(las: Any) -> str:
-    """Returns the unit of the coordinates, where the file's reference system says so; "" where it doesn't."""
+def _units(path: Path, las: Any) -> tuple[str, str]:
+    """Returns the units of the coordinates on the map and of the heights, where the file's reference system says so; "" where
+    it doesn't. Raises DataError where they are degrees.
+    """
     for record in [*las.header.vlrs, *(las.evlrs or [])]:
         text = getattr(record, "string", "")
-        if text and (found := _unit_of_wkt(text)):
-            return found
-        for key in getattr(record, "geo_keys", []):
-            if key.id == _UNIT_KEY and key.tiff_tag_location == 0:
-                return _GEO_UNITS.get(key.value_offset, "")
-    return ""
+        keys = {key.id: key.value_offset for key in getattr(record, "geo_keys", []) if key.tiff_tag_location == 0}
+        if _is_geographic(text) or keys.get(_MODEL_KEY) == _GEOGRAPHIC:
+            raise DataError(
+                f"{path}: its coordinates are longitudes and latitudes in degrees; expected lengths: project them first,"
+                " such as to UTM"
+            )
+        found = (
+            units_of_wkt(text) if text else [_GEO_UNITS.get(keys.get(key), "") for key in (_UNIT_KEY, _HEIGHT_UNIT_KEY)]
+        )
+        if found and found[0]:
+            return found[0], found[-1] or found[0]
+    return "", ""
+
+
+def _is_geographic(text: str) -> bool:
+    """Returns whether a reference system in WKT is of longitudes and latitudes, neither projected nor cartesian.
+
+    >>> _is_geographic('GEOGCS["WGS 84",UNIT["degree",0.0174]]'), _is_geographic('PROJCS["a",GEOGCS["b"]]')
+    (True, False)
+    """
+    plain = text.upper().replace(" ", "")
+    lengths = re.search(r"PROJ(ECTED)?(CS|CRS)\[|GEOCCS\[|CS\[CARTESIAN", plain)
+    return lengths is None and re.search(r"GEOG(CS|CRS)\[|GEOD(ETIC)?CRS\[|CS\[ELLIPSOIDAL", plain) is not None
+
+
+def units_of_wkt(text: str) -> list[str]:
+    """Returns the unit of a reference system in WKT and that of its heights, where it has ones of their own; [] of units
+    that aren't known.
+
+    >>> units_of_wkt('PROJCS["a",GEOGCS["b",UNIT["degree",0.0174]],UNIT["US survey foot",0.304800609601219]]')
+    ['us-ft']
+    """
+    whole = re.sub(r"\s*([\[,])\s*", r"\1", text)
+    place = re.search(r"VERT(ICAL)?_?(CS|CRS)\[", whole, re.IGNORECASE)
+    parts = [whole] if place is None else [whole[: place.start()], whole[place.start() :]]
+    return [found for part in parts if (found := _unit_of_wkt(part))]
 
 
 def _unit_of_wkt(text: str) -> str:
-    """Returns the unit of a reference system in WKT: the last one that is a length.
-
-    >>> _unit_of_wkt('PROJCS["a",GEOGCS["b",UNIT["degree",0.0174]],UNIT["US survey foot",0.304800609601219]]')
-    'us-ft'
-    """
-    units = re.findall(r'(?:LENGTH)?UNIT\["([^"]*)",\s*([-+.\deE]+)', text)
+    found = re.findall(r'(?:LENGTH)?UNIT\["[^"]*",([-+.\deE]+)', text, re.IGNORECASE)
     sizes = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
-    found = [name for _, size in units for name, meters in sizes.items() if abs(float(size) - meters) < 1e-9]
-    return found[0] if found else ""
+    known = [name for size in found for name, meters in sizes.items() if abs(float(size) - meters) < 1e-9]
+    return known[-1] if known else ""

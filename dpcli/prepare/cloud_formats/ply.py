@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,10 +55,10 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
     """Returns the byte order ("" for text) and the elements; the file stands behind the header."""
     head = file.read(_HEADER_BYTES)
     mark = 3 if head.startswith(b"\xef\xbb\xbf") else 0
-    end = head.find(b"end_header")
-    if head[mark : mark + 3] != b"ply" or end < 0:
+    found = re.search(rb"[\r\n]end_header", head)  # a line of its own: comments may mention it
+    if head[mark : mark + 3] != b"ply" or found is None:
         raise DataError(f"{path}: not a PLY point cloud: no number of points in its header")
-    after = end + len(b"end_header")
+    end, after = found.start(), found.end()
     after += 2 if head[after : after + 2] == b"\r\n" else 1
     order, elements = None, []
     for line in head[mark:end].decode("latin-1").splitlines():

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, named_axes
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, named_axes, unnamed_columns, without
 from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
+
+_IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
+    (".pts", 4): "x y z intensity",
+    (".pts", 6): "x y z red green blue",
+    (".pts", 7): "x y z intensity red green blue",
+    (".xyzrgb", 6): "x y z red green blue",
+    (".xyzn", 6): "x y z nx ny nz",
+}
 
 
 def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads one cloud from a text. Raises DataError when it holds several frames, or is no table of numbers."""
     table = read_text_table(path)
+    if not table.names:
+        names = _IMPLIED.get((path.suffix.lower(), table.width), "")
+        table = replace(table, names=tuple(names.split()))
     refuse_frames(table)
     return cloud_of_table(table, keep)
 
@@ -30,14 +42,15 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
                 f"{table.path}: array of shape {(len(table.numbered), table.width)}; expected numbers (points, 3 or more)"
             )
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
-        return Cloud(values[:, :3])
+        return Cloud(values[:, :3], unread=unnamed_columns(4, table.width))
     axes = named_axes(table.path, table.names)
     if axes is None:
         raise DataError(f"{table.path}: columns {', '.join(table.names)[:80]}; expected x, y and z among them")
     places = [*axes[0], *find_colors(table.names), *(table.names.index(name) for name in keep if name in table.names)]
     places = list(dict.fromkeys(places))
     values = table.columns(places)
-    return cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
+    cloud = cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
+    return replace(cloud, unread=without([name for name in table.names if name], cloud.columns, keep))
 
 
 def refuse_frames(table: TextTable) -> None:

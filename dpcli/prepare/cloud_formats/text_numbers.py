@@ -15,6 +15,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import named_axes
+from dpcli.prepare.cloud_formats.column_names import unit_of
 from dpcli.prepare.cloud_formats.plain_numbers import parse_plain
 
 _MARKS = (
@@ -39,7 +40,7 @@ class TextTable:
     """Holds the rows of a text, not yet taken for numbers. names: of the columns, none where the file names none.
 
     body: the text from the first row on; first_line: which line of the file that is, from 1. delimiter: None for blanks.
-    limit: rows that count, None for all.
+    limit: rows that count, None for all. header: the line of the names, which files that were joined hold several times.
     """
 
     path: Path
@@ -48,13 +49,14 @@ class TextTable:
     first_line: int = 1
     delimiter: str | None = None
     limit: int | None = None
+    header: str = ""
 
     @cached_property
     def numbered(self) -> list[tuple[int, str]]:
-        """Returns the rows with the number of their line; no empty ones, no comments."""
+        """Returns the rows with the number of their line; no empty ones, no comments, no header that comes again."""
         lines = enumerate(self.body.split("\n"), self.first_line)
         rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip() and not line.lstrip().startswith(_COMMENT))
-        return list(islice(rows, self.limit))
+        return list(islice((row for row in rows if row[1] != self.header or not self.header), self.limit))
 
     @cached_property
     def width(self) -> int:
@@ -182,7 +184,8 @@ def read_text_table(path: Path) -> TextTable:
         delimiter = head.pop(0)[1][-1]
     first, names = _find_header(path, head, delimiter)
     body = text.split("\n", first - 1)[-1] if first > 1 else text
-    table = TextTable(path, tuple(names), body, first)
+    header = next((line for k, line in head if k == first - 1), "") if names else ""
+    table = _with_units(TextTable(path, tuple(names), body, first, delimiter, header=header))
     rows = table.first_rows(2)
     if not rows:
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
@@ -191,6 +194,21 @@ def read_text_table(path: Path) -> TextTable:
         rows = rows[1:] or rows
     table = replace(table, delimiter=delimiter or _delimiter(rows[0][1]))
     return table if names else _checked_unnamed(table)
+
+
+def _with_units(table: TextTable) -> TextTable:
+    """Returns the table without a first row that tells the units of its columns, which stand in their names then."""
+    row = re.match(r"\s*(.+)\n", table.body) if table.names else None
+    axes = named_axes(table.path, table.names) if row else None
+    if not row or not axes:
+        return table
+    units = dict(enumerate(_names(row[1].strip(_EDGES), table.delimiter or _delimiter(row[1]))))
+    told = {unit_of(f"x {units.get(place, '')}") for place in axes[0]}
+    if len(told) != 1 or not (unit := told.pop()):
+        return table
+    names = tuple(f"{name} [{unit}]" if place in axes[0] else name for place, name in enumerate(table.names))
+    number = table.first_line + row[0].count("\n")
+    return replace(table, names=names, body=table.body[row.end() :], first_line=number)
 
 
 def decode_text(path: Path) -> str:

@@ -28,6 +28,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".pts": read_text,
     ".asc": read_text,
     ".txt": read_text,
+    ".xyzn": read_text,
+    ".xyzrgb": read_text,
 }
 SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", ".npy", ".npz", ".parquet", *list(_READERS)[7:])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ from dpcli.store.schema import kept_name
 
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
+_COUNTED, _LOOKED_AT = 20.0, 1000  # meters from which on whole numbers alone are odd, and points that tell
 SHIFTED = "sequences shifted to their first frame's corner for precision"
 
 
@@ -53,7 +55,7 @@ def assemble(
 
     color: every frame has one. time: seconds of each frame, f64 (T), or None. What is dropped is counted by reason.
     """
-    notes = clean(clouds)
+    notes = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter(clean(clouds))))
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
     kept, dropped = drop_empty_frames(str(item.path), counts)
     divisor, converted = lengths.divisor([clouds[t] for t in kept])
@@ -65,7 +67,7 @@ def assemble(
     if shift is not None:
         notes[SHIFTED] = 1
     if lengths.unit == "m":
-        notes |= _doubts(*ends)
+        notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
     extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
     sequence = CloudSequence(
         item.name,
@@ -97,12 +99,16 @@ def _joined(
     return (points - corner).astype(np.float32), corner if far else None
 
 
-def _doubts(low: np.ndarray, high: np.ndarray) -> dict[str, int]:
-    """Returns notes about lengths that no sensor sees. low, high: the ends of the original coordinates, f64 (3)."""
-    widest = float((high - low).max())
+def _doubts(low: np.ndarray, high: np.ndarray, some: np.ndarray | None) -> dict[str, int]:
+    """Returns notes about lengths that no sensor sees. low, high: the ends of the original coordinates, f64 (3); some:
+    points as they were read, or None.
+    """
+    widest, farthest = float((high - low).max()), float(np.abs([low, high]).max())
     if widest > _ABSURD:
         return {"sequences more than 100 km wide; are they in meters? --scale N divides them": 1}
-    if widest > _WIDE and ((low <= 0) & (high >= 0)).all():
+    if some is not None and widest > _COUNTED and farthest <= _FAR_AWAY and (some == np.floor(some)).all():
+        return {"sequences in whole numbers, hardly meters; if they are millimeters, give --scale 1000": 1}
+    if widest > _WIDE and farthest <= _FAR_AWAY:
         return {"sequences that reach 1 km around their sensor; if these are millimeters, give --scale 1000": 1}
     return {}
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from os.path import splitext
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,10 @@ from dpcli.prepare.series import TEXTS, Series, choose_series, is_hidden
 
 _PREFERRED = (".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".xyz")  # of two files of one frame
 
+_FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
+    ".e57 .ptx .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx".split()
+)
+
 
 def find_sequences(
     root: Path, suffixes: Sequence[str], *, pattern: str = "", table: Path | None = None
@@ -23,26 +30,35 @@ def find_sequences(
     suffixes: of point clouds. pattern: of the names of frames. table: a file that is no cloud, whatever its name. Raises
     DataError when there is none, or when a folder's clip must be chosen.
     """
-    found = []
-    for folder, names in _folders(root, suffixes, table.resolve() if table else None):
-        series = choose_series(folder, names, pattern=pattern, suffixes=_PREFERRED)
+    found, others = [], Counter[str]()
+    for folder, names, foreign in _folders(root, suffixes, table.resolve() if table else None):
+        others += foreign
+        series = choose_series(folder, names, pattern=pattern, suffixes=_PREFERRED) if names else None
         if series and not is_pose(series.paths[0]):
-            found.append(series)
+            found.append(replace(series, left_out=(*series.left_out, *_counted(foreign))))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them")
+        advice = f"; found {', '.join(_counted(others))}: save their points as .ply" if others else ""
+        raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
     return sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix()))
 
 
-def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterator[tuple[Path, list[str]]]:
-    """Yields every folder at or below ``root`` with the names of its point clouds, when it has any."""
+def _counted(foreign: Counter[str]) -> tuple[str, ...]:
+    return tuple(f"{count} {suffix} file{'s' if count > 1 else ''}" for suffix, count in sorted(foreign.items()))
+
+
+def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterator[tuple[Path, list[str], Counter[str]]]:
+    """Yields every folder at or below ``root`` with the names of its point clouds, and how many it has in formats that
+    are not read, by suffix; no folder that has neither.
+    """
     for folder, below, names in os.walk(root):
         below[:] = [name for name in below if not is_hidden(name)]
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]
-        if clouds:
-            yield Path(folder), clouds
+        foreign = Counter(splitext(name)[1].lower() for name in names if name.lower().endswith(_FOREIGN))
+        if clouds or foreign:
+            yield Path(folder), clouds, foreign
 
 
 def is_cloud(name: str, suffixes: Sequence[str]) -> bool:

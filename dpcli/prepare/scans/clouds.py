@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
-from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, require_folder
@@ -21,6 +21,7 @@ from dpcli.prepare.scans.cloud_series import find_sequences
 from dpcli.prepare.series import Series, about_series
 from dpcli.store.schema import kept_name
 
+_LISTED = 8
 _LOOKED_AT = 5  # frames that tell how many columns a .bin has
 
 
@@ -93,14 +94,20 @@ class CloudFolders:
         """Returns whether the time of every frame is known: by ``fps``, or because all names are times."""
         return all(one.frame_times(self.fps) is not None for one in self._series)
 
-    @cached_property
+    @property
     def _has_color(self) -> bool:
+        return self._first[0]
+
+    @cached_property
+    def _first(self) -> tuple[bool, tuple[str, ...]]:
+        """Returns whether the first good cloud has colors, and which of its columns are not read."""
         for one in self._series:
             try:
-                return read_cloud(one.paths[0], self.bin_columns).color is not None
+                cloud = read_cloud(one.paths[0], self.bin_columns)
             except DataError:
                 continue  # a bad sample: the next one tells
-        return False
+            return cloud.color is not None, without(cloud.unread, self.keep)
+        return False, ()
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
@@ -137,6 +144,9 @@ class CloudFolders:
         """Returns lines for the log about what the index holds and lacks."""
         frames = sum(len(item.extra["series"].names) for item in items)
         lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
+        if self._first[1]:
+            lines[0] += f"; not read: {', '.join(self._first[1][:_LISTED])}{' ...' if self._first[1][_LISTED:] else ''}"
+            lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"
         if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
         return lines + about_series([(item.name, item.extra["series"]) for item in items])

@@ -20,10 +20,11 @@ from dpcli.prepare.cloud_formats.text_numbers import read_text_table
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
-from dpcli.prepare.scans.frames_of_tables import JOINED, Rows, frame_column, split_rows
+from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.store.schema import kept_name
 
 TABLES = (".csv", ".tsv", ".parquet", ".txt", ".xyz", ".asc")
+_FEW = 5  # frames of one point that may be true
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ class TableSequences:
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= {JOINED: part.joined} if part.joined else {}
+        sample.notes |= {SINGLE: 1} if len(clouds) > _FEW and all(len(cloud.points) == 1 for cloud in clouds) else {}
         return sample
 
     def summary(self, items: list[Item]) -> list[str]:

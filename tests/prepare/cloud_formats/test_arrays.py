@@ -45,6 +45,25 @@ def test_what_numpy_writes_is_read_back(tmp_path, data):
     np.testing.assert_array_equal(found.points, array[:, :3].astype(np.float64))
 
 
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"data": "points"},
+        {"x": 0, "y": 1, "z": 2, "snr": 0},
+        {"pc": "points", "rgb": "colors", "normals": "points"},
+        {"frame": "points", "label": 0},
+    ],
+)
+def test_archives_whose_points_are_called_otherwise(tmp_path, arrays):
+    points = np.random.default_rng(0).uniform(0, 2, (20, 3))
+    made = {"points": points, "colors": np.zeros((20, 3), np.uint8)}
+    np.savez(tmp_path / "a.npz", **{k: points[:, v] if isinstance(v, int) else made[v] for k, v in arrays.items()})
+    cloud = read_npz(tmp_path / "a.npz")
+    np.testing.assert_array_equal(cloud.points, points)
+    assert (cloud.color is not None) == ("rgb" in arrays)
+    assert cloud.unread == tuple(name for name in arrays if name in ("snr", "normals", "label"))
+
+
 def test_an_array_that_lies_on_its_side_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((3, 1000)))
     with pytest.raises(DataError, match=r"\(3, 1000\); expected a row for each point"):

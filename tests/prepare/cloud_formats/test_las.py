@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct
+from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.colors import as_bytes
-from dpcli.prepare.cloud_formats.las import read_las
+from dpcli.prepare.cloud_formats.las import WITHHELD, read_las
 from dpcli.prepare.scans.clouds import CloudFolders
 
 quick = settings(
@@ -87,6 +87,61 @@ def test_feet_that_a_file_declares_become_meters(tmp_path, code, name, meters):
     assert sample.notes == {f"sequences converted from {name} to m, as their files declare": 1}
     kept = CloudFolders(tmp_path / "in", scale=1.0)
     np.testing.assert_allclose(kept.read(kept.items()[0], np.random.default_rng(0)).sequence.points, points, atol=1e-4)
+
+
+FEET_AND_METERS = (
+    'COMPD_CS["a", PROJCS["b", GEOGCS["c", UNIT["degree", 0.0174532925]], UNIT["US survey foot", 0.3048006096012192]],'
+    ' VERT_CS["d", VERT_DATUM["e", 2005], UNIT["metre", 1.0]]]'
+)
+
+
+def make_with(path, points, wkt="", keys=()):
+    las = make(6, points, 1e-4)
+    if wkt:
+        las.header.vlrs.append(WktCoordinateSystemVlr(wkt))
+    if keys:
+        record = GeoKeyDirectoryVlr()
+        record.geo_keys = [GeoKeyEntryStruct(key, 0, 1, value) for key, value in keys]
+        record.geo_keys_header.number_of_keys = len(keys)
+        las.header.vlrs.append(record)
+    las.write(str(path))
+
+
+@pytest.mark.parametrize("told", [{"wkt": FEET_AND_METERS}, {"keys": [(1024, 1), (3076, 9003), (4099, 9001)]}])
+def test_heights_of_another_unit_than_the_map(tmp_path, told):
+    points = np.random.default_rng(0).uniform(0, 20, (30, 3))
+    (tmp_path / "in").mkdir()
+    make_with(tmp_path / "in" / "0.las", points, **told)
+    reader = CloudFolders(tmp_path / "in")
+    found = reader.read(reader.items()[0], np.random.default_rng(0)).sequence.points
+    np.testing.assert_allclose(found, points * [1200 / 3937, 1200 / 3937, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"wkt": 'GEOGCS["WGS 84",DATUM["d",SPHEROID["e",6378137,298.257]],UNIT["degree",0.0174532925199433]]'},
+        {"wkt": 'GEOGCRS["WGS 84",CS[ellipsoidal,3],ANGLEUNIT["degree",0.0174],LENGTHUNIT["metre",1]]'},
+        {"keys": [(1024, 2), (2048, 4326)]},
+    ],
+)
+def test_degrees_are_no_lengths(tmp_path, told):
+    make_with(tmp_path / "a.las", np.array([[8.5, 47.3, 400], [8.6, 47.2, 410]]), **told)
+    with pytest.raises(DataError, match="longitudes and latitudes in degrees; expected lengths: project them"):
+        read_las(tmp_path / "a.las")
+
+
+def test_withheld_points_are_dropped_and_counted(tmp_path):
+    las = make(6, np.arange(30.0).reshape(10, 3))
+    las.withheld = np.arange(10) < 3
+    las.intensity = np.arange(10)
+    (tmp_path / "in").mkdir()
+    las.write(str(tmp_path / "in" / "0.las"))
+    reader = CloudFolders(tmp_path / "in", keep=("intensity",))
+    sample = reader.read(reader.items()[0], np.random.default_rng(0))
+    assert sample.notes == {WITHHELD: 3}
+    assert sample.sequence.points[:, 0].tolist() == [9, 12, 15, 18, 21, 24, 27]
+    assert sample.sequence.extra["field_intensity"].tolist() == [3, 4, 5, 6, 7, 8, 9]
 
 
 def test_a_damaged_laz_is_named(tmp_path):

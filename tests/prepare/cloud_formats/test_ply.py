@@ -89,6 +89,13 @@ def test_names_of_colors(tmp_path, names):
     ]
 
 
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
+def test_comments_that_sound_like_the_header(tmp_path, ends):
+    text = text_ply(["1 2 3", "4 5 6"]).replace("element", "comment element vertex 9 end_header\nobj_info x 1\nelement")
+    (tmp_path / "a.ply").write_bytes(text.replace("\n", ends).encode())
+    assert read_ply(tmp_path / "a.ply").points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
 def test_a_mark_before_the_header_and_windows_line_ends(tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(b"\xef\xbb\xbf" + text_ply(["1 2 3", "4 5 6"]).replace("\n", "\r\n").encode())

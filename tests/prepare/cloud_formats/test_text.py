@@ -61,6 +61,9 @@ def test_what_csv_writers_write_is_read_back(tmp_path, data):
         '"x","y","z"\n"0.126","-0.132","0.64"\n"0.105","-0.536","0.362"\n"-1.265","-0.623","0.041"\n',
         "0.126, -0.132, 0.64\n0.105, -0.536, 0.362\n\n-1.265, -0.623, 0.041",
         "x,y,z\n1.26e-1,-1.32E-01,+.64\n0.105,-0.536,0.362\n-1.265,-0.623,0.041\n",
+        "x,y,z,v\nm,m,m,m/s\n0.126,-0.132,0.64,1\n0.105,-0.536,0.362,2\n-1.265,-0.623,0.041,3\n",
+        "x;y;z\n#[m];[m];[m]\n0,126;-0,132;0,64\n0,105;-0,536;0,362\n-1,265;-0,623;0,041\n",
+        "x y z\n0.126 -0.132 0.64\nx y z\n0.105 -0.536 0.362\nx y z\n-1.265 -0.623 0.041\n",
         "Points:0,Points:1,Points:2,id\n0.126,-0.132,0.64,0\n0.105,-0.536,0.362,1\n-1.265,-0.623,0.041,2\n",
     ],
 )
@@ -101,6 +104,32 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
 def test_what_cannot_be_told_is_refused(tmp_path, text, message):
     with pytest.raises(DataError, match=message):
         read(tmp_path / "a.csv", text)
+
+
+@pytest.mark.parametrize("row", ["mm,mm,mm,m/s", "[mm],[mm],[mm]", "# mm,mm,mm,-"])
+def test_a_row_of_units_below_the_header_counts(tmp_path, row):
+    cloud = read(tmp_path / "a.csv", f"x,y,z,v\n{row}\n1,2,3,4\n5,6,7,8\n", keep=["v"])
+    assert (
+        cloud.unit == "mm" and cloud.points.tolist() == [[1, 2, 3], [5, 6, 7]] and cloud.extra["v"].tolist() == [4, 8]
+    )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "rows", "color", "unread"),
+    [
+        ("pts", "2\n1 2 3 -700 255 0 9\n4 5 6 -1 0 1 2\n", [[255, 0, 9], [0, 1, 2]], ("intensity",)),
+        ("pts", "1 2 3 255 0 9\n4 5 6 0 1 2\n", [[255, 0, 9], [0, 1, 2]], ()),
+        ("pts", "1 2 3 9\n4 5 6 8\n", None, ("intensity",)),
+        ("xyzrgb", "1 2 3 1 0 0.5\n4 5 6 0 0.25 0\n", [[1, 0, 0.5], [0, 0.25, 0]], ()),
+        ("xyzn", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("nx", "ny", "nz")),
+        ("xyz", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("columns 4 to 6 (no names)",)),
+        ("csv", "x,y,z,snr\n1,2,3,4\n4,5,6,7\n", None, ("snr",)),
+    ],
+)
+def test_columns_that_a_format_implies_and_those_not_read(tmp_path, suffix, rows, color, unread):
+    cloud = read(tmp_path / f"a.{suffix}", rows)
+    assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.unread == unread
+    assert (None if cloud.color is None else cloud.color.tolist()) == color
 
 
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):

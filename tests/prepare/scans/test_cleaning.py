@@ -92,6 +92,9 @@ def test_shards_and_merges_keep_shifts(tmp_path):
     [
         (POINTS * 1.6e7, "more than 100 km wide"),
         ((POINTS - 1) * 4000, "if these are millimeters, give --scale 1000"),
+        ((POINTS + 1) * 1000, "if these are millimeters, give --scale 1000"),
+        ((POINTS * 100).round(), "whole numbers, hardly meters; if they are millimeters, give --scale 1000"),
+        (POINTS.round(), ""),
         (POINTS * 1000 + 448_000, ""),
         (POINTS * 100 - 80, ""),
     ],

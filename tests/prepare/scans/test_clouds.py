@@ -215,8 +215,8 @@ def test_arrays_of_other_kinds(tmp_path):
     np.save(tmp_path / "1.npy", np.array([{"pickled": 1}], object))
     with pytest.raises(DataError, match="not a readable .npy"):
         read_cloud(tmp_path / "1.npy")
-    np.savez(tmp_path / "2.npz", other=np.ones((3, 3)))
-    with pytest.raises(DataError, match="arrays other; expected one called points"):
+    np.savez(tmp_path / "2.npz", other=np.ones((3, 3)), more=np.ones((3, 3)))
+    with pytest.raises(DataError, match="arrays other, more; expected one called points"):
         read_cloud(tmp_path / "2.npz")
 
 
@@ -239,3 +239,22 @@ def test_a_missing_open3d_is_explained(monkeypatch):
     with pytest.raises(DpcError, match="pip install open3d libusb-package"):
         load_open3d()
     load_open3d.cache_clear()
+
+
+def test_what_else_lies_there_is_named(tmp_path):
+    save(tmp_path / "a" / "0.ply")
+    (tmp_path / "a" / "0.e57").write_bytes(b"ASTM-E57")
+    reader = CloudFolders(tmp_path)
+    assert reader.summary(reader.items())[1] == "a: its frames are 0.ply; left out: 1 .e57 file"
+    (tmp_path / "a" / "0.ply").rename(tmp_path / "a" / "0.ply.gz")
+    with pytest.raises(DataError, match="no point clouds .*found 1 .e57 file, 1 .gz file: save their points as .ply"):
+        CloudFolders(tmp_path).items()
+
+
+def test_columns_that_are_not_read_are_named(tmp_path):
+    (tmp_path / "0.csv").write_text("x,y,z,ring,snr\n1,2,3,4,5\n1,2,4,4,5\n")
+    reader = CloudFolders(tmp_path, keep=("snr",))
+    assert reader.summary(reader.items()) == ["1 sequence of 1 frames found; not read: ring (--keep-fields)"]
+    np.save(tmp_path / "0.npy", np.ones((4, 6)))
+    reader = CloudFolders(tmp_path, pattern="*.npy")
+    assert reader.summary(reader.items())[0] == "1 sequence of 1 frames found; not read: columns 4 to 6 (no names)"

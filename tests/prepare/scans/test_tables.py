@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.scans.frames_of_tables import JOINED
+from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE
 from dpcli.prepare.scans.tables import TableSequences
 from dpcli.store import CloudsReader
 
@@ -119,6 +119,19 @@ def test_a_bad_table_is_skipped_and_named(tmp_path):
     assert report.written == 1
     ((name, reason),) = report.skipped
     assert name == "b" and "b.csv:2: column 'z' holds 'word'" in reason
+
+
+def test_times_of_points_taken_for_frames_are_doubted(tmp_path):
+    path = write(tmp_path / "a.csv", [(k / 1000, 1, 2, k) for k in range(9)], "timestamp,x,y,z")
+    (sample,) = sequences(path, frame_column="timestamp")
+    assert sample.notes == {SINGLE: 1}
+    assert sequences(write(tmp_path / "b.csv", frames(0, 1, 2, 3, 4, 5)))[0].notes == {}
+
+
+@pytest.mark.parametrize("name", ["Frame #", "frame no.", "#Frame", "frameNum", "scan_id"])
+def test_names_of_frame_columns(tmp_path, name):
+    (sample,) = sequences(write(tmp_path / "a.csv", frames(0, 1, 8), f"{name},x,y,z"))
+    assert sample.sequence.num_frames == 3
 
 
 @pytest.mark.parametrize(
