@@ -98,10 +98,10 @@ def _again() -> None:
 
 
 def _lost(told: SimpleNamespace) -> None:
-    """Raises Ended again where Python drops errors, such as in what runs as an object goes."""
+    """Raises Ended again where Python drops errors, such as in what runs as an object goes; others only --debug shows."""
     if told.exc_type is Ended:
         _again()
-    else:
+    elif "--debug" in sys.argv:
         sys.__unraisablehook__(told)
 
 
