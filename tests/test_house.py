@@ -18,6 +18,7 @@ COMMON = {
     "regular_files",
     "signal_exit",
     "standard_streams",
+    "text_files",
 }  # files that every room may import
 GROUND = {"store", "ops", "runtime", "draw"}
 ALLOWED = {
