@@ -25,6 +25,7 @@ from dpcli.prepare.recordings.recording import find_recordings, is_recording
 from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
+MISSING = "frames that videos declare and don't hold (truncated or damaged)"
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
@@ -150,6 +151,8 @@ class DepthVideos:
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
+        if video.missing:
+            notes[MISSING] = video.missing
         depth, unit = self._inverted(depth, item.path), 1 / scale
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
@@ -182,7 +185,8 @@ class DepthVideos:
         if self.fps:
             return kept * self.stride / self.fps
         if video.time is None:
-            raise DataError(f"{item.path}: its frames have no time stamps that rise; give their rate with --fps")
+            cut = f"truncated, it lacks {video.missing} frames that it declares, and " if video.missing else ""
+            raise DataError(f"{item.path}: {cut}its frames have no time stamps that rise; give their rate with --fps")
         return video.time[kept]
 
     @property

@@ -18,6 +18,7 @@ from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import check_png, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
+from dpcli.runtime.clips.video_frames import missing_frames
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".jp2", ".pfm", ".exr")
@@ -35,10 +36,14 @@ _TICK = 0.0011  # seconds by which a container's time stamps may be off: it coun
 
 @dataclass
 class DepthVideo:
-    """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known."""
+    """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known.
+
+    missing: how many more frames the file declares than it holds, such as a recording that was cut.
+    """
 
     frames: np.ndarray
     time: np.ndarray | None = None
+    missing: int = 0
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture
@@ -87,15 +92,16 @@ def read_video(
         capture.release()
 
 
-def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.ndarray | None]:
-    """Returns every ``stride``-th frame of a depth video, (H,W) u8, u16 or f32 as stored, and their seconds since the first,
-    f64 (T), None where the file has no time stamps that rise.
+def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.ndarray | None, int]:
+    """Returns every ``stride``-th frame of a depth video, (H,W) u8, u16 or f32 as stored, their seconds since the first,
+    f64 (T), None where the file has no time stamps that rise, and how many more frames the file declares than it holds.
 
     Of several streams the one of depth is taken. Raises DataError where gray of more than 8 bits would be cut.
     """
     capture = _opened(path)
     try:
         tag, rate = int(capture.get(load_cv2().CAP_PROP_CODEC_PIXEL_FORMAT)), _declared_rate(capture)
+        declared = _declared_frames(capture)
         one_stream = (
             path.suffix.lower() == ".avi"
         )  # in others depth often lies beside color; asking takes a tenth of a second
@@ -103,7 +109,8 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
         if stream is None or (stream.place == 0 and _is_plain(stream)):
             stamps: list[float | None] = []
             frames = list(_decoded(capture, path, 0, None, stride, stamps))
-            return frames, rising_times(stamps, rate, stride)
+            times = rising_times(stamps, rate, stride)
+            return frames, times, _missing(path, declared, len(frames), times, stride)
     finally:
         capture.release()
     if stream.is_eight_bits:
@@ -112,7 +119,23 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
             f" ffmpeg -i {path.name} -map 0:v:{stream.place} -c copy depth{path.suffix}"
         )
     kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
-    return [frame for frame, _ in kept], rising_times([seconds for _, seconds in kept], rate, stride)
+    times = rising_times([seconds for _, seconds in kept], rate, stride)
+    return (
+        [frame for frame, _ in kept],
+        times,
+        0 if stream.place else _missing(path, declared, len(kept), times, stride),
+    )
+
+
+def _declared_frames(capture) -> int:
+    count = float(capture.get(load_cv2().CAP_PROP_FRAME_COUNT))
+    return int(count) if 0 < count < 1e9 else 0
+
+
+def _missing(path: Path, declared: int, count: int, times: np.ndarray | None, stride: int) -> int:
+    """Returns how many frames the file lacks; it is opened again only where OpenCV's guess of its length says more."""
+    seen = count * stride  # but for the last few
+    return missing_frames(path, seen, times if stride == 1 else None) if declared > seen + 1 else 0
 
 
 def _is_plain(stream: VideoStream) -> bool:
@@ -293,10 +316,10 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
     elif suffix == ".npy":
         video = DepthVideo(read_array(path, stride))
     elif suffix in VIDEO_SUFFIXES:
-        frames, time = read_timed_video(path, stride)
+        frames, time, missing = read_timed_video(path, stride)
         if not frames:
             raise DataError(f"{path}: an empty video: no frame can be decoded")
-        video = DepthVideo(np.stack(frames), time)
+        video = DepthVideo(np.stack(frames), time, missing)
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:

@@ -140,21 +140,38 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
             yield frame
 
 
+def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
+    """Returns how many frames of its first video a file declares beyond the `count` that were decoded, 0 where it is whole.
+
+    times: seconds of the decoded frames f64 (count), None where they are not known. Frames that an edit list hides are no
+    loss; one is none either, since containers count differently.
+    """
+    container, stream = _open(path)
+    with closing(container):
+        declared, held = _declared_and_held(path, container, stream, count, times)
+    return declared - held if declared > held + 1 else 0
+
+
 def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | None, failed: bool) -> None:
     """Raises DataError when the file declares more frames than it holds; frames that an edit list hides are no loss."""
-    declared, held = stream.frames, count
-    if declared > count + 1 and not failed:
-        held = _packets(path)
-    elif not declared and times is not None and stream.average_rate and len(container.streams) == 1:
-        seconds = float(container.duration or 0) / 1e6
-        estimate = 0 if lasts(times, seconds) else round(seconds * float(stream.average_rate))
-        declared = estimate if estimate > 1.05 * count + 3 else 0  # some containers round their duration up
+    declared, held = (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times)
     if failed or declared > held + 1:
         of = f" of its {declared}" if declared else ""
         raise DataError(
             f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
+
+
+def _declared_and_held(path: Path, container, stream, count: int, times: np.ndarray | None) -> tuple[int, int]:
+    """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it."""
+    if stream.frames > count + 1:
+        return stream.frames, _packets(path)
+    if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
+        seconds = float(container.duration or 0) / 1e6
+        estimate = 0 if lasts(times, seconds) else round(seconds * float(stream.average_rate))
+        return (estimate if estimate > 1.05 * count + 3 else 0), count  # some containers round their duration up
+    return stream.frames, count
 
 
 def _packets(path: Path) -> int:

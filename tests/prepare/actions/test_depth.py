@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from hypothesis import given
@@ -277,7 +279,7 @@ def test_bad_images_are_named(tmp_path):
     folder = write_pngs(tmp_path / "v", depth16())
     whole = (folder / "depth_9.png").read_bytes()
     (folder / "depth_9.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataError, match=r"depth_9.png: not a readable image"):
+    with pytest.raises(DataError, match=r"depth_9.png: a truncated PNG"):
         read(folder)
     cv2.imwrite(str(folder / "depth_9.png"), np.ones((3, 3), np.uint16))
     with pytest.raises(DataError, match=r"depth_9.png: 3x3 uint16; the first image is 32x24 uint16"):
@@ -290,6 +292,50 @@ def test_a_truncated_video_gives_the_frames_it_has(tmp_path):
     found = list(video_frames(path))
     assert 0 < len(found) < 20
     np.testing.assert_array_equal(found[0], depth16(frames=20)[0])
+
+
+@pytest.mark.parametrize(
+    "suffix, codec", [(".avi", "ffv1"), (".mkv", "ffv1"), (".avi", "libx264"), (".mp4", "libx264")]
+)
+def test_frames_that_a_video_declares_and_lacks_are_counted(tmp_path, suffix, codec):
+    """Written by ffmpeg, cut at several places; the whole one tells nothing of the kind."""
+    path, count = tmp_path / f"v{suffix}", 90
+    shape = {"libx264": "gray", "ffv1": "gray16le"}[codec]
+    depth = np.random.default_rng(0).integers(1, 200, (count, 32, 48)).astype("<u2" if "16" in shape else "u1")
+    words = [
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        shape,
+        "-s",
+        "48x32",
+        "-r",
+        "30",
+        "-i",
+        "-",
+        "-c:v",
+        codec,
+        "-pix_fmt",
+        shape,
+    ]
+    subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words, "-movflags", "faststart", "-y", path],
+        input=depth.tobytes(),
+        check=True,
+    )
+    reader = DepthVideos(inputs=(tmp_path,), fps=30)
+    whole = reader.read(reader.items()[0], RNG)
+    assert whole.sequence.num_frames == count and not any("declare" in note for note in whole.notes)
+    data = path.read_bytes()
+    for share in (0.5, 0.8):
+        path.write_bytes(data[: int(share * len(data))])
+        try:
+            cut = reader.read(reader.items()[0], RNG)
+        except DataError as error:
+            assert "v" + suffix in str(error)
+            continue
+        lost = sum(number for note, number in cut.notes.items() if "declare" in note)
+        assert 0 < cut.sequence.num_frames < count and abs(cut.sequence.num_frames + lost - count) <= 2
 
 
 def test_folders_without_videos(tmp_path):
