@@ -44,22 +44,22 @@ def wrist_path(movement: int, s: np.ndarray, rng: np.random.Generator) -> tuple[
     reach, tilt = rng.uniform(0.85, 0.97), rng.uniform(-0.15, 0.15)
     if movement == 0:  # up through an upright plane, from the hip to above the head
         elevation = np.interp(s, [0, 1], [-1.3 + tilt, 1.2 + tilt])
-        return _direction(rng.uniform(0.1, 1.0), elevation) * reach, None
+        return direction(rng.uniform(0.1, 1.0), elevation) * reach, None
     if movement == 1:  # across the chest, from the right to the left
-        return _direction(np.interp(s, [0, 1], [1.1 + tilt, -0.7 + tilt]), rng.uniform(-0.25, 0.35)) * reach, None
+        return direction(np.interp(s, [0, 1], [1.1 + tilt, -0.7 + tilt]), rng.uniform(-0.25, 0.35)) * reach, None
     if movement == 2:  # away from the chest
         ahead = np.interp(s, [0, 1], [rng.uniform(0.3, 0.4), reach])
-        return _direction(rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.3) + 0 * s) * ahead[:, None], None
+        return direction(rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.3) + 0 * s) * ahead[:, None], None
     if movement == 3:  # clockwise as the figure itself sees it
         angle, radius = rng.uniform(0, 2 * np.pi) + 2 * np.pi * s, rng.uniform(0.3, 0.45)
         center = np.array([tilt, rng.uniform(-0.1, 0.2), 0.65])
         return center + radius * np.stack([np.sin(angle), np.cos(angle), 0 * s], axis=1), None
     azimuth = np.interp(s, [0, 1], [-0.1 + tilt / 2, 1.4 + tilt / 2])
-    right = _direction(azimuth, rng.uniform(-0.3, 0.3)) * reach
+    right = direction(azimuth, rng.uniform(-0.3, 0.3)) * reach
     return right, right * [-1, 1, 1]
 
 
-def _direction(azimuth: np.ndarray | float, elevation: np.ndarray | float) -> np.ndarray:
+def direction(azimuth: np.ndarray | float, elevation: np.ndarray | float) -> np.ndarray:
     """Returns unit vectors (T,3); azimuth from straight ahead toward the right, elevation from the horizon, radians."""
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     return np.stack(
@@ -174,7 +174,7 @@ class SyntheticGestures:
         figure, phase = subject.figure, time_warp(self.frames, subject.pause, rng)
         right, left = wrist_path(label // 2, 1 - phase if label % 2 else phase, rng)
         if left is None:
-            left = np.broadcast_to(_direction(-0.9, -1.35) * 0.95, right.shape)
+            left = np.broadcast_to(direction(-0.9, -1.35) * 0.95, right.shape)
         tremor = 0.01 * rng.standard_normal((2, self.frames, 3))
         wrists = [s + figure.reach * w + t for s, w, t in zip(figure.shoulders(), (right, left), tremor, strict=True)]
         yaw = subject.yaw + rng.normal(0, 0.08)

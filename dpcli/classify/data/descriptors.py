@@ -1,0 +1,49 @@
+"""Hand-made descriptors of a video: what a forest of decision trees classifies by, and every network should beat.
+
+All of them are quantiles and slopes, so that a few points far off, or frames without any, change little.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.store import CloudSequence, CloudsReader
+from dpcli.store.schema import KEPT
+
+_SLOTS = 6  # parts of a video, equally long
+_LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)
+
+
+def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
+    """Returns the descriptor f64 (D) of a video; D depends on the number of fields alone.
+
+    fields: kept columns, such as `field_doppler`. It holds the place and extent of the whole cloud, and for each of six
+    slots of time the number of points, quantiles of position (about the video's median) and fields, and their shift
+    since the slot before. A slot without points repeats the one before.
+    """
+    times = np.repeat(np.arange(sequence.num_frames), np.diff(sequence.frame_offsets))
+    middle = np.median(sequence.points, 0)
+    columns = [sequence.extra[name] for name in fields if name in sequence.extra]
+    missing = [np.zeros(len(times))] * (len(fields) - len(columns))
+    values = np.column_stack([sequence.points - middle, *columns, *missing]).astype(np.float64)
+    whole = np.quantile(values, _LEVELS, axis=0)
+    slots = _slots(values, times * _SLOTS // max(sequence.num_frames, 1), whole)
+    middles = slots[:, len(_LEVELS) // 2]
+    counts = np.bincount(times * _SLOTS // max(sequence.num_frames, 1), minlength=_SLOTS) / max(len(times), 1)
+    size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *middle]
+    return np.concatenate([size, counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
+
+
+def _slots(values: np.ndarray, slot: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Returns the quantiles of each slot, f64 (slots,levels,columns); `whole`, of all points, before the first with any."""
+    found = [whole]
+    for number in range(_SLOTS):
+        own = values[slot == number]
+        found.append(np.quantile(own, _LEVELS, axis=0) if len(own) else found[-1])
+    return np.stack(found[1:])
+
+
+def descriptors(reader: CloudsReader, sequences: list[int]) -> np.ndarray:
+    """Returns the descriptors f64 (N,D) of some videos of a file, with all columns that it keeps."""
+    fields = tuple(name for name in reader.fields if name.startswith(KEPT))
+    return np.stack([descriptor(reader.read(i, fields=fields), fields) for i in sequences])
