@@ -1,0 +1,124 @@
+"""`dpc classify baseline`: hand-made descriptors and a random forest, which say in seconds what a network must beat."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.classify.data.descriptors import descriptors
+from dpcli.errors import DataError
+from dpcli.runtime import provenance
+from dpcli.runtime.progress import log
+from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
+from dpcli.store.pipes import refuse_repeats
+
+TREES = 500
+_FOLDS = 5  # where a file has no test split and no people
+_STEADY = 3  # videos a class at least, so that each fold has some to learn from
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """Says how a forest did: videos it learned from and judged, how many of these it got right, and who they were.
+
+    seen: what the judged videos share with those of the training, in words for a person.
+    """
+
+    learned: int
+    judged: int
+    right: int
+    classes: int
+    seen: str
+
+    @property
+    def accuracy(self) -> float:
+        """The share of the judged videos that are right."""
+        return self.right / self.judged
+
+
+def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool = False) -> Baseline:
+    """Trains a forest on the descriptors of a file's videos, and judges it on its test split; scores go to `output`.
+
+    Without a test split the videos are judged in turn, by a forest that saw neither them nor, where the file knows
+    people, their person. Raises DataError where nothing has a label, or a class has too few videos.
+    """
+    refuse_repeats([data, *([output] if output else [])])
+    with ExitStack() as stack:
+        path = stack.enter_context(input_file(data))
+        reader = stack.enter_context(CloudsReader(path))
+        known = np.flatnonzero(reader.labels >= 0)
+        if not len(known):
+            raise DataError(f"{path}: no video has a label; prepare them with --labels TABLE or --label-from-folder")
+        values, labels = descriptors(reader, known.tolist()), reader.labels[known]
+        scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
+        rounds = list(_rounds(reader, known, labels))
+        for learned, judged in rounds:
+            scores[judged] = _forest_scores(values[learned], labels[learned], values[judged], scores.shape[1], seed)
+        judged = np.flatnonzero(np.isfinite(scores[:, 0]))
+        if output:
+            _write(reader, known[judged], scores[judged], output, seed, force)
+        right = int((scores[judged].argmax(1) == labels[judged]).sum())
+        learned = sum(len(one) for one, _ in rounds) // len(rounds)
+        return Baseline(learned, len(judged), right, len(set(labels.tolist())), _seen(reader, known, rounds))
+
+
+def _rounds(reader: CloudsReader, known: np.ndarray, labels: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yields the places among `known` that a forest learns from and those that it is judged on."""
+    from sklearn.model_selection import GroupKFold, StratifiedKFold
+
+    splits = np.array(reader.splits)[known]
+    if "test" in splits:
+        learned = np.flatnonzero((splits != "test") & (splits != "validation"))
+        if not len(learned):
+            raise DataError(
+                f"{reader.path}: all labeled videos are of the split test; a forest needs some to learn from"
+            )
+        yield learned, np.flatnonzero(splits == "test")
+        return
+    people = reader.subjects[known]
+    if people.min() >= 0 and len(set(people.tolist())) > 1:
+        yield from GroupKFold(min(_FOLDS, len(set(people.tolist())))).split(known, labels, people)
+        return
+    fewest = int(np.unique(labels, return_counts=True)[1].min())
+    if fewest < 2:
+        raise DataError(f"{reader.path}: a class of one video and no test split; expected at least two videos a class")
+    if fewest < _STEADY:
+        log.warn(f"{reader.path}: a class of {fewest} videos; the accuracy says little")
+    yield from StratifiedKFold(min(_FOLDS, fewest), shuffle=True, random_state=0).split(known, labels)
+
+
+def _forest_scores(
+    learned: np.ndarray, labels: np.ndarray, judged: np.ndarray, classes: int, seed: int
+) -> np.ndarray:  # [N, C]
+    """Returns the probabilities that a forest gives; a class that it never saw has 0."""
+    from sklearn.ensemble import RandomForestClassifier
+
+    forest = RandomForestClassifier(TREES, random_state=seed % 2**32, n_jobs=1).fit(learned, labels)
+    scores = np.zeros((len(judged), classes), np.float32)
+    scores[:, forest.classes_] = forest.predict_proba(judged)
+    return scores
+
+
+def _seen(reader: CloudsReader, known: np.ndarray, rounds: list[tuple[np.ndarray, np.ndarray]]) -> str:
+    people = reader.subjects[known]
+    if people.min() < 0:
+        return "whether they are of the same people is not in the file"
+    shared = [set(people[learned].tolist()) & set(people[judged].tolist()) for learned, judged in rounds]
+    return (
+        "of people whom it also learned from: people never seen come out lower" if any(shared) else "of unseen people"
+    )
+
+
+def _write(
+    reader: CloudsReader, sequences: np.ndarray, scores: np.ndarray, output: str, seed: int, force: bool
+) -> None:
+    with output_file(output) as target:
+        entry = provenance.record({"baseline": "forest", "trees": TREES}, seed, {"data": reader.path})
+        names = reader.class_names or [str(label) for label in range(scores.shape[1])]
+        with ScoresWriter(target, class_names=names, source=reader.path.name, provenance=entry, force=force) as writer:
+            for sequence, row in zip(sequences, scores):
+                name, label, split = reader.names[sequence], int(reader.labels[sequence]), reader.splits[sequence]
+                writer.write(name, row, label=label, split=split)

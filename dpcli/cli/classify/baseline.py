@@ -1,0 +1,34 @@
+"""`dpc classify baseline`: its options, and what it prints."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Annotated
+
+import typer
+
+from dpcli.cli.options import Force, Json, Seed
+
+
+def baseline(
+    data: Annotated[str, typer.Argument(help="A clouds file with labels, or - for a pipe.")],
+    output: Annotated[
+        str | None, typer.Option("-o", "--output", help="Scores file to write, for `evaluate`, or - for a pipe.")
+    ] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Tell in seconds what a network must beat: a random forest on quantiles of position, motion and kept columns."""
+    from dpcli.classify.commands.baseline import baseline as run
+
+    result = run(data, output=output, seed=seed, force=force)
+    if as_json:
+        typer.echo(json.dumps({**asdict(result), "accuracy": result.accuracy}), err=output == "-")
+        return
+    typer.echo(
+        f"forest: {100 * result.accuracy:.1f} % ({result.right} of {result.judged} videos, {result.classes} classes;"
+        f" learned from {result.learned}); these are {result.seen}",
+        err=output == "-",
+    )

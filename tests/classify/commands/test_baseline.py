@@ -1,0 +1,102 @@
+"""The forest on descriptors: right where classes differ, at chance where they don't, and who was judged is said."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dpcli.classify.commands import baseline as command
+from dpcli.errors import DataError
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
+from dpcli.store.schema import kept_name
+
+UP, DOPPLER = ("up", "down", "still"), kept_name("doppler")
+
+
+@pytest.fixture(autouse=True)
+def few_trees(monkeypatch):
+    monkeypatch.setattr(command, "TREES", 30)
+
+
+def write(path, *, videos=8, splits=True, people=True, labels=UP, field=False, lone=False, same=False):
+    """Points that move up, down or not at all, with far outliers and frames of one point; some tell themselves by Doppler."""
+    rng = np.random.default_rng(0)
+    with CloudsWriter(path, class_names=labels, fields=[DOPPLER] if field else []) as writer:
+        for number in range(videos * len(labels)):
+            label, length = number % len(labels), int(rng.integers(5, 12))
+            step = 0.0 if same or field else (0.1, -0.1, 0.0)[label % 3]
+            frames = [
+                rng.normal((0, t * step, 2), 0.05, (int(rng.integers(1, 9)), 3)).astype(np.float32)
+                for t in range(length)
+            ]
+            frames[0][0] = (0, 0, 30)
+            sequence = CloudSequence.from_frames(f"v{number}", frames, label=label)
+            sequence.subject = number % 4 if people else -1
+            sequence.split = ("test" if number % 4 == 3 else "train") if splits else ""
+            if field:
+                sequence.extra = {DOPPLER: np.full(len(sequence.points), label, np.float32)}
+            if not (lone and label == 2 and number > 2):
+                writer.write(sequence)
+    return str(path)
+
+
+def test_what_moves_in_another_way_is_told_and_scores_are_written(tmp_path):
+    data, output = write(tmp_path / "a.h5"), tmp_path / "s.h5"
+    result = command.baseline(data, output=str(output))
+    assert (result.learned, result.judged, result.classes) == (18, 6, 3) and result.accuracy > 0.8
+    assert result.seen == "of unseen people"
+    scores = ScoresReader(output)
+    assert scores.class_names == list(UP) and set(scores.splits) == {"test"}
+    assert np.abs(scores.scores.sum(1) - 1).max() < 1e-5
+    assert (scores.scores.argmax(1) == scores.labels).sum() == result.right
+    with CloudsReader(data) as reader:
+        assert set(scores.names) == {name for name, split in zip(reader.names, reader.splits) if split == "test"}
+
+
+def test_where_nothing_differs_it_is_no_better_than_chance(tmp_path):
+    assert command.baseline(write(tmp_path / "a.h5", videos=20, same=True)).accuracy < 0.65
+
+
+def test_kept_columns_count(tmp_path):
+    assert command.baseline(write(tmp_path / "a.h5", field=True)).accuracy == 1.0
+
+
+@pytest.mark.parametrize(
+    "people, seen", [(True, "of unseen people"), (False, "whether they are of the same people is not in the file")]
+)
+def test_without_a_test_split_every_video_is_judged_in_turn(tmp_path, people, seen):
+    result = command.baseline(write(tmp_path / "a.h5", splits=False, people=people))
+    assert result.judged == 24 and result.seen == seen and result.accuracy > 0.7
+
+
+def test_people_of_both_splits_are_told(tmp_path):
+    data = write(tmp_path / "a.h5")
+    with CloudsReader(data) as reader, CloudsWriter(tmp_path / "b.h5", class_names=UP) as writer:
+        for index in range(len(reader)):
+            sequence = reader.read(index)
+            sequence.subject = index % 3
+            writer.write(sequence)
+    assert "people never seen come out lower" in command.baseline(str(tmp_path / "b.h5")).seen
+
+
+def test_too_few_videos_are_refused_by_name(tmp_path):
+    with pytest.raises(DataError, match="a class of one video and no test split"):
+        command.baseline(write(tmp_path / "a.h5", splits=False, people=False, lone=True))
+    with CloudsWriter(tmp_path / "b.h5") as writer:
+        writer.write(CloudSequence.from_frames("v", [np.zeros((1, 3), np.float32)]))
+    with pytest.raises(DataError, match="no video has a label"):
+        command.baseline(str(tmp_path / "b.h5"))
+
+
+def test_the_command_reads_a_pipe_and_prints_one_line(tmp_path):
+    data = write(tmp_path / "a.h5")
+    words = [sys.executable, "-m", "dpcli", "classify", "baseline", "-"]
+    with open(data, "rb") as file:
+        told = subprocess.run(words, stdin=file, capture_output=True, text=True, check=True).stdout
+    assert told.startswith("forest: ") and told.count("\n") == 1 and "of 6 videos, 3 classes" in told
+    found = json.loads(subprocess.check_output([*words[:-1], data, "--json"]))
+    assert found["judged"] == 6 and found["accuracy"] == found["right"] / 6
