@@ -85,8 +85,9 @@ def _variable(path: Path, kind: int, content: bytes, order: str, wanted: str) ->
     if count * dtype.itemsize > _MOST:
         raise _Damaged(f"{wanted!r} of shape {shape} takes more than {_MOST} bytes")
     if begin is not content:
-        content = zlib.decompressobj().decompress(content, 8 + used + 8 + 8 * count)[8:]
-    stored, raw = next(_elements(content[used:], order), (0, b""))
+        content = zlib.decompressobj().decompress(content, 8 + used + 8 + 8 * count)
+        content = memoryview(content)[8:]
+    stored, raw = next(_elements(memoryview(content)[used:], order), (0, b""))  # no copies: videos are large
     if stored not in _NUMBERS:
         raise _Damaged(f"{wanted!r} has no numbers")
     values = np.frombuffer(raw[: len(raw) - len(raw) % np.dtype(_NUMBERS[stored]).itemsize], order + _NUMBERS[stored])

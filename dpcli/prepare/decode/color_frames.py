@@ -45,13 +45,14 @@ class Frames:
         return (animation_frames if is_image_file(self.path) else video_frames)(self.path, wanted)
 
 
-def open_frames(path: Path, pattern: str = "") -> Frames:
-    """Opens the frames of a folder, video or GIF; pattern: which images of a folder are frames.
+def open_frames(path: Path, pattern: str = "", *, quiet: bool = False) -> Frames:
+    """Opens the frames of a folder, video or GIF; pattern: which images of a folder are frames; quiet: what else lies there
+    is not told.
 
     Raises DataError when there are none or they cannot be decoded, UsageError at a pattern for what is no folder.
     """
     if path.is_dir():
-        return _open_folder(path, pattern)
+        return _open_folder(path, pattern, quiet)
     if pattern and path.exists():
         raise UsageError(f"--pattern {pattern}: chooses among the images of a folder; {path} is a file")
     if not path.is_file():
@@ -104,21 +105,22 @@ def _telling_columns(stems: Sequence[str]) -> list[list[int]]:
     return [column for column in columns if len(set(column)) > 1] or columns[-1:]
 
 
-def _open_folder(folder: Path, pattern: str) -> Frames:
+def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     paths = image_paths(folder)
     if paths and pattern:
         chosen = choose_series(folder, [path.name for path in paths], pattern=pattern)
         if chosen is None:
             raise DataError(f"{folder}: no images whose names fit --pattern '{pattern}', such as {paths[0].name}")
         for line in about_series([(str(folder), replace(chosen, numbered=False))]):  # gaps are told with the frames
-            log.info(line)
+            if not quiet:
+                log.info(line)
         paths = [path for path in paths if path.name in chosen.names]
     elif not paths:
         _refuse_videos(folder)
         inside = sorted(p.name for p in folder.iterdir() if p.is_dir())[:3]
         hint = f"; it has folders ({', '.join(inside)}): name one of them" if inside else ""
         raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){hint}")
-    paths = paths if pattern else one_series(folder, paths, option="--pattern")
+    paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:

@@ -116,7 +116,7 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
     config = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}
     if not options.pattern:
         del config["pattern"]
-    config["input_digest"] = digest_of(open_frames(path, options.pattern).files)
+    config["input_digest"] = digest_of(open_frames(path, options.pattern, quiet=True).files)
     if options.mask:
         config["mask_digest"] = digest_of(image_paths(require_folder(options.mask, "a mask per frame")))
     if options.views:

@@ -21,10 +21,11 @@ def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image
     return ImageOps.exif_transpose(image)
 
 
-def one_series(folder: Path, paths: Sequence[Path], option: str = "") -> list[Path]:
+def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: bool = False) -> list[Path]:
     """Returns the images of the one series that `paths` hold, in their order; images without fellows are named and left out.
 
-    Names belong to one series where they differ in numbers alone. option: the one that chooses a series, if any.
+    Names belong to one series where they differ in numbers alone. option: the one that chooses a series, if any. quiet: nothing
+    is told.
     Raises DataError, which names them, when two or more series lie in the folder: they are several objects, or color
     beside depth.
     """
@@ -46,10 +47,11 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "") -> list[Pa
         if len(others) >= len(kept):
             return list(paths)
         more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
-        log.warn(
-            f"{folder}: left out {len(others)} of {len(paths)} images, whose names are not like {kept[0].name}: "
-            f"{', '.join(others[:_NAMED])}{more}"
-        )
+        if not quiet:
+            log.warn(
+                f"{folder}: left out {len(others)} of {len(paths)} images, whose names are not like {kept[0].name}: "
+                f"{', '.join(others[:_NAMED])}{more}"
+            )
         return kept
     return list(paths)
 

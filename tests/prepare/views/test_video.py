@@ -21,6 +21,7 @@ from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
 from dpcli.runtime.clips.video_frames import frame_times, lasts
 from dpcli.store import ViewsReader
+from tests.support.commands import exit_code
 
 RED = (200, 40, 30)
 
@@ -629,3 +630,12 @@ def test_images_and_animations_are_known_by_their_content(tmp_path):
     (tmp_path / "half").write_bytes((tmp_path / "moving-gif").read_bytes()[:200])
     with pytest.raises(DataError, match="not a readable animation"):
         open_frames(tmp_path / "half")
+
+
+@pytest.mark.parametrize(("other", "pattern"), [("fox_{}.png", "anya_*.png"), ("preview.png", "")])
+def test_what_is_left_out_is_told_once(tmp_path, capfd, other, pattern):
+    folder = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(3)], "anya_{}.png")
+    save(folder, [disc((20, 24), 8)], other)
+    chosen = ("--pattern", pattern) if pattern else ()
+    assert exit_code("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32", *chosen) == 0
+    assert capfd.readouterr().err.count("left out") == 1
