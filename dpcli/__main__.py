@@ -11,11 +11,12 @@ def main() -> None:
     import sys
 
     try:
-        from dpcli.standard_streams import hush_warnings, ready_streams
+        from dpcli.standard_streams import hush_warnings, quiet_libraries, ready_streams
 
         ready_streams()
         if "--debug" not in sys.argv:
             hush_warnings()
+            quiet_libraries()
 
         from dpcli.cli.app import main
 

@@ -77,9 +77,10 @@ def _handle(number: int, frame: FrameType | None) -> None:
         return
     code, said = signal_outcome() or (STOPPED, "stopped")
     try:
-        shown = "\x1b[?25h" if os.isatty(2) else ""  # a bar hides the cursor
-        os.write(2, f"{shown}dpc: error: {said}\n".encode())
-    except OSError:  # closed
+        stderr = sys.__stderr__.fileno() if sys.__stderr__ else 2
+        shown = "\x1b[?25h" if os.isatty(stderr) else ""  # a bar hides the cursor
+        os.write(stderr, f"{shown}dpc: error: {said}\n".encode())
+    except (OSError, ValueError):  # closed
         pass
     os._exit(code)
 
@@ -97,10 +98,10 @@ def _again() -> None:
 
 
 def _lost(told: SimpleNamespace) -> None:
-    """Raises Ended again where Python drops errors, such as in what runs as an object goes."""
+    """Raises Ended again where Python drops errors, such as in what runs as an object goes; others only --debug shows."""
     if told.exc_type is Ended:
         _again()
-    else:
+    elif "--debug" in sys.argv:
         sys.__unraisablehook__(told)
 
 

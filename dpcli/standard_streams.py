@@ -6,7 +6,8 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
@@ -37,6 +38,38 @@ def ready_streams() -> None:
         else:
             stream.reconfigure(errors="backslashreplace")
         setattr(sys, name, PrintableStream(getattr(sys, name)))
+
+
+def quiet_libraries() -> None:
+    """Lets what C libraries write to stderr, such as libpng about each damaged picture, go nowhere; Python's stderr stays.
+
+    They write to number 2, which from now on is the null device, also in programs that this process starts.
+    """
+    before = sys.stderr
+    kept = open(
+        os.dup(2),
+        "w",
+        buffering=1,
+        encoding=sys.__stderr__.encoding if sys.__stderr__ else "utf-8",
+        errors="backslashreplace",
+    )
+    sys.__stderr__ = kept
+    sys.stderr = PrintableStream(kept) if isinstance(before, PrintableStream) else kept
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+
+
+@contextmanager
+def loud_libraries() -> Iterator[None]:
+    """Undoes `quiet_libraries` for the programs that the block starts."""
+    quiet, number = os.dup(2), sys.__stderr__.fileno() if sys.__stderr__ else 2
+    os.dup2(number, 2)
+    try:
+        yield
+    finally:
+        os.dup2(quiet, 2)
+        os.close(quiet)
 
 
 class PrintableStream:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import closing
+import errno
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +32,7 @@ _BT709 = (
     ),
     *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", "-color_range", "tv"),
 )
+_ROOM = 64 << 10  # bytes: with less a disk counts as full, as encoders write whole buffers
 _COLORS = 255  # of an animation
 _PALETTE_FRAMES = 5  # pictures, about, that an animation's colors are chosen from
 
@@ -82,12 +86,23 @@ def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
             output_params=[*_X264, *_BT709],
             ffmpeg_log_level="error",
         )
-        with closing(writer):  # ends the encoder, also where a picture fails
+        with _telling(path), closing(writer):  # ends the encoder, also where a picture fails
             writer.send(None)
             for picture in chain([first], frames):
                 writer.send(np.ascontiguousarray(picture))
     if not path.exists():
         raise DpcError("the video encoder wrote nothing; a .gif or a folder of pictures needs no encoder")
+
+
+@contextmanager
+def _telling(path: Path) -> Iterator[None]:
+    """Says why an encoder ended early, which itself says it with its whole command line, or not at all."""
+    try:
+        yield
+    except OSError as error:
+        if shutil.disk_usage(path.parent).free < _ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+        raise OSError(f"the video encoder ended early: {(str(error).splitlines() or [''])[0]}") from error
 
 
 def _mp4_by_opencv(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:

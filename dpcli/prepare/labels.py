@@ -120,8 +120,8 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         if label < 0:
             raise DataError(f"{where}: label {label} is out of range; labels count from 0")
         subject = record.get("subject", "") or "-1"
-        if not _is_number(subject):
-            raise DataError(f"{where}: subject {subject!r}; expected a whole number")
+        if not _is_number(subject) or len(subject) > 10 or int(subject) >= 1 << 31:
+            raise DataError(f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31")
         split = record.get("split", "")
         rows[name] = Row(label, int(subject), SPLIT_FOLDERS.get(split, split))
     return LabelTable(path, rows, class_names)

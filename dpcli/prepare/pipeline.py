@@ -36,7 +36,8 @@ class Conversion:
 
     points, sampling: see Thinning. limit: only the first items. compression: that of the coordinates. on_error:
     ``skip`` bad samples or ``stop`` at one. jobs: processes, None for as many as there are CPUs. shard: only its
-    items, for ``merge``; it may turn out empty. force: start over. task: what the progress bar calls it. Raises
+    items, for ``merge``; it may turn out empty. force: start over. task: what the progress bar calls it. item_seconds:
+    see `convert_item`; with it a sample that was made by others is always read in a process of its own. Raises
     UsageError for another word or number.
     """
 
@@ -50,6 +51,7 @@ class Conversion:
     seed: int = 0
     force: bool = False
     task: str = "prepare"
+    item_seconds: float = 0
 
     def __post_init__(self) -> None:
         if self.on_error not in ("skip", "stop"):
@@ -129,13 +131,18 @@ def _fingerprint(path: Path) -> str:
         return ""
 
 
+def _roots(reader: Reader) -> list[Path]:
+    """Returns the files and folders that a reader was given; none for one that makes its data."""
+    given = getattr(reader, "inputs", ()) or (getattr(reader, "raw", None),)
+    return [root for root in given if isinstance(root, Path)]
+
+
 def all_items(reader: Reader) -> tuple[list[Item], list[Item]]:
     """Returns a reader's index, and an item with a problem for each entry below its folder that can't be opened.
 
     So a dangling link or a FIFO named like data is skipped by name. Raises DataError when the index can't be made.
     """
-    given = getattr(reader, "inputs", ()) or (getattr(reader, "raw", None),)
-    roots = [root for root in given if isinstance(root, Path)]
+    roots = _roots(reader)
     with reading(", ".join(map(str, roots)) or type(reader).__name__):
         items = list(reader.items())
     taken = {item.path for item in items}
@@ -180,10 +187,12 @@ def convert(
     with _open_writer(output, reader, conversion, provenance, resume) as writer:
         taken = _write_items(writer, items, conversion)
         taken.run(
-            partial(convert_item, reader, conversion.thinning, conversion.seed),
+            partial(convert_item, reader, conversion.thinning, conversion.seed, item_seconds=conversion.item_seconds),
             lambda place: (place, items[place]),
             partial(_write_sample, writer, report, items),
-            Workers(slots or conversion.processes, executor),
+            Workers(
+                slots or conversion.processes, executor, apart=conversion.item_seconds > 0 and bool(_roots(reader))
+            ),
         )
     return _closed(count_samples(report, output), output)
 

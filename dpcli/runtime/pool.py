@@ -10,20 +10,46 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DataError
 from dpcli.runtime import shared_memory as handover
+from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import fast_transport, keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
+from dpcli.standard_streams import quiet_libraries
 
 _MOST = 1024  # processes; with far more, the counters of a pool's queue overflow
 
 
-def _start_worker() -> None:
+_worker = threading.local()  # `apart` where this process is a worker, which may be ended
+
+
+@contextmanager
+def at_most(seconds: float) -> Iterator[None]:
+    """Ends this process, a worker of `ordered_map`, when the block takes more seconds of its processor; elsewhere does nothing.
+
+    So a C library that loops for ever costs one item. Time that others take on a busy machine does not count.
+    """
+    if not getattr(_worker, "apart", False) or not hasattr(signal, "setitimer"):
+        yield
+        return
+    signal.setitimer(signal.ITIMER_PROF, seconds)  # what SIGPROF does by default needs no help of Python's
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+
+
+def _start_worker(debug: bool) -> None:
     """Leaves it to the parent when to stop: Ctrl-C and stop signals reach the whole process group, workers ignore them."""
+    _worker.apart = True
+    if not debug:
+        quiet_libraries()
+    os.dup2(2, 1)  # nothing that a library prints is a result
     for number in (signal.SIGINT, *STOPPING):
         signal.signal(number, signal.SIG_IGN)
     os.environ.update({name: "1" for name in SINGLE_THREAD})
@@ -41,7 +67,7 @@ def _end_with_parent() -> None:
 
 def _new_pool(jobs: int) -> ProcessPoolExecutor:
     ensure_server()
-    return ProcessPoolExecutor(min(jobs, _MOST), multiprocessing.get_context("forkserver"), initializer=_start_worker)
+    return ProcessPoolExecutor(min(jobs, _MOST), multiprocessing.get_context("forkserver"), _start_worker, (log.debug,))
 
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
@@ -104,13 +130,15 @@ class _Pool:
     def _try_alone(self, item: Any) -> Any:
         strangers = set(multiprocessing.active_children())
         with _new_pool(1) as alone:
+            tried = alone.submit(self._guarded, item)
+            children = set(multiprocessing.active_children()) - strangers  # now: later it forgets those that ended
             try:
-                return alone.submit(self._guarded, item).result()
+                return tried.result()
             except BrokenProcessPool:
-                return _lost(_kill_children(strangers))
+                return _lost(_end(children))
 
     def _end_broken(self) -> None:
-        _kill_children(self._strangers)
+        _end(set(multiprocessing.active_children()) - self._strangers)
         self._executor.shutdown(wait=True, cancel_futures=True)
 
     def close(self) -> None:
@@ -119,16 +147,15 @@ class _Pool:
             try:
                 self._executor.submit(int)  # the one public way to learn that processes died since the last item
             except BrokenProcessPool:
-                _kill_children(self._strangers)
+                _end(set(multiprocessing.active_children()) - self._strangers)
             self._executor.shutdown(wait=True, cancel_futures=True)
 
 
-def _kill_children(strangers: set) -> str:
+def _end(children: set) -> str:
     """Ends the processes of a broken executor, and returns the name of the signal that broke it, "" where nobody can say.
 
     The executor sends them SIGTERM, which they ignore, and would wait for them for ever.
     """
-    children = set(multiprocessing.active_children()) - strangers
     codes = [child.exitcode for child in children if not child.is_alive()]
     for child in children:
         child.kill()
@@ -136,25 +163,32 @@ def _kill_children(strangers: set) -> str:
 
 
 def _lost(how: str = "") -> LostWorker:
+    if how == "SIGPROF":
+        return LostWorker("it took more of the processor's time than --item-seconds allows, a second time too")
     why = f"by {how}" if how else "killed, or out of memory"
     return LostWorker(f"the process that worked on it died ({why}), and so did the one that tried it again")
 
 
 def ordered_map(
-    function: Callable[[Any], Any], items: Iterable[Any], jobs: int, executor: Executor | None = None
+    function: Callable[[Any], Any],
+    items: Iterable[Any],
+    jobs: int,
+    executor: Executor | None = None,
+    apart: bool = False,
 ) -> Iterator[tuple[Any, Any]]:
     """Yields `(item, function(item) or the exception it raised)` in input order.
 
     At most `2 * jobs` results exist at a time, so memory doesn't grow with the number of items. `jobs <= 1` without an
-    executor runs in this process; else `executor`, or `jobs` processes started by `forkserver` (safe beside threads).
+    executor runs in this process unless `apart`, for what may take its process down; else `executor`, or `jobs` processes
+    started by `forkserver` (safe beside threads).
     A worker that dies (out of memory, killed) costs time: what was on its way is worked on again. An item that takes
     down a second one has LostWorker for its result.
     """
-    if executor is None and jobs <= 1:
+    if executor is None and jobs <= 1 and not apart:
         for item in items:
             yield item, _guarded(function, item)
         return
-    pool, waiting = _Pool(function, jobs, executor), deque()
+    pool, waiting = _Pool(function, max(jobs, 1), executor), deque()
     try:
         for item in items:
             waiting.append((item, pool.submit(item)))

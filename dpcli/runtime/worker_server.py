@@ -6,6 +6,8 @@ import os
 import signal
 from multiprocessing import forkserver, resource_tracker
 
+from dpcli.standard_streams import loud_libraries
+
 # One process per core is the parallelism: libraries inside a worker must not start threads of their own.
 SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -24,7 +26,8 @@ def ensure_server() -> None:
     # blocked, not ignored: one that comes now is this process's, a moment later
     let_through = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
     try:
-        forkserver.ensure_running()
+        with loud_libraries():  # each worker decides for itself
+            forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, let_through)
         for name, value in before.items():

@@ -120,7 +120,23 @@ class CloudSequence:
             raise DataError(
                 f"{where}: label {self.label} is out of range; expected -1 (unknown) or 0..{num_classes - 1}"
             )
+        self.validate_index()
         self._validate_fields(where)
+
+    def validate_index(self) -> None:
+        """Raises DataError unless what tells this sample from others can be written: whole numbers that fit, texts
+        without NUL.
+        """
+        for one in TABLES["clouds"]:
+            value = getattr(self, one.name) if one.shape == ("S",) and not one.optional else None
+            if isinstance(value, str) and "\0" in value:
+                raise DataError(f"sample {self.name!r}: {one.name} {value!r} holds NUL, expected a text")
+            if value is not None and not isinstance(value, str):
+                limits = np.iinfo(one.dtype)
+                if not limits.min <= value <= limits.max:
+                    raise DataError(
+                        f"sample {self.name!r}: {one.name} {value} is too large, expected at most {limits.max}"
+                    )
 
     def _validate_fields(self, where: str) -> None:
         for key, (dtype, shape) in POINT_FIELDS.items():

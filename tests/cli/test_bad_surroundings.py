@@ -78,6 +78,23 @@ def test_a_full_disk_keeps_what_is_done_and_the_same_command_continues(raw, tmp_
     assert said[7].split()[0] == hashlib.sha256((tmp_path / "whole.h5").read_bytes()).hexdigest()
 
 
+@pytest.mark.parametrize(
+    "words", ["prepare merge c.h5 -o {}/o.h5", "info c.h5 --picture {}/p.png", "info c.h5 --page {}/p.html"]
+)
+def test_a_disk_without_one_free_byte_is_told_in_the_same_words(words, tmp_path, mounting):
+    """Not even an empty file of HDF5 fits; no library adds what it thinks of that."""
+    with CloudsWriter(tmp_path / "c.h5") as writer:
+        writer.write(CloudSequence.from_frames("a", [np.ones((4, 3), np.float32)] * 2))
+    (tmp_path / "full").mkdir()
+    script = (
+        'mount -t tmpfs -o size=64k none "$D/full"; set +e; head -c 65536 /dev/zero > "$D/full/fill"; cd "$D"\n'
+        f'"{sys.executable}" -m dpcli -q {words.format("full")}; echo "code $?"'
+    )
+    done = namespace(script, D=str(tmp_path), PYTHONPATH=str(ROOT))
+    assert done.stdout.endswith("code 1\n"), done.stderr
+    assert re.fullmatch(r"dpc: error: full/\S+: no space left on the device; .*\n", done.stderr), done.stderr
+
+
 def test_a_full_disk_below_the_pipe(raw, tmp_path, dpc, mounting):
     """`-o -` spools beside nothing the user named: the message still says what was full."""
     script = (

@@ -39,7 +39,7 @@ prepare synthetic articulated -o objects.h5 --objects 6 --sequences-per-object 2
 prepare synthetic gestures -o part-0.h5 --videos-per-class 20 --frames 10 --size 64 --shard 0/2
 prepare synthetic gestures -o part-1.h5 --videos-per-class 20 --frames 10 --size 64 --shard 1/2
 classify train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1
-segment predict objects.h5 -o parts.h5 --flow nearest
+segment predict objects.h5 -o parts.h5 --method network --flow nearest
 classify predict gestures.h5 --model model -o scores.h5 --clips-per-video 1
 """
 COMMANDS = """
@@ -48,7 +48,7 @@ merge: prepare merge part-1.h5 part-0.h5 -o OUT.h5
 classify train: classify train gestures.h5 -o OUT --preset tiny --epochs 2 --set epochs_dynamic=2
 segment train: segment train objects.h5 -o OUT --flow nearest --points 48 --batch 2 --epochs 4 --set pairs_per_epoch=8
 classify predict: classify predict gestures.h5 --model model -o OUT.h5 --split all --jobs 2
-segment predict: segment predict objects.h5 -o OUT.h5 --flow nearest --jobs 2
+segment predict: segment predict objects.h5 -o OUT.h5 --method network --flow nearest --jobs 2
 estimate-flow: segment estimate-flow objects.h5 -o OUT.h5 --jobs 2 --points 200
 fit: generate4d fit views.h5 -o OUT.h5 --preset tiny --size 16 --set dense_steps=300 --set sparse_steps=300
 evaluate: evaluate segmentation parts.h5 --truth objects.h5 --split all -o OUT.h5 --jobs 2

@@ -230,7 +230,7 @@ def test_a_command_spelled_otherwise_goes_on_and_another_one_is_refused(tmp_path
         run(["toy", "RAW", "--points", "1"], points=1)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
     read = []
-    monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
+    monkeypatch.setattr(pipeline, "convert_item", lambda *a, **k: read.append(a[-1][0]) or convert_item(*a, **k))
     run(["toy", "RAW/", "--on-error", "stop"], on_error="stop")
     assert read == [3, 4]
 
@@ -256,7 +256,7 @@ def test_a_lost_worker_keeps_what_is_done(tmp_path, monkeypatch):
         patch.setattr(item_pass, "ordered_map", dies_after_three)
         convert(ToyReader(), tmp_path / "a.h5")
     read = []
-    monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
+    monkeypatch.setattr(pipeline, "convert_item", lambda *a, **k: read.append(a[-1][0]) or convert_item(*a, **k))
     assert convert(ToyReader(), tmp_path / "a.h5").written == whole.written
     assert read == [3, 4] and digest(tmp_path / "a.h5") == digest(tmp_path / "whole.h5")
 

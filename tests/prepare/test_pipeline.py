@@ -237,7 +237,7 @@ def test_a_stopped_run_is_continued_to_the_same_bytes(tmp_path, monkeypatch, num
             convert(reader, path, Conversion(points=20))
     assert {p.name for p in tmp_path.iterdir()} == {"whole.h5", ".a.h5.part", ".a.h5.new"}
     read = []
-    monkeypatch.setattr(pipeline, "convert_item", lambda *a: read.append(a[-1][0]) or convert_item(*a))
+    monkeypatch.setattr(pipeline, "convert_item", lambda *a, **k: read.append(a[-1][0]) or convert_item(*a, **k))
     report = convert(reader, path, Conversion(points=20))
     assert set(read) == set(range(9)) - ({0, 1, 2} if not bad else {1, 3, 4})  # good ones are not read again
     assert digest(path) == digest(tmp_path / "whole.h5")

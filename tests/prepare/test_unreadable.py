@@ -1,15 +1,17 @@
 """Input folders with what can't be opened or read: each is skipped by name, and the others go on."""
 
+import io
 import os
 import socket
 import subprocess
 import sys
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from dpcli.errors import DataError, DpcError
 from dpcli.prepare.cloud_formats.arrays import read_npz
@@ -18,7 +20,7 @@ from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
 from dpcli.prepare.reader import Item
 from dpcli.prepare.thinning import Thinning
-from tests.support.prepare_helpers import dpc
+from tests.support.prepare_helpers import ToyReader, dpc
 
 
 @dataclass(frozen=True)
@@ -128,3 +130,33 @@ def test_a_list_that_names_nul_and_a_link_in_a_circle_are_no_bugs(tmp_path):
     (tmp_path / "loop.h5").symlink_to("loop.h5")
     done = dpc("prepare", "merge", tmp_path / "x.h5", tmp_path / "loop.h5", "-o", tmp_path / "y.h5")
     assert done.returncode in (2, 3) and "loop.h5" in done.stderr and "a bug" not in done.stderr
+
+
+@pytest.mark.parametrize("what", [{"subject": 1 << 31}, {"camera": -(1 << 40)}, {"split": "a\0b"}, {"name": "a\0"}])
+def test_what_an_index_cannot_hold_is_a_bad_sample(what):
+    """A NUL would end the whole run where the index is written, after the last sample."""
+    reader = ToyReader()
+    item = replace(reader.items()[0], problem="")
+    made = reader.read(item, np.random.default_rng(0))
+
+    class Odd(ToyReader):
+        def read(self, item, rng):
+            return replace(made, sequence=replace(made.sequence, **what))
+
+    with pytest.raises(DataError, match="sample .*(too large|NUL)"):
+        convert_item(Odd(), Thinning(0), 0, (0, item))
+
+
+def test_a_damaged_png_is_refused_before_its_claims_are_believed(tmp_path):
+    """OpenCV takes a gigabyte for a chunk that claims it."""
+    from dpcli.prepare.decode.depth_files import read_image
+    from dpcli.prepare.scans.kitti_files import read_png
+
+    whole = io.BytesIO()
+    Image.fromarray(np.full((12, 16), 1000, np.uint16)).save(whole, "png")
+    data = whole.getvalue()
+    at = data.index(b"IDAT") - 4
+    (tmp_path / "a.png").write_bytes(data[:at] + (1 << 30).to_bytes(4, "big") + b"juNk" + data[at:])
+    for read in (read_image, lambda path: read_png(path, 1)):
+        with pytest.raises(DataError, match="a.png: a (damaged|truncated) PNG"):
+            read(tmp_path / "a.png")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from dpcli.cli.options import Force, Jobs, OnError, Seed
-from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, PointsAtMost, Sampling
+from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, ItemSeconds, PointsAtMost, Sampling
 from dpcli.cli.spread_options import Dask, Shard
 from dpcli.errors import UsageError
 
@@ -30,6 +30,7 @@ class ConversionOptions:
     jobs: Jobs = None
     shard: Shard = ""
     dask: Dask = ""
+    item_seconds: ItemSeconds = 120
     check: Check = False
     seed: Seed = 0
     force: Force = False
@@ -71,6 +72,7 @@ def run_conversion(
         seed=options.seed,
         force=options.force,
         task=f"prepare {name}",
+        item_seconds=options.item_seconds,
     )
     report = convert_raw_data(reader, options.output, conversion, options.dask)
     for line in report.lines():

@@ -19,6 +19,15 @@ Sampling = Annotated[
     Literal["random", "fps", "voxel"],
     typer.Option("--sampling", help="How --points chooses: at random, farthest points (fps), or one per voxel."),
 ]
+ItemSeconds = Annotated[
+    float,
+    typer.Option(
+        "--item-seconds",
+        min=0,
+        help="Processor time that one sample may take, and 10 seconds more for each MB of its files; then it is passed over."
+        " 0: no limit.",
+    ),
+]
 Stride = Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th frame.")]
 Pattern = Annotated[
     str,

@@ -257,7 +257,7 @@ class NTU60:
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
         where = item.path if "root" in item.extra else item.path / item.name
-        frames = sorted(self._frames(item, where))
+        frames, others = self._frames(item, where)
         numbers = np.array([number for number, _ in frames])
         if len(set(numbers)) < len(numbers):
             raise DataError(f"{where}: a frame is there twice; expected one MDepth-00000001.png per number")
@@ -274,25 +274,26 @@ class NTU60:
         missing = int(numbers[-1] - len(numbers))
         if missing:
             notes["frames missing in the numbering from 1"] = missing
+        if others:
+            notes["pictures left out, whose name is not MDepth-NUMBER.png"] = len(others)
         return Sample(CloudSequence(item.name, points, offsets(counts[kept]), time=time, **describe(item)), notes)
 
-    def _frames(self, item: Item, where: Path) -> Iterator[tuple[int, Path | bytes]]:
-        """Yields (number, file or content) of the frames of a video, unsorted."""
+    def _frames(self, item: Item, where: Path) -> tuple[list[tuple[int, Path | bytes]], list[str]]:
+        """Returns (number, file or content) of the frames of a video, sorted, and the names of other pictures beside them."""
         if "root" in item.extra:
             files: Iterator = folder_files(item.path, item.extra["root"], ".png")
         else:
             files = zip_folders.read_files(item.path, item.extra["files"])
-        others, empty = "", True
+        frames, others = [], []
         for name, data in files:
-            match = FRAME.fullmatch(name)
-            if match:
-                empty = False
-                yield int(match[1]), data
+            if match := FRAME.fullmatch(name):
+                frames.append((int(match[1]), data))
             else:
-                others = name
-        if empty:
-            found = f"found {others}; the masked depth maps are needed" if others else "it holds no pictures"
+                others.append(name)
+        if not frames:
+            found = f"found {others[-1]}; the masked depth maps are needed" if others else "it holds no pictures"
             raise DataError(f"{where}: no MDepth-00000001.png ...; {found}")
+        return sorted(frames), others
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.deep_video import deep_frames
 from dpcli.prepare.decode.exr import read_exr
-from dpcli.prepare.decode.png import decode_gray_png
+from dpcli.prepare.decode.png import check_png, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
 
@@ -178,6 +179,7 @@ def read_image(path: Path) -> np.ndarray:
     image = decode_gray_png(data)
     if image is not None:
         return image
+    check_png(data, path)
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
     if not pages:
@@ -234,6 +236,15 @@ def frame_series(folder: Path, pattern: str = "") -> Series | None:
     return choose_series(
         folder, names, pattern=pattern, suffixes=FRAME_SUFFIXES, wanted=_DEPTH_NAME, judge=_holds_depth
     )
+
+
+def says_depth(name: str) -> bool:
+    """Returns whether a name without suffix says that its pictures are depth, and no picture of depth.
+
+    >>> says_depth("lowres_depth"), says_depth("depth_vis"), says_depth("anna_1")
+    (True, False, False)
+    """
+    return re.search(_DEPTH_NAME, name, re.IGNORECASE) is not None
 
 
 def _is_frame(path: Path) -> bool:

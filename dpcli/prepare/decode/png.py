@@ -105,7 +105,7 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
         raise DataError(f"{where}: {header.bits}-bit {color} PNG; expected {allowed}-bit gray depth")
     image = decode_gray_png(data)
     if image is None:
-        _check_chunks(data, where)
+        check_png(data, where)
         cv2 = load_cv2()
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape != (header.height, header.width):
@@ -113,8 +113,14 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
     return image
 
 
-def _check_chunks(data: bytes, where: str) -> None:
-    """Raises DataError unless every chunk is there with its right checksum, the last one being IEND."""
+def check_png(data: bytes, where: str | Path) -> None:
+    """Raises DataError where a PNG's chunks are not all there with the right checksums, the last one IEND; lets all that
+    is no PNG pass.
+
+    OpenCV gets nothing else: it takes as much memory as a damaged chunk claims.
+    """
+    if not data.startswith(_SIGNATURE):
+        return
     position, view = len(_SIGNATURE), memoryview(data)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")

@@ -14,10 +14,14 @@ from dpcli.runtime.machines.shards import Shard
 
 @dataclass(frozen=True)
 class Workers:
-    """Holds how many items are worked on at a time, and where: `executor`, or processes of this machine for None."""
+    """Holds how many items are worked on at a time, and where: `executor`, or processes of this machine for None.
+
+    apart: even one at a time is worked on in a process of its own, which may die.
+    """
 
     slots: int = 1
     executor: Executor | None = None
+    apart: bool = False
 
 
 @dataclass(frozen=True)

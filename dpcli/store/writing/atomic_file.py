@@ -52,6 +52,9 @@ class AtomicFile:
             if not busy:
                 with suppress(OSError):  # the first byte did not fit: an empty file would stay
                     self.part.unlink(missing_ok=True)
+            full = None if busy else self.problem(error)
+            if full is not None:
+                raise full from None
             why = "another dpc is writing it" if busy else str(error).splitlines()[0]
             raise DpcError(f"{self.target}: cannot write ({why})") from None
 

@@ -98,10 +98,12 @@ class ItemPass:
         todo = [place for place in self.places if place not in written]
         with stop_requested() as stop, Progress(self.words.task, len(self.places), self.words.unit) as bar:
             bar.skip(len(written))
-            slots = min(workers.slots, len(todo))  # one item needs no process of its own
+            slots = min(workers.slots, len(todo))
             items = ((place, load(place)) for place in todo)
             try:
-                with closing(ordered_map(partial(_work_on, work), items, slots, workers.executor)) as results:
+                with closing(
+                    ordered_map(partial(_work_on, work), items, slots, workers.executor, workers.apart)
+                ) as results:
                     for (place, _), result in results:
                         self._take(place, result, write, bar)
                         self._check(stop)

@@ -179,7 +179,7 @@ def damage(path, change):
     "key, change, words",
     [
         ("flow_occ", b"", "not a readable PNG"),
-        ("flow_occ", png_bytes(make_scene(0)["flow_occ"])[:60], "not a readable"),
+        ("flow_occ", png_bytes(make_scene(0)["flow_occ"])[:60], "a truncated PNG"),
         ("flow_occ", np.zeros((H, W), np.uint16), "expected 16 bits, 3 channels"),
         ("disp_occ_0", np.zeros((H, W), np.uint8), "expected 16 bits, 1 channel"),
         ("disp_occ_1", np.zeros((H, W - 1), np.uint16), "15x12 pixels; the scene's other images have 16x12"),
