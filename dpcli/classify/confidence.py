@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 
 NOTE = "confidence"  # the name under which a weights file's notes hold it
 _LEAST = 1e-12  # the probability that 0 is taken for
@@ -51,9 +51,22 @@ class Confidence:
 
 
 def stored_confidence(notes: dict[str, Any]) -> Confidence | None:
-    """Returns what a weights file's notes say; None for weights from before there was any, or without validation videos."""
-    found = notes.get(NOTE)
-    return Confidence(**found) if isinstance(found, dict) else None
+    """Returns what a weights file's notes say; None for weights from before there was any, or without validation videos.
+
+    Raises DataError for notes that make no sense.
+    """
+    if NOTE not in notes:
+        return None
+    try:
+        found = Confidence(**notes[NOTE])
+        sound = 0 < found.temperature < np.inf and 0 <= found.threshold <= 1
+    except TypeError:
+        sound = False
+    if not sound:
+        raise DataError(
+            f"the weights' notes hold no temperature and threshold but {str(notes[NOTE])[:80]!r}; train again"
+        )
+    return found
 
 
 def choose_confidence(notes: dict[str, Any], reject_below: str | None, model: str) -> Confidence:

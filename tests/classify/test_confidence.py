@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dpcli.classify.confidence import NOTE, Confidence, choose_confidence, fit_confidence, stored_confidence
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 
 
 def case(seed: int, sharpness: float, count: int = 4000) -> tuple[np.ndarray, np.ndarray]:
@@ -58,3 +58,11 @@ def test_notes_bring_it_back_and_old_weights_have_none():
 def test_a_threshold_that_is_none_is_refused(given, told):
     with pytest.raises(UsageError, match=told):
         choose_confidence({}, given, "m")
+
+
+@pytest.mark.parametrize(
+    "note", [3, {"temperature": 0}, {"threshold": 2}, {"temperature": "x"}, {"other": 1}, {"temperature": None}]
+)
+def test_damaged_notes_are_bad_data(note):
+    with pytest.raises(DataError, match="train again"):
+        stored_confidence({NOTE: note})

@@ -29,10 +29,12 @@ def write(path, frames: int = 40, names: tuple[str, ...] = ("wave </script>", "b
 )
 def test_the_page_tells_what_was_said_at_a_frame(tmp_path, frame, told):
     write(tmp_path / "live.html")
-    html, _ = open_page(
-        f"file://{tmp_path / 'live.html'}#frame={frame}&play=0&renderer=2d", tmp_path, "--virtual-time-budget=4000"
-    )
-    said = html.split('id="said"')[1].split("</div>")[0]
+    address = f"file://{tmp_path / 'live.html'}#frame={frame}&play=0&renderer=2d"
+    for budget in (4000, 16_000, 64_000):  # on a busy machine the time of a page may be over before it has drawn
+        html, _ = open_page(address, tmp_path, f"--virtual-time-budget={budget}")
+        said = html.split('id="said"')[1].split("</div>")[0]
+        if not said.endswith(">"):
+            break
     assert told in said and 'id="error" class="card" role="alert" hidden' in html
 
 

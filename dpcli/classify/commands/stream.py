@@ -151,15 +151,14 @@ def _follow(
     """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     feed = ReadAhead(frames, 2 * predictor.window.size)
     problem: BaseException | None = None
-    before: float | None = None
     arrived, watch = time.monotonic(), _Oddities()
     try:
         predictor.warm_up()  # the first frames come in meanwhile
-        for points, arrived in feed.frames(stop):
-            silent = arrived - before if before is not None else 0.0
+        for points, arrived, waited in feed.frames(stop):
+            silent = waited if predictor.window.count else 0.0
             watch.see(predictor.window.count, points, silent)
             lines.see(points, silent)
-            before, made = arrived, predictor.add(points)
+            made = predictor.add(points)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
     except BrokenPipeError:  # nobody reads the lines any more

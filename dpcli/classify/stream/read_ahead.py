@@ -22,10 +22,13 @@ class ReadAhead:
 
     def _run(self, frames: Iterator[np.ndarray]) -> None:
         try:
+            began = time.monotonic()
             for points in frames:
-                self._put((points, time.monotonic()))
+                arrived = time.monotonic()
+                self._put((points, arrived, arrived - began))
                 if self._closed.is_set():
                     return
+                began = time.monotonic()  # not before: while there is no room, it is not the writer who is silent
             self._put(None)
         except Exception as error:  # raised again where the frames are taken, after those before it
             self._put(error)
@@ -42,8 +45,9 @@ class ReadAhead:
         """Frames that have arrived and were not taken yet."""
         return self._queue.qsize()
 
-    def frames(self, stop: StopRequest) -> Iterator[tuple[np.ndarray, float]]:
-        """Yields (points, time.monotonic() at arrival) until the stream ends or a stop is asked for."""
+    def frames(self, stop: StopRequest) -> Iterator[tuple[np.ndarray, float, float]]:
+        """Yields (points, time.monotonic() at arrival, seconds that it was waited for) until the stream ends or a stop is
+        asked for."""
         while not stop.requested:
             try:
                 item = self._queue.get(timeout=0.1)

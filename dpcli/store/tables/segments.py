@@ -22,7 +22,7 @@ from dpcli.errors import DataError
 SUFFIXES = (".csv", ".json")  # of the files
 _NEEDED = ("recording", "start", "end", "class")
 _COLUMNS = (*_NEEDED, "confidence", "start_seconds", "end_seconds")
-_MOST_FRAMES = 2**31
+_MOST_FRAMES = 20_000_000  # of a recording: a week at 30 a second; a damaged number must not ask for all memory
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,7 @@ def read_segments(path: str | Path, text: str | None = None) -> Segments:
         about = _json_of(path, text)
         rows = [(f"entry {number}", row) for number, row in enumerate(about.get("segments", []))]
     else:
-        reader = csv.DictReader(io.StringIO(text))
-        _check_columns(path, reader.fieldnames or [])
-        rows = [(f"line {number}", row) for number, row in enumerate(reader, start=2)]
+        rows = _csv_rows(path, text)
     recordings: dict[str, list[Segment]] = {}
     for where, row in rows:
         name, segment = _parsed(f"{path}: {where}", row)
@@ -117,6 +115,16 @@ def _json_of(path: str | Path, text: str) -> Mapping[str, Any]:
     if found.get("kind") != "segments" or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise DataError(f"{path}: no segments; expected what `dpc classify predict --segments` writes")
     return found
+
+
+def _csv_rows(path: str | Path, text: str) -> list[tuple[str, Mapping[str, Any]]]:
+    """Returns the rows of a CSV table, each with its line in words."""
+    reader = csv.DictReader(io.StringIO(text))
+    try:
+        _check_columns(path, reader.fieldnames or [])
+        return [(f"line {reader.line_num}", row) for row in reader]
+    except csv.Error as error:
+        raise DataError(f"{path}: line {reader.line_num}: damaged CSV ({error})") from None
 
 
 def _check_columns(path: str | Path, columns: Sequence[str]) -> None:
@@ -151,7 +159,7 @@ def _whole(where: str, key: str, value: Any) -> int:
     except (TypeError, ValueError):
         number = float("nan")
     if isinstance(value, bool) or not 0 <= number < _MOST_FRAMES or number != int(number):
-        raise DataError(f"{where}: {key} {value!r}; expected a frame's number, from 0")
+        raise DataError(f"{where}: {key} {value!r}; expected a frame's number, from 0 to {_MOST_FRAMES:,}")
     return int(number)
 
 

@@ -21,6 +21,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dpcli.classify.commands.stream import _Oddities
 from dpcli.classify.data.clips import Clip, ClipSource, uniform_frames
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
@@ -333,7 +334,7 @@ def test_frames_wait_in_bounded_room_and_none_is_lost():
     assert len(taken) == 6 and feed.waiting == 5  # one more is in the reader's hand
     got = []
     with pytest.raises(DataError, match="frame 40"):
-        for points, _ in feed.frames(StopRequest()):
+        for points, _, _ in feed.frames(StopRequest()):
             got.append(int(points[0, 0]))
     assert got == list(range(40))
 
@@ -550,3 +551,13 @@ def test_nothing_happens_below_the_threshold_and_scores_stay(model_file, tmp_pat
     assert lines["0"][-1]["scores"] == lines["1"][-1]["scores"]
     with pytest.raises(UsageError, match="no threshold of its own"):
         predict(str(tmp_path / "s.npy"), str(model_file), stream=True, reject_below="auto")
+
+
+def test_a_silence_is_told_once_and_counted(capsys):
+    watch, points = _Oddities(), np.ones((9, 3), np.float32)
+    for number, silent in enumerate((0.0, 0.1, 7.3, 0.1, 2.5)):
+        watch.see(number, points, silent)
+    watch.sum_up()
+    said = capsys.readouterr().err
+    assert said.count("nothing came for 7.3 s before frame 2") == 1 and "2.5 s" not in said
+    assert "frames in all: 2 after a silence" in said

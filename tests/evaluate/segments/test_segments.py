@@ -140,7 +140,10 @@ def test_a_bad_table_is_named(tmp_path, capsys, rows, told):
     assert told in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text", ["{", "{}", '{"kind": "segments", "segments": 3}', "a,b\n1,2\n", ""])
+@pytest.mark.parametrize(
+    "text",
+    ["{", "{}", '{"kind": "segments", "segments": 3}', "a,b\n1,2\n", "", "recording,start,end,class\n" + 200_000 * "x"],
+)
 def test_what_is_no_table_is_named(tmp_path, text):
     path = tmp_path / "t.json"
     path.write_text(text)
