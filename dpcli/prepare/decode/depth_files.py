@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,6 +103,7 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
         if stream is None or (stream.place == 0 and _is_plain(stream)):
             stamps: list[float | None] = []
             frames = list(_decoded(capture, path, 0, None, stride, stamps))
+            _check_count(path, len(frames), stride)
             return frames, rising_times(stamps, rate, stride)
     finally:
         capture.release()
@@ -111,7 +113,21 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
             f" ffmpeg -i {path.name} -map 0:v:{stream.place} -c copy depth{path.suffix}"
         )
     kept = [pair for index, pair in enumerate(deep_frames(path, stream)) if index % stride == 0]
+    _check_count(path, len(kept), stride)
     return [frame for frame, _ in kept], rising_times([seconds for _, seconds in kept], rate, stride)
+
+
+def _check_count(path: Path, count: int, stride: int) -> None:
+    """Raises DataError where every ``stride``-th frame of an AVI gave fewer than its header promises, but for a last one."""
+    with open(path, "rb") as file:
+        head = file.read(52)
+    promised = struct.unpack_from("<I", head, 48)[0] if head[8:16] == b"AVI LIST" and head[24:28] == b"avih" else 0
+    if len(range(0, promised - 1, stride)) > count:
+        of = f", of every {stride}th," if stride > 1 else ""
+        raise DataError(
+            f"{path}: only {count} frames{of} can be decoded where its header says {promised}; it is truncated or damaged:"
+            " copy it again, or cut the good part out"
+        )
 
 
 def _is_plain(stream: VideoStream) -> bool:
