@@ -21,7 +21,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
 .PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.1 table-5.2
-.PHONY: prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
+.PHONY: segments prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
 	@echo "make demo [MSRACTION=folder]  depth videos -> point clouds -> a trained Kinet -> a table; results in demo/"
@@ -34,6 +34,7 @@ help:
 	@echo "make figure-3.5 MSRACTION=folder four settings swept over ten folds; or NVGESTURE=folder; days"
 	@echo "make figure-3.8 MSRACTION=folder parameters, FLOPs, accuracy of three backbones (= table-A.1)"
 	@echo "make figure-A.4 MSRACTION=folder what each class gains; docs/reproduce.md says more of all of these"
+	@echo "make segments MSRACTION=folder actions found in long recordings; ten minutes"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, five rows and those of the thesis; hours"
@@ -66,8 +67,8 @@ demo: $(READY)
 	$(DPC) prepare synthetic articulated -o demo/objects.h5 --objects 11 --sequences-per-object 1 --force
 	$(DPC) segment predict demo/objects.h5 -o demo/parts.h5 --picture demo/parts.png --turntable demo/parts.gif --force
 	$(DPC) evaluate segmentation demo/parts.h5 --truth demo/objects.h5 --split all
-	$(DPC) prepare synthetic animal -o demo/animal.h5 --size 128 --frames 16 --train-azimuths 90,180 --azimuths 45,135 --force
-	$(DPC) generate4d fit demo/animal.h5 -o demo/scene.h5 --prior views --set most_gaussians=6000 --set dense_steps=200 --set sparse_steps=500
+	$(DPC) prepare synthetic animal -o demo/animal.h5 --size 128 --frames 16 --yaw 90 --no-travel --force
+	$(DPC) generate4d fit demo/animal.h5 -o demo/scene.h5 --preset fast
 	$(DPC) generate4d render demo/scene.h5 -o demo/scene.mp4 --picture demo/scene.png --force
 	$(DPC) generate4d view demo/scene.h5 -o demo/scene.html --force
 	$(DPC) evaluate video demo/scene.h5 --truth demo/animal.h5
@@ -164,6 +165,11 @@ table-4.2: $(READY)
 	    echo "## $$name, protocol $$protocol"; \
 	    $(DPC) evaluate segmentation $(T42)/$$name.h5 --truth $(T42)/test.h5 --split test --protocol $$protocol --markdown || exit 1; \
 	done; done | tee $(T42)/table.md
+
+# Actions found in long recordings made of MSR-Action3D's test videos; SEGMENTS: words for the program.
+segments: $(READY)
+	$(if $(MSRACTION),,$(error make segments needs MSRACTION=folder, $(MSR_IS)))
+	$(TABLES).segments "$(MSRACTION)" table/segments $(SEGMENTS)
 
 # Table 4.1: the switches of training, one after the other, with the same budget. Stopped, it goes on where it was.
 T41 := table/4.1

@@ -33,6 +33,7 @@ class ClassifyStream(IntEnum):
     HELD_OUT_SAMPLES = 3  # samples for validation; key: the class
     HELD_OUT_PEOPLE = 4  # people for validation, and with one more key the order of each person's samples
     DRAW_ORDER = 5  # order of the clips of a draw that comes back; key: the epoch
+    RECORDING = 6  # order of the videos of a recording made of them; key: the person
 
 
 class SegmentStream(IntEnum):

@@ -132,6 +132,7 @@ _SCORES = (
     Field("scores", "f32", ("S", "C"), "class probabilities"),
     *_WHO,
     Field("streams", "f32", ("S", "C"), "the same of one stream of the network", optional=True, group=True),
+    Field("rejected", "u8", ("S",), "1 where nothing was recognized (`--reject-below`); scores stay", optional=True),
 )
 _STATISTICS = (
     Field("name", "str", ("S",), "unique name"),

@@ -44,13 +44,15 @@ class ScoresWriter(ResumableWriter):
         source: str = "",
         provenance: dict | Sequence[dict] | None = None,
         streams: Sequence[str] = (),
+        rejects: bool = False,
         force: bool = False,
         resume: bool = False,
     ) -> None:
-        self.streams = tuple(streams)
+        self.streams, self.rejects = tuple(streams), rejects
         self._names: list[str] = []
         self._splits: list[str] = []
         self._labels = array("i")
+        self._rejected = array("B")
         self._rows = [array("f") for _ in range(1 + len(self.streams))]  # of the scores, then of each stream
         super().__init__(
             path,
@@ -71,8 +73,12 @@ class ScoresWriter(ResumableWriter):
         label: int = -1,
         split: str = "",
         streams: dict[str, np.ndarray] | None = None,
+        rejected: bool = False,
     ) -> None:
-        """Adds one sample: scores f32 (C); DataError unless they are finite and as many as there are classes."""
+        """Adds one sample: scores f32 (C), and whether nothing was recognized, which a file that `rejects` keeps.
+
+        Raises DataError unless scores are finite and as many as there are classes.
+        """
         own = streams or {}
         for key, row in (("scores", scores), *own.items()):  # a stream may be called scores, too
             if np.shape(row) != (len(self.class_names),) or not np.isfinite(row).all():
@@ -87,9 +93,10 @@ class ScoresWriter(ResumableWriter):
         self._names.append(name)
         self._splits.append(split)
         self._labels.append(int(label))
+        self._rejected.append(bool(rejected))
         for rows, row in zip(self._rows, (main, *single)):
             rows.frombytes(row.tobytes())
-        self._record([name, split, int(label), main, single])
+        self._record([name, split, int(label), main, single, bool(rejected)])
 
     def __len__(self) -> int:
         return len(self._names)
@@ -98,12 +105,12 @@ class ScoresWriter(ResumableWriter):
         return self
 
     def _about(self) -> dict[str, Any]:
-        return super()._about() | {"streams": list(self.streams)}
+        return super()._about() | {"streams": list(self.streams), "rejects": self.rejects}
 
     def write_again(self, given: list[Any]) -> str:
         """Writes a sample as `_record` was told of it, and returns its name."""
-        name, split, label, scores, single = given
-        self.write(name, scores, label=label, split=split, streams=dict(zip(self.streams, single)))
+        name, split, label, scores, single, rejected = given
+        self.write(name, scores, label=label, split=split, streams=dict(zip(self.streams, single)), rejected=rejected)
         return name
 
     def _complete(self) -> None:
@@ -113,13 +120,16 @@ class ScoresWriter(ResumableWriter):
         file.create_dataset("name", data=np.array(self._names, dtype=object), dtype=STRING)
         file.create_dataset("split", data=np.array(self._splits, dtype=object), dtype=STRING)
         file.create_dataset("label", data=np.array(self._labels, _FIELD["label"].dtype), **_PACKED)
+        if self.rejects:
+            file.create_dataset("rejected", data=np.array(self._rejected, _FIELD["rejected"].dtype), **_PACKED)
         for name, rows in zip(("scores", *(f"streams/{stream}" for stream in self.streams)), self._rows):
             table = np.frombuffer(rows, _FIELD["scores"].dtype) if rows else np.zeros(0, _FIELD["scores"].dtype)
             file.create_dataset(name, data=table.reshape(len(self._names), len(self.class_names)))
 
 
 class ScoresReader:
-    """A `scores` file in memory: scores f32 (S,C), labels i32 (S), names, splits, class_names, streams {name: (S,C)}.
+    """A `scores` file in memory: scores f32 (S,C), labels i32 (S), names, splits, class_names, streams {name: (S,C)},
+    rejected bool (S), None where nothing was asked to be.
 
     Raises DataError when shapes disagree, a value is not finite, a name repeats, or a label is out of range.
     """
@@ -135,6 +145,7 @@ class ScoresReader:
                     raise DataError(f"{path}: data set {key!r} is missing; the file is incomplete, make it again")
             self.scores, self.labels = file["scores"][:], file["label"][:]
             self.streams = {key: file["streams"][key][:] for key in file.get("streams", {})}
+            self.rejected = file["rejected"][:].astype(bool) if "rejected" in file else None
             self.skipped, self.positions = read_skipped(file), read_positions(file)
             self._check()
 
@@ -146,7 +157,8 @@ class ScoresReader:
     def given(self, index: int) -> list[Any]:
         """Returns sample `index` as the writer of such a file takes it again."""
         single = [self.streams[name][index] for name in self.stream_names]
-        return [self.names[index], self.splits[index], int(self.labels[index]), self.scores[index], single]
+        rejected = self.rejected is not None and bool(self.rejected[index])
+        return [self.names[index], self.splits[index], int(self.labels[index]), self.scores[index], single, rejected]
 
     def close(self) -> None:
         """Does nothing: all of it is in memory."""
@@ -162,6 +174,8 @@ class ScoresReader:
                     f"{self.path}: {len(bad)} of {len(value)} samples with NaN or infinite {key}, the first "
                     f"{self.names[bad[0]]!r}; predict again"
                 )
+        if self.rejected is not None and self.rejected.shape != shape[:1]:
+            raise DataError(f"{self.path}: rejected has shape {self.rejected.shape}, expected {shape[:1]}")
         if self.labels.shape != shape[:1] or len(self.splits) != shape[0]:
             raise DataError(f"{self.path}: {len(self.labels)} labels for {shape[0]} names")
         twice = sorted({name for name in self.class_names if name and self.class_names.count(name) > 1})

@@ -9,6 +9,7 @@ from typing import Any
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.commands.scores_made import already_scored
+from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
 from dpcli.classify.data.videos import check_classes, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS, Kinet
@@ -60,10 +61,12 @@ def predict(
     drop_short: bool = False,
     batch: int = 8,
     spread: Spread = ALONE,
+    reject_below: str | None = None,
 ) -> Prediction:
     """Scores the videos and writes a scores file; goes on where a stopped run ended.
 
-    clips_per_video: spread evenly over a video, None takes every start. spread: who works on which videos. Raises UsageError
+    clips_per_video: spread evenly over a video, None takes every start. reject_below: see `choose_confidence`; None marks
+    nothing as rejected. spread: who works on which videos. Raises UsageError
     when the output holds something else, DataError when data and model don't fit.
     """
     weights = find_model(task.model)
@@ -76,16 +79,24 @@ def predict(
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
         report_short(source, info.config.num_frames)
         config = _record(task, weights, info, source, clips_per_video)
+        confidence = None if reject_below is None else choose_confidence(info.notes, reject_below, task.model)
+        if confidence is not None:
+            config["reject_below"] = {"temperature": confidence.temperature, "threshold": confidence.threshold}
         entry = describe_shard(provenance.record(config, task.seed, {"clouds": path}), spread.shard)
         complete = not task.force and already_scored(target, entry)
         if not complete:
             keep_freed_memory()
-            with _writer(task, target, info, [*reader.provenance, entry]) as writer:
+            with _writer(task, target, info, [*reader.provenance, entry], confidence is not None) as writer:
                 once = OncePerProcess(open_model, config["weights"] + task.device, (model, info))
                 device = str(choose_device(task.device))
                 work = ScoreVideo(once, clips_per_video, batch, device, writer.streams, task.seed)
-                _score_videos(source, work, writer, task.split if task.split == "validation" else None, spread)
+                split = task.split if task.split == "validation" else None
+                _score_videos(source, work, writer, split, spread, confidence or Confidence())
         made = ScoresReader(target)
+    if made.rejected is not None:
+        log.info(
+            f"nothing recognized in {int(made.rejected.sum())} of {len(made.names)} videos (`rejected` in the file)"
+        )
     for line in skipped_lines(made.skipped):
         log.warn(line)
     return Prediction(len(made.names), len(info.class_names), complete)
@@ -112,7 +123,7 @@ def _record(
     }
 
 
-def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict]) -> ScoresWriter:
+def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict], rejects: bool) -> ScoresWriter:
     return ScoresWriter(
         target,
         class_names=info.class_names,
@@ -120,13 +131,19 @@ def _writer(task: ModelTask, target: Path, info: ModelInfo, history: list[dict])
         source=task.source,
         provenance=history,
         streams=tuple(info.notes.get("streams", STREAMS)),
+        rejects=rejects,
         force=task.force,
         resume=task.output != "-",
     )
 
 
 def _score_videos(
-    source: ClipSource, work: ScoreVideo, writer: ScoresWriter, split: str | None, spread: Spread
+    source: ClipSource,
+    work: ScoreVideo,
+    writer: ScoresWriter,
+    split: str | None,
+    spread: Spread,
+    confidence: Confidence,
 ) -> None:
     """Writes the scores of the videos that an earlier run has not scored. split: what to call the videos' split, None: as
     their file does."""
@@ -138,7 +155,8 @@ def _score_videos(
     def write(place: int, video: VideoScores) -> dict[str, float]:
         i = video.sequence
         label, own = int(reader.labels[i]), split or reader.splits[i]
-        writer.write(reader.names[i], video.fused, label=label, split=own, streams=video.streams)
+        rejected = bool(confidence.of(video.fused).max() < confidence.threshold)
+        writer.write(reader.names[i], video.fused, label=label, split=own, streams=video.streams, rejected=rejected)
         return {"clips": video.clips}
 
     names = [reader.names[i] for i in chosen]

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from dpcli.classify.commands.model_task import ModelTask
+from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames
 from dpcli.classify.stream.read_ahead import ReadAhead
@@ -27,13 +28,18 @@ from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import ScoresWriter
 
 _CTRL_C = "SIGINT"
+_SILENT = 2.0  # seconds without a frame that are told
+_SPARSE = 4  # points: fewer show no shape
 
 
 class Listener(Protocol):
     """Takes predictions as they are made."""
 
-    def write(self, made: Prediction, arrived: float, waiting: int) -> None:
-        """Takes one prediction, when its last frame arrived (time.monotonic()), and how many frames wait."""
+    def see(self, points: np.ndarray, silent: float) -> None:
+        """Takes a frame f32 (P,3), before what is predicted of it, and the seconds since the one before."""
+
+    def write(self, made: Prediction, latency: float, waiting: int) -> None:
+        """Takes one prediction, the seconds since its last frame arrived, and how many frames wait."""
 
     def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
         """Takes the mean over all clips f32 (1+S,C), the numbers of frames and clips, and how the stream ended."""
@@ -44,32 +50,44 @@ class StreamOptions:
     """Says how a stream is predicted.
 
     hop: frames between predictions. window: frames to look back at, None for a clip's. follow: seconds to wait for more
-    at the end of a file or folder. files: how a folder's files are read.
+    at the end of a file or folder. files: how a folder's files are read. reject_below: see `choose_confidence`.
     """
 
     hop: int
     window: int | None
     follow: float
     files: CloudFiles
+    reject_below: str | None = None
 
 
-def predict_stream(
-    task: ModelTask, options: StreamOptions, new_listener: Callable[[list[str], Sequence[str]], Listener]
-) -> int:
+@dataclass(frozen=True)
+class Speaker:
+    """Says what predictions are made with: class names, the streams that were trained, confidence, window and hop in frames."""
+
+    class_names: list[str]
+    streams: Sequence[str]
+    confidence: Confidence
+    window: int
+    hop: int
+
+
+def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callable[[Speaker], Listener]) -> int:
     """Predicts until the stream ends, a frame is bad or a signal comes; what was predicted is kept and summed up each time.
 
-    new_listener: makes, from class names and streams, the one who takes the predictions. Returns the number of frames.
+    new_listener: makes the one who takes the predictions. Returns the number of frames.
     Raises what ended the stream early.
     """
     weights = find_model(task.model)
     model, info = load_model(weights, task.backbone)
     device = choose_device(task.device)
     predictor = StreamPredictor(model, info, window=options.window, hop=options.hop, seed=task.seed, device=device)
+    confidence = choose_confidence(info.notes, options.reject_below, task.model)
+    speaker = Speaker(info.class_names, predictor.streams, confidence, predictor.window.size, options.hop)
     frames = open_frames(task.data, options.follow, options.files)
     keep_freed_memory()
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
-        problem = _follow(predictor, frames, new_listener(info.class_names, predictor.streams), stop)
+        problem = _follow(predictor, frames, new_listener(speaker), stop)
         if not predictor.clips:
             raise problem or DataError(f"{task.source}: not one frame came; the program before the pipe wrote nothing")
         if target is not None:
@@ -133,16 +151,17 @@ def _follow(
     """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     feed = ReadAhead(frames, 2 * predictor.window.size)
     problem: BaseException | None = None
-    arrived, empty = time.monotonic(), False
+    before: float | None = None
+    arrived, watch = time.monotonic(), _Oddities()
     try:
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived in feed.frames(stop):
-            if len(points) == 0 and not empty:
-                log.warn(f"frame {predictor.window.count} has no points: they are taken to be at the origin; told once")
-                empty = True
-            made = predictor.add(points)
+            silent = arrived - before if before is not None else 0.0
+            watch.see(predictor.window.count, points, silent)
+            lines.see(points, silent)
+            before, made = arrived, predictor.add(points)
             if made is not None:
-                lines.write(made, arrived, feed.waiting)
+                lines.write(made, time.monotonic() - arrived, feed.waiting)
     except BrokenPipeError:  # nobody reads the lines any more
         raise
     except (DpcError, OSError, KeyboardInterrupt) as error:
@@ -151,7 +170,8 @@ def _follow(
         feed.close()
     if (made := predictor.finish()) is not None:
         log.info(f"{predictor.window.count} frames are fewer than the window's {predictor.window.size}")
-        lines.write(made, arrived, feed.waiting)
+        lines.write(made, time.monotonic() - arrived, feed.waiting)
+    watch.sum_up()
     count = predictor.window.count
     if stop.requested and problem is None and stop.name == _CTRL_C:
         problem = KeyboardInterrupt()
@@ -160,6 +180,41 @@ def _follow(
     if predictor.clips:
         lines.finish(predictor.mean, count, predictor.clips, _ending(problem, stop))
     return problem
+
+
+class _Oddities:
+    """Tells the first of the frames that are odd at once, and at the end how many there were."""
+
+    def __init__(self) -> None:
+        self.empty = self.sparse = self.gaps = 0
+
+    def see(self, number: int, points: np.ndarray, silent: float) -> None:
+        """Looks at a frame, and at the seconds since the one before."""
+        if silent > _SILENT:
+            if not self.gaps:
+                log.warn(
+                    f"nothing came for {silent:.1f} s before frame {number}: the frames before and after it count as"
+                    " neighbors; told once"
+                )
+            self.gaps += 1
+        if len(points) == 0:
+            if not self.empty:
+                log.warn(f"frame {number} has no points: they are taken to be at the origin; told once")
+            self.empty += 1
+        elif len(points) < _SPARSE:
+            if not self.sparse:
+                log.warn(f"frame {number} has {len(points)} points, repeated to fill a clip; told once")
+            self.sparse += 1
+
+    def sum_up(self) -> None:
+        """Tells how many odd frames there were, where one was told of already."""
+        counts = {
+            "without points": self.empty,
+            f"of fewer than {_SPARSE} points": self.sparse,
+            "after a silence": self.gaps,
+        }
+        if any(count > 1 for count in counts.values()):
+            log.warn("frames in all: " + ", ".join(f"{count} {what}" for what, count in counts.items() if count))
 
 
 def _ending(problem: BaseException | None, stop: StopRequest) -> str:

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.validation_split import carve_validation, class_table, default_rule
 from dpcli.classify.data.videos import report_short
-from dpcli.classify.network.kinet import Kinet
-from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.network.kinet import STREAMS, Kinet
+from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
+from dpcli.classify.training.confidence_fit import fitted_confidence
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
@@ -103,8 +105,24 @@ def _train(
         processes.wait()  # the others find the folder as it is to be
         trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
         trainer.run()
+        if processes.first and videos.validation is not None:
+            _add_confidence(trainer, info, videos.validation, folder)
     accuracy = trainer.validate() if videos.validation is not None else {}
     return Training(folder.file("best.safetensors"), videos.counts[1], accuracy) if processes.first else None
+
+
+def _add_confidence(trainer: Trainer, info: ModelInfo, validation: ClipSource, folder: RunFolder) -> None:
+    """Writes the weights again with temperature and threshold fitted on the validation videos in their notes."""
+    schedule, streams = trainer.schedule, list(STREAMS) if trainer.schedule.epochs_dynamic else ["static"]
+    clips, device = schedule.validation_clips, trainer.device
+    found = fitted_confidence(trainer.model, validation, clips, schedule.batch, device, streams)
+    info.notes |= {"streams": streams, NOTE: found.notes()}
+    save_model(folder.file("best.safetensors"), trainer.model, info)
+    log.info(
+        f"confidence: temperature {found.temperature:g}; below {found.threshold:g} nothing is recognized: that keeps"
+        f" {100 * (found.kept or 0):.0f} % of {found.clips} validation clips and rejects"
+        f" {100 * (found.rejected_still or 0):.0f} % of those in which nobody moves"
+    )
 
 
 def _for_device(schedule: Schedule, device: torch.device) -> Schedule:

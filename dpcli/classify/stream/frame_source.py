@@ -64,12 +64,13 @@ class _Bytes:
     waiting, and the interpreter can't end while another thread holds stdin's."""
 
     def __init__(self, descriptor: int, follow: float) -> None:
-        self.descriptor, self.ended, self.position = descriptor, False, 0
+        self.descriptor, self.ended, self.position, self._again = descriptor, False, 0, b""
         self.follow = follow if stat.S_ISREG(os.fstat(descriptor).st_mode) else 0.0
 
     def read(self, count: int) -> bytes:
         """Returns `count` bytes; fewer, with `ended` set, when no more came for `follow` seconds."""
-        pieces, missing, last = [], count, time.monotonic()
+        pieces, self._again = [self._again[:count]], self._again[count:]
+        missing, last = count - len(pieces[0]), time.monotonic()
         while missing and not self.ended:
             piece = os.read(self.descriptor, min(missing, _PIECE))
             if piece:
@@ -82,6 +83,12 @@ class _Bytes:
                 time.sleep(_POLL)
         self.position += count - missing
         return b"".join(pieces)
+
+    def unread(self, data: bytes) -> None:
+        """Takes back the last bytes that were read; the next read gives them again."""
+        self._again = data + self._again
+        self.position -= len(data)
+        self.ended = False
 
 
 def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.ndarray]:
@@ -98,6 +105,13 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.
             raise DataError(f"{where}, byte {start}: not a .npy array but {magic!r}; {_RECIPE}")
         shape, fortran, dtype = _header(source, magic, where)
         body = source.read(int(np.prod(shape)) * dtype.itemsize)
+        if (cut := body.find(_MAGIC + b"\x01\x00")) >= 0:  # no coordinates look like this: the next frame begins here
+            log.warn(
+                f"{where}: cut off after {source.position - len(body) + cut - start} bytes, then another frame begins;"
+                " its writer stopped and came back? The cut one is left out"
+            )
+            source.unread(body[cut:])
+            continue
         _check_whole(source, where)
         array = np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
         yield as_frame(array[:, :3], where)

@@ -24,3 +24,11 @@ Stream = Annotated[
         "--stream", help="One or more of static, dynamic, fused, with commas between. Default: those that were trained."
     ),
 ]
+RejectBelow = Annotated[
+    str | None,
+    typer.Option(
+        "--reject-below",
+        help="Confidence below which nothing is recognized: a number, or auto, the model's own. Default: auto with --stream and"
+        " --segments where the model has one; else none is rejected.",
+    ),
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,52 +16,101 @@ if TYPE_CHECKING:
     from dpcli.classify.commands.model_task import ModelTask
     from dpcli.classify.stream.frame_source import CloudFiles
 
+PANEL = "Streams and long recordings"  # heading in the help
+
 Stream = Annotated[
     bool,
-    typer.Option("--stream", help="Predict while frames still arrive; DATA is then -, a growing file or a folder."),
+    typer.Option(
+        "--stream",
+        rich_help_panel=PANEL,
+        help="Predict while frames still arrive; DATA is then -, a growing file or a folder.",
+    ),
 ]
-Hop = Annotated[int | None, typer.Option("--hop", help="With --stream: frames between predictions. Default: 1.")]
+Hop = Annotated[
+    int | None,
+    typer.Option(
+        "--hop", help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window."
+    ),
+]
 Window = Annotated[
     int | None,
-    typer.Option("--window", help="With --stream: frames to look back at, for models trained with --timing uniform."),
+    typer.Option(
+        "--window", help="With --stream or --segments: frames of a window, for models trained with --timing uniform."
+    ),
 ]
 Follow = Annotated[
     float | None,
     typer.Option(
-        "--follow", help="With --stream: seconds to wait for more at the end of a file or folder. Default: 0."
+        "--follow",
+        rich_help_panel=PANEL,
+        help="With --stream: seconds to wait for more at the end of a file or folder. Default: 0.",
     ),
 ]
 
-JsonLines = Annotated[bool, typer.Option("--json", help="With --stream: one JSON object per line.")]
+Page = Annotated[
+    Path | None,
+    typer.Option(
+        "--page",
+        rich_help_panel=PANEL,
+        help="With --stream: write a page of what was seen and said to this .html at the end.",
+    ),
+]
+JsonLines = Annotated[
+    bool, typer.Option("--json", rich_help_panel=PANEL, help="With --stream: one JSON object per line.")
+]
 
 
-def require_stream(**given: object) -> None:
-    """Raises UsageError when an option of --stream is given without it."""
+def require(mode: str, **given: object) -> None:
+    """Raises UsageError when an option that needs another one, `mode` in words, is given without it."""
     for name, value in given.items():
         if value not in (None, False):
-            raise UsageError(f"--{name} goes with --stream")
+            raise UsageError(f"--{name} goes with {mode}")
 
 
-def refuse_batch_options(given: dict[str, bool]) -> None:
-    """Raises UsageError when an option of batch prediction is given. given: option -> whether it is."""
+def refuse(reason: str, given: dict[str, bool]) -> None:
+    """Raises UsageError, which tells the reason, when an option is given. given: option -> whether it is."""
     for name in (name for name, typed in given.items() if typed):
-        raise UsageError(f"--{name} does not go with --stream, which is one video, as it comes")
+        raise UsageError(f"--{name} does not go with {reason}")
 
 
-def predict_stream(task: ModelTask, hop: int | None, window: int | None, follow: float | None, as_json: bool) -> None:
-    """Checks the options and predicts, a line per prediction on stdout."""
+@dataclass(frozen=True)
+class StreamOptions:
+    """Says how a stream is read, predicted and shown."""
+
+    stream: Stream = False
+    follow: Follow = None
+    json_output: JsonLines = False
+    page: Page = None
+
+
+def predict_stream(
+    task: ModelTask, given: StreamOptions, hop: int | None, window: int | None, reject: str | None
+) -> None:
+    """Checks the options and predicts: a line per prediction on stdout, or a view that changes in place on a terminal."""
+    follow = given.follow
     if task.output == "-":
         raise UsageError("-o - would mix HDF5 with the lines on stdout; name a file, or leave -o out")
     if hop is not None and hop < 1:
         raise UsageError(f"--hop {hop}: expected at least 1 frame")
     if follow is not None and not follow >= 0:
         raise UsageError(f"--follow {follow:g}: expected seconds, 0 or more (inf: until a signal)")
-    from dpcli.classify.commands.stream import StreamOptions
+    if given.page is not None:
+        check_page(given.page, task)
+    from dpcli.classify.commands.stream import StreamOptions as Options
     from dpcli.classify.commands.stream import predict_stream as run
-    from dpcli.cli.classify.stream_lines import Lines
+    from dpcli.cli.classify.stream_listeners import listener
 
-    options = StreamOptions(hop or 1, window, follow or 0.0, cloud_files())
-    run(task, options, lambda class_names, streams: Lines(class_names, streams, as_json))
+    options = Options(hop or 1, window, follow or 0.0, cloud_files(), reject)
+    run(task, options, lambda speaker: listener(speaker, given.json_output, given.page, task.source))
+
+
+def check_page(page: Path, task: ModelTask) -> None:
+    """Raises UsageError, before the work, where the page can't be written or would replace something."""
+    from dpcli.runtime.whole_file import check_target
+
+    check_target(page, "--page", (".html", ".htm"))
+    if page.exists() and not task.force:
+        raise UsageError(f"--page {page}: exists already; --force replaces it")
 
 
 def cloud_files() -> CloudFiles:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from dpcli.standard_streams import printable
@@ -12,26 +10,35 @@ from dpcli.standard_streams import printable
 if TYPE_CHECKING:
     import numpy as np
 
+    from dpcli.classify.commands.stream import Speaker
     from dpcli.classify.stream.sliding_window import Prediction
+
+NOTHING = "nothing happening"
 
 
 class Lines:
     """Prints a line per prediction, at once, and one with the whole at the end: JSON or for people."""
 
-    def __init__(self, class_names: list[str], streams: Sequence[str], as_json: bool) -> None:
-        self.class_names, self.streams, self.as_json = class_names, tuple(streams), as_json
+    def __init__(self, speaker: Speaker, as_json: bool) -> None:
+        self.class_names, self.streams, self.as_json = speaker.class_names, tuple(speaker.streams), as_json
+        self.confidence = speaker.confidence
         self.count, self.seconds, self.highest = 0, 0.0, 0.0
 
-    def write(self, made: Prediction, arrived: float, waiting: int) -> None:
-        """Prints one prediction. Its latency runs from the arrival of its last frame to this line, waiting behind earlier ones
-        included."""
-        seconds = time.monotonic() - arrived
+    def see(self, points: np.ndarray, silent: float) -> None:
+        """Prints nothing of a frame."""
+
+    def write(self, made: Prediction, latency: float, waiting: int) -> None:
+        """Prints one prediction. Its latency runs from the arrival of its last frame, waiting behind earlier ones included."""
+        seconds = latency
+        sure, nothing = self._sure(made.scores[0])
         self.count, self.seconds, self.highest = self.count + 1, self.seconds + seconds, max(self.highest, seconds)
-        latency = round(1000 * seconds, 1)
+        latency = round(1000 * seconds, 1)  # ms from here on
         if self.as_json:
             row = {
                 "frame": made.frame,
                 **self._tops(made.scores),
+                "confidence": round(sure, 6),
+                "nothing": nothing,
                 "mean": self._top(made.mean[0]),
                 "clips": made.clips,
                 "latency_ms": latency,
@@ -40,8 +47,9 @@ class Lines:
             print(json.dumps(row), flush=True)
             return
         behind = f", {waiting} frames waiting" if waiting else ""
+        said = f"{NOTHING}; best " if nothing else ""
         print(
-            f"frame {made.frame}: {self._text(made.scores)}; so far {self._name(made.mean[0])}; "
+            f"frame {made.frame}: {said}{self._text(made.scores)}; so far {self._name(made.mean[0])}; "
             f"{latency:.0f} ms{behind}",
             flush=True,
         )
@@ -67,6 +75,11 @@ class Lines:
             f"latency {average:.0f} ms on average, at most {highest:.0f}",
             flush=True,
         )
+
+    def _sure(self, scores: np.ndarray) -> tuple[float, bool]:
+        """Returns the confidence of a prediction, and whether it is too small for anything to be recognized."""
+        sure = float(self.confidence.of(scores).max())
+        return sure, sure < self.confidence.threshold
 
     def _top(self, scores: np.ndarray) -> dict:
         best = int(scores.argmax())

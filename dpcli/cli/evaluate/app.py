@@ -11,12 +11,13 @@ from dpcli.cli.evaluate.motion import motion
 from dpcli.cli.evaluate.report import report
 from dpcli.cli.evaluate.runs import runs
 from dpcli.cli.evaluate.segmentation import segmentation
+from dpcli.cli.evaluate.segments import segments
 from dpcli.cli.evaluate.video import video
 from dpcli.cli.evaluate.weights import app as weights
 from dpcli.cli.help_groups import SectionedGroup
 
 SECTIONS = {
-    "One prediction against the truth": (classification, segmentation, motion, joints, video),
+    "One prediction against the truth": (classification, segments, segmentation, motion, joints, video),
     "Several predictions or results": (compare, runs, report),
 }  # heading in `dpc evaluate --help` -> its commands
 

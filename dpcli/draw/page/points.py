@@ -11,7 +11,7 @@ import numpy as np
 from dpcli.draw.page.assemble import data_blocks, data_page
 from dpcli.draw.palette import UNKNOWN, part_colors
 
-SCRIPTS = ("clip", "points_gl", "points_canvas", "floor", "points")
+SCRIPTS = ("clip", "points_gl", "points_canvas", "floor", "points")  # of every page with clouds; what starts it follows
 MOST_POINTS = 1_000_000  # of all frames on a page: about 8 MB of positions in base64
 MOST_FRAMES = 2400  # of all sequences on a page
 _FEWEST_POINTS, _MOST_IN_FRAME = 256, 65_536
@@ -84,6 +84,14 @@ def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np
 
     Positions are rounded to 1/65535 of the box around their sequence. Equal input gives an equal page.
     """
+    header, blocks = points_parts(facts, sequences, axes=axes, unit=unit)
+    return data_page(header, "points", script=(*SCRIPTS, "points_start"), data=data_blocks(blocks))
+
+
+def points_parts(
+    facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np.ndarray, unit: str
+) -> tuple[dict[str, Any], list[bytes]]:
+    """Return the header of a page with point clouds, and the block of each sequence; arguments as of `points_page`."""
     header = facts.header() | {
         "axes": axes.tolist(),
         "unit": unit,
@@ -94,7 +102,7 @@ def points_page(facts: PageFacts, sequences: Sequence[PageSequence], *, axes: np
     blocks = [_packed(sequence) for sequence in sequences]
     for about, block in zip(header["sequences"], blocks):
         about["bytes"] = len(block)
-    return data_page(header, "points", script=SCRIPTS, data=data_blocks(blocks))
+    return header, blocks
 
 
 def _looks(sequences: Sequence[PageSequence]) -> list[str]:

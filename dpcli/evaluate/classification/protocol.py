@@ -11,7 +11,12 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.bootstrap import Interval, Resampling, WeightedMetric
 from dpcli.evaluate.classification.calibration import Calibration, are_probabilities, calibrate, calibration_weighted
-from dpcli.evaluate.classification.metrics import ClassificationMetrics, classification_metrics, classification_weighted
+from dpcli.evaluate.classification.metrics import (
+    ClassificationMetrics,
+    classification_metrics,
+    classification_weighted,
+    predicted_labels,
+)
 from dpcli.evaluate.classification.truth_labels import TruthLabels, labels_in_file, match_labels
 from dpcli.evaluate.results import LeftOut, counted_split
 from dpcli.store import ScoresReader
@@ -38,6 +43,15 @@ class ClassificationReport:
     resampling: Resampling = field(default_factory=lambda: Resampling(0))
     intervals: dict[str, dict[str, Interval]] = field(default_factory=dict)
     calibration: dict[str, Calibration | None] = field(default_factory=dict)
+    rejected: np.ndarray | None = None  # bool (S), of the samples that count
+
+    @property
+    def accepted(self) -> tuple[int, int] | None:
+        """The numbers of samples not rejected and, by the main scores, of those of them that are right; None: none could be."""
+        if self.rejected is None:
+            return None
+        kept = ~self.rejected
+        return int(kept.sum()), int((predicted_labels(self.scores[kept]) == self.labels[kept]).sum())
 
     @property
     def main(self) -> ClassificationMetrics:
@@ -83,6 +97,7 @@ def evaluate_classification(
         scores=scores.scores[keep],
         resampling=resampling,
         intervals={name: resampling.intervals(_metric(rows, labels), len(labels)) for name, rows in streams.items()},
+        rejected=None if scores.rejected is None else scores.rejected[keep],
         calibration={name: calibrate(rows, labels) for name, rows in streams.items()},
     )
 

@@ -44,6 +44,7 @@ def classification_json(report: ClassificationReport, source: str, provenance: S
             "classes": len(report.class_names),
             "classes_that_occur": int((main.support > 0).sum()),
         },
+        "accepted": dict(zip(("samples", "correct"), report.accepted)) if report.accepted else None,
         "left_out": left_out_json(report.left_out),
         "provenance": list(provenance),
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dpcli.evaluate.classification.calibration import BINS, Calibration
 from dpcli.evaluate.classification.metrics import ClassificationMetrics
 from dpcli.evaluate.classification.protocol import ClassificationReport
+from dpcli.evaluate.proportions import divide
 from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
 
@@ -25,6 +26,12 @@ def classification_notes(report: ClassificationReport) -> list[str]:
     lines = [f"{report.main.samples} samples of split {report.split!r}, {occur}; truth: {report.truth}."]
     lines += resampling_note(report.resampling, "samples", report.main.samples)
     lines.append(_calibration_note(report))
+    if report.accepted is not None:
+        kept, right = report.accepted
+        lines.append(
+            f"Nothing was recognized in {report.main.samples - kept} samples (the tables count them as scored); of the other"
+            f" {kept} {right} are right ({percent(float(divide(right, kept)))})."
+        )
     for entry in report.left_out:
         lines.append(left_out_note(entry, named="label" in entry.reason))
     return lines

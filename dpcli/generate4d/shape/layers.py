@@ -27,10 +27,14 @@ class Camera:
 
     def ray_points(self, depth: np.ndarray) -> np.ndarray:  # [..., H, W] -> [..., H, W, 3]
         """Returns the points, in the camera's axes, at these depths on the rays through the pixels' centers."""
-        height, width = depth.shape[-2:]
-        x = (np.arange(width) + 0.5 - self.intrinsics[0, 2]) / self.intrinsics[0, 0]
-        y = (np.arange(height) + 0.5 - self.intrinsics[1, 2]) / self.intrinsics[1, 1]
-        return np.stack([x * depth, y[:, None] * depth, depth], -1)
+        row, column = np.indices(depth.shape[-2:])
+        return self.pixel_points(row, column, depth)
+
+    def pixel_points(self, row: np.ndarray, column: np.ndarray, depth: np.ndarray) -> np.ndarray:  # [...] -> [..., 3]
+        """Returns the points, in the camera's axes, at these depths on the rays through these pixels' centers."""
+        x = (column + 0.5 - self.intrinsics[0, 2]) / self.intrinsics[0, 0]
+        y = (row + 0.5 - self.intrinsics[1, 2]) / self.intrinsics[1, 1]
+        return np.stack([x * depth, y * depth, depth], -1)
 
     @property
     def distance(self) -> float:

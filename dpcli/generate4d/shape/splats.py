@@ -17,6 +17,7 @@ _RADIUS, _THIN, _STEEPEST = (
     8.0,
 )  # of a pixel's width; a disc on a steep slope is longer, at most so many times
 _OPACITY = 0.95
+_INSIDE = 1.0  # of a pixel's width, from the outline's pixels to the discs that join front and back
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,39 @@ def splats_of(layers: ShapeLayers, camera: Camera) -> Splats:
     pixel = depth / camera.intrinsics[0, 0]
     scale = np.stack([_RADIUS * pixel * stretch, _RADIUS * pixel, _THIN * pixel], 1)
     quaternion = Rotation.from_matrix(axes).as_quat()[:, [3, 0, 1, 2]] if len(axes) else np.zeros((0, 4))
-    arrays = (points.position, quaternion, scale, np.full(len(scale), _OPACITY), points.color)
-    return Splats(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in arrays))
+    arrays = points.position, quaternion, scale, np.full(len(scale), _OPACITY), points.color
+    both = [np.concatenate(pair) for pair in zip(arrays, _walls(layers, camera))]
+    return Splats(*(torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in both))
+
+
+def _walls(layers: ShapeLayers, camera: Camera) -> tuple[np.ndarray, ...]:  # [M, 3], [M, 4], [M, 3], [M], [M, 3]
+    """Returns positions, turns, sizes, opacities and colors of discs that join front and back along each interval's outline.
+
+    Fronts and backs end half a pixel inside of the outline, apart: from the side the object would be two open shells. The
+    discs stand on the picture's plane, their thin axis across the outline, so that the stack of them widens no silhouette.
+    """
+    from scipy.ndimage import binary_erosion, gaussian_filter
+    from scipy.spatial.transform import Rotation
+
+    present = layers.presence >= 0.5
+    rim = np.nonzero(present & ~np.stack([binary_erosion(mask) for mask in present]))
+    front, back = layers.depth[::2][rim], layers.depth[1::2][rim]
+    count = np.ceil(np.maximum(back - front, 0) * camera.intrinsics[0, 0] / front).astype(int)  # one a pixel's width
+    which = np.repeat(np.arange(len(count)), count)
+    share = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[which]
+    interval, row, column = (index[which] for index in rim)
+    depth = front[which] + share * (back - front)[which]
+    smooth = present.astype(np.float32)
+    inward = np.stack([gaussian_filter(smooth, (0, 1, 1), order=(0, *order))[rim][which] for order in ((0, 1), (1, 0))])
+    inward /= np.maximum(np.linalg.norm(inward, axis=0), 1e-6)
+    right, down = _INSIDE * inward
+    position = camera.to_world(camera.pixel_points(row + down, column + right, depth))
+    angle = np.arctan2(inward[1], inward[0])
+    turn = Rotation.from_matrix(camera.world_to_camera[:3, :3].T) * Rotation.from_euler("z", angle[:, None])
+    quaternion = turn.as_quat()[:, [3, 0, 1, 2]] if len(which) else np.zeros((0, 4))
+    scale = np.array([_THIN, _RADIUS, _RADIUS]) * (depth / camera.intrinsics[0, 0])[:, None]
+    color = layers.color[2 * interval + (share > 0.5), :, row, column]
+    return position, quaternion, scale, np.full(len(which), _OPACITY), color
 
 
 def _any_normal_to(direction: np.ndarray) -> np.ndarray:  # [M, 3] -> [M, 3]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +16,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.actions.depth_units import require_plausible, usual_scale, without_marks
 from dpcli.prepare.decode.calibration import Calibration
-from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, DepthVideo, frame_series, read_depth_video
+from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, DepthVideo, frame_series, read_depth_video, says_depth
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
@@ -25,6 +27,11 @@ from dpcli.store import CloudSequence
 
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
+_OTHER_PICTURES = re.compile(
+    r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|semantic|instance|segm|albedo|flow|image|photo"
+    r"|infra|(?<![a-z])(ir|gray|grey)(?![a-z])",
+    re.IGNORECASE,
+)
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
 
 
@@ -113,10 +120,20 @@ class DepthVideos:
         return read_labels(self.labels) if self.labels else None
 
     @cached_property
+    def _chosen(self) -> tuple[list[tuple[Path, Series | None, Path]], list[str]]:
+        """Returns the videos with their series and the inputs they come from, and the names of what only lies beside them."""
+        kept, left_out = [], []
+        for given in self.inputs:
+            found = find_videos(given, self.pattern)
+            beside = pictures_beside_depth([path.relative_to(given) for path, _ in found])
+            left_out += [as_utf8(path.as_posix()) for path in sorted(beside)]
+            kept += [(path, series, given) for path, series in found if path.relative_to(given) not in beside]
+        return kept, left_out
+
+    @cached_property
     def _found(self) -> list[Item]:
-        paths = [(*found, given) for given in self.inputs for found in find_videos(given, self.pattern)]
         items: dict[str, Item] = {}
-        for path, series, given in paths:
+        for path, series, given in self._chosen[0]:
             name = as_utf8(path.relative_to(given).as_posix() if path != given else path.name)
             if name in items:
                 raise DataError(f"{path}: another input is called {name!r}, too ({items[name].path}); rename one")
@@ -198,6 +215,9 @@ class DepthVideos:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
         lines = [f"{len(items)} depth video{'s' if len(items) != 1 else ''} found"]
+        if left_out := self._chosen[1]:
+            more = f" ... ({len(left_out)} in all)" if left_out[5:] else ""
+            lines.append(f"left out, by their names beside depth: {', '.join(left_out[:5])}{more}")
         unknown = not (self.intrinsics or self.calibration or self.fov)
         if unknown and not all(item.extra["recording"] for item in items):
             lines.append(
@@ -222,6 +242,25 @@ def _tells_time(item: Item) -> bool:
     series: Series | None = item.extra["series"]
     stamped = item.extra["recording"] or item.path.suffix.lower() in VIDEO_SUFFIXES
     return series.times() is not None if series else stamped
+
+
+def pictures_beside_depth(paths: Sequence[Path]) -> set[Path]:
+    """Returns those of some relative paths that hold confidence, color, masks and the like: a part of the path says so, and
+    another one at its place says depth.
+    """
+    siblings: dict[Path, set[str]] = {}
+    for path in paths:
+        for part in (path, *path.parents):
+            siblings.setdefault(part.parent, set()).add(part.stem)
+    with_depth = {folder for folder, names in siblings.items() if any(says_depth(name) for name in names)}
+    return {
+        path
+        for path in paths
+        if any(
+            part.parent in with_depth and _OTHER_PICTURES.search(part.stem) and not says_depth(part.stem)
+            for part in (path, *path.parents)
+        )
+    }
 
 
 def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None]]:

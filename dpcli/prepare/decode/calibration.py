@@ -25,6 +25,7 @@ _WIDTH = ("width", "w", "image_width", "depthwidth")
 _HEIGHT = ("height", "h", "image_height", "depthheight")
 _SCALE = (
     "depth_scale",
+    "depthmapfactor",
     "depthscale",
     "depth_factor",
     "depth_units",
@@ -44,8 +45,9 @@ _LENS = (
     "distortion",
     "disto",
 )
-_MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model")
+_MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
+_OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
 _AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
 _ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 _COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
@@ -81,6 +83,11 @@ class Calibration:
                 )
             middle = ((camera.cx + 0.5) * x - 0.5, (camera.cy + 0.5) * y - 0.5)
             camera = replace(camera, fx=camera.fx * x, fy=camera.fy * y, cx=middle[0], cy=middle[1])
+        if 0 < camera.cx <= 1 and 0 < camera.cy <= 1 and min(width, height) > 8:
+            raise DataError(
+                f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) seems to be a fraction of the picture;"
+                f" expected pixels of these {found} pictures: multiply fx and cx by the width, fy and cy by the height"
+            )
         if not (-0.5 <= camera.cx <= width and -0.5 <= camera.cy <= height):
             raise DataError(
                 f"{self.source}: the principal point ({camera.cx:g}, {camera.cy:g}) lies outside of these {found} pictures;"
@@ -148,9 +155,10 @@ def _yaml(path: Path, text: str) -> Any:
 
     plain = re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
     try:
-        return next((part for part in yaml.safe_load_all(plain) if part), None)
+        data = next((part for part in yaml.safe_load_all(plain) if part), None)
     except (yaml.YAMLError, RecursionError) as error:
         raise DataError(f"{path}: is not YAML ({' '.join(str(error).split())})") from None
+    return {_OF_SLAM.sub("", str(key)): value for key, value in data.items()} if isinstance(data, dict) else data
 
 
 def _number_or_text(text: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -251,6 +252,15 @@ def frame_series(folder: Path, pattern: str = "") -> Series | None:
     return choose_series(
         folder, names, pattern=pattern, suffixes=FRAME_SUFFIXES, wanted=_DEPTH_NAME, judge=_holds_depth
     )
+
+
+def says_depth(name: str) -> bool:
+    """Returns whether a name without suffix says that its pictures are depth, and no picture of depth.
+
+    >>> says_depth("lowres_depth"), says_depth("depth_vis"), says_depth("anna_1")
+    (True, False, False)
+    """
+    return re.search(_DEPTH_NAME, name, re.IGNORECASE) is not None
 
 
 def _is_frame(path: Path) -> bool:

@@ -41,7 +41,7 @@ def _parts(reader: Reader, path: Path, **options: Any) -> PartsWriter:
 
 
 def _scores(reader: Reader, path: Path, **options: Any) -> ScoresWriter:
-    return ScoresWriter(path, streams=reader.stream_names, **options)
+    return ScoresWriter(path, streams=reader.stream_names, rejects=reader.rejected is not None, **options)
 
 
 def _statistics(reader: Reader, path: Path, **options: Any) -> StatisticsWriter:

@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.classify.confidence import stored_confidence
 from dpcli.classify.data.validation_split import carve_validation
 from dpcli.classify.data.videos import held_out
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.network.model_file import ModelInfo
+from dpcli.classify.network.model_file import ModelInfo, load_model
 from dpcli.errors import UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from tests.support.commands import exit_code
@@ -67,6 +68,15 @@ def test_training_leaves_weights_logs_and_a_picture(run_folder):
     assert (run_folder / "log.csv").read_text().count("\n") == 5
     assert (run_folder / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert (run_folder / "best.safetensors").stat().st_size > 100_000
+
+
+def test_training_fits_a_confidence_that_streams_and_segments_take(data, run_folder, dpc):
+    found = stored_confidence(load_model(run_folder)[1].notes)
+    assert 0.04 < found.temperature < 21 and 0 <= found.threshold <= 1
+    assert found.clips > 0 and found.kept >= 0.95 and "validation videos" in found.source
+    words = ("--model", run_folder, "--split", "all", "--segments", "--reject-below", "auto", "-o", "-")
+    done = dpc("classify", "predict", data, *words)
+    assert done.returncode == 0 and done.stdout.startswith(b"recording,start,end,class,confidence")
 
 
 def test_a_pipe_and_files_give_the_same_scores_and_evaluation(data, run_folder, dpc, tmp_path):

@@ -347,7 +347,9 @@ def run(*words: object) -> int:
 
 def predict(data: str, model: str, output: str | None = None, **options: object) -> None:
     """The command as a function, for the errors that it raises."""
-    command.predict(data=data, model=model, output=output, **{"jobs": None, "shard": "", "dask": "", **options})
+    unused = {"jobs": None, "shard": "", "dask": "", "segments": False, "shortest": None}
+    unused |= {"stream": False, "follow": None, "json_output": False, "page": None}
+    command.predict(data=data, model=model, output=output, **{**unused, **options})
 
 
 def rows(text: str) -> list[dict]:
@@ -512,3 +514,39 @@ def test_a_reader_that_leaves_ends_it_with_nothing_written(model_file, tmp_path,
         with pytest.raises(BrokenPipeError):
             predict(str(tmp_path / "x.npy"), str(model_file), str(tmp_path / "s.h5"), stream=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["x.npy"]
+
+
+def test_a_writer_that_stops_within_a_frame_and_comes_back_loses_that_frame_alone(tmp_path, capsys):
+    frames = [np.full((n, 3), n, np.float32) for n in (50, 40, 3, 1)]
+    first, cut, *rest = (as_stream([frame]) for frame in frames)
+    for place in (140, 300, len(cut) - 8):
+        path = tmp_path / f"{place}.npy"
+        path.write_bytes(first + cut[:place] + first + b"".join(rest))
+        found = [len(frame) for frame in open_frames(str(path), 0.0, cloud_files())]
+        assert found == [50, 50, 3, 1]
+        assert "frame 1: cut off after" in capsys.readouterr().err
+    path.write_bytes(first + cut[:200] + rest[0])  # what came back is smaller than what is missing
+    assert [len(frame) for frame in open_frames(str(path), 0.0, cloud_files())] == [50, 3]
+
+
+def test_odd_frames_are_told_once_and_counted(model_file, tmp_path, capsys):
+    frames = random_frames(6) + [np.ones((1, 3), np.float32), np.ones((2, 3), np.float32), np.zeros((0, 3), np.float32)]
+    (tmp_path / "s.npy").write_bytes(as_stream(frames))
+    predict(str(tmp_path / "s.npy"), str(model_file), stream=True)
+    said = capsys.readouterr()
+    assert said.err.count("has no points") == 1 and said.err.count("repeated to fill a clip") == 1
+    assert "2 without points, 2 of fewer than 4 points" in said.err
+    assert said.out.count("\n") == 7
+
+
+def test_nothing_happens_below_the_threshold_and_scores_stay(model_file, tmp_path, capsys):
+    (tmp_path / "s.npy").write_bytes(as_stream(random_frames(8)))
+    lines = {}
+    for below in ("0", "1"):
+        predict(str(tmp_path / "s.npy"), str(model_file), stream=True, json_output=True, reject_below=below)
+        lines[below] = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [one["nothing"] for one in lines["0"][:-1]] == [False] * 5
+    assert [one["nothing"] for one in lines["1"][:-1]] == [one["confidence"] < 1 for one in lines["0"][:-1]]
+    assert lines["0"][-1]["scores"] == lines["1"][-1]["scores"]
+    with pytest.raises(UsageError, match="no threshold of its own"):
+        predict(str(tmp_path / "s.npy"), str(model_file), stream=True, reject_below="auto")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -43,6 +45,23 @@ def test_a_ball_of_splats_is_a_disc_from_every_side():
         pose = torch.from_numpy(orbit_pose(azimuth, elevation, 4.0)).float()
         seen = splats.draw(pose, torch.from_numpy(camera.intrinsics).float(), 96, 96)[..., 3].numpy() > 0.5
         assert (seen & truth).sum() / (seen | truth).sum() > 0.82  # a cut-out has 0.1 from the side
+
+
+def test_front_and_back_are_joined_and_the_outline_stays():
+    """A slab, upright, whose front and back lie apart: closed from the side, no wider from the front."""
+    camera = Camera(pinhole(0.5, 96, 96), orbit_pose(0.0, 0.0, 4.0))
+    picture = np.zeros((1, 4, 96, 96), np.float32)
+    picture[:, :, 20:76, 36:60] = 1
+    flat = Flat().layers(picture, camera)[0]
+    slab = replace(flat, depth=np.float32([3.8, 4.2, 4.0, 4.0])[:, None, None] + np.zeros_like(flat.depth))
+    splats = splats_of(slab, camera)
+
+    def seen(azimuth: float) -> np.ndarray:
+        pose, intrinsics = orbit_pose(azimuth, 0.0, 4.0), camera.intrinsics
+        return splats.draw(*(torch.from_numpy(a).float() for a in (pose, intrinsics)), 96, 96)[..., 3].numpy()
+
+    assert seen(np.pi / 2)[24:72, 44:52].min() > 0.5  # the middle of its narrow side, nothing there without the join
+    assert (seen(0.0) > 0.5).sum() == pytest.approx(56 * 24 * (4.0 / 3.8) ** 2, rel=0.12)
 
 
 def test_points_drawn_from_a_ball_lie_on_it_evenly():

@@ -122,3 +122,30 @@ def test_openexr_colors_and_damaged_files_are_named(tmp_path):
     (tmp_path / "0.exr").write_bytes((tmp_path / "0.exr").read_bytes()[:100])
     with pytest.raises(DataError, match="0.exr: not a readable OpenEXR"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("depth_at", "beside"),
+    [
+        ("scene/depth", ["scene/confidence", "scene/rgb"]),
+        ("scene/lowres_depth", ["scene/lowres_wide_confidence"]),
+        ("depth/anna", ["confidence/anna", "ir/anna"]),
+        ("depth", ["depth_vis", "masks"]),
+    ],
+)
+def test_folders_beside_depth_are_left_out_by_name(tmp_path, depth_at, beside):
+    write(tmp_path / "in" / depth_at, **{"0": depth(1000), "1": depth(1001)})
+    for name in beside:
+        write(tmp_path / "in" / name, **{str(t): np.full((6, 8), 255, np.uint8) for t in (0, 1)})
+    reader, sequence = read(tmp_path / "in")
+    assert first_depths(sequence) == [1.0, 1.001]
+    assert f"left out, by their names beside depth: {', '.join(sorted(beside))}" in reader.summary(reader.items())
+    reader = DepthVideos(inputs=(tmp_path / "in" / beside[0],))
+    assert len(reader.items()) == 1  # who names it, gets it
+
+
+def test_folders_of_other_names_stay(tmp_path):
+    for name in ("anna", "depth", "ben"):
+        write(tmp_path / "in" / name, **{"0": depth(1000)})
+    write(tmp_path / "other" / "image_browsing", **{"0": depth(1000)})
+    assert len(DepthVideos(inputs=(tmp_path / "in", tmp_path / "other")).items()) == 4

@@ -48,6 +48,18 @@ distortion_coefficients:
   data: [0, 0, 0, 0, 0]
 """
 KALIBR = f"cam0:\n  camera_model: pinhole\n  intrinsics: [{FX}, {FY}, {CX}, {CY}]\n  resolution: [640, 480]\n"
+SLAM = f"""%YAML:1.0
+Camera.type: "PinHole"
+Camera.fx: {FX}
+Camera.fy: {FY}
+Camera.cx: {CX}
+Camera.cy: {CY}
+Camera.k1: 0.0
+Camera.k2: 0.0
+Camera.width: 640
+Camera.height: 480
+Camera.bf: 40.0
+"""
 SCANNET = f"fx_depth = {FX}\nfy_depth = {FY}\nmx_depth = {CX}\nmy_depth = {CY}\ndepthWidth = 640\ndepthHeight = 480\n"
 FOUR = f"{FX} 0 {CX} 0\n0 {FY} {CY} 0\n0 0 1 0\n0 0 0 1\n"
 COLMAP = f"# Camera list\n1 PINHOLE 640 480 {FX} {FY} {CX + 0.5} {CY + 0.5}\n"
@@ -72,6 +84,8 @@ REALSENSE["coeffs"] = [0, 0, 0, 0, 0]
         ("k.yaml", ROS, (640, 480)),
         ("k.yml", OPENCV, (640, 480)),
         ("k.yaml", KALIBR, (640, 480)),
+        ("k.yaml", SLAM, (640, 480)),
+        ("k.yaml", SLAM.replace("Camera.f", "Camera1.f").replace("Camera.c", "Camera1.c"), (640, 480)),
         ("k.yaml", f"K: {ROWS}\nD: [0, 0, 0, 0, 0]\nwidth: 640\nheight: 480\n", (640, 480)),
         ("scene0000_00.txt", SCANNET, (640, 480)),
         ("intrinsic_depth.txt", FOUR, (0, 0)),
@@ -137,6 +151,19 @@ def test_another_shape_and_a_center_outside_are_refused(tmp_path):
     (tmp_path / "k.json").write_text(json.dumps(PLAIN))
     with pytest.raises(DataError, match=r"principal point \(325.25, 237.75\) lies outside of these 320x240 pictures"):
         read_calibration(tmp_path / "k.json").of_pictures(320, 240)
+
+
+def test_fractions_of_a_picture_are_no_pixels():
+    with pytest.raises(DataError, match="seems to be a fraction of the picture; expected pixels of these 640x480"):
+        Calibration(Intrinsics(0.9, 1.2, 0.5, 0.5), source="k.json").of_pictures(640, 480)
+
+
+def test_the_depth_factor_and_the_lens_that_a_slam_declares(tmp_path):
+    (tmp_path / "k.yaml").write_text(SLAM + "RGBD.DepthMapFactor: 5000.0\n")
+    assert read_calibration(tmp_path / "k.yaml").depth_scale == 5000
+    (tmp_path / "k.yaml").write_text(SLAM.replace("PinHole", "KannalaBrandt8").replace("k1: 0.0", "k1: 0.1"))
+    with pytest.raises(DataError, match="its lens is of model kannalabrandt8"):
+        read_calibration(tmp_path / "k.yaml")
 
 
 def test_a_lens_is_straightened(tmp_path):

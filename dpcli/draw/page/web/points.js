@@ -192,6 +192,3 @@ class PointsPage extends Stage {
     });
   }
 }
-
-window.page = new PointsPage(JSON.parse($("header").textContent));
-window.page.start();

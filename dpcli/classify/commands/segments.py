@@ -1,0 +1,133 @@
+"""`dpc classify predict --segments`: which action is when in long recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.classify.commands.model_task import ModelTask
+from dpcli.classify.confidence import choose_confidence
+from dpcli.classify.data.videos import check_classes, select_videos
+from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
+from dpcli.classify.segments.recording import Cutting, WindowScores, cut, score_windows
+from dpcli.classify.stream.sliding_window import StreamPredictor, window_size
+from dpcli.errors import UsageError
+from dpcli.runtime import provenance
+from dpcli.runtime.device import choose_device
+from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.tuning import keep_freed_memory
+from dpcli.runtime.whole_file import write_whole
+from dpcli.store import CloudsReader, input_file
+from dpcli.store.tables.segments import SUFFIXES, Segment, Segments, segments_text
+
+_HOPS_IN_WINDOW = 4  # predictions that see a frame, by default
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Says how recordings are cut: hop and shortest in frames, None: a quarter and half of the window; the rest as in a stream."""
+
+    hop: int | None = None
+    window: int | None = None
+    shortest: int | None = None
+    reject_below: str | None = None
+
+
+def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments, str]:
+    """Returns the segments of all recordings and, as text, the file that holds them, which is written unless it is `-`.
+
+    Raises UsageError for options that don't fit the model and for an output that exists, DataError for bad recordings.
+    """
+    suffix = _suffix(task)
+    weights = find_model(task.model)
+    model, info = load_model(weights, task.backbone)
+    how = _cutting(info, options, task.model)
+    new_predictor = _predictors(model, info, how, task)
+    with input_file(task.data) as path:
+        reader = CloudsReader(path)
+        check_classes(reader, info, task.model)
+        chosen = select_videos(reader, task.split, info, task.model)
+        keep_freed_memory()
+        recordings = {}
+        with Progress("classify predict --segments", int(reader.frame_counts[chosen].sum()), "frame") as bar:
+            for i in chosen:
+                scored = _with_true_times(score_windows(new_predictor(), reader, i, bar), reader.names[i])
+                recordings[reader.names[i]] = cut(scored, info.class_names, how)
+        entry = provenance.record(_record(weights, info, how, task), task.seed, {"clouds": path})
+        found = Segments(recordings, info.class_names, [*reader.provenance, entry])
+    text = segments_text(found, suffix)
+    if task.output != "-":
+        write_whole(Path(str(task.output)), text.encode())
+    return found, text
+
+
+def _suffix(task: ModelTask) -> str:
+    """Returns the form of the output. Raises UsageError for another, and for a file that exists and may not be replaced."""
+    if task.output == "-":
+        return ".csv"
+    path = Path(str(task.output))
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"-o {path}: segments are written as {' or '.join(SUFFIXES)}; name such a file")
+    if path.exists() and not task.force:
+        raise UsageError(f"{path}: exists already; --force replaces it")
+    return path.suffix.lower()
+
+
+def _cutting(info: ModelInfo, options: SegmentOptions, model: str) -> Cutting:
+    """Returns how to cut for this model. Raises UsageError for what can't be."""
+    window = window_size(info, options.window)
+    hop = options.hop or max(1, window // _HOPS_IN_WINDOW)
+    if hop > window:
+        raise UsageError(
+            f"--hop {hop}: the window has {window} frames, and those between two windows would never be seen"
+        )
+    shortest = window // 2 if options.shortest is None else options.shortest
+    if shortest < 1:
+        raise UsageError(f"--shortest {shortest}: expected at least 1 frame")
+    return Cutting(window, hop, shortest, choose_confidence(info.notes, options.reject_below, model))
+
+
+def _predictors(model: Kinet, info: ModelInfo, how: Cutting, task: ModelTask) -> Callable[[], StreamPredictor]:
+    device, window = choose_device(task.device), how.window if info.timing == "uniform" else None
+
+    def new() -> StreamPredictor:
+        return StreamPredictor(model, info, window=window, hop=how.hop, seed=task.seed, device=device)
+
+    return new
+
+
+def _with_true_times(found: WindowScores, name: str) -> WindowScores:
+    """Returns the scores without times where these don't rise, and says so: a frame's number is then all that tells when."""
+    if found.time is None:
+        return found
+    steps = np.diff(found.time)
+    back = np.flatnonzero(~(steps >= 0))  # NaN, too
+    if not len(back):
+        return found
+    at = int(back[0]) + 1
+    log.warn(
+        f"{name}: time runs back {len(back)} times, first at frame {at} ({found.time[at - 1]:g} s, then {found.time[at]:g} s);"
+        " frames are taken in their order, and no seconds are written"
+    )
+    return replace(found, time=None)
+
+
+def _record(weights: Path, info: ModelInfo, how: Cutting, task: ModelTask) -> dict[str, object]:
+    """Returns what shapes the segments, for their provenance."""
+    return {
+        "segments": {"window": how.window, "hop": how.hop, "shortest": how.shortest},
+        "confidence": how.confidence.notes(),
+        "split": task.split,
+        "model": info.notes,
+        "weights": provenance.file_digest(weights),
+    }
+
+
+def counted(recordings: dict[str, list[Segment]]) -> tuple[int, int]:
+    """Returns how many segments show an action, and how many nothing."""
+    names = [one.name for own in recordings.values() for one in own]
+    return sum(map(bool, names)), names.count("")

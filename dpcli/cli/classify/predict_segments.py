@@ -1,0 +1,55 @@
+"""The options of `dpc classify predict --segments`, and what it prints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dpcli.cli.classify.predict_stream import PANEL
+from dpcli.errors import UsageError
+
+if TYPE_CHECKING:
+    from dpcli.classify.commands.model_task import ModelTask
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Says whether, and how, recordings are cut into actions."""
+
+    segments: Annotated[
+        bool,
+        typer.Option("--segments", rich_help_panel=PANEL, help="Cut long recordings into actions, as .csv or .json."),
+    ] = False
+    shortest: Annotated[
+        int | None,
+        typer.Option(
+            "--shortest",
+            min=1,
+            rich_help_panel=PANEL,
+            help="With --segments: frames an action lasts at least. Default: half a window.",
+        ),
+    ] = None
+
+
+def predict_segments(
+    task: ModelTask, hop: int | None, window: int | None, shortest: int | None, reject: str | None
+) -> None:
+    """Checks the options, cuts the recordings, and prints how many segments there are, or with `-o -` the table itself."""
+    if task.output is None:
+        raise UsageError("Missing option '-o' / '--output'.")
+    if hop is not None and hop < 1:
+        raise UsageError(f"--hop {hop}: expected at least 1 frame")
+    from dpcli.classify.commands.segments import SegmentOptions as Options
+    from dpcli.classify.commands.segments import counted
+    from dpcli.classify.commands.segments import predict_segments as run
+
+    found, text = run(task, Options(hop, window, shortest, reject))
+    if task.output == "-":
+        typer.echo(text, nl=False)
+        return
+    actions, nothing = counted(found.recordings)
+    typer.echo(
+        f"{task.output}: {actions} actions and {nothing} stretches of nothing in {len(found.recordings)} recordings"
+    )

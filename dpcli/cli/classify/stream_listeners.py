@@ -1,0 +1,58 @@
+"""Listeners of a stream: lines in a log or a pipe, a view that changes in place on a terminal, a page at the end."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dpcli.cli.classify.stream_lines import Lines
+from dpcli.cli.classify.stream_view import View
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from dpcli.classify.commands.stream import Listener, Speaker
+    from dpcli.classify.stream.sliding_window import Prediction
+
+
+class Several:
+    """Passes all that is seen and said on to several listeners, in their order."""
+
+    def __init__(self, listeners: list[Listener]) -> None:
+        self.listeners = listeners
+
+    def see(self, points: np.ndarray, silent: float) -> None:
+        """Passes a frame on."""
+        for one in self.listeners:
+            one.see(points, silent)
+
+    def write(self, made: Prediction, latency: float, waiting: int) -> None:
+        """Passes a prediction on."""
+        for one in self.listeners:
+            one.write(made, latency, waiting)
+
+    def finish(self, mean: np.ndarray, frames: int, clips: int, end: str) -> None:
+        """Passes the end on."""
+        for one in self.listeners:
+            one.finish(mean, frames, clips, end)
+
+
+def listener(speaker: Speaker, as_json: bool, page: Path | None, source: str) -> Several:
+    """Returns those who listen: a view on a terminal, else lines; and the page's writer."""
+    lines = Lines(speaker, as_json)
+    in_place = sys.stdout.isatty() and os.environ.get("TERM") != "dumb" and not as_json
+    several: list[Listener] = [View(speaker, lines) if in_place else lines]
+    if page is not None:
+        several.append(_page(speaker, page, source))
+    return Several(several)
+
+
+def _page(speaker: Speaker, path: Path, source: str) -> Listener:
+    from dpcli.classify.segments.live_page import LivePage
+    from dpcli.classify.segments.recording import Cutting
+    from dpcli.runtime.provenance import command_line
+
+    how = Cutting(speaker.window, speaker.hop, max(1, speaker.window // 2), speaker.confidence)
+    return LivePage(path, source, speaker.class_names, how, command_line())

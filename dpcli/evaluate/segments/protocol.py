@@ -1,0 +1,141 @@
+"""The protocol for segments: which recordings count, against which truth, and the report as tables, notes and JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.evaluate.bootstrap import Interval, Resampling
+from dpcli.evaluate.results import (
+    LeftOut,
+    intervals_json,
+    left_out_json,
+    left_out_note,
+    list_names,
+    none_if_nan,
+    samples_json,
+)
+from dpcli.evaluate.segments.metrics import METRICS, OVERLAPS, RecordingCounts, count_recording, segments_weighted
+from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
+from dpcli.store.tables.segments import Segments
+
+_TITLES = {"frame_accuracy": "frame accuracy", "edit_score": "edit score"}
+_TITLES |= {f"f1_{overlap}": f"F1@{overlap}" for overlap in OVERLAPS}
+_NOTE = (
+    "Frame accuracy: frames with the right class, or rightly with nothing. Edit score: 1 - Levenshtein distance of the orders "
+    "of actions / the longer one. F1@k: a segment is right when it overlaps a true one of its class by k % of their union; "
+    "neighbors of one class are one segment, nothing is no segment (Lea et al. 2017)."
+)
+
+
+@dataclass(frozen=True)
+class SegmentsReport:
+    """Holds the metrics (0..1, NaN = undefined) of some recordings, the counts of each, and what was left out."""
+
+    names: list[str]
+    counts: list[RecordingCounts]
+    metrics: dict[str, float]
+    intervals: dict[str, Interval]
+    resampling: Resampling
+    truth: str
+    left_out: list[LeftOut]
+
+
+def evaluate_segments(
+    predicted: Segments, true: Segments, truth: str, *, intersect: bool = False, resampling: Resampling | None = None
+) -> SegmentsReport:
+    """Returns the metrics of the recordings that both have. truth: the true table as it was named.
+
+    Raises DataError where one side lacks a recording, unless `intersect`, or where no class of the prediction is in the truth.
+    """
+    resampling = resampling or Resampling(0)
+    names = [name for name in true.recordings if name in predicted.recordings]
+    left_out = _left_out(predicted, true, names, truth, intersect)
+    _check_classes(predicted, true, names, truth)
+    counts = [count_recording(predicted.recordings[name], true.recordings[name]) for name in names]
+    metric = segments_weighted(counts)
+    values = {key: float(value[0]) for key, value in metric(np.ones((1, len(counts)))).items()}
+    return SegmentsReport(names, counts, values, resampling.intervals(metric, len(counts)), resampling, truth, left_out)
+
+
+def _left_out(predicted: Segments, true: Segments, names: Sequence[str], truth: str, intersect: bool) -> list[LeftOut]:
+    unknown = [name for name in predicted.recordings if name not in true.recordings]
+    missing = [name for name in true.recordings if name not in predicted.recordings]
+    if not names:
+        raise DataError(f"{truth}: no recording of this name: {list_names(unknown)}; it has {list_names(missing)}")
+    if (unknown or missing) and not intersect:
+        side, lacking = ("the truth lacks", unknown) if unknown else ("the prediction lacks", missing)
+        raise DataError(f"{truth}: {side} {list_names(lacking)}; --intersect evaluates the recordings that both have")
+    entries = [LeftOut("the truth doesn't have", unknown), LeftOut("not predicted", missing)]
+    return [entry for entry in entries if entry.names]
+
+
+def _check_classes(predicted: Segments, true: Segments, names: Sequence[str], truth: str) -> None:
+    """Raises DataError where the truth has classes and the prediction could name none of them: their spelling differs."""
+    said = {*predicted.class_names, *_names_in(predicted, names)} - {""}
+    given = _names_in(true, names) - {""}
+    if given and said and not given & said:
+        raise DataError(
+            f"{truth}: its classes ({list_names(sorted(given))}) are none of those predicted ({list_names(sorted(said))}); "
+            "spell them alike"
+        )
+
+
+def _names_in(table: Segments, names: Sequence[str]) -> set[str]:
+    return {one.name for name in names for one in table.recordings[name]}
+
+
+def segments_tables(report: SegmentsReport) -> list[TextTable]:
+    """Returns a table of the metrics of all recordings, and one with a row for each."""
+    title = f"{100 * report.resampling.confidence:.4g} % interval"
+    rows = [[_TITLES[key], percent(report.metrics[key]), percent_ends(report.intervals.get(key))] for key in METRICS]
+    single = [[name, *_row(one)] for name, one in zip(report.names, report.counts)]
+    header = ["recording", "frames", "true segments", "predicted", *(_TITLES[key] for key in METRICS)]
+    return [TextTable("Segments", ["metric", "value", title], rows), TextTable("By recording", header, single)]
+
+
+def _row(one: RecordingCounts) -> list[str]:
+    values = segments_weighted([one])(np.ones((1, 1)))
+    return [str(one.frames), str(one.true), str(one.predicted), *(percent(float(values[key][0])) for key in METRICS)]
+
+
+def segments_notes(report: SegmentsReport) -> list[str]:
+    """Returns sentences on what was counted and how, and what was left out."""
+    true, said = (sum(getattr(one, key) for one in report.counts) for key in ("true", "predicted"))
+    return [
+        f"{len(report.names)} recordings, {sum(one.frames for one in report.counts)} frames, {true} true segments and {said} "
+        f"predicted ones; truth: {report.truth}.",
+        *resampling_note(report.resampling, "recordings", len(report.names)),
+        _NOTE,
+        *(left_out_note(entry, "recordings") for entry in report.left_out),
+    ]
+
+
+def segments_json(report: SegmentsReport, source: str, provenance: Sequence[dict] = ()) -> dict[str, Any]:
+    """Returns the report as `--json` prints it. source: the predicted table, as it was named; provenance: its own."""
+    counts = report.counts
+    rows = [
+        {"name": name, "frames": one.frames, "right": one.right, "true": one.true, "predicted": one.predicted}
+        for name, one in zip(report.names, counts)
+    ]
+    return {
+        "task": "segments",
+        "input": source,
+        "protocol": {"truth": report.truth, "overlaps": list(OVERLAPS), "definition": _NOTE},
+        "metrics": {key: none_if_nan(report.metrics[key]) for key in METRICS} | {"per_recording": rows},
+        "intervals": intervals_json(report.resampling, "recordings", len(counts), report.intervals),
+        "samples": samples_json("recordings", report.names),
+        "units": dict.fromkeys(METRICS, "fraction"),
+        "denominators": {
+            "recordings": len(counts),
+            "frames": sum(one.frames for one in counts),
+            "true_segments": sum(one.true for one in counts),
+            "predicted_segments": sum(one.predicted for one in counts),
+        },
+        "left_out": left_out_json(report.left_out),
+        "provenance": list(provenance),
+    }

@@ -1,0 +1,164 @@
+"""Tables of segments: which action each stretch of a recording shows, as CSV, or as JSON with provenance.
+
+Both hold, for each recording, `start` (first frame, from 0), `end` (one past the last), `class` (empty: nothing) and,
+where they were predicted, `confidence`, and where the recording has times `start_seconds` and `end_seconds`, those of
+the first and the last frame.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dpcli.errors import DataError
+
+SUFFIXES = (".csv", ".json")  # of the files
+_NEEDED = ("recording", "start", "end", "class")
+_COLUMNS = (*_NEEDED, "confidence", "start_seconds", "end_seconds")
+_MOST_FRAMES = 2**31
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Holds the frames `start` to `end` (one past the last) and their class, "" for nothing; confidence: NaN = unknown.
+
+    seconds: of its first and last frame, where the recording has times.
+    """
+
+    start: int
+    end: int
+    name: str
+    confidence: float = float("nan")
+    seconds: tuple[float, float] | None = None
+
+
+@dataclass
+class Segments:
+    """Holds the segments of recordings by name, in order and without overlap, and what made them."""
+
+    recordings: dict[str, list[Segment]]
+    class_names: list[str] = field(default_factory=list)
+    provenance: list[dict[str, Any]] = field(default_factory=list)
+
+
+def segments_text(found: Segments, suffix: str) -> str:
+    """Returns the segments as a file of that suffix holds them, `.csv` or `.json`."""
+    rows = [_row(name, one) for name, own in found.recordings.items() for one in own]
+    if suffix == ".json":
+        whole = {"kind": "segments", "class_names": found.class_names, "provenance": found.provenance, "segments": rows}
+        return json.dumps(whole, indent=1, allow_nan=False) + "\n"
+    columns = [name for name in _COLUMNS if name in _NEEDED or any(name in row for row in rows)]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _row(recording: str, one: Segment) -> dict[str, Any]:
+    row: dict[str, Any] = {"recording": recording, "start": one.start, "end": one.end, "class": one.name}
+    if np.isfinite(one.confidence):
+        row["confidence"] = round(one.confidence, 4)
+    if one.seconds is not None:
+        row |= {"start_seconds": round(one.seconds[0], 4), "end_seconds": round(one.seconds[1], 4)}
+    return row
+
+
+def read_segments(path: str | Path, text: str | None = None) -> Segments:
+    """Returns the segments of a table, sorted. text: what it holds, where it was read already.
+
+    Raises DataError, which names the line or entry, for a table without the columns `recording,start,end,class`, a frame
+    that is no whole number from 0 up, an end that is not behind its start, and segments that overlap.
+    """
+    if text is None:
+        text = _text_of(Path(path))
+    about: Mapping[str, Any] = {}
+    if text.lstrip().startswith("{"):
+        about = _json_of(path, text)
+        rows = [(f"entry {number}", row) for number, row in enumerate(about.get("segments", []))]
+    else:
+        reader = csv.DictReader(io.StringIO(text))
+        _check_columns(path, reader.fieldnames or [])
+        rows = [(f"line {number}", row) for number, row in enumerate(reader, start=2)]
+    recordings: dict[str, list[Segment]] = {}
+    for where, row in rows:
+        name, segment = _parsed(f"{path}: {where}", row)
+        recordings.setdefault(name, []).append(segment)
+    if not recordings:
+        raise DataError(f"{path}: holds no segment")
+    for name, own in recordings.items():
+        own.sort(key=lambda one: one.start)
+        _check_overlap(path, name, own)
+    return Segments(recordings, list(about.get("class_names", [])), list(about.get("provenance", [])))
+
+
+def _text_of(path: Path) -> str:
+    try:
+        return path.read_text("utf-8-sig")
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: no text; expected segments as .csv or .json") from None
+    except OSError as error:
+        raise DataError(f"{path}: can't be read ({error.strerror})") from None
+
+
+def _json_of(path: str | Path, text: str) -> Mapping[str, Any]:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: damaged JSON ({error})") from None
+    rows = found.get("segments")
+    if found.get("kind") != "segments" or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise DataError(f"{path}: no segments; expected what `dpc classify predict --segments` writes")
+    return found
+
+
+def _check_columns(path: str | Path, columns: Sequence[str]) -> None:
+    missing = [name for name in _NEEDED if name not in columns]
+    if missing:
+        raise DataError(
+            f"{path}: no column {missing[0]!r}; expected a first line with {','.join(_NEEDED)} (it has "
+            f"{','.join(columns)[:80] or 'none'})"
+        )
+
+
+def _parsed(where: str, row: Mapping[str, Any]) -> tuple[str, Segment]:
+    """Returns the recording and the segment of a row. Raises DataError where it can't be one."""
+    name, title = row.get("recording"), row.get("class")
+    start, end = (_whole(where, key, row.get(key)) for key in ("start", "end"))
+    if not isinstance(name, str) or not name or not isinstance(title, str):
+        raise DataError(f"{where}: recording {name!r}, class {title!r}; expected a name, and a class that may be empty")
+    if end <= start:
+        raise DataError(
+            f"{where}: ends at {end}, which is not behind its start {start}; `end` is one past the last frame"
+        )
+    try:
+        confidence = float(row.get("confidence") or "nan")
+    except (TypeError, ValueError):
+        raise DataError(f"{where}: confidence {row.get('confidence')!r}; expected a number") from None
+    return name, Segment(start, end, title.strip(), confidence)
+
+
+def _whole(where: str, key: str, value: Any) -> int:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if isinstance(value, bool) or not 0 <= number < _MOST_FRAMES or number != int(number):
+        raise DataError(f"{where}: {key} {value!r}; expected a frame's number, from 0")
+    return int(number)
+
+
+def _check_overlap(path: str | Path, name: str, own: Sequence[Segment]) -> None:
+    for one, following in zip(own, own[1:]):
+        if following.start < one.end:
+            raise DataError(
+                f"{path}: {name}: frames {one.start} to {one.end} ({one.name or 'nothing'}) and {following.start} to "
+                f"{following.end} ({following.name or 'nothing'}) overlap; a frame has one class"
+            )

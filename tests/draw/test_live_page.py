@@ -1,0 +1,50 @@
+"""The page of a stream in a browser: it draws without an error and tells what was said at a frame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.classify.confidence import Confidence
+from dpcli.classify.segments.live_page import LivePage, Thinned
+from dpcli.classify.segments.recording import Cutting
+from dpcli.classify.stream.sliding_window import Prediction
+from tests.support.browser import needs_browser, open_page
+
+
+def write(path, frames: int = 40, names: tuple[str, ...] = ("wave </script>", "bow")) -> None:
+    how = Cutting(8, 2, 4, Confidence(1.0, 0.7))
+    page, rng = LivePage(path, "stdin", names, how, "dpc classify predict -"), np.random.default_rng(0)
+    for frame in range(frames):
+        page.see(rng.normal(size=(0 if frame == 5 else 1 + frame % 40, 3)).astype(np.float32), 0.0)
+        if frame >= 7 and frame % 2:
+            row = [0.9, 0.1] if frame < 20 else [0.5, 0.5]
+            page.write(Prediction(frame, 1, np.array([row], np.float32), np.array([row], np.float32)), 0.02, 0)
+    page.finish(np.array([[0.5, 0.5]]), frames, 10, "end of stream")
+
+
+@needs_browser
+@pytest.mark.parametrize(
+    "frame, told", [(12, "wave &lt;/script&gt; 0.90"), (38, "nothing happening"), (3, "not full yet")]
+)
+def test_the_page_tells_what_was_said_at_a_frame(tmp_path, frame, told):
+    write(tmp_path / "live.html")
+    html, _ = open_page(
+        f"file://{tmp_path / 'live.html'}#frame={frame}&play=0&renderer=2d", tmp_path, "--virtual-time-budget=4000"
+    )
+    said = html.split('id="said"')[1].split("</div>")[0]
+    assert told in said and 'id="error" class="card" role="alert" hidden' in html
+
+
+def test_the_page_of_an_hour_is_no_larger_than_that_of_minutes(tmp_path):
+    write(tmp_path / "short.html", frames=4000)
+    write(tmp_path / "long.html", frames=20_000)
+    assert (tmp_path / "long.html").stat().st_size < 1.3 * (tmp_path / "short.html").stat().st_size
+
+
+@pytest.mark.parametrize("count", [1, 10, 11, 1000])
+def test_a_row_of_any_length_is_kept_evenly(count):
+    kept = Thinned(10)
+    for item in range(count):
+        kept.add(item)
+    assert kept.items == list(range(0, count, kept.every)) and len(kept.items) <= 10
