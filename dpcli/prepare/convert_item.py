@@ -34,12 +34,19 @@ def convert_item(
 @lru_cache(maxsize=16)  # items may share a folder
 def _megabytes(path: Path) -> float:
     try:
-        files = (
-            [path] if path.is_file() else [Path(parent, name) for parent, _, names in os.walk(path) for name in names]
-        )
-        return sum(one.stat().st_size for one in files if one.is_file()) / 1e6
-    except (OSError, ValueError):  # a name that is none; the reader will say so
+        return _bytes(path) / 1e6
+    except (OSError, ValueError):  # not there, or a name that is none; the reader will say so
         return 0.0
+
+
+def _bytes(path: str | Path) -> int:
+    if not os.path.isdir(path):
+        return os.stat(path).st_size
+    with os.scandir(path) as entries:
+        return sum(
+            _bytes(entry.path) if entry.is_dir(follow_symlinks=False) else entry.stat(follow_symlinks=False).st_size
+            for entry in entries
+        )
 
 
 def _converted(reader: Reader, thinning: Thinning, seed: int, indexed: tuple[int, Item]) -> Sample:

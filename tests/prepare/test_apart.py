@@ -63,3 +63,15 @@ def test_what_c_libraries_print_is_shown_to_debug_alone(tmp_path, dpc):
     quiet, loud = dpc(*words), dpc(*words, "--debug")
     assert quiet.returncode == loud.returncode == 3
     assert b"libpng" not in quiet.stderr and b"1.png" in quiet.stderr and b"libpng error" in loud.stderr
+
+
+def test_larger_files_may_take_longer(tmp_path):
+    from dpcli.prepare.convert_item import _megabytes
+
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    for name, size in (("a/1", 1000), ("a/b/2", 2000)):
+        (tmp_path / name).write_bytes(bytes(size))
+    (tmp_path / "a" / "above").symlink_to("..")
+    (tmp_path / "a" / "gone").symlink_to("nowhere")
+    assert _megabytes(tmp_path / "a") == pytest.approx(0.003, abs=1e-4)
+    assert _megabytes(tmp_path / "none") == _megabytes(Path("a\0")) == 0

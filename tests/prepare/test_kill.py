@@ -242,8 +242,8 @@ def test_what_a_kill_after_the_renaming_left_is_swept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.h5"]
 
 
-def dies_after_three(work, items, jobs, executor):
-    for number, result in enumerate(pool.ordered_map(work, items, jobs, executor)):
+def dies_after_three(work, items, jobs, executor, apart):
+    for number, result in enumerate(pool.ordered_map(work, items, jobs, executor, apart)):
         if number == 3:
             raise DpcError("a worker process died")
         yield result

@@ -20,7 +20,7 @@ from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
 from dpcli.prepare.reader import Item
 from dpcli.prepare.thinning import Thinning
-from tests.support.prepare_helpers import ToyReader, dpc
+from tests.support.prepare_helpers import ToyReader, dpc, write_video
 
 
 @dataclass(frozen=True)
@@ -160,3 +160,24 @@ def test_a_damaged_png_is_refused_before_its_claims_are_believed(tmp_path):
     for read in (read_image, lambda path: read_png(path, 1)):
         with pytest.raises(DataError, match="a.png: a (damaged|truncated) PNG"):
             read(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_an_avi_gives_what_its_header_promises_or_says_what_is_missing(tmp_path, stride):
+    from dpcli.prepare.decode.depth_files import read_timed_video
+
+    depth = np.random.default_rng(0).integers(1000, 2000, (9, 12, 16)).astype(np.uint16)
+    whole = write_video(tmp_path / "a.avi", depth).read_bytes()
+    frames, _, missing = read_timed_video(tmp_path / "a.avi", stride)
+    assert (len(frames), missing) == (len(depth[::stride]), 0)
+    told = 0
+    for cut in np.linspace(0.3, 0.85, 6):
+        (tmp_path / "a.avi").write_bytes(whole[: int(cut * len(whole))])
+        try:
+            frames, _, missing = read_timed_video(tmp_path / "a.avi", stride)
+        except DataError:
+            told += 1
+            continue
+        told += missing > 0
+        assert missing > 0 or len(frames) >= len(depth[:-1:stride])
+    assert told >= 3
