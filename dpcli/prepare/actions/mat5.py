@@ -31,7 +31,7 @@ class _Damaged(ValueError):
 
 
 def read_mat5(path: Path, name: str) -> np.ndarray:
-    """Reads the variable ``name``, an array of real numbers of any shape, as MATLAB means it.
+    """Reads the variable ``name``, an array of real numbers of any shape; whole doubles come in the type they are stored in.
 
     Raises DataError when it is absent, something else, or damaged; also for files of version 4.
     """
@@ -93,7 +93,9 @@ def _variable(path: Path, kind: int, content: bytes, order: str, wanted: str) ->
     values = np.frombuffer(raw[: len(raw) - len(raw) % np.dtype(_NUMBERS[stored]).itemsize], order + _NUMBERS[stored])
     if len(values) != count:
         raise _Damaged(f"{wanted!r} of shape {shape} has {len(values)} numbers")
-    return name, values.astype(dtype.newbyteorder("=")).reshape(shape, order="F")
+    if dtype.kind == "f" and values.dtype.kind in "iu" and values.dtype.itemsize < dtype.itemsize:
+        dtype = values.dtype  # MATLAB stores whole doubles in few bytes: the same numbers, a quarter of the memory
+    return name, values.astype(dtype.newbyteorder("="), copy=False).reshape(shape, order="F")
 
 
 def _head(data: bytes, order: str) -> tuple[int, tuple[int, ...], str, int]:
