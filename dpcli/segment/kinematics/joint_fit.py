@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dpcli.segment.kinematics.part_trajectories import moved
+from dpcli.segment.kinematics.registration import Registration, motion_twist, twist_motion
 from dpcli.store.joints import FIXED, FREE, PRISMATIC, REVOLUTE
 
-_PARAMETERS = {
-    FIXED: 0,
-    PRISMATIC: 2,
-    REVOLUTE: 4,
-}  # of the axis; each frame after the first has one more but where fixed
+_RARE = 6.0  # 2 ln 20: parts that move against each other nearly always do so by a hinge or a slide
+_OUTLIER = 2.0  # standard deviations from which an error counts linearly
+_NEAR, _CHOICES = np.cos(np.radians(35)), 3  # directions of the surfaces that are tried as axes
 
 
 @dataclass(frozen=True)
@@ -33,25 +34,86 @@ class JointFit:
     length: float = np.inf
 
 
-def fit_joint(relative: np.ndarray, points: np.ndarray, noise: float) -> JointFit:
+def fit_joint(seen: Registration, directions: np.ndarray | None = None) -> JointFit:
     """Returns the joint with the least description length (BIC, Schwarz 1978): misfit and number of parameters weighed.
 
-    relative f64 (T,4,4): motion of the child since frame 0, in the parent's coordinates. points f64 (M,3): the child's, in
-    frame 0. noise: how far the motions may be off at the points, in length_unit, above 0.
+    seen: the child's motions in the parent's coordinates, with their covariances, which say what misfit is noise.
+    directions f64 (D,3): of the parts' surfaces; an axis along one of them costs no parameters but the choice.
     """
-    target = moved(relative, points)
-    found = [_fit_fixed(target, points), _fit_prismatic(target, points), _fit_revolute(relative, target, points)]
-    free = JointFit(FREE, np.zeros(3), np.zeros(3), np.zeros(len(relative)), 0.0)
-    weighed = [replace(fit, length=_description_length(fit, noise)) for fit in (*found, free)]
-    return min(weighed, key=lambda fit: fit.length)
+    points = seen.center + seen.size * np.concatenate([np.eye(3), -np.eye(3)])
+    target = moved(seen.motion, points)
+    first = [_fit_fixed(target, points), _fit_prismatic(target, points), _fit_revolute(seen.motion, target, points)]
+    tried = [_weighed(seen, fit, points) for fit in first]
+    for fit in first[1:]:
+        near = [d for d in (() if directions is None else directions) if abs(d @ fit.axis) > _NEAR]
+        near = sorted(near, key=lambda d: -abs(d @ fit.axis))[:_CHOICES]
+        along = [replace(fit, axis=d * (1 if d @ fit.axis > 0 else -1)) for d in near]
+        tried += [_weighed(seen, one, points, 2 * np.log(len(directions))) for one in along]
+    free = JointFit(FREE, np.zeros(3), np.zeros(3), np.zeros(len(target)), 0.0)
+    measured = 6 * (len(target) - 1)
+    tried.append(replace(free, length=measured * np.log(max(measured, 2)) + _RARE))
+    return min(tried, key=lambda fit: fit.length)
 
 
-def _description_length(fit: JointFit, noise: float) -> float:
-    steps = len(fit.value) - 1
-    measured = 6 * steps  # numbers that a relative motion consists of
-    moving = 0 if fit.kind == FIXED else steps
-    parameters = measured if fit.kind == FREE else _PARAMETERS[fit.kind] + moving
-    return measured * np.log(fit.residual**2 / noise**2 + 1) + parameters * np.log(max(measured, 2))
+def _weighed(seen: Registration, start: JointFit, points: np.ndarray, choice: float | None = None) -> JointFit:
+    """Returns the joint of a kind nearest to the motions, as their covariances weigh, and its description length.
+
+    choice: the price of an axis that is given; none: the axis is fitted too. Besides, the child may lie otherwise in its own
+    coordinates than the motion of frame 0, which is an estimate too, says.
+    """
+    from scipy.optimize import least_squares
+
+    white = np.swapaxes(np.linalg.cholesky(np.linalg.inv(seen.covariance)), 1, 2)
+    back = np.linalg.inv(seen.motion)
+    across = np.linalg.svd(start.axis[None])[2][1:] if start.kind != FIXED else np.zeros((2, 3))
+    turns = 2 if choice is None and start.kind != FIXED else 0
+
+    def joint(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        tilted = start.axis + parameters[6 : 6 + turns] @ across[:turns]
+        shift = seen.size * parameters[6 + turns :] @ across[: len(parameters) - 6 - turns]
+        return tilted / max(float(np.linalg.norm(tilted)), 1e-9), start.point + shift
+
+    def whitened(parameters: np.ndarray, value: np.ndarray) -> np.ndarray:
+        placed = _joint_motion(start.kind, *joint(parameters), value) @ twist_motion(parameters[:6], seen.center)
+        return np.einsum("tij,tj->ti", white, motion_twist(back @ placed, seen.center))
+
+    def misfit(parameters: np.ndarray) -> np.ndarray:
+        return _at_best_value(whitened, parameters, start, seen.size)[0].ravel()
+
+    count = 6 + turns + (2 if start.kind == REVOLUTE else 0)
+    solved = least_squares(misfit, np.zeros(count), loss="soft_l1", f_scale=_OUTLIER, max_nfev=30)
+    axis, point = joint(solved.x)
+    value = _at_best_value(whitened, solved.x, start, seen.size)[1]
+    steps = len(value) - 1
+    parameters = count - 6 + (0 if start.kind == FIXED else steps)
+    length = 2 * solved.cost + parameters * np.log(max(6 * steps, 2)) + (choice or 0.0)
+    residual = _residual(moved(_joint_motion(start.kind, axis, point, value), points), moved(seen.motion, points))
+    return JointFit(start.kind, axis, point, value, residual, float(length + (_RARE if start.kind == FIXED else 0.0)))
+
+
+def _at_best_value(
+    whitened: Callable[[np.ndarray, np.ndarray], np.ndarray], parameters: np.ndarray, start: JointFit, size: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the whitened errors (T,6) at the joint's best values (T), which a Gauss-Newton step finds; frame 0's stays 0."""
+    error = whitened(parameters, start.value)
+    if start.kind == FIXED:
+        return error, start.value
+    step = 1e-4 * (size if start.kind == PRISMATIC else 1.0)
+    slope = (whitened(parameters, start.value + step) - error) / step
+    change = -(slope * error).sum(1) / np.maximum((slope * slope).sum(1), 1e-12)
+    change[0] = 0
+    return error + slope * change[:, None], start.value + change
+
+
+def _joint_motion(kind: int, axis: np.ndarray, point: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Returns the motions f64 (T,4,4) of a joint at its values (T)."""
+    motion = np.tile(np.eye(4), (len(value), 1, 1))
+    if kind == PRISMATIC:
+        motion[:, :3, 3] = value[:, None] * axis
+    elif kind == REVOLUTE:
+        motion[:, :3, :3] = Rotation.from_rotvec(value[:, None] * axis).as_matrix()
+        motion[:, :3, 3] = point - motion[:, :3, :3] @ point
+    return motion
 
 
 def _residual(placed: np.ndarray, target: np.ndarray) -> float:
@@ -72,7 +134,6 @@ def _fit_prismatic(target: np.ndarray, points: np.ndarray) -> JointFit:
 
 def _fit_revolute(relative: np.ndarray, target: np.ndarray, points: np.ndarray) -> JointFit:
     from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
 
     turns = Rotation.from_matrix(relative[:, :3, :3]).as_rotvec()
     axis = _main_direction(turns)

@@ -10,12 +10,14 @@ from scipy.spatial import cKDTree
 
 from dpcli.segment.kinematics.joint_fit import JointFit, fit_joint
 from dpcli.segment.kinematics.part_trajectories import Trajectories, part_trajectories, points_at_start
+from dpcli.segment.kinematics.registration import Registration, register, relative_registration
+from dpcli.segment.kinematics.surface_directions import surface_directions
 from dpcli.store import CloudSequence, PartsSample
 from dpcli.store.joints import AXIS, PARENT, POINT, PRISMATIC, REVOLUTE, TYPE, TYPES, VALUE, no_joints
 
-_POINTS = 64  # of a part that a joint is fitted to
-_NOISE = 0.3  # of the distance between neighboring points: how far estimated motions are off at the least
+_SURE = 0.05  # of the distance between neighboring points: no motion is known better
 _APART = 2.0  # nats for each such distance between two parts: joined parts touch
+_NEAREST = 3  # parts to which a part may be joined, besides what connects all
 _LARGE = 2.0  # nats by which the largest part is preferred as parent
 
 
@@ -64,16 +66,17 @@ def kinematic_tree(sequence: CloudSequence, said: PartsSample) -> KinematicTree:
         points_at_start(sequence, int(part), trajectories.motion[:, k]) for k, part in enumerate(trajectories.ids)
     ]
     spacing = _spacing(points)
-    noise = np.maximum(trajectories.disagreement, _NOISE * spacing)
+    known = _registrations(sequence, trajectories, spacing)
+    directions = [surface_directions(cloud) for cloud in points]
     sizes = np.array([len(cloud) for cloud in points])
     count = len(points)
+    gaps = _gaps(points, spacing)
     fits, cost = {}, np.full((count, count), np.inf)
-    for a in range(count):
-        for b in range(count):
-            if a != b and (sizes[a], -a) >= (sizes[b], -b):
-                fits[a, b] = _relative_joint(trajectories, a, b, points[b], float(np.hypot(noise[a], noise[b])))
-                gap = max(_gap(points[a], points[b]) / spacing - 1, 0)
-                cost[a, b] = cost[b, a] = fits[a, b].length + _APART * gap - _LARGE * sizes[a] / sizes.max()
+    for a, b in _neighbors(gaps):
+        a, b = (a, b) if (sizes[a], -a) >= (sizes[b], -b) else (b, a)
+        both = np.concatenate([directions[a], directions[b]])
+        fits[a, b] = _relative_joint(known[a], known[b], trajectories.seen[:, a] & trajectories.seen[:, b], both)
+        cost[a, b] = cost[b, a] = fits[a, b].length + _APART * gaps[a, b] - _LARGE * sizes[a] / sizes.max()
     root = int(sizes.argmax())
     joints = [PartJoint(child, parent, _oriented(fits, parent, child)) for parent, child in _spanning_tree(cost, root)]
     return KinematicTree(trajectories, points, root, joints)
@@ -85,14 +88,24 @@ def _spacing(points: list[np.ndarray]) -> float:
     return max(float(np.median(np.concatenate(distances))), 1e-9) if distances else 1e-9
 
 
-def _relative_joint(trajectories: Trajectories, parent: int, child: int, points: np.ndarray, noise: float) -> JointFit:
-    """Returns the joint that explains the child's motion as the parent sees it, in the frames that show both."""
-    both = trajectories.seen[:, parent] & trajectories.seen[:, child]
+def _registrations(sequence: CloudSequence, trajectories: Trajectories, spacing: float) -> list[Registration]:
+    """Returns the parts' motions with what is known of their errors: from points, and from where pairs disagree."""
+    rng, known = np.random.default_rng(0), []
+    frames = np.split(np.arange(len(sequence.points)), sequence.frame_offsets[1:-1])
+    for k, part in enumerate(trajectories.ids):
+        clouds = [sequence.points[rows[sequence.part[rows] == part]].astype(np.float64) for rows in frames]
+        one = register(clouds, trajectories.motion[:, k], rng)
+        off = max(float(trajectories.disagreement[k]), _SURE * spacing)
+        noise = np.diag(np.repeat([(off / max(one.size, 1e-9)) ** 2, off**2], 3))
+        known.append(replace(one, covariance=one.covariance + noise))
+    return known
+
+
+def _relative_joint(parent: Registration, child: Registration, both: np.ndarray, directions: np.ndarray) -> JointFit:
+    """Returns the joint that explains the child's motion as the parent sees it, in the frames (mask) that show both."""
+    both = both.copy()
     both[0] = True
-    motion = trajectories.motion
-    relative = np.linalg.inv(motion[:, parent]) @ motion[:, child]
-    thinned = points[np.linspace(0, len(points) - 1, min(len(points), _POINTS)).astype(int)]
-    fit = fit_joint(relative[both], thinned, noise)
+    fit = fit_joint(relative_registration(parent, child).of_frames(both), directions)
     value = np.interp(np.arange(len(both)), np.flatnonzero(both), fit.value)
     return replace(fit, value=value)
 
@@ -101,6 +114,22 @@ def _gap(first: np.ndarray, second: np.ndarray) -> float:
     """Returns the distance between two clouds where they are nearest: the fifth least, so that no single point decides."""
     distances = np.sort(cKDTree(first).query(second)[0])
     return float(distances[min(len(distances) - 1, 4)])
+
+
+def _gaps(points: list[np.ndarray], spacing: float) -> np.ndarray:
+    """Returns the distances (K,K) between the parts, in spacings beyond the first."""
+    gaps = np.zeros((len(points), len(points)))
+    for a, cloud in enumerate(points):
+        for b in range(a):
+            gaps[a, b] = gaps[b, a] = max(_gap(cloud, points[b]) / spacing - 1, 0)
+    return gaps
+
+
+def _neighbors(gaps: np.ndarray) -> set[tuple[int, int]]:
+    """Returns the pairs of parts between which a joint is looked for: each with its nearest ones, and what connects all."""
+    nearest = np.argsort(gaps + np.diag(np.full(len(gaps), np.inf)), axis=1, kind="stable")[:, :_NEAREST]
+    pairs = {(a, int(b)) for a, row in enumerate(nearest) for b in row if a != b}
+    return {(min(pair), max(pair)) for pair in [*pairs, *_spanning_tree(gaps, 0)]}
 
 
 def _spanning_tree(cost: np.ndarray, root: int) -> list[tuple[int, int]]:

@@ -1,0 +1,105 @@
+"""The errors of a part's motions, measured: frames are registered to the others again, on halves of the points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from dpcli.segment.flow.surface_icp import Surface, columns
+
+_SAMPLES = 12  # halves of the points that are registered anew
+_FRAMES = 12  # of a part that are registered; others are known as surely as the nearest of these
+_MOST = 256  # points of a part in a frame, and twice as many of all other frames together
+_FEWEST = 9  # points that make a surface
+_STEPS = 8  # of ICP
+_SURE = 1e-3  # of the part's size: nothing is known better
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Holds motions f64 (T,4,4) since frame 0 and how surely they are known.
+
+    center f64 (3), size: the moved thing's middle in frame 0, and the root mean square distance of its points from it.
+    covariance f64 (T,6,6): of each motion's error, as frame 0 sees it: a rotation vector about the center, and the center's
+    displacement.
+    """
+
+    motion: np.ndarray
+    center: np.ndarray
+    size: float
+    covariance: np.ndarray
+
+    def of_frames(self, chosen: np.ndarray) -> Registration:
+        """Returns the same of some frames (an index or mask)."""
+        return Registration(self.motion[chosen], self.center, self.size, self.covariance[chosen])
+
+
+def register(clouds: list[np.ndarray], motion: np.ndarray, rng: np.random.Generator) -> Registration:
+    """Returns the motions with their covariances: the spread of where ICP ends from starts a little off.
+
+    clouds: the part's points f64 (n_t,3) in every frame; motion f64 (T,4,4): from frame 0. Each time half of a frame's
+    points go onto half of all others' (the variance of estimates from halves is that of the whole's, Shao and Wu 1989); what
+    slides along itself, such as a cap that turns about its own axis, so shows that its motion can't be known.
+    """
+    back = [(cloud - m[:3, 3]) @ m[:3, :3] for cloud, m in zip(clouds, motion)]
+    joined = np.concatenate(back)
+    center, size = joined.mean(0), max(float(np.sqrt(joined.var(0).sum())), 1e-9)
+    unit = [_some((cloud - center) / (2 * size), _MOST, rng) for cloud in back]
+    chosen = np.unique(np.linspace(0, len(unit) - 1, min(len(unit), _FRAMES)).astype(int))
+    spread = np.stack([_spread(unit[t], [unit[u] for u in chosen if u != t], rng) for t in chosen])
+    lengths = np.repeat([1.0, 2 * size], 3)
+    covariance = spread * lengths[:, None] * lengths
+    nearest = np.abs(np.arange(len(unit))[:, None] - chosen).argmin(1)
+    return Registration(motion, center, size, covariance[nearest])
+
+
+def _spread(own: np.ndarray, others: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    """Returns the covariance (6,6) of a frame's points (n,3) about 0 registered to others; without enough points: of size 1."""
+    rest = _some(np.concatenate(others), 4 * _MOST, rng)
+    if len(own) < 6 or len(rest) < 2 * _FEWEST:
+        return np.eye(6)
+    ends = []
+    for _ in range(_SAMPLES):
+        surface = Surface(_some(rest, len(rest) // 2, rng))
+        shake = rng.normal(size=6) * surface.spacing / np.sqrt(3)
+        start = twist_motion(shake * np.repeat([2.0, 1.0], 3), np.zeros(3))
+        half = columns(_some(own, len(own) // 2, rng))
+        ends.append(surface.icp(half, start[:3], _STEPS, 2 * surface.spacing, surface.spacing))
+    twist = motion_twist(np.stack(ends), np.zeros(3))
+    return twist.T @ twist / _SAMPLES + _SURE**2 * np.eye(6)
+
+
+def _some(points: np.ndarray, most: int, rng: np.random.Generator) -> np.ndarray:
+    return points if len(points) <= most else points[rng.permutation(len(points))[:most]]
+
+
+def twist_motion(twist: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Returns the motion f64 (4,4) that turns by the rotation vector twist[:3] about a center and shifts by twist[3:]."""
+    motion = np.eye(4)
+    motion[:3, :3] = Rotation.from_rotvec(twist[:3]).as_matrix()
+    motion[:3, 3] = center + twist[3:] - motion[:3, :3] @ center
+    return motion
+
+
+def motion_twist(motion: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Returns the twists f64 (T,6) of `twist_motion` that motions (T,4,4) or (T,3,4) make."""
+    turn = motion[:, :3, :3]
+    return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), turn @ center + motion[:, :3, 3] - center], 1)
+
+
+def relative_registration(parent: Registration, child: Registration) -> Registration:
+    """Returns the child's motions in the parent's coordinates, both as in frame 0, with the errors of both."""
+    motion = np.linalg.inv(parent.motion) @ child.motion
+    x, y, z = np.moveaxis(motion[:, :3, :3] @ child.center + motion[:, :3, 3] - parent.center, -1, 0)
+    none = np.zeros_like(x)
+    arm = np.stack([none, z, -y, -z, none, x, y, -x, none], -1).reshape(
+        -1, 3, 3
+    )  # turns a rotation into a shift at the child
+    back = np.swapaxes(motion[:, :3, :3], 1, 2)
+    seen = np.zeros((len(motion), 6, 6))
+    seen[:, :3, :3] = seen[:, 3:, 3:] = back
+    seen[:, 3:, :3] = back @ arm
+    covariance = child.covariance + seen @ parent.covariance @ np.swapaxes(seen, 1, 2)
+    return Registration(motion, child.center, child.size, covariance)

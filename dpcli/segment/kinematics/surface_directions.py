@@ -1,0 +1,43 @@
+"""The directions of a part's own surface, along which its joints nearly always lie."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.segment.flow.surface_icp import Surface
+
+_COSINE = np.cos(np.radians(12))  # of the normals that make one direction
+_NORMALS = 3  # directions of normals of a part
+_FEWEST = 9  # points that make a surface
+_ACROSS = 0.3  # least sine between two normals whose cross product is a direction
+
+
+def surface_directions(points: np.ndarray) -> np.ndarray:
+    """Returns unit vectors f64 (D,3): the part's most frequent normals and those at right angles to two of them.
+
+    points (n,3). Fewer than 9 have none.
+    """
+    if len(points) < _FEWEST:
+        return np.zeros((0, 3))
+    centered = points - points.mean(0)
+    normals = Surface(centered / max(float(np.abs(centered).max()), 1e-9)).normals.astype(np.float64)
+    found: list[np.ndarray] = []
+    left = normals
+    while len(found) < _NORMALS and len(left) >= _FEWEST:
+        votes = (np.abs(left @ normals.T) > _COSINE).sum(1)
+        found.append(_mean_direction(normals, left[votes.argmax()]))
+        left = left[np.abs(left @ found[-1]) <= _COSINE]
+    crossed = [np.cross(one, two) for n, one in enumerate(found) for two in found[:n]]
+    found += [normal / np.linalg.norm(normal) for normal in crossed if np.linalg.norm(normal) > _ACROSS]
+    return np.stack(found)
+
+
+def _mean_direction(normals: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Returns the mean (3) of the normals (n,3), of either sign, about a first direction, after a few rounds."""
+    direction = first
+    for _ in range(5):
+        cosine = normals @ direction
+        near = np.abs(cosine) > _COSINE
+        direction = (normals[near] * np.sign(cosine[near])[:, None]).sum(0)
+        direction = direction / np.linalg.norm(direction)
+    return direction
