@@ -16,6 +16,7 @@ COMMON = {
     "file_lock",
     "path_names",
     "regular_files",
+    "text_files",
     "signal_exit",
     "standard_streams",
 }  # files that every room may import

@@ -16,7 +16,6 @@ its name.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +23,7 @@ from typing import Any
 
 from dpcli.errors import DataError
 from dpcli.runtime.toml_file import read_toml
+from dpcli.text_files import read_json
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,7 @@ class LabelMap:
     def read(cls, path: Path) -> LabelMap:
         """Reads a .toml or .json file. Raises DataError when it is not as the module says."""
         if path.suffix.lower() == ".json":
-            try:
-                content = json.loads(path.read_text("utf-8"))
-            except ValueError as error:
-                raise DataError(f"{path}: not JSON ({error})") from None
+            content = read_json(path)
         else:
             content = read_toml(path)
         allowed = {"classes": list, "labels": dict, "files": dict}

@@ -16,6 +16,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.file_lock import open_alone
 from dpcli.runtime.progress import log
 from dpcli.runtime.whole_file import DiskFull, disk_full, whole_file
+from dpcli.text_files import read_json
 
 _TOLD = 3  # differences named when a run can't be continued
 _LOCK = ".lock"
@@ -106,8 +107,8 @@ class RunFolder:
                 )
             return False
         try:
-            before = json.loads(saved.read_text())
-        except ValueError:
+            before = read_json(saved)
+        except DataError:
             raise DataError(f"{saved}: not JSON, the run can't be continued; --force starts over") from None
         differing = differences(before, self.config)
         if differing:

@@ -20,7 +20,7 @@ def read_toml(path: Path) -> dict[str, Any]:
             raise DpcError("reading TOML on Python 3.10 needs a package: pip install tomli") from None
     try:
         return tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"{path}: not TOML ({error})") from None
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None

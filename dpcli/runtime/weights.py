@@ -7,20 +7,26 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from dpcli import __version__
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError, UsageError, reading
 from dpcli.path_names import utf8_path
+from dpcli.runtime.settings.stored import from_json, json_value
+from dpcli.runtime.settings.value_types import numbers_in
 from dpcli.runtime.whole_file import whole_file
 
 if TYPE_CHECKING:
     import torch
 
 SUFFIX = ".safetensors"
+_SPARE = 1000  # tensors for each that is stored, and numbers more than a file holds: a network makes some that it drops
+Kind = TypeVar("Kind")
+Network = TypeVar("Network", bound="torch.nn.Module")
 
 
 def shipped_models(folder: Path) -> list[str]:
@@ -93,25 +99,96 @@ def load_weights(path: Path, expected_format: str, maker: str) -> tuple[dict[str
     """Returns tensors and header. DataError when the file is not whole, of another format (made by `maker`), or holds NaN."""
     from safetensors import SafetensorError, safe_open
 
-    try:
-        with safe_open(utf8_path(path, "safetensors"), "pt") as file:
-            header = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}
-    except (SafetensorError, OSError) as error:
-        raise DataError(f"{path}: not a complete safetensors file ({error})") from None
+    with reading(path):
+        try:
+            with safe_open(utf8_path(path, "safetensors"), "pt") as file:
+                header = file.metadata() or {}
+                tensors = {key: file.get_tensor(key) for key in file.keys()}
+        except (SafetensorError, OSError) as error:
+            raise DataError(f"{path}: not a complete safetensors file ({error})") from None
+        whole = all(value.isfinite().all() for value in tensors.values())
     if header.get("format") != expected_format:
         raise DataError(f"{path}: format {header.get('format')!r}, expected {expected_format!r}, written by `{maker}`")
-    if not all(value.isfinite().all() for value in tensors.values()):
+    if not whole:
         raise DataError(f"{path}: holds NaN or infinite weights; train again or use another checkpoint")
     return tensors, header
 
 
-def load_state(model: torch.nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """Puts the tensors of a file into a model, in the model's precision. DataError when names or shapes differ."""
+def fill_network(make: Callable[[], Network], tensors: dict[str, torch.Tensor], path: Path) -> Network:
+    """Returns the network that `make` builds with the tensors of a file in it, in eval mode and in the network's precision.
+
+    Raises DataError when names, shapes or types differ, and, before much memory is asked for, when the configuration that
+    `make` follows claims more weights than the file can hold.
+    """
+    with reading(path), _plausible_sizes(path, tensors):
+        try:
+            network = make()
+        except UsageError as error:
+            raise DataError(f"{path}: the configuration's {error}") from None
+    own = network.state_dict()
+    for name in [name for name in own if name in tensors]:
+        if own[name].is_floating_point() != tensors[name].is_floating_point() or tensors[name].is_complex():
+            raise DataError(f"{path}: {name} is of {tensors[name].dtype}, expected {own[name].dtype}")
     try:
-        model.load_state_dict(tensors)
+        network.load_state_dict(tensors)
     except RuntimeError as error:
         raise DataError(f"{path}: weights don't fit the configuration: {str(error).splitlines()[1].strip()}") from None
+    return network.eval()
+
+
+@contextmanager
+def _plausible_sizes(path: Path, tensors: dict[str, torch.Tensor]) -> Iterator[None]:
+    """Raises DataError in the block where torch is asked for more, or larger, tensors than a network of these tensors has."""
+    import torch
+    from torch.overrides import TorchFunctionMode
+
+    makers = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn, torch.linspace, torch.arange}
+    held, left = sum(value.numel() for value in tensors.values()), _SPARE * (1 + len(tensors))
+
+    class Plausible(TorchFunctionMode):
+        """Looks at each size before the tensor is made."""
+
+        def __torch_function__(self, function, types, arguments=(), named=None):
+            nonlocal left
+            if function in makers:
+                left -= 1
+                claimed = prod(abs(number) for number in numbers_in(arguments) if isinstance(number, int) and number)
+                if claimed > held + _SPARE or left < 0:
+                    of = f"a layer of {claimed}" if left >= 0 else "countless layers of"
+                    raise DataError(
+                        f"{path}: the configuration claims {of} weights, the file holds {held}; copy it again"
+                    )
+            return function(*arguments, **(named or {}))
+
+    with Plausible():
+        yield
+
+
+def header_value(path: Path, header: dict[str, str], key: str, kind: type[Kind]) -> Kind:
+    """Returns the JSON value of this kind (dict, list) in a weights file's header. Raises DataError that names the file."""
+    with _named(path):
+        return json_value(_entry(header, key), kind, key)
+
+
+def header_settings(path: Path, header: dict[str, str], cls: type[Kind]) -> Kind:
+    """Returns the configuration in a weights file's header. Raises DataError, which names the file, as `from_json`."""
+    with _named(path):
+        return from_json(cls, _entry(header, "config"))
+
+
+def _entry(header: dict[str, str], key: str) -> str:
+    if key not in header:
+        raise DataError(f"its header lacks {key}")
+    return header[key]
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Puts the file's name before a DataError of the block, and what to do behind it."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{path}: {error}; copy it again, or make it anew") from None
 
 
 def weights_summary(path: Path) -> dict[str, Any]:

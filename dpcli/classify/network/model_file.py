@@ -10,9 +10,9 @@ from torch import nn
 
 from dpcli.classify.network.backbones.interface import BACKBONES
 from dpcli.classify.network.config import KinetConfig
-from dpcli.classify.network.kinet import Kinet
-from dpcli.errors import UsageError
-from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
+from dpcli.classify.network.kinet import STREAMS, Kinet
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime.weights import fill_network, find_weights, header_settings, header_value, load_weights, save_weights
 
 
 @dataclass
@@ -55,12 +55,21 @@ def load_model(name: str | Path, backbone: str | None = None) -> tuple[Kinet, Mo
     """
     path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
-    config = KinetConfig.from_json(header["config"])
+    config = header_settings(path, header, KinetConfig)
+    if config.backbone not in BACKBONES and ":" not in config.backbone:
+        raise DataError(f"{path}: backbone = {config.backbone!r:.80}, expected {', '.join(BACKBONES)}; copy it again")
     if config.backbone not in BACKBONES and config.backbone != backbone:
         raise UsageError(
             f"{path}: made on the backbone {config.backbone}, which is code of yours; if you trust it, add --backbone {config.backbone}"
         )
-    model = Kinet(config)
-    load_state(model, tensors, path)
-    names, notes = json.loads(header["class_names"]), json.loads(header["notes"])
-    return model.eval(), ModelInfo(model.config, names, header["timing"], notes)
+    notes, names = (header_value(path, header, *one) for one in (("notes", dict), ("class_names", list)))
+    timing = header.get("timing")
+    if timing not in ("clips", "uniform"):
+        raise DataError(f"{path}: timing = {timing!r}, expected clips or uniform; copy it again")
+    if len(names) != config.num_classes or not all(isinstance(name, str) and name.isprintable() for name in names):
+        raise DataError(f"{path}: class_names = {names!r:.80}, expected {config.num_classes} names; copy it again")
+    streams = notes.get("streams", list(STREAMS))
+    if streams not in (list(STREAMS), *([one] for one in STREAMS)):
+        raise DataError(f"{path}: streams = {streams!r:.80} in its notes, expected some of {', '.join(STREAMS)}")
+    network = fill_network(lambda: Kinet(config), tensors, path)
+    return network, ModelInfo(config, names, timing, notes)

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 
 from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.stored import from_json
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,5 @@ class ShapeConfig:
 
     @classmethod
     def from_json(cls, text: str) -> ShapeConfig:
-        """Returns the sizes that `to_json` wrote."""
-        values = json.loads(text)
-        return cls(**{**values, "widths": tuple(values["widths"])})
+        """Returns the sizes that `to_json` wrote. Raises DataError as `stored.from_json`."""
+        return from_json(cls, text)

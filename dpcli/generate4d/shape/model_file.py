@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 import json
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from dpcli.errors import DataError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.network import ShapeNetwork
-from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights import fill_network, find_weights, header_settings, header_value, load_weights, save_weights
 
 _FORMAT, _MAKER = "dpc-shape-1", "dpc generate4d train-prior"
 SHIPPED = Path(__file__).parent / "weights"
+_LARGEST = 4096  # pixels
 DEFAULT = "creatures"  # the shipped network
 
 
@@ -38,8 +41,17 @@ def load_shape_model(name: str | Path) -> tuple[ShapeNetwork, dict[str, Any]]:
 def _read(path: Path, _changed: int) -> tuple[ShapeNetwork, dict[str, Any]]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
     tensors, header = load_weights(path, _FORMAT, _MAKER)
-    model = ShapeNetwork(ShapeConfig.from_json(header["config"]))
-    load_state(
-        model, {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}, path
-    )
-    return model.eval(), json.loads(header["notes"])
+    config, notes = header_settings(path, header, ShapeConfig), header_value(path, header, "notes", dict)
+    size, confidence = notes.get("size"), notes.get("confidence")
+    numbers = [size, *(confidence if isinstance(confidence, list) else [])]
+    if type(size) is not int or not 16 <= size <= _LARGEST or len(numbers) != 3 or not all(map(_is_number, numbers)):
+        raise DataError(
+            f"{path}: its notes say size {size!r:.40} and confidence {confidence!r:.40}, expected pixels and two numbers;"
+            " copy it again"
+        )
+    tensors = {name: value.float() if value.is_floating_point() else value for name, value in tensors.items()}
+    return fill_network(lambda: ShapeNetwork(config), tensors, path), notes
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and isfinite(value)

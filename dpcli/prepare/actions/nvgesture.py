@@ -17,6 +17,7 @@ from dpcli.prepare.decode.depth_files import read_video
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, pixel_rays
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
 from dpcli.store import CloudSequence
+from dpcli.text_files import read_text
 
 CLASSES = 25
 INTRINSICS = Intrinsics(224.502, 230.494, 160.0, 120.0)
@@ -129,7 +130,7 @@ class NvGesture:
             raise DataError(f"{folder}: no list file; expected {expected}")
         items: dict[str, Item] = {}
         for split, found in lists.items():
-            for number, line in enumerate(found[-1].read_text().splitlines() if found else [], start=1):
+            for number, line in enumerate(read_text(found[-1]).splitlines() if found else [], start=1):
                 if line.strip():
                     item = self._item(line, split, f"{found[-1]}:{number}")
                     duplicate = item.name in items

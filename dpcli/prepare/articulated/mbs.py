@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,6 +14,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.decode.safe_pickle import read_npz_member
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
+from dpcli.text_files import read_json
 
 _SPLITS = {"train": "train", "val": "validation", "test": "test"}
 _RIGID = 1e-3  # how far R^T R of a stored matrix may be from the identity
@@ -25,11 +25,9 @@ def read_meta(raw: Path) -> dict[str, list[int]]:
     """Reads the numbers of the samples of each split from meta.json. Raises DataError when it is not that."""
     path = require_folder(raw, "meta.json and data/000000.npz ... as the authors distribute it") / "meta.json"
     try:
-        meta = json.loads(path.read_text())
+        meta = read_json(path)
     except OSError:
         raise DataError(f"{path}: not found; expected meta.json and a folder data/ of .npz files") from None
-    except ValueError as error:
-        raise DataError(f"{path}: not JSON ({error})") from None
     good = isinstance(meta, dict) and set(meta) & set(_SPLITS)
     good = good and all(isinstance(meta[s], list) and all(type(n) is int and n >= 0 for n in meta[s]) for s in meta)
     if not good:

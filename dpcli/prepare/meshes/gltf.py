@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import binascii
 import io
-import json
 import re
 import struct
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
+from dpcli.text_files import parse_json
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -235,9 +235,9 @@ def read_gltf(path: Path) -> Gltf:
         )
     text, binary = _split_glb(path, data) if data[:4] == b"glTF" else (data, None)
     try:
-        tree = json.loads(text)
+        tree = parse_json(text, path)
         version = str(tree["asset"]["version"])
-    except (ValueError, KeyError, TypeError):
+    except (KeyError, TypeError):
         raise DataError(f"{path}: not a glTF file (no JSON with an asset version); expected .glb or .gltf") from None
     if not version.startswith("2"):
         raise DataError(f"{path}: glTF version {version}; version 2 is read, convert the file")

@@ -21,6 +21,7 @@ from dpcli.prepare.synthetic.gait import bone_motion
 from dpcli.prepare.synthetic.wild_creature import wild_creature, wild_turns
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import PrepareStream, generator
+from dpcli.text_files import read_text
 
 _POSES, _CELLS = 4, 48  # poses of a mesh at a time; cells of the grid a creature's skin is cut from
 _PER_MESH = 6  # pictures of one mesh in a round
@@ -102,7 +103,7 @@ def find_meshes(places: Sequence[Path], held_out: str | None) -> tuple[list[Mesh
     paths = [path for place in places for path in _models_in(place)]
     if held_out and not Path(held_out).is_file():
         raise UsageError(f"--held-out {held_out}: no such file")
-    text = Path(held_out).read_text() if held_out else ""
+    text = read_text(Path(held_out)) if held_out else ""
     ends = [end for end in (line.split("#")[0].strip() for line in text.splitlines()) if end]
     for end in ends:
         if not any(_ends_with(path, end) for path in paths):

@@ -10,6 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import require_folder
+from dpcli.text_files import read_text
 
 _IMAGE = ("img_{:04d}.jpg", "img_{:04d}.png")
 _ALPHA = "img_{:04d}_alpha.png"
@@ -59,8 +60,10 @@ def declared_frames(animal: Path) -> dict[str, int]:
     """Returns frames of each motion as the file `sequences` says; empty without one."""
     for name in ("sequences", "sequences.txt"):
         if (animal / name).is_file():
-            words = (line.split() for line in (animal / name).read_text(encoding="utf-8").splitlines())
-            return {line[0]: int(line[1]) for line in words if len(line) >= 2 and line[1].isdecimal()}
+            words = (line.split() for line in _text(animal / name).splitlines())
+            return {
+                line[0]: int(line[1]) for line in words if len(line) >= 2 and line[1].isdecimal() and len(line[1]) < 10
+            }
     return {}
 
 
@@ -116,10 +119,7 @@ def _numbers(path: Path) -> np.ndarray:
 def _text(path: Path) -> str:
     if not path.is_file():
         raise DataError(f"{path}: missing; the cameras and bones of an ARTEMIS folder are needed, copy it completely")
-    try:
-        return path.read_text(encoding="utf-8")
-    except ValueError:
-        raise DataError(f"{path}: not text; copy it again") from None
+    return read_text(path)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dpcli.errors import DataError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS
 from dpcli.prepare.decode.color_frames import frame_numbers, image_paths
 from dpcli.prepare.reader import natural_key, require_folder
+from dpcli.text_files import read_json
 
 _KEYS = {"azimuth", "elevation", "radius", "fovy", "role"}
 _EXAMPLE = '[{"azimuth": 30, "elevation": 20}, ...] in degrees (also radius, fovy, role: train or test)'
@@ -41,8 +42,8 @@ def read_cameras(path: Path, radius: float = DEFAULT_RADIUS, fovy: float = DEFAU
     lacks.
     """
     try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        entries = read_json(path)
+    except (OSError, DataError) as error:
         raise DataError(f"{path}: not readable JSON ({error}); expected {_EXAMPLE}") from None
     if not isinstance(entries, list) or not entries:
         raise DataError(f"{path}: expected a list of cameras, {_EXAMPLE}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -22,6 +21,7 @@ from dpcli.prepare.views.video import VideoOptions, spread_frames
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
+from dpcli.text_files import read_json
 
 FILES = {
     "transforms.json": "train",
@@ -130,9 +130,9 @@ def _grid(folder: Path) -> tuple[list[_View], list[float]]:
 
 def _collect(path: Path, role: str, views: dict[bytes, _View], times: set[float]) -> None:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         frames = found["frames"]
-        if not frames:
+        if not frames or not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
             raise ValueError("no frames")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: not a readable list of frames ({error!r})") from None

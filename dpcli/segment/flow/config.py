@@ -9,6 +9,7 @@ from typing import Literal
 
 from dpcli.runtime.settings.catalog import Catalog
 from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.stored import from_json
 
 
 @dataclass(frozen=True)
@@ -24,12 +25,14 @@ class FlowConfig:
     )
     hidden: int = setting(64, "Width of the gated recurrent unit.", least=1)
     head: int = setting(48, "Width of the layers that regress the flow.", least=1)
-    neighbors: int = setting(16, "Neighbors that a set convolution looks at.", least=1)
-    correlated: int = setting(8, "Nearest points of the other frame that a warped point is compared with.", least=1)
+    neighbors: int = setting(16, "Neighbors that a set convolution looks at.", least=1, most=2048)
+    correlated: int = setting(
+        8, "Nearest points of the other frame that a warped point is compared with.", least=1, most=2048
+    )
     radius: float = setting(
         0.1, "Distance beyond which such a point is replaced by the nearest, in diameters.", above=0
     )
-    iterations: int = setting(4, "Estimates of the flow: the global match, then corrections.", least=1)
+    iterations: int = setting(4, "Estimates of the flow: the global match, then corrections.", least=1, most=1000)
     norm: Literal["layer", "batch"] = setting("layer", "Normalization of the layers.")
     support: float = setting(10.0, "Distance beyond which the global match looks for nothing, in diameters.", above=0)
 
@@ -42,9 +45,8 @@ class FlowConfig:
 
     @classmethod
     def from_json(cls, text: str) -> FlowConfig:
-        """Returns the sizes that `to_json` wrote."""
-        values = json.loads(text)
-        return cls(**{key: tuple(v) if isinstance(v, list) else v for key, v in values.items()})
+        """Returns the sizes that `to_json` wrote. Raises DataError as `stored.from_json`."""
+        return from_json(cls, text)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from dpcli.ops import fps, gather_points, three_nn_interpolate
-from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights
+from dpcli.runtime.weights import fill_network, find_weights, header_settings, header_value, load_weights, save_weights
 from dpcli.segment.flow.config import FlowConfig
 from dpcli.segment.flow.flowstep3d import FlowStep3D
 
@@ -43,9 +43,8 @@ def load_flow_model(name: str | Path) -> tuple[FlowStep3D, dict]:
 def _read_flow_model(path: Path, _changed: int) -> tuple[FlowStep3D, dict]:
     """Returns the network and notes of a file; `_changed`, its time of change, is there for the cache."""
     tensors, header = load_weights(path, _FORMAT, _MAKER)
-    model = FlowStep3D(FlowConfig.from_json(header["config"]))
-    load_state(model, tensors, path)
-    return model.eval(), json.loads(header["notes"])
+    config, notes = header_settings(path, header, FlowConfig), header_value(path, header, "notes", dict)
+    return fill_network(lambda: FlowStep3D(config), tensors, path), notes
 
 
 @torch.inference_mode()

@@ -9,9 +9,15 @@ from typing import Literal, get_args
 
 from dpcli.errors import UsageError
 from dpcli.runtime.settings.fields import check, setting
+from dpcli.runtime.settings.stored import from_json
+from dpcli.runtime.settings.value_types import numbers_in
 
 Group = Literal["icosahedral", "trivial"]
 Pooling = Literal["point", "global"]
+_POSITIVE = (
+    *("decoder", "motion_layers", "pool_heads", "slots", "slot_width", "slot_layers", "slot_heads", "embedding"),
+    *("temperature", "points"),
+)
 
 
 @dataclass(frozen=True)
@@ -70,8 +76,8 @@ class PartConfig:
 
     layers: tuple[tuple[Layer, ...], ...]  # blocks of layers; every block ends in an invariant pooling
     group: Group = "icosahedral"
-    kernel: str = "vertices"  # uniform: 23 points that no rotation permutes (release)
-    rule: str = "nearest"  # first: in index order (release)
+    kernel: Literal["vertices", "uniform"] = "vertices"  # uniform: 23 points that no rotation permutes (release)
+    rule: Literal["nearest", "first"] = "nearest"  # first: in index order (release)
     pooling: Pooling = "point"
     pool_heads: int = 4
     canonical_heads: int = 4  # learned frames that give exactly invariant coordinates; 0: raw xyz (release)
@@ -87,10 +93,26 @@ class PartConfig:
     points: int = 512  # per frame in training
 
     def __post_init__(self) -> None:
-        """Raises UsageError for a rotation group or pooling that does not exist."""
+        """Raises UsageError for a rotation group or pooling that does not exist, and for sizes that no network has."""
         for name, legal in (("group", get_args(Group)), ("pooling", get_args(Pooling))):
             if getattr(self, name) not in legal:
                 raise UsageError(f"{name} = {getattr(self, name)}: expected one of {', '.join(legal)}")
+        if (
+            len(self.layers) != 2
+            or len(self.decoder) != 2
+            or not all((*self.layers, *self.decoder, self.motion_layers))
+        ):
+            raise UsageError(
+                "layers, decoder, motion_layers: expected two blocks, two groups of widths and some widths"
+            )
+        for layer in (one for block in self.layers for one in block):
+            if min(dataclasses.astuple(layer)) <= 0:
+                raise UsageError(f"layers = {layer}: expected sizes above 0")
+        for name in _POSITIVE:
+            if min(numbers_in(getattr(self, name))) <= 0:
+                raise UsageError(f"{name} = {getattr(self, name)}: expected more than 0")
+        if min(self.canonical_heads, self.motion_width) < 0:
+            raise UsageError("canonical_heads, motion_width: expected at least 0")
 
     def to_json(self) -> str:
         """Returns the text that a weights file keeps."""
@@ -98,12 +120,8 @@ class PartConfig:
 
     @classmethod
     def from_json(cls, text: str) -> PartConfig:
-        """Returns the sizes that `to_json` wrote."""
-        values = json.loads(text)
-        values["layers"] = tuple(tuple(Layer(**layer) for layer in block) for block in values["layers"])
-        for key in ("decoder", "motion_layers"):
-            values[key] = tuple(tuple(v) if isinstance(v, list) else v for v in values[key])
-        return cls(**values)
+        """Returns the sizes that `to_json` wrote. Raises DataError as `stored.from_json`."""
+        return from_json(cls, text)
 
 
 def compact() -> PartConfig:

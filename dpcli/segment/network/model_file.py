@@ -6,7 +6,15 @@ import json
 from pathlib import Path
 
 from dpcli.errors import UsageError
-from dpcli.runtime.weights import find_weights, load_state, load_weights, save_weights, shipped_models
+from dpcli.runtime.weights import (
+    fill_network,
+    find_weights,
+    header_settings,
+    header_value,
+    load_weights,
+    save_weights,
+    shipped_models,
+)
 from dpcli.segment.network.config import PartConfig
 from dpcli.segment.network.part_network import PartNetwork
 
@@ -35,9 +43,8 @@ def load_model(name: str | Path) -> tuple[PartNetwork, dict]:
     """
     path = find_model(name)
     tensors, header = load_weights(path, _FORMAT, _MAKER)
-    model = PartNetwork(PartConfig.from_json(header["config"]))
-    load_state(model, tensors, path)
-    return model.eval(), json.loads(header["notes"])
+    config, notes = header_settings(path, header, PartConfig), header_value(path, header, "notes", dict)
+    return fill_network(lambda: PartNetwork(config), tensors, path), notes
 
 
 def default_model() -> str:

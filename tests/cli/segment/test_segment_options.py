@@ -10,7 +10,7 @@ import typer
 
 from dpcli.cli.segment.app import app
 from dpcli.cli.segment.profile import render_cost
-from dpcli.errors import UsageError
+from dpcli.errors import DataError
 from dpcli.segment import prediction_settings
 from dpcli.segment.flow import config as flow_settings
 from dpcli.segment.network.config import NETWORK_PRESETS, PartConfig, compact, release
@@ -98,7 +98,7 @@ def test_network_settings_make_the_sizes():
         3,
         64,
     )
-    with pytest.raises(UsageError, match="group = cubic: expected one of icosahedral, trivial"):
+    with pytest.raises(DataError, match="group = 'cubic': expected one of icosahedral, trivial"):
         PartConfig.from_json(config.to_json().replace("trivial", "cubic"))
 
 
