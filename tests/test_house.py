@@ -16,9 +16,9 @@ COMMON = {
     "file_lock",
     "path_names",
     "regular_files",
+    "text_files",
     "signal_exit",
     "standard_streams",
-    "text_files",
 }  # files that every room may import
 GROUND = {"store", "ops", "runtime", "draw"}
 ALLOWED = {

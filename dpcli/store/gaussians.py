@@ -15,6 +15,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.store.file import open_store, read_provenance, root_attributes, write_root
 from dpcli.store.schema import TABLES
 from dpcli.store.writing.atomic_file import AtomicFile
+from dpcli.text_files import parse_json
 
 SH_C0 = 0.28209479177387814  # the constant spherical harmonic: color = 0.5 + SH_C0 sh[:, 0]
 _LARGEST_LOG_SCALE = 40  # so that a scale, and its square in a covariance, stay finite in float32
@@ -251,9 +252,12 @@ def read_scene(path: str | Path) -> GaussianScene:
             raise DataError(f"{path}: {', '.join(missing)} missing; the file is incomplete, fit again")
         arrays = {key: file[key][()] for key in LAYOUT}
         try:
-            size, metrics = tuple(int(side) for side in file.attrs["size"]), json.loads(file.attrs["metrics"])
+            size, metrics = (
+                tuple(int(side) for side in file.attrs["size"]),
+                parse_json(str(file.attrs["metrics"]), "metrics"),
+            )
             scene = GaussianScene(**arrays, size=size, reference=int(file.attrs["reference"]), metrics=metrics)
-        except (TypeError, ValueError) as error:
+        except (DataError, TypeError, ValueError, OverflowError) as error:
             raise DataError(f"{path}: size, reference or metrics is damaged ({error}); fit again") from None
         scene.validate(str(path))
     return scene

@@ -20,6 +20,7 @@ from dpcli.store.file import (
     root_attributes,
 )
 from dpcli.store.writing.resumable_writer import ResumableWriter
+from dpcli.text_files import parse_json
 
 
 class StatisticsWriter(ResumableWriter):
@@ -95,8 +96,8 @@ class StatisticsReader:
     def read(self, index: int) -> dict[str, Any]:
         """Returns the values of one sample, as they were written. DataError when they can't be read."""
         try:
-            return _unpacked(json.loads(self._texts[index]))
-        except (ValueError, TypeError, KeyError):
+            return _unpacked(parse_json(self._texts[index], self.path))
+        except (DataError, ValueError, TypeError, KeyError, RecursionError):
             raise DataError(
                 f"{self.path}: the statistics of {self.names[index]!r} are damaged; evaluate again"
             ) from None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from dpcli.evaluate.compare.file_metrics import EvaluationOptions, FileMetrics, 
 from dpcli.evaluate.compare.measure_file import measure_file
 from dpcli.evaluate.results import samples_json
 from dpcli.evaluate.video.sources.open_source import is_media
+from dpcli.text_files import parse_json, read_text
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _COUNTS = ("samples", "sequences", "views", "frames", "videos")  # denominators that a prediction doesn't change
@@ -138,9 +138,9 @@ def _facts(found: Sequence[FileMetrics]) -> dict[str, Any]:
 
 def _json_runs(path: Path, source: str, options: EvaluationOptions) -> list[Run]:
     try:
-        lines = [line for line in path.read_text().splitlines() if line.strip()]
-        objects = [json.loads(line) for line in lines]
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
+        lines = [line for line in read_text(path).splitlines() if line.strip()]
+        objects = [parse_json(line, source) for line in lines]
+    except DataError:
         raise DataError(
             f"{source}: neither a file of this program nor JSON objects, one a line; expected what "
             "`dpc evaluate ... --json` prints"

@@ -30,6 +30,7 @@ from dpcli.segment.training.learning_curves import COLUMNS, draw_curves
 from dpcli.segment.training.settings import CATALOG, RunSettings, TrainSettings
 from dpcli.segment.training.trainer import Trainer
 from dpcli.store import CloudsReader, input_file
+from dpcli.text_files import read_json
 
 
 def train_part_network(data: str, output: str, settings: TrainSettings, *, seed: int, device: str, force: bool) -> Path:
@@ -118,8 +119,8 @@ def _check_flows(
     folder = Path(settings.flows_of)
     run.refuse_inside("flows_of", folder / "flows_first.npy")
     try:
-        other = json.loads((folder / "config.json").read_text())
-    except (OSError, ValueError):
+        other = read_json(folder / "config.json")
+    except (OSError, DataError):
         raise UsageError(f"flows_of = {folder}: no folder of a `dpc segment train` run") from None
     for key in ("data", "seed", "validation", "flow", "flow_weights"):
         if other.get(key) != record.get(key):

@@ -1,0 +1,25 @@
+"""Text and JSON files in other encodings, too deep or with halves of letters are bad data that names the file."""
+
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.text_files import read_json, read_text
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"{", b"[" * 100_000, b'{"a": "\\ud800"}', b'"\xe9"', '{"a": 1}'.encode("utf-16"), b"9" * 5000, b"\0"]
+)
+def test_what_is_no_json_is_said_with_the_name(data, tmp_path):
+    path = tmp_path / "meta.json"
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="meta.json: is not (JSON|text)"):
+        read_json(path)
+
+
+def test_a_byte_order_mark_and_pairs_of_surrogates_are_read(tmp_path):
+    path = tmp_path / "meta.json"
+    path.write_bytes(b'\xef\xbb\xbf{"a": "\\ud83d\\ude00 \xc3\xa9"}')
+    assert read_json(path) == {"a": "\U0001f600 é"}
+    path.write_bytes("é".encode("latin-1"))
+    with pytest.raises(DataError, match="byte 0 is 0xe9"):
+        read_text(path)
