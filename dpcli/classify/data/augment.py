@@ -12,7 +12,7 @@ from dpcli.runtime.settings.fields import check, setting
 @dataclass(frozen=True)
 class Augmentation:
     """Holds the ranges of the random changes, 0 switches one off; called with a clip, changes it. One draw a clip, so that
-    motion within it stays as it is.
+    motion within it stays as it is; `sway` alone adds motion, of the body as a whole.
 
     The defaults are ours (chosen on a validation subject: docs/experiments/classify.md). `PEERS` scales the axes only, from the
     camera, as the published loaders of MSR-Action3D do; `RELEASE` is what the published Kinet does. Raises UsageError for
@@ -56,6 +56,13 @@ class Augmentation:
         "Scale and turn about the camera, so that a far body moves by meters; false: about the clip's mean.",
         name="augment_origin",
     )
+    sway: float = setting(
+        0.0,
+        "Largest slow swing of the whole body within a clip, in radians, so that leaning and stepping tell nothing.",
+        least=0,
+        below=1,
+        name="augment_sway",
+    )
 
     def __post_init__(self) -> None:
         check(self)
@@ -70,6 +77,7 @@ class Augmentation:
         linear = np.diag(rng.uniform(1 - self.scale, 1 + self.scale, 3 if self.per_axis else 1) * np.ones(3))
         angles = np.clip(rng.normal(0, 1, 3), -3, 3) * self.tilt
         angles[1] += rng.uniform(-self.turn, self.turn)
+        points = self._swayed(points, rng) if self.sway else points
         center = np.zeros(3, np.float32) if self.origin else points.mean((0, 1))
         moved = (points - center) @ (linear @ _rotation(angles).T).astype(np.float32)
         moved += center + rng.uniform(-self.shift, self.shift, 3).astype(np.float32)
@@ -87,6 +95,23 @@ class Augmentation:
         fastest = np.log1p(self.speed)
         factor = np.exp(rng.uniform(-fastest, fastest))
         return np.floor(np.arange(frames) * factor + rng.random()).astype(int)
+
+    def _swayed(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Returns the clip, each frame turned about the clip's mean, moved and scaled by slow curves of time.
+
+        A body that leans by some angle moves its middle by that angle times its half height: so shifts are in units of the
+        points' spread.
+        """
+        time = np.linspace(0, 1, len(points))[:, None]
+        curve = np.cos(
+            2 * np.pi * (rng.uniform(0.25, 1.5, 7) * time + rng.random(7))
+        )  # three turns, three shifts, a size
+        curve *= rng.uniform(0, self.sway, 7)
+        turn = np.stack([_rotation(angles) for angles in curve[:, :3]]) * np.exp(curve[:, 6] / 2)[:, None, None]
+        center = points.mean((0, 1))
+        spread = np.sqrt(((points - center) ** 2).sum(-1).mean())
+        moved = np.einsum("tpi,tji->tpj", points - center, turn.astype(np.float32))
+        return moved + center + (curve[:, None, 3:6] * spread).astype(np.float32)
 
     def _drop(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         if not self.dropout:
