@@ -298,6 +298,30 @@ def test_without_a_speed_clips_are_drawn_as_ever(reader):
     assert all((np.diff(clip.frames) == 1).all() for clip in still.epoch(3, 2) if clip.sequence == 3)
 
 
+def test_sway_moves_the_body_as_one_and_slowly():
+    """Each frame is turned, moved and scaled as a whole, by no more than said, and neighbors in time alike."""
+    rng = np.random.default_rng(4)
+    body = rng.normal(0, (0.2, 0.5, 0.1), (80, 3)).astype(np.float32)
+    still = np.repeat(body[None], 24, 0)
+    spread = np.sqrt(((body - body.mean(0)) ** 2).sum(1).mean())
+    angles, shifts, sizes = [], [], []
+    for _ in range(40):
+        moved = Augmentation(0, False, 0, 0, 0, 0, 0, 0, sway=0.3)(still, rng)
+        centered = moved - moved.mean(1, keepdims=True)
+        turns = []
+        for frame in centered:
+            left, stretch, right = np.linalg.svd((body - body.mean(0)).T @ frame)
+            turns.append(right.T @ left.T)
+            size = stretch.sum() / ((body - body.mean(0)) ** 2).sum()
+            np.testing.assert_allclose(frame, size * (body - body.mean(0)) @ turns[-1].T, atol=1e-5)  # a similarity
+            sizes.append(size)
+        angles += [np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)) for turn in turns]
+        shifts.append(np.abs(moved.mean(1) - body.mean(0)).max() / spread)
+        assert np.linalg.norm(np.diff(moved, axis=0), axis=-1).max() < 0.4 * spread  # of one frame to the next
+    assert 0.3 < max(angles) <= 0.3 * 3**0.5 + 1e-3 and 0.2 < max(shifts) <= 0.3 + 1e-5
+    assert np.exp(-0.151) <= min(sizes) < 0.9 and 1.1 < max(sizes) <= np.exp(0.151)
+
+
 def test_an_augmentation_is_one_by_name_and_changes():
     """The name sets all ranges, and each may then be changed; the preset's holds where nothing is said."""
 
@@ -308,6 +332,6 @@ def test_an_augmentation_is_one_by_name_and_changes():
     changed = said("quick", augment="peers", augment_turn=0.4, augment_speed=0.3, augment_per_axis=False)
     assert changed == Augmentation(0.1, False, 0.4, 0, 0, 0, 0, 0, 0.3, True)
     assert said("thesis", augment_turn=0.2) == Augmentation(0.1, True, 0.2, 0, 0, 0, 0, 0, 0, True)
-    for field, bad in (("turn", -1), ("turn", float("nan")), ("dropout", 1.0), ("speed", 10.0)):
+    for field, bad in (("turn", -1), ("turn", float("nan")), ("dropout", 1.0), ("speed", 10.0), ("sway", 1.0)):
         with pytest.raises(UsageError, match=f"augment_{field} = "):
             Augmentation(**{field: bad})
