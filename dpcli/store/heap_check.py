@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import mmap
+import os
 import struct
+from functools import lru_cache
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -19,8 +21,15 @@ def check_heaps(path: Path) -> None:
     """Raises DataError where a heap's free space takes no bytes, which libhdf5 would pass over without an end.
 
     Also where lengths are not of 8 bytes each, as all of ours and nearly all others are, since heaps would lie otherwise.
-    Files that are not HDF5 pass: whoever opens them says so. Files of more than 128 MiB are searched at both ends only.
+    Files that are not HDF5 pass: whoever opens them says so. Files of more than 128 MiB are searched at both ends only. A
+    file that did not change is searched once.
     """
+    state = os.stat(path)
+    _check_once(path, state.st_ino, state.st_size, state.st_mtime_ns)
+
+
+@lru_cache(maxsize=256)
+def _check_once(path: Path, _place: int, _size: int, _changed: int) -> None:
     with open(path, "rb") as file:
         start = file.read(_USER_BLOCKS[-1] + 16)
         heads = (start[at : at + 16] for at in _USER_BLOCKS)

@@ -25,6 +25,7 @@ from dpcli.cli.prepare.scans.semantickitti import semantickitti
 from dpcli.cli.prepare.synthetic.animal import animal
 from dpcli.cli.prepare.synthetic.articulated import articulated
 from dpcli.cli.prepare.synthetic.gestures import gestures
+from dpcli.cli.prepare.synthetic.streets import streets
 from dpcli.cli.prepare.views.animation import animation
 from dpcli.cli.prepare.views.artemis import artemis
 from dpcli.cli.prepare.views.video import video
@@ -36,7 +37,7 @@ SECTIONS = {
     "One object filmed, to views": (video, animation, artemis),
     "Files of clouds": (merge, split),
 }  # heading in `dpc prepare --help` -> its commands
-MADE = (gestures, articulated, animal)
+MADE = (gestures, articulated, streets, animal)
 
 app = typer.Typer(no_args_is_help=True, cls=SectionedGroup)
 synthetic = typer.Typer(no_args_is_help=True, cls=SectionedGroup)
@@ -48,6 +49,6 @@ for command in MADE:
 app.add_typer(
     synthetic,
     name="synthetic",
-    help="Makes data out of nothing, with ground truth: gestures, articulated objects, an animal.",
+    help="Makes data out of nothing, with ground truth: gestures, articulated objects, streets, an animal.",
     rich_help_panel="Synthetic data",
 )
