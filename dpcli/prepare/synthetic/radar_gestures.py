@@ -101,9 +101,7 @@ class RadarGestures(SyntheticGestures):
         return measure(rng.permutation(rows)[:MOST_POINTS], self.noise, rng)
 
 
-def animate(
-    subject: RadarSubject, label: int, frames: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def animate(subject: RadarSubject, label: int, frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Returns the axes of all capsules in the radar's axes, f64 (T,parts,3) each; the gesture lasts `frames` by the person's
     tempo, and before and after it a part of the way from and to rest is seen."""
     count = max(2, round(frames * subject.tempo * np.exp(rng.normal(0, 0.12))))
@@ -139,9 +137,7 @@ def reach_and_return(path: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.concatenate([ways[0], path, ways[1][::-1]])
 
 
-def detect(
-    radii: np.ndarray, starts: np.ndarray, ends: np.ndarray, t: int, rng: np.random.Generator
-) -> np.ndarray:
+def detect(radii: np.ndarray, starts: np.ndarray, ends: np.ndarray, t: int, rng: np.random.Generator) -> np.ndarray:
     """Returns what is detected of the body in frame t: x y z, radial speed, intensity in dB, f64 (N,5).
 
     Candidates fall on the parts by their area. One is detected the likelier the faster it comes or goes, as what stands

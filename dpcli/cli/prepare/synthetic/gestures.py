@@ -18,7 +18,9 @@ def gestures(
     noise: Annotated[float, typer.Option("--noise", min=0.0, help="Sensor noise; 1 is like a Kinect's.")] = 1.0,
     sensor: Annotated[
         Literal["depth", "radar"],
-        typer.Option("--sensor", help="A depth camera, or a radar: 1 to 64 points a frame, with Doppler and intensity."),
+        typer.Option(
+            "--sensor", help="A depth camera, or a radar: 1 to 64 points a frame, with Doppler and intensity."
+        ),
     ] = "depth",
     conversion: ConversionOptions,
 ) -> None:
