@@ -20,7 +20,7 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-5.1 table-5.2
+.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-4.3 table-5.1 table-5.2
 .PHONY: segments prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
@@ -37,6 +37,7 @@ help:
 	@echo "make segments MSRACTION=folder actions found in long recordings; ten minutes"
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
+	@echo "make table-4.3 MESHES=folder | OGC=folder  rigid parts of rooms, all methods"
 	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, five rows and those of the thesis; hours"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
@@ -179,6 +180,12 @@ table-4.1: $(READY)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/train.h5 --pairs-per-object 16 --joint-step 0.6 --seed 1 $(MADE_OF)
 	$(DPC) prepare sapien "$(SAPIEN)" -o $(T41)/test.h5 --pairs-per-object 4 --seed 0 $(MADE_OF)
 	$(BIN)/python -m dpcli.reproduce.table_4_1 $(T41)/train.h5 $(T41)/test.h5 $(T41) -- $(T42_TRAIN)
+
+# Table 4.3 on new rooms of the models below MESHES, or on OGC-DR and OGC-DRSV in the folder OGC; T43: words for the program.
+OGC ?=
+table-4.3: $(READY)
+	$(if $(MESHES)$(OGC),,$(error make table-4.3 needs MESHES=folder, models to furnish rooms with, or OGC=folder, with OGC-DR and OGC-DRSV in it))
+	$(BIN)/python -m dpcli.reproduce.table_4_3 table/4.3 $(if $(OGC),--ogc "$(OGC)",--meshes "$(MESHES)") $(T43)
 
 # Table 5.1 on ARTEMIS' animals (ARTEMIS names their folder) or on animated meshes; T51: words for the program.
 MESHES ?=

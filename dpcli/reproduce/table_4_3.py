@@ -1,0 +1,106 @@
+"""Table 4.3 of the thesis: rigid parts of rooms seen from all around and by one camera, every method of `segment predict`.
+
+    python -m dpcli.reproduce.table_4_3 FOLDER --meshes MESHES [--rooms 20] | --ogc OGC [--points 2048] [--methods ...]
+
+MESHES is a folder of models, of which new rooms are made; OGC holds `OGC-DR` and `OGC-DRSV` as released. Each step is
+done once; the table FOLDER/table.md is written again after every method.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from dpcli.reproduce import runs
+
+METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
+VIEWS = {"full": ("ogc-dr", "OGC-DR"), "single view": ("ogc-drsv", "OGC-DRSV")}
+METHODS = ("multibody", "network", "ssc", "trajaffn", "ward", "dbscan")
+THESIS = {  # percent, full / single view, by METRICS
+    "trajaffn": ((42.6, 46.7, 57.8, 69.6, 49.4, 46.8, 80.1), (39.3, 43.8, 54.8, 63.0, 48.4, 45.9, 77.7)),
+    "ssc": ((74.5, 79.2, 84.2, 92.5, 77.3, 74.6, 91.5), (70.3, 75.4, 81.5, 89.6, 74.7, 70.8, 91.3)),
+    "ward": ((72.3, 74.0, 82.5, 93.9, 73.6, 69.9, 94.3), (69.8, 71.6, 80.5, 91.8, 71.7, 67.2, 93.3)),
+    "dbscan": ((73.9, 76.0, 81.6, 85.8, 77.8, 74.7, 91.5), (71.9, 76.3, 81.8, 79.1, 84.8, 80.1, 93.5)),
+    "OGC": ((92.3, 85.1, 89.4, 85.6, 93.6, 90.8, 97.8), (86.8, 77.0, 83.9, 77.7, 91.2, 84.8, 95.4)),
+    "the thesis's network": ((93.9, 87.0, 91.1, 87.0, 95.6, 92.4, 98.1), (88.1, 80.0, 86.1, 80.8, 92.2, 86.7, 96.6)),
+}
+
+
+def prepare(view: str, options: argparse.Namespace) -> Path:
+    """Returns the clouds file of a view; `prepare` passes over what is there already."""
+    command, released = VIEWS[view]
+    path = options.folder / f"{command}.h5"
+    made = ["--generate", options.meshes, "--rooms", options.rooms, "--seed", options.seed, "--fractions", "0,0,1"]
+    source = made if options.meshes else [options.ogc / released]
+    runs.dpc("prepare", command, *source, "--points", options.points, "-o", path)
+    return path
+
+
+def score(data: Path, method: str, points: int) -> dict:
+    """Returns the metrics of a method on the test rooms, as shares of 1, with their intervals."""
+    parts = data.with_name(f"{data.stem}-{method}.h5")
+
+    def work() -> dict:
+        runs.dpc("segment", "predict", data, "-o", parts, "--method", method, "--points", points, "--split", "test")
+        return json.loads(runs.dpc("evaluate", "segmentation", parts, "--truth", data, "--split", "test", "--json"))
+
+    return runs.once(parts.with_suffix(".json"), [runs.digest(data), method, points], work)
+
+
+def table(found: dict[str, dict[str, dict]], about: str) -> str:
+    """Returns Markdown with a part for each view: our methods, then the thesis's numbers, percent."""
+    lines = []
+    for place, (view, by_method) in enumerate(found.items()):
+        lines += [f"## {view}", "", "| |" + "|".join(f" {name.upper()} " for name in METRICS) + "| AP, 95 % |"]
+        lines += ["|---|" + "---|" * (len(METRICS) + 1)]
+        for method, result in by_method.items():
+            values = [result["metrics"][name] for name in METRICS]
+            cells = [runs.DASH if value is None else f"{100 * value:.1f}" for value in values]
+            lines.append(f"| {method} | {' | '.join([*cells, _interval(result)])} |")
+        for name, numbers in THESIS.items():
+            lines.append(f"| *{name}, thesis* | {' | '.join([*map(str, numbers[place]), runs.DASH])} |")
+        lines.append("")
+    return "\n".join([*lines, about, ""])
+
+
+def _interval(result: dict) -> str:
+    found = result.get("intervals", {}).get("metrics", {}).get("ap")
+    return f"{100 * found[0]:.1f} – {100 * found[1]:.1f}" if found else runs.DASH
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Makes the rooms, runs the methods that are asked for, and writes the table after each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--meshes", type=Path)
+    source.add_argument("--ogc", type=Path)
+    parser.add_argument("--rooms", type=int, default=20, help="new rooms of each number of objects")
+    parser.add_argument("--points", type=int, default=2048)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--methods", default=",".join(METHODS), help=f"some of {','.join(METHODS)}")
+    options = parser.parse_args(argv)
+    chosen = options.methods.split(",")
+    unknown = [method for method in chosen if method not in METHODS]
+    if unknown:
+        parser.error(f"--methods: no method {unknown[0]!r}; there are {', '.join(METHODS)}")
+    options.folder.mkdir(parents=True, exist_ok=True)
+    target = options.folder / "table.md"
+    rooms = f"new rooms from {options.meshes.name}" if options.meshes else "the released rooms"
+    about = (
+        f"Percent; {rooms}, {options.points} points a frame, split test, seed {options.seed}; thesis: its own rooms."
+    )
+    found: dict[str, dict[str, dict]] = {view: {} for view in VIEWS}
+    for view in VIEWS:
+        data = prepare(view, options)
+        for method in chosen:
+            print(f"table 4.3: {view}, {method}", file=sys.stderr)
+            found[view][method] = score(data, method, options.points)
+            runs.write_text(target, table(found, about))
+    print(target.read_text(), end="")
+
+
+if __name__ == "__main__":
+    main()
