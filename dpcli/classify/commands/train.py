@@ -13,7 +13,7 @@ import torch
 
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import carve_validation, class_table, default_rule
+from dpcli.classify.data.validation_split import about_people, carve_validation, class_table, default_rule
 from dpcli.classify.data.videos import report_short
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
@@ -40,11 +40,15 @@ SETTINGS_FILE = "settings.toml"
 
 @dataclass(frozen=True)
 class Training:
-    """Names the weights that a training left, and says how well its validation videos are classified, by stream."""
+    """Names the weights that a training left, and says how well its validation videos are classified, by stream.
+
+    caveat: what the people of these videos have to do with those of the training, "" where they are others.
+    """
 
     weights: Path
     videos: int  # for validation
     accuracy: dict[str, float]
+    caveat: str = ""
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class _Videos:
     counts: tuple[int, int]  # videos of both, those too short for a clip included
     class_names: list[str]
     digest: str
+    caveat: str  # see `Training`
 
 
 def train(
@@ -108,7 +113,9 @@ def _train(
         if processes.first and videos.validation is not None:
             _add_confidence(trainer, info, videos.validation, folder)
     accuracy = trainer.validate() if videos.validation is not None else {}
-    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy) if processes.first else None
+    if not processes.first:
+        return None
+    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy, videos.caveat)
 
 
 def _add_confidence(trainer: Trainer, info: ModelInfo, validation: ClipSource, folder: RunFolder) -> None:
@@ -147,7 +154,8 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
-    return settings, _Videos(source, held, counts, class_table(reader), provenance.file_digest(path))
+    caveat = about_people(reader, training, validation)
+    return settings, _Videos(source, held, counts, class_table(reader), provenance.file_digest(path), caveat)
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:

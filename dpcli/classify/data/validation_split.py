@@ -129,6 +129,21 @@ def default_rule(reader: CloudsReader) -> str:
     return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
 
 
+def about_people(reader: CloudsReader, training: list[int], validation: list[int]) -> str:
+    """Returns what a person must know before believing the accuracy of validation, "" where nobody seen there trained."""
+    learned, judged = ({int(reader.subjects[i]) for i in some} for some in (training, validation))
+    if not judged:
+        return ""
+    if min(learned | judged) < 0:
+        return (
+            "the file doesn't say who is seen; if the same people train and validate, people never seen come out lower"
+            " (a column subject in --labels holds whole people out)"
+        )
+    shared = len(learned & judged)
+    who = f"{shared} {'person trains and validates' if shared == 1 else 'people train and validate'}"
+    return f"{who}: people never seen come out lower (--validation subject holds whole people out)" if shared else ""
+
+
 def class_table(reader: CloudsReader) -> list[str]:
     """Returns the class names; numbers where the file has labels but no names."""
     if reader.class_names:

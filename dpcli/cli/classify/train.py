@@ -40,3 +40,5 @@ def train(
     if result.accuracy:
         scores = ", ".join(f"{key} {100 * value:.1f} %" for key, value in result.accuracy.items())
         typer.echo(f"{result.videos} validation videos: {scores}")
+        if result.caveat:
+            typer.echo(f"note: {result.caveat}")

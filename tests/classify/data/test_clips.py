@@ -19,7 +19,7 @@ from dpcli.classify.data.clips import (
     sample_points,
     uniform_frames,
 )
-from dpcli.classify.data.validation_split import carve_validation, default_rule, folds
+from dpcli.classify.data.validation_split import about_people, carve_validation, default_rule, folds
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.settings import training_settings
 from dpcli.errors import DataError, UsageError
@@ -193,6 +193,24 @@ def test_validation_comes_from_training_subjects_only(reader):
     for bad in ("subjects:9", "subjects:0,1,2,3,4", "1.5", "some", "subjects:x"):
         with pytest.raises(UsageError):
             carve_validation(reader, bad, 0)
+
+
+@pytest.mark.parametrize(
+    "subjects, told",
+    [
+        ((0, 1, 2, 3), ""),
+        ((0, 1, 1, 0), "2 people train and validate: people never seen come out lower"),
+        ((0, 1, 2, 1), "1 person trains and validates"),
+        ((0, 1, -1, 1), "the file doesn't say who is seen"),
+    ],
+)
+def test_people_who_train_and_validate_are_told(tmp_path, make_sequence, subjects, told):
+    with CloudsWriter(tmp_path / "own.h5", class_names=["a"]) as writer:
+        for k, subject in enumerate(subjects):
+            writer.write(make_sequence(f"v{k}", label=0, split="train", subject=subject))
+    said = about_people(CloudsReader(tmp_path / "own.h5"), [0, 1], [2, 3])
+    assert said.startswith(told) and bool(said) == bool(told)
+    assert about_people(CloudsReader(tmp_path / "own.h5"), [0, 1], []) == ""
 
 
 def test_the_files_own_validation_videos_validate(tmp_path, make_sequence):
