@@ -65,6 +65,13 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         return Baseline(learned, len(judged), right, len(set(labels.tolist())), _seen(reader, known, rounds))
 
 
+def forest_accuracy(reader: CloudsReader, learned: list[int], judged: list[int], seed: int) -> float:
+    """Returns the share of the labeled sequences `judged` that a forest which saw the sequences `learned` gets right."""
+    known, asked = descriptors(reader, learned), descriptors(reader, judged)
+    scores = _forest_scores(known, reader.labels[learned], asked, int(reader.labels.max()) + 1, seed)
+    return float((scores.argmax(1) == reader.labels[judged]).mean())
+
+
 def _rounds(reader: CloudsReader, known: np.ndarray, labels: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yields the places among `known` that a forest learns from and those that it is judged on."""
     from sklearn.model_selection import GroupKFold, StratifiedKFold

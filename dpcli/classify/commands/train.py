@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.validation_split import about_people, carve_validation, class_table, default_rule
@@ -36,19 +37,22 @@ from dpcli.runtime.whole_file import write_whole
 from dpcli.store import CloudsReader, input_file
 
 SETTINGS_FILE = "settings.toml"
+_FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
 
 
 @dataclass(frozen=True)
 class Training:
     """Names the weights that a training left, and says how well its validation videos are classified, by stream.
 
-    caveat: what the people of these videos have to do with those of the training, "" where they are others.
+    caveat: what the people of these videos have to do with those of the training, "" where they are others. forest: the
+    share of them that a random forest on descriptors gets right, None where it was not asked.
     """
 
     weights: Path
     videos: int  # for validation
     accuracy: dict[str, float]
     caveat: str = ""
+    forest: float | None = None
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,15 @@ def _train(
     accuracy = trainer.validate() if videos.validation is not None else {}
     if not processes.first:
         return None
-    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy, videos.caveat)
+    return Training(folder.file("best.safetensors"), videos.counts[1], accuracy, videos.caveat, _forest(videos, seed))
+
+
+def _forest(videos: _Videos, seed: int) -> float | None:
+    """Returns the accuracy that the network had to beat, where it takes seconds and says something."""
+    source, held = videos.training, videos.validation
+    if held is None or not _FOREST[0] <= len(source.sequences) <= _FOREST[1]:
+        return None
+    return forest_accuracy(source.reader, list(source.sequences), list(held.sequences), seed)
 
 
 def _add_confidence(trainer: Trainer, info: ModelInfo, validation: ClipSource, folder: RunFolder) -> None:

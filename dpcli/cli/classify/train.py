@@ -40,5 +40,7 @@ def train(
     if result.accuracy:
         scores = ", ".join(f"{key} {100 * value:.1f} %" for key, value in result.accuracy.items())
         typer.echo(f"{result.videos} validation videos: {scores}")
+        if result.forest is not None:
+            typer.echo(f"a random forest on hand-made descriptors: {100 * result.forest:.1f} % (dpc classify baseline)")
         if result.caveat:
             typer.echo(f"note: {result.caveat}")

@@ -92,6 +92,17 @@ def test_too_few_videos_are_refused_by_name(tmp_path):
         command.baseline(str(tmp_path / "b.h5"))
 
 
+def test_training_tells_the_forest_beside_the_network(tmp_path):
+    data = write(tmp_path / "a.h5", videos=12)
+    few = "--epochs 1 --set epochs_dynamic=1 --preset tiny --frames 4 --points 64 --validation 0.25".split()
+    told = subprocess.check_output(
+        [sys.executable, "-m", "dpcli", "classify", "train", data, "-o", tmp_path / "run", *few], text=True
+    ).splitlines()
+    assert told[1].startswith("6 validation videos: static ")
+    assert told[2].startswith("a random forest on hand-made descriptors: ") and told[2].split()[6] in ("83.3", "100.0")
+    assert told[3].startswith("note: 2 people train and validate")
+
+
 def test_the_command_reads_a_pipe_and_prints_one_line(tmp_path):
     data = write(tmp_path / "a.h5")
     words = [sys.executable, "-m", "dpcli", "classify", "baseline", "-"]
