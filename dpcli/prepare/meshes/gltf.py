@@ -43,6 +43,8 @@ _FOREIGN = {  # how files of other formats begin
     b"<?xml": "XML (COLLADA, perhaps)",
     b"<COLLADA": "COLLADA",
 }
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+_UNPACKED = 4096  # bytes that one of compressed data may make
 
 
 @dataclass
@@ -146,6 +148,34 @@ class Gltf:
 
     def _view(self, index: Any) -> tuple[bytes, int]:
         entry = self.item("bufferViews", index)
+        packed = next((entry["extensions"][name] for name in MESHOPT if name in entry.get("extensions", {})), None)
+        if packed is not None:
+            return self._unpacked(index, packed)
+        return self._part(index, entry), entry.get("byteStride", 0)
+
+    def _unpacked(self, index: Any, packed: dict[str, Any]) -> tuple[bytes, int]:
+        """Returns the bytes of a buffer view that meshopt compressed, and its stride, 0 for indices."""
+        count, size, mode = (packed.get(key) for key in ("count", "byteStride", "mode"))
+        data = self._part(index, packed)
+        sizes = all(type(number) is int and number > 0 for number in (count, size))
+        if not sizes or count * size > _UNPACKED * len(data) + (1 << 20):
+            raise self.fail(
+                f"bufferView {index} claims {count} rows of {size} bytes, which {len(data)} bytes can't hold; the file is damaged"
+            )
+        try:
+            import meshopt
+        except ImportError:
+            raise self.fail(
+                "is compressed by meshopt: pip install 'dpc-toolkit[meshopt]' (Python 3.11 or later), or export it without"
+            ) from None
+        try:
+            rows = meshopt.decode_gltf_buffer(data, count, size, mode, packed.get("filter", "NONE"))
+        except (ValueError, RuntimeError, TypeError) as error:
+            raise self.fail(f"bufferView {index}: meshopt cannot decode it ({error}); export the file again") from None
+        return rows.tobytes(), size if mode == "ATTRIBUTES" else 0
+
+    def _part(self, index: Any, entry: dict[str, Any]) -> bytes:
+        """Returns the bytes of a buffer that a buffer view, or its compressed form, names."""
         data = self._buffer(entry.get("buffer"))
         start, length = entry.get("byteOffset", 0), entry.get("byteLength", 0)
         if not (0 <= start and 0 < length and start + length <= len(data)):
@@ -153,7 +183,7 @@ class Gltf:
                 f"bufferView {index} needs bytes {start} to {start + length} of a buffer of {len(data)}; "
                 "the file is truncated or damaged"
             )
-        return data[start : start + length], entry.get("byteStride", 0)
+        return data[start : start + length]
 
     def _buffer(self, index: Any) -> bytes:
         if index not in self._buffers:
@@ -237,7 +267,7 @@ def read_gltf(path: Path) -> Gltf:
     try:
         tree = parse_json(text, path)
         version = str(tree["asset"]["version"])
-    except (KeyError, TypeError):
+    except (DataError, KeyError, TypeError):
         raise DataError(f"{path}: not a glTF file (no JSON with an asset version); expected .glb or .gltf") from None
     if not version.startswith("2"):
         raise DataError(f"{path}: glTF version {version}; version 2 is read, convert the file")

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.prepare.meshes.gltf import Gltf
+from dpcli.prepare.meshes.gltf import MESHOPT, Gltf
 from dpcli.prepare.meshes.skinning import matrices
 from dpcli.runtime.progress import log
 
 READ = {
+    *MESHOPT,
     "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
     "KHR_animation_pointer",
@@ -37,8 +38,6 @@ _UNSEEN = {  # what they say does not change a picture
     "VRMC_vrm",
 }
 _ADVICE = {
-    "EXT_meshopt_compression": "export it without compression",
-    "KHR_meshopt_compression": "export it without compression",
     "KHR_texture_basisu": "export its textures as PNG or JPEG",
     "EXT_texture_avif": "export its textures as PNG or JPEG",
 }

@@ -400,7 +400,7 @@ def broken_files() -> dict[str, tuple[GlbFile, str]]:
             "zero quaternion",
             "times fall",
             "bone missing",
-            "meshopt",
+            "required",
             "circle",
             "no mesh",
             "weights",
@@ -418,7 +418,7 @@ def broken_files() -> dict[str, tuple[GlbFile, str]]:
     files["zero quaternion"].animate(1, "rotation", [0, 1], [[0, 0, 0, 1], [0, 0, 0, 0]])
     files["times fall"].animate(1, "translation", [1, 0], np.zeros((2, 3)))
     trees["bone missing"]["skins"][0]["joints"] = [1]
-    trees["meshopt"]["extensionsRequired"] = ["EXT_meshopt_compression"]
+    trees["required"]["extensionsRequired"] = ["ACME_required"]
     trees["circle"]["nodes"][2]["children"] = [0]
     trees["no mesh"]["nodes"][3] = {"name": "strip"}
     primitive = trees["weights"]["meshes"][0]["primitives"][0]
@@ -436,7 +436,7 @@ def broken_files() -> dict[str, tuple[GlbFile, str]]:
         "zero quaternion": "key 1 is zero",
         "times fall": "do not rise",
         "bone missing": "bone 1 of 1",
-        "meshopt": "EXT_meshopt",
+        "required": "ACME_required",
         "circle": "circle",
         "no mesh": "no triangles",
         "weights": "10 of 10 vertices",
