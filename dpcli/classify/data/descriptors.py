@@ -12,6 +12,7 @@ from dpcli.store.schema import KEPT
 
 _SLOTS = 6  # parts of a video, equally long
 _LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)
+_LARGEST = 1e30  # a forest takes float32
 
 
 def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
@@ -19,8 +20,10 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
 
     fields: kept columns, such as `field_doppler`. It holds the place and extent of the whole cloud, and for each of six
     slots of time the number of points, quantiles of position (about the video's median) and fields, and their shift
-    since the slot before. A slot without points repeats the one before.
+    since the slot before. A slot without points repeats the one before; a video without any is a point at the origin.
     """
+    if not len(sequence.points):
+        sequence = CloudSequence.from_frames(sequence.name, [np.zeros((1, 3), np.float32)])
     times = np.repeat(np.arange(sequence.num_frames), np.diff(sequence.frame_offsets))
     middle = np.median(sequence.points, 0)
     columns = [sequence.extra[name] for name in fields if name in sequence.extra]
@@ -31,7 +34,8 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
     middles = slots[:, len(_LEVELS) // 2]
     counts = np.bincount(times * _SLOTS // max(sequence.num_frames, 1), minlength=_SLOTS) / max(len(times), 1)
     size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *middle]
-    return np.concatenate([size, counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
+    found = np.concatenate([size, counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
+    return np.nan_to_num(found).clip(-_LARGEST, _LARGEST)
 
 
 def _slots(values: np.ndarray, slot: np.ndarray, whole: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dpcli.classify.commands import baseline as command
+from dpcli.classify.data.descriptors import descriptor
 from dpcli.errors import DataError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from dpcli.store.schema import kept_name
@@ -90,6 +91,14 @@ def test_too_few_videos_are_refused_by_name(tmp_path):
         writer.write(CloudSequence.from_frames("v", [np.zeros((1, 3), np.float32)]))
     with pytest.raises(DataError, match="no video has a label"):
         command.baseline(str(tmp_path / "b.h5"))
+
+
+def test_videos_without_points_or_with_odd_numbers_are_described():
+    odd = np.float32([[np.nan, 0, 1], [np.inf, 1e38, -1e38], [0, 0, 1]])
+    for frames in ([np.zeros((0, 3), np.float32)] * 2, [odd, odd]):
+        found = descriptor(CloudSequence.from_frames("v", frames), ())
+        assert np.isfinite(found.astype(np.float32)).all()
+    assert len(found) == len(descriptor(CloudSequence.from_frames("v", [odd]), ()))
 
 
 def test_training_tells_the_forest_beside_the_network(tmp_path):

@@ -74,7 +74,10 @@ def test_the_command_tells_it_in_every_form(tmp_path, probabilities):
     with ScoresWriter(path, class_names=["a", "b", "c", "d"]) as writer:
         for i, (row, label) in enumerate(zip(scores, labels)):
             writer.write(f"v{i}", row if probabilities else 7 * row, label=int(label), split="test")
-    run = lambda *words: CliRunner().invoke(evaluate.app, ["classification", str(path), *words])  # noqa: E731
+
+    def run(*words):
+        return CliRunner().invoke(evaluate.app, ["classification", str(path), *words])
+
     found = json.loads(run("--json").stdout)
     text = run("--picture", str(tmp_path / "p.png"), "--resamples", "200").stdout
     assert (tmp_path / "p.png").stat().st_size > 10_000
