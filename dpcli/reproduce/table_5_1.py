@@ -148,7 +148,8 @@ def main() -> None:
     source.add_argument("--meshes", type=Path)
     source.add_argument("--artemis", type=Path)
     parser.add_argument("--clips", default=CLIPS, help="MODEL.glb:CLIP, comma between; of --meshes")
-    parser.add_argument("--rows", default=",".join((*LAYERS, *FITS.values())))
+    known = (*LAYERS, *FITS.values())
+    parser.add_argument("--rows", default=",".join(known), help=f"some of {', '.join(known)}")
     parser.add_argument("--size", type=int, help="pixels; 256 for meshes, 512 for ARTEMIS when left out")
     parser.add_argument("--frames", type=int, default=32)
     parser.add_argument(
@@ -157,6 +158,9 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     own, fit = runs.cut(None)
     given = parser.parse_args(own)
+    rows = given.rows.split(",")
+    if unknown := [row for row in rows if row not in known]:
+        parser.error(f"--rows: no row {unknown[0]!r}; there are {', '.join(known)}")
     given.out.mkdir(parents=True, exist_ok=True)
     if given.artemis:
         clips = {"as filmed": film_artemis(given.artemis, given.out, given.size or 512, given.frames)}
@@ -166,7 +170,6 @@ def main() -> None:
     tables = []
     with ThreadPoolExecutor(given.jobs) as pool:
         for side, views in clips.items():
-            rows = given.rows.split(",")
             running = {row: [pool.submit(score, v, row, tuple(fit), given.learned) for v in views] for row in rows}
             tables.append(table({row: [job.result() for job in jobs] for row, jobs in running.items()}, side))
     runs.write_text(given.out / "table.md", "\n\n".join(tables) + "\n")
