@@ -83,7 +83,7 @@ def test_spatial_convolution_equals_the_published_one(golden):
     assert (near.index.numpy() == golden["epn_nbr_idx"]).all()
     rotations = golden["epn_anchors"].astype(np.float64)
     layer = Layer(5, 2, float(radius), float(sigma), int(count), 1.0)
-    conv = SpatialConv(3, layer, PartConfig(((layer,),), kernel="uniform"))
+    conv = SpatialConv(3, layer, PartConfig(((layer,), (layer,)), kernel="uniform"))
     conv.orbit = torch.tensor(np.concatenate([golden["epn_kernels"] @ r.T for r in rotations]).astype(np.float32))
     conv.slot = torch.arange(60 * 24).view(60, 24)
     weight = torch.tensor(golden["epn_W"]).view(5, 3, 24)  # [out, in, kernel]
@@ -95,7 +95,7 @@ def test_spatial_convolution_equals_the_published_one(golden):
 
 def test_group_convolution_equals_the_published_one(golden):
     layer = compact().layers[0][0]
-    conv = GroupConv(5, 2, PartConfig(((layer,),)))
+    conv = GroupConv(5, 2, PartConfig(((layer,), (layer,))))
     conv.table = torch.tensor(golden["epn_intra_idx"])
     conv.weight.data = torch.tensor(golden["epn_intra_W"]).view(2, 5, 12).permute(2, 1, 0).contiguous()
     features = torch.tensor(golden["epn_out"]).permute(0, 2, 3, 1).contiguous()
