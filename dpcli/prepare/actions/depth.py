@@ -151,6 +151,7 @@ class DepthVideos:
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
+        notes |= video.notes
         if video.missing:
             notes[MISSING] = video.missing
         depth, unit = self._inverted(depth, item.path), 1 / scale
@@ -172,8 +173,8 @@ class DepthVideos:
         """Returns the frames of an item, and the camera that a recording describes."""
         if not item.extra["recording"]:
             return read_depth_video(item.path, self.stride, item.extra["series"]), None
-        frames, time, camera = read_recorded_depth(item.path, self.topic, self.stride)
-        return DepthVideo(frames, time), camera
+        read, camera = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes), camera
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""

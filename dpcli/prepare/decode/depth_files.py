@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +38,14 @@ _TICK = 0.0011  # seconds by which a container's time stamps may be off: it coun
 class DepthVideo:
     """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known.
 
-    missing: how many more frames the file declares than it holds, such as a recording that was cut.
+    missing: how many more frames the file declares than it holds, such as a recording that was cut. notes: counts of what
+    else is missing or doubtful.
     """
 
     frames: np.ndarray
     time: np.ndarray | None = None
     missing: int = 0
+    notes: dict[str, int] = field(default_factory=dict)
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture
