@@ -11,6 +11,7 @@ from dpcli.errors import DataError, reading
 from dpcli.runtime.clips.images import as_shown
 from dpcli.runtime.clips.video_frames import video_frames
 
+_MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
 
 
@@ -22,6 +23,8 @@ def is_image_file(path: Path) -> bool:
         return start[8:12] in (b"avif", b"avis")
     if start[:4] == b"RIFF":
         return start[8:12] == b"WEBP"
+    if path.suffix.lower() in _MANY_JPEGS:
+        return False
     return start.startswith((b"GIF8", b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*"))
 
 
