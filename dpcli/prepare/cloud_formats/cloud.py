@@ -18,8 +18,8 @@ class Cloud:
 
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
     coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
-    names of those that points and colors came from. unread: the names of those that nobody asked for. dropped: points
-    that the file itself says don't count, by reason.
+    names of those that points and colors came from. unread: the names of those that nobody asked for. notes:
+    counts of what the file itself says about its points, such as those that don't count.
     """
 
     points: np.ndarray
@@ -28,7 +28,7 @@ class Cloud:
     extra: dict[str, np.ndarray] = field(default_factory=dict)
     columns: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
-    dropped: dict[str, int] = field(default_factory=dict)
+    notes: dict[str, int] = field(default_factory=dict)
 
     def keep(self, rows: np.ndarray) -> None:
         """Keeps only some points: a mask bool (N), or indices."""

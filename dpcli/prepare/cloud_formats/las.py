@@ -54,7 +54,7 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     withheld = np.asarray(las["withheld"]).astype(bool)
     if withheld.any():
         cloud.keep(~withheld)
-        cloud.dropped[WITHHELD] = int(withheld.sum())
+        cloud.notes[WITHHELD] = int(withheld.sum())
     return cloud
 
 
