@@ -18,6 +18,7 @@ from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import check_png, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
+from dpcli.runtime.clips.container_ends import ends_early
 from dpcli.runtime.clips.video_frames import missing_frames
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
@@ -38,12 +39,14 @@ _TICK = 0.0011  # seconds by which a container's time stamps may be off: it coun
 class DepthVideo:
     """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known.
 
-    missing: how many more frames the file declares than it holds, such as a recording that was cut.
+    missing: how many more frames the file declares than it holds, such as a recording that was cut. ends_early: the file
+    stops before its container does, whether or not it says how many frames there were.
     """
 
     frames: np.ndarray
     time: np.ndarray | None = None
     missing: int = 0
+    ends_early: bool = False
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture
@@ -135,7 +138,7 @@ def _declared_frames(capture) -> int:
 def _missing(path: Path, declared: int, count: int, times: np.ndarray | None, stride: int) -> int:
     """Returns how many frames the file lacks; it is opened again only where OpenCV's guess of its length says more."""
     seen = count * stride  # but for the last few
-    return missing_frames(path, seen, times if stride == 1 else None) if declared > seen + 1 else 0
+    return missing_frames(path, seen, times if stride == 1 else None) if declared > seen else 0
 
 
 def _is_plain(stream: VideoStream) -> bool:
@@ -319,7 +322,7 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         frames, time, missing = read_timed_video(path, stride)
         if not frames:
             raise DataError(f"{path}: an empty video: no frame can be decoded")
-        video = DepthVideo(np.stack(frames), time, missing)
+        video = DepthVideo(np.stack(frames), time, missing, ends_early(path))
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:
