@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import map_npy
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.deep_video import deep_frames
@@ -276,8 +277,8 @@ def says_depth(name: str) -> bool:
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame (H,W), by its header."""
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False).ndim == 2
-    except Exception:  # a damaged header raises nearly anything; reading the file says so
+        return map_npy(path).ndim == 2
+    except (DataError, OSError):  # reading the file says so
         return False
 
 
@@ -291,10 +292,7 @@ def _holds_depth(path: Path) -> bool:
 
 def read_array(path: Path, stride: int = 1) -> np.ndarray:
     """Reads a ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header raises nearly anything
-        raise DataError(f"{path}: not a readable .npy array ({type(error).__name__}: {error})") from None
+    array = map_npy(path)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.dtype.kind not in "uif":

@@ -1,4 +1,4 @@
-"""Whether a video file stops before the end that its container promises; FFmpeg reads on to where the bytes end, and is silent.
+"""Tells whether a video file stops before the end that its container promises; FFmpeg reads to where the bytes end, silently.
 
 Only lengths are read, so that a file of any size is answered at once. Containers without any promise (MPEG program streams, bare
 streams) pass.

@@ -160,7 +160,9 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
     Warns where it ends early and nothing tells how many frames it had.
     """
     cut = ends_early(path)
-    declared, held = (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times, cut)
+    declared, held = (
+        (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times, cut)
+    )
     if failed or declared > held + (not cut):
         of = f" of its {declared}" if declared else ""
         raise DataError(
