@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.articulated.mesh_counts import require_counts
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
+from dpcli.prepare.decode.mesh_counts import require_counts
 from dpcli.prepare.reader import natural_key, require_folder
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
-from dpcli.prepare.articulated.mesh_counts import require_counts
+from dpcli.prepare.decode.mesh_counts import require_counts
 
 MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
 _PACKAGES = ("package://", "model://")  # of ROS and Gazebo: the folder of the robot, or one above it
