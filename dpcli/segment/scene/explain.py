@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.segment.scene.carrying import MovingObject, extended
 from dpcli.segment.scene.ego_motion import OVERLAP, register_frames
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import range_jumps
-from dpcli.segment.scene.moving_objects import MovingObject, find_moving_objects
+from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.world import Frame, World
 
@@ -38,20 +39,8 @@ class SceneExplanation:
         moved = np.eye(4)
         if part > 0:
             known = self.objects[part - 1]
-            moved = _extended(known, target) @ np.linalg.inv(_extended(known, source))
+            moved = extended(known, target) @ np.linalg.inv(extended(known, source))
         return np.linalg.inv(self.pose[target]) @ moved @ self.pose[source]
-
-
-def _extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
-    """Returns the motion to a frame; beyond those known, with the step of the last two repeated."""
-    if frame in known:
-        return known[frame]
-    first, last = min(known), max(known)
-    if first == last:
-        return known[first]
-    edge, inner, count = (last, last - 1, frame - last) if frame > last else (first, first + 1, first - frame)
-    step = known[edge] @ np.linalg.inv(known[inner])
-    return np.linalg.matrix_power(step, count) @ known[edge]
 
 
 def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings) -> SceneExplanation:
@@ -64,7 +53,7 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
     poses, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], []
     if len(filled) > 1:
         world, own, turn, apart = _build_world([frames[t] for t in filled], sensor, settings)
-        found = sorted(find_moving_objects(world, settings), key=lambda one: -one.size)[: settings.most_objects]
+        found = find_moving_objects(world, settings)[: settings.most_objects]
         for number, one in enumerate(found, 1):
             for t, points in one.points.items():
                 labels[filled[t]][points] = number

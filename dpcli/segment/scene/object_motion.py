@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from dpcli.segment.scene.world import World
+from dpcli.segment.scene.world import Frame, World
 
 _CELL = 0.2  # meters, of the map of distances
 _CUT = 0.6  # meters: a point farther from everything has no partner
@@ -14,6 +14,7 @@ _FEW = 150  # points of an object that the search looks at
 _STARTS = 3
 _CUTS = (1.0, 0.6, 0.35)  # meters, farthest partners of ICP, one stage after the other
 _STEPS = 8
+_MOST = 600  # points of an object that ICP looks at
 
 
 def search_velocity(points: np.ndarray, t: int, others: list[int], world: World, reach: float) -> np.ndarray:
@@ -57,18 +58,20 @@ def _displaced_cost(points: np.ndarray, shifts: np.ndarray, target: np.ndarray, 
     return np.where(inside, found, 1.0).mean(1)
 
 
-def refine(points: np.ndarray, target: np.ndarray, start: np.ndarray, turns: bool = True) -> np.ndarray:
-    """Returns the motion f64 (4,4) of points (N,3) onto a frame's points (M,3), by ICP both ways from a start (4,4).
+def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
+    """Returns the motion f64 (4,4) of an object's points (N,3) onto a frame, by ICP both ways from a start (4,4).
 
     Objects turn about the upright axis only, and only where they are large enough to show it.
     """
-    motion = start.copy()
-    moved = points @ motion[:3, :3].T + motion[:3, 3]
-    near = np.all((target > moved.min(0) - 1.5) & (target < moved.max(0) + 1.5), axis=1)
-    target = target[near]
-    turns = turns and len(points) >= 40 and np.ptp(points[:, :2], axis=0).max() > 1.0
+    points = points[np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int)]
+    motion, moved = start.copy(), points @ start[:3, :3].T + start[:3, 3]
+    middle, radius = (moved.min(0) + moved.max(0)) / 2, np.linalg.norm(np.ptp(moved, axis=0)) / 2 + _CUTS[0]
+    target = frame.solid[frame.tree.query_ball_point(middle, radius)] if len(frame.solid) else frame.solid
+    target = target[np.all((target > moved.min(0) - _CUTS[0]) & (target < moved.max(0) + _CUTS[0]), axis=1)]
+    turns = len(points) >= 40 and np.ptp(points[:, :2], axis=0).max() > 1.0
     if len(target) < 3 or len(points) < 3:
         return motion
+    target = target[np.linspace(0, len(target) - 1, min(len(target), 3 * _MOST)).astype(int)]
     tree = cKDTree(target)
     for cut in _CUTS:
         for _ in range(_STEPS):
@@ -76,8 +79,8 @@ def refine(points: np.ndarray, target: np.ndarray, start: np.ndarray, turns: boo
             if step is None:
                 return motion
             motion = step @ motion
-            moved = points @ motion[:3, :3].T + motion[:3, 3]
-            if abs(step[:3, 3] + step[:3, :3] @ moved.mean(0) - moved.mean(0)).max() < 2e-3:
+            before, moved = moved, points @ motion[:3, :3].T + motion[:3, 3]
+            if abs(moved - before).max() < 3e-3:
                 break
     return motion
 

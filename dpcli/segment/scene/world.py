@@ -19,7 +19,8 @@ _SPACING = 0.6  # distances between rows of beams at which a surface still count
 class Frame:
     """Holds a registered frame: points f64 (N,3) and the sensor's origin (3) in the world, z up, meters; height f64 (N).
 
-    origin: None where nobody knows where the sensor stood. low, raised: heights above which points are met, and told apart.
+    origin: None where nobody knows where the sensor stood. raised_above: meters over the ground from which points are
+    looked at. label: the object of each point from 1, i64 (N). doubt, free: what others say against its standing still.
     """
 
     points: np.ndarray
@@ -27,9 +28,12 @@ class Frame:
     origin: np.ndarray | None
     raised_above: float
     label: np.ndarray = field(init=False)
+    doubt: np.ndarray = field(init=False)
+    free: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         self.label = np.zeros(len(self.points), np.int64)
+        self.doubt, self.free = np.zeros(len(self.points)), np.zeros(len(self.points))
 
     @cached_property
     def raised(self) -> np.ndarray:
@@ -90,3 +94,8 @@ class World:
         near = [u for u in range(t - self.window, t + self.window + 1) if 0 <= u < len(self.frames) and u != t]
         near = [u for u in near if self.run[u] == self.run[t] and len(self.frames[u].points)]
         return sorted(near, key=lambda u: (abs(u - t), u))
+
+    def label(self, one, number: int) -> None:
+        """Labels the points of a moving object in all frames."""
+        for t, own in one.points.items():
+            self.frames[t].label[own] = number
