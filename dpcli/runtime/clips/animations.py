@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.runtime.clips.images import as_shown
 from dpcli.runtime.clips.video_frames import video_frames
 
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
@@ -53,10 +54,12 @@ def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     from PIL import Image
 
     with reading(path), Image.open(path) as image:
+        profile = image.info.get("icc_profile")
         if image.format == "PNG":
-            yield from video_frames(path, wanted)
+            for frame in video_frames(path, wanted):
+                yield np.array(as_shown(Image.fromarray(frame), profile)) if profile else frame
             return
         for index in wanted:
             image.seek(index)
-            picture = np.array(image.convert("RGBA"))
+            picture = np.array(as_shown(image).convert("RGBA"))
             yield picture

@@ -120,10 +120,17 @@ def test_square_pixels_and_rotation_are_what_plays(pictures, tmp_path, capfd):
     wide = film(pictures, tmp_path / "wide.mp4", *PLAIN, "-vf", "setsar=2/1")
     assert decoded(wide).shape[1:3] == (SIDE, 2 * SIDE) and "2:1" in capfd.readouterr().err
     straight = film(pictures, tmp_path / "straight.mp4", *PLAIN)
-    ffmpeg("-display_rotation", 90, "-i", straight, "-c", "copy", tmp_path / "turned.mp4")
-    turned, upright = decoded(tmp_path / "turned.mp4"), decoded(straight)
-    assert min(np.abs(np.rot90(upright, k, (1, 2)).astype(int) - turned).max() for k in (1, 3)) < 8
-    assert "turned by" in capfd.readouterr().err
+    plays = {
+        ("-display_rotation", 90): lambda p: np.rot90(p, 1, (1, 2)),
+        ("-display_rotation", 180): lambda p: p[:, ::-1, ::-1],
+        ("-display_hflip",): lambda p: p[:, :, ::-1],
+        ("-display_vflip",): lambda p: p[:, ::-1],
+        ("-display_rotation", 90, "-display_hflip"): lambda p: p[:, ::-1, ::-1].transpose(0, 2, 1, 3),
+    }
+    for words, turn in plays.items():
+        ffmpeg(*words, "-i", straight, "-c", "copy", tmp_path / "turned.mp4")
+        np.testing.assert_array_equal(decoded(tmp_path / "turned.mp4"), turn(decoded(straight)))
+        assert ("mirrored" if "flip" in str(words) else "turned by") in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("matrix, number", [("bt709", 1), ("smpte170m", 6), ("bt2020nc", 9)])
@@ -137,21 +144,22 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
+def test_colors_that_are_not_converted_are_refused(pictures, tmp_path):
+    tag = ("-bsf:v", "h264_metadata=matrix_coefficients=8")
+    with pytest.raises(DataError, match="its colors are YCgCo; expected RGB, or YCbCr"):
+        look_at_video(film(pictures, tmp_path / "c.mp4", *PLAIN, *tag))
+
+
+def test_interlaced_lines_are_told(pictures, tmp_path, capfd):
+    words = ("-c:v", "mpeg2video", "-r", 25, "-vf", "setfield=tff,interlace", "-flags", "+ilme+ildct")
+    look_at_video(film(pictures, tmp_path / "i.ts", *words))
+    assert "interlaced: each frame shows two moments" in capfd.readouterr().err
+
+
 def test_an_hdr_clip_is_named(pictures, tmp_path, capfd):
     tags = "setparams=color_trc=arib-std-b67:color_primaries=bt2020:colorspace=bt2020nc"
     look_at_video(film(pictures, tmp_path / "hdr.mp4", *PLAIN, "-vf", tags))
     assert "HDR" in capfd.readouterr().err
-
-
-def test_images_are_upright_as_their_exif_says(tmp_path):
-    rgb = np.zeros((20, 40, 3), np.uint8)
-    rgb[:, :10] = (255, 0, 0)
-    turned = Image.fromarray(np.rot90(rgb).copy())
-    exif = turned.getexif()
-    exif[0x0112] = 6  # to be turned by 90 degrees clockwise
-    turned.save(tmp_path / "0.png", exif=exif)
-    read = read_rgba(tmp_path / "0.png")
-    assert read.shape == (20, 40, 4) and tuple(read[10, 4, :3]) == (255, 0, 0)
 
 
 def test_two_series_of_a_folder_are_named(pictures, tmp_path):
