@@ -12,7 +12,7 @@ from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _MARGIN = 0.35  # meters around an object's moved points in which a frame's points are its own
 _AROUND = 1.0  # meters around its box in which points in doubt are its own
-_FOOT = 0.15  # meters beside an object within which points near the ground are its own
+_FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
 _FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
 _JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one another may differ
 _ALIKE = (0.3, 0.25)  # the same for two pieces of one object
@@ -111,10 +111,10 @@ def claim_around(one: MovingObject, world: World) -> None:
 
 def _feet(own: np.ndarray, frame: Frame) -> np.ndarray:
     """Returns the points i64 of a frame near the ground that lie right below an object's points (its wheels, its feet)."""
-    low = np.flatnonzero((frame.height >= frame.raised_above / 2) & (frame.height < frame.raised_above))
+    low = np.flatnonzero((frame.height >= _FOOT[1] * frame.raised_above) & (frame.height < frame.raised_above))
     low = low[frame.label[low] == 0]
     tree = cKDTree(frame.points[own][:, :2])
-    return low[np.isfinite(tree.query(frame.points[low][:, :2], distance_upper_bound=_FOOT)[0])]
+    return low[np.isfinite(tree.query(frame.points[low][:, :2], distance_upper_bound=_FOOT[0])[0])]
 
 
 def merge_alike(found: list[MovingObject], world: World) -> list[MovingObject]:
