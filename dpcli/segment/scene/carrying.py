@@ -12,9 +12,10 @@ from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _MARGIN = 0.35  # meters around an object's moved points in which a frame's points are its own
 _AROUND = 1.0  # meters around its box in which points in doubt are its own
+_FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
 _FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
 _JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one another may differ
-_ALIKE = (0.25, 0.15)  # the same for two pieces of one object
+_ALIKE = (0.3, 0.25)  # the same for two pieces of one object
 _APART = 1.5  # meters between pieces of one object
 
 
@@ -75,9 +76,12 @@ def carry(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -
 
 
 def _alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, limits: tuple[float, float]) -> bool:
-    """Returns whether two motions (4,4) take points (N,3) to about the same places."""
-    ways = [moved(points.mean(0, keepdims=True), motion)[0] - points.mean(0) for motion in (first, second)]
-    return bool(np.linalg.norm(ways[0] - ways[1]) <= limits[0] + limits[1] * np.linalg.norm(ways[0]))
+    """Returns whether two motions (4,4) take the corners of the box around points (N,3) to about the same places."""
+    low, high = points.min(0), points.max(0)
+    corners = np.stack(np.meshgrid(*zip(low, high)), -1).reshape(-1, 3)
+    ways = [moved(corners, motion) - corners for motion in (first, second)]
+    apart = np.linalg.norm(ways[0] - ways[1], axis=1).max()
+    return bool(apart <= limits[0] + limits[1] * np.linalg.norm(ways[0].mean(0)))
 
 
 def _members(moved_points: np.ndarray, frame: Frame) -> np.ndarray:
@@ -97,12 +101,20 @@ def _inside(frame: Frame, points: np.ndarray, margin: float) -> np.ndarray:
 
 
 def claim_around(one: MovingObject, world: World) -> None:
-    """Gives an object the points in doubt around it in every frame, and those of frames that it was not met in."""
+    """Gives an object the points in doubt around it, and those right below it, in every frame that it was met in."""
     for t, frame in enumerate(world.frames):
         if t in one.points and len(one.points[t]):
             near = _inside(frame, frame.points[one.points[t]], _AROUND)
             near = near[(frame.doubt[near] > 0.9 * UNSEEN) | (frame.free[near] > 0)]
-            one.points[t] = np.union1d(one.points[t], near)
+            one.points[t] = np.union1d(np.union1d(one.points[t], near), _feet(one.points[t], frame))
+
+
+def _feet(own: np.ndarray, frame: Frame) -> np.ndarray:
+    """Returns the points i64 of a frame near the ground that lie right below an object's points (its wheels, its feet)."""
+    low = np.flatnonzero((frame.height >= _FOOT[1] * frame.raised_above) & (frame.height < frame.raised_above))
+    low = low[frame.label[low] == 0]
+    tree = cKDTree(frame.points[own][:, :2])
+    return low[np.isfinite(tree.query(frame.points[low][:, :2], distance_upper_bound=_FOOT[0])[0])]
 
 
 def merge_alike(found: list[MovingObject], world: World) -> list[MovingObject]:

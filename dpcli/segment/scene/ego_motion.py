@@ -12,6 +12,7 @@ from dpcli.ops.open3d_import import load_open3d
 _SCALES = ((1.0, 3.0), (0.5, 1.2), (0.3, 0.5))  # voxel and farthest partner, meters
 _STEP = 2.5  # meters between the starts of the search
 _STEPS = {0: 20, 1: 20, 2: 30}
+_BETTER = 0.97  # of the misfit of standing still that a motion must leave, or the sensor stood
 _NEAR = 0.5  # meters: a point this near to the other frame's has a partner
 OVERLAP = 0.3  # share of points with a partner below which two frames are not of one place
 
@@ -62,8 +63,9 @@ def _register_pair(source: list, target: list, before: np.ndarray) -> tuple[np.n
         for scale in (1, 2):
             motion = _icp(source[scale], target[scale], motion, scale)
         ends.append((*_misfit(source[1], tree, motion), motion))
-    _, share, motion = min(ends, key=lambda end: end[0])
-    return motion, share
+    rest = (*_misfit(source[1], tree, np.eye(4)), np.eye(4))
+    misfit, share, motion = min(ends, key=lambda end: end[0])
+    return (motion, share) if misfit < _BETTER * rest[0] else (rest[2], rest[1])
 
 
 def _icp(source, target, start: np.ndarray, scale: int) -> np.ndarray:

@@ -11,12 +11,16 @@ from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _FEWEST = 6  # points of an object in the frame that proposes it
+_FEW_FREE = 2  # of them that some other frame sees through
 _LARGEST = 14.0  # meters: a longer cluster is no object, but may hold some
 _TALLEST = 5.0
 _DOUBT = 0.12  # mean cost of standing still above which a cluster is looked at
 _GAIN = 0.1  # mean saving of the motion per point and frame, in points that a frame contradicts
 _THROUGH = 0.05  # share of an object's points that frames must see through, in the mean
-_FLAT = 0.25  # meters: anything lower is a bump of the ground
+_SHARE = 0.4  # share of the cost of standing still that a motion must save
+_FLAT = 0.4  # meters: anything lower is a bump of the ground, or a mirror
+_VEHICLE = 4.0  # meters around the sensor that its own vehicle takes up
+_STAYS = 0.3  # meters, of things on board
 _WORSE = 0.3  # a point that its object's motion explains worse by so much stands
 
 
@@ -28,7 +32,7 @@ def find_moving_objects(world: World, settings: SceneSettings) -> list[MovingObj
     for t, frame in enumerate(world.frames):
         for own in _propose(frame):
             own = own[frame.label[own] == 0]
-            if len(own) < _FEWEST or not frame.free[own].any():
+            if len(own) < _FEWEST or (frame.free[own] > 0).sum() < max(_FEW_FREE, _THROUGH * len(own) / 2):
                 continue
             one = _explain(own, t, world, settings)
             if one is not None:
@@ -107,21 +111,45 @@ def _shift(way: np.ndarray) -> np.ndarray:
 def _judge(one: MovingObject, world: World, settings: SceneSettings) -> bool:
     """Returns whether an object's motion explains its points clearly better than standing still, over all its frames.
 
-    Points that stand are taken out before.
+    Points that stand are taken out before. Things on the sensor's own vehicle, which go where it goes, are no objects.
     """
-    saved, through, count, heights = 0.0, 0.0, 0, []
+    saved, still, through, count, heights = 0.0, 0.0, 0.0, 0, [0.0]
     for t in [t for t in one.points if len(one.points) > 1]:
         frame = world.frames[t]
-        others = [u for u in world.around(t) if u in one.motion]
-        points, gain, free = frame.points[one.points[t]], np.zeros(len(one.points[t])), np.zeros(len(one.points[t]))
-        for u in others:
-            still, seen = world.frames[u].cost(points)
-            gain += (still - world.frames[u].cost(moved(points, one.between(t, u)))[0]) / len(others)
-            free += seen / len(others)
-        kept = gain > -_WORSE
+        costs, moving, free = _costs(one, t, world)
+        kept = costs - moving > -_WORSE
         one.points[t] = one.points[t][kept]
-        saved, through, count = saved + gain[kept].sum(), through + free[kept].sum(), count + int(kept.sum())
-        heights += [points[kept, 2].max() - points[kept, 2].min()] if kept.any() else []
+        saved, still = saved + (costs - moving)[kept].sum(), still + costs[kept].sum()
+        through, count = through + free[kept].sum(), count + int(kept.sum())
+        heights.append(float(np.ptp(frame.points[one.points[t], 2])) if kept.any() else 0.0)
     one.saved = float(saved)
-    enough = saved >= max(settings.evidence, _GAIN * count) and through >= max(settings.evidence, _THROUGH * count)
-    return enough and max(heights) > _FLAT
+    enough = saved >= max(settings.evidence, _GAIN * count, _SHARE * still)
+    seen_through = through >= max(settings.evidence, _THROUGH * count)
+    return bool(enough and seen_through and max(heights) > _FLAT and not _on_board(one, world))
+
+
+def _costs(one: MovingObject, t: int, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns, for an object's points in frame t, the mean cost f64 (N) of standing still, that of its motion, and the
+    share of the frames that see through them.
+    """
+    others = [u for u in world.around(t) if u in one.motion]
+    points = world.frames[t].points[one.points[t]]
+    still, moving, free = np.zeros((3, len(points)))
+    for u in others:
+        cost, seen = world.frames[u].cost(points)
+        still += cost / len(others)
+        moving += world.frames[u].cost(moved(points, one.between(t, u)))[0] / len(others)
+        free += seen / len(others)
+    return still, moving, free
+
+
+def _on_board(one: MovingObject, world: World) -> bool:
+    """Returns whether an object is near the sensor in all its frames and stays where it is from there."""
+    places = []
+    for t, own in one.points.items():
+        frame = world.frames[t]
+        if frame.origin is None or not len(own):
+            return False
+        places.append(frame.points[own].mean(0) - frame.origin)
+    away = np.array(places)
+    return bool(np.linalg.norm(away, axis=1).max() < _VEHICLE and np.ptp(away, axis=0).max() < _STAYS)

@@ -14,6 +14,7 @@ _FEW = 150  # points of an object that the search looks at
 _STARTS = 3
 _CUTS = (1.0, 0.6, 0.35)  # meters, farthest partners of ICP, one stage after the other
 _STEPS = 8
+_TURN = 0.15  # radians that an object may turn by against its start
 _MOST = 600  # points of an object that ICP looks at
 
 
@@ -76,13 +77,17 @@ def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
     for cut in _CUTS:
         for _ in range(_STEPS):
             step = _step(moved, target, tree, cut, turns)
-            if step is None:
+            if step is None or abs(_angle(step @ motion) - _angle(start)) > _TURN:
                 return motion
             motion = step @ motion
             before, moved = moved, points @ motion[:3, :3].T + motion[:3, 3]
             if abs(moved - before).max() < 3e-3:
                 break
     return motion
+
+
+def _angle(motion: np.ndarray) -> float:
+    return float(np.arctan2(motion[1, 0], motion[0, 0]))
 
 
 def _step(moved: np.ndarray, target: np.ndarray, tree: cKDTree, cut: float, turns: bool) -> np.ndarray | None:
