@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.classify.data.augment import NONE, Augmentation
-from dpcli.classify.data.slots import changed_rows, in_slots, slot_rows
+from dpcli.classify.data.slots import changed_rows, in_slots, signed_columns, slot_rows
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
 from dpcli.runtime.seeds import ClassifyStream, generator
@@ -168,8 +168,7 @@ class ClipSource:
             rows = slot_rows(self.reader.read(number, clip.frames, fields=fields), config)
             if whole and self.augmentation != NONE:
                 self._rows[number] = rows
-        speeds = [k for k, middle in enumerate(config.scales[1::2]) if middle == 0]
-        return in_slots(changed_rows(rows, self.augmentation, speeds, rng), config, rng)
+        return in_slots(changed_rows(rows, self.augmentation, signed_columns(config), rng), config, rng)
 
 
 _LOOKS = 4  # at a video in slots

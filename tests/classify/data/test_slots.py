@@ -96,9 +96,8 @@ def test_a_batch_in_training_is_shared_by_the_members_in_its_order(tmp_path):
             layer.p = 0.0
     together = model.static_logits(clips)
     members = model.static.members
-    for k in range(5):
-        alone = members[k % 2](clips[k : k + 1])
-        assert torch.allclose(together[k], alone[0], atol=1e-5)
+    for k in range(2):
+        assert torch.allclose(together[k::2], members[k](clips[k::2]), atol=1e-5)
     mean = torch.softmax(model.eval().static_logits(clips), -1)
     expected = torch.stack([torch.softmax(one(clips), -1) for one in members]).mean(0)
     assert torch.allclose(mean, expected, atol=1e-6)

@@ -68,6 +68,7 @@ class _Member(nn.Module):
         self.position = nn.Parameter(torch.zeros(config.num_frames, width))
         self.over_time = nn.ModuleList(_OverTime(width, step) for step in _STEPS)
         self.dropout, self.classify = nn.Dropout(config.dropout), ClipLinear(2 * width, config.num_classes)
+        nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
 
     def forward(self, clips: Tensor) -> Tensor:
         """Returns the logits (B,C)."""
@@ -76,7 +77,7 @@ class _Member(nn.Module):
         values = known.new_zeros(clips[..., 3].numel(), known.shape[-1]).index_copy(0, here, known)
         values, count = values.view(*clips.shape[:3], -1), clips[..., 3:4].sum(2)
         pooled = [values.sum(2) / count.clamp(min=1), values.amax(2), torch.log1p(count)]  # values are not below 0
-        found = self.slots(torch.cat(pooled, -1)) + self.position
+        found = self.slots(torch.cat(pooled, -1).flatten(0, 1)).view(*count.shape[:2], -1) + self.position
         for layer in self.over_time:
             found = found + layer(found)
         return self.classify(self.dropout(torch.cat([found.mean(1), found.amax(1)], -1)))
@@ -88,12 +89,25 @@ class _OverTime(nn.Module):
     def __init__(self, width: int, step: int) -> None:
         super().__init__()
         self.mix = nn.Conv1d(width, width, _REACH, padding=step * (_REACH // 2), dilation=step)
-        self.norm, self.dropout = nn.LayerNorm(width), nn.Dropout(_DROPPED)
+        self.norm, self.dropout = _Norm(width), nn.Dropout(_DROPPED)
 
     def forward(self, slots: Tensor) -> Tensor:
         """Returns what is added to the slots."""
-        return self.dropout(torch.relu(self.norm(self.mix(slots.transpose(1, 2)).transpose(1, 2))))
+        mixed = self.mix(slots.transpose(1, 2)).transpose(1, 2)
+        return self.dropout(torch.relu(self.norm(mixed.flatten(0, 1)).view_as(mixed)))
+
+
+class _Norm(nn.BatchNorm1d):
+    """Normalizes as a BatchNorm1d; a batch of one row, such as a video's only point, as outside of training."""
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Returns rows (R,C) normalized."""
+        if len(rows) > 1:
+            return super().forward(rows)
+        return nn.functional.batch_norm(
+            rows, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps
+        )
 
 
 def _layer(inputs: int, outputs: int) -> tuple[nn.Module, ...]:
-    return nn.Linear(inputs, outputs), nn.LayerNorm(outputs), nn.ReLU()
+    return nn.Linear(inputs, outputs), _Norm(outputs), nn.ReLU()
