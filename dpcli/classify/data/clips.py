@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dpcli.classify.data.augment import NONE, Augmentation
-from dpcli.classify.data.slots import changed_rows, in_slots, slot_rows
+from dpcli.classify.data.slots import changed_rows, in_slots, signed_columns, slot_rows
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
 from dpcli.runtime.seeds import ClassifyStream, generator
@@ -83,7 +83,8 @@ class ClipSource:
 
     `timing` is `clips` (consecutive frames, as MSR-Action3D's peers), `uniform` (frames spread over the whole video) or `slots`
     (all frames, in as many equal parts as a clip has). `dropped` lists the videos left out because they are shorter than a
-    clip (only with `drop_short`). Raises DataError where none is left, or the file lacks columns that the network reads.
+    clip (only with `drop_short`). `folds`: the member of the network that must not learn from a sequence in slots. Raises
+    DataError where none is left, or the file lacks columns that the network reads.
     """
 
     def __init__(
@@ -96,7 +97,9 @@ class ClipSource:
         augmentation: Augmentation = NONE,
         drop_short: bool = False,
         seed: int = 0,
+        folds: Mapping[int, int] | None = None,
     ) -> None:
+        self.folds = folds or {}
         self.reader, self.config, self.timing = reader, config, timing
         self.augmentation, self.drop_short, self.seed = augmentation, drop_short, seed
         check_columns(reader, config)
@@ -161,15 +164,17 @@ class ClipSource:
 
     def _slots(self, clip: Clip, rng: np.random.Generator) -> np.ndarray:
         config, number = self.config, clip.sequence
-        whole = len(clip.frames) == self.reader.frame_counts[number]
+        whole = clip.frames == tuple(range(int(self.reader.frame_counts[number])))
         rows = self._rows.get(number) if whole else None
         if rows is None:
             fields = tuple(map(kept_name, config.columns))
             rows = slot_rows(self.reader.read(number, clip.frames, fields=fields), config)
             if whole and self.augmentation != NONE:
                 self._rows[number] = rows
-        speeds = [k for k, middle in enumerate(config.scales[1::2]) if middle == 0]
-        return in_slots(changed_rows(rows, self.augmentation, speeds, rng), config, rng)
+        made = in_slots(changed_rows(rows, self.augmentation, signed_columns(config), rng), config, rng)
+        if number in self.folds:
+            made[..., 3] *= 2 + self.folds[number]  # 1 says no more than that there is a point
+        return made
 
 
 _LOOKS = 4  # at a video in slots

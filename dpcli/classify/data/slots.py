@@ -19,6 +19,7 @@ from dpcli.store.schema import KEPT, kept_name
 
 FARTHEST = 3.0  # units from the median: beyond it lies nobody who makes a gesture
 _EXTREME = 3.0  # spreads: a column's value beyond counts as being there
+_FAST, _SLOWEST = 0.8, 0.1  # the quantile that is a video's level, which is about 1 spread; the least level
 _LEAST = 4  # points that random changes leave of a video
 _BOTH_SIGNS = 0.1  # of a column's values at least above and below 0: it is a speed, and 0 its middle
 
@@ -92,8 +93,25 @@ def slot_rows(sequence: CloudSequence, config: KinetConfig) -> np.ndarray:
     if not len(rows):
         return rows
     rows[:, :3] = (rows[:, :3] - np.median(rows[:, :3], 0)) / config.scales[0]
-    rows[:, 4:] = np.nan_to_num(rows[:, 4:]).clip(-_EXTREME, _EXTREME)
+    rows[:, 4:] = _about_the_video(np.nan_to_num(rows[:, 4:]), config).clip(-_EXTREME, _EXTREME)
     return rows[np.linalg.norm(rows[:, :3], axis=1) < FARTHEST]
+
+
+def signed_columns(config: KinetConfig) -> list[int]:
+    """Returns the places of the columns that are speeds: their middle is 0."""
+    return [place for place, middle in enumerate(config.scales[1::2]) if middle == 0]
+
+
+def _about_the_video(columns: np.ndarray, config: KinetConfig) -> np.ndarray:
+    """Returns columns f32 (N,F) in which a video's own level counts half, or, but for speeds, not at all.
+
+    Who is slow, or far away, does the same gestures with lower speeds and intensities.
+    """
+    signed = signed_columns(config)
+    level = np.quantile(np.abs(columns), _FAST, axis=0).clip(_SLOWEST)
+    own = columns - np.median(columns, 0)
+    own[:, signed] = (columns * 2 / (1 + level))[:, signed]
+    return own
 
 
 def changed_rows(rows: np.ndarray, change: Augmentation, speeds: list[int], rng: np.random.Generator) -> np.ndarray:

@@ -27,8 +27,9 @@ class RunSettings:
     validation: str = setting(
         "auto",
         "Videos that validate: split (the file's own validation videos); or carved from the training videos by subject,"
-        " subjects:3,5, fold:3/10 (counted from 0) or a fraction such as 0.15; or none. auto: split where the file has one,"
-        " else subject, or 0.15 without subjects.",
+        " subjects:3,5, fold:3/10 (counted from 0) or a fraction such as 0.15; or none; or cross (preset"
+        " sparse: all videos train, and members that never saw them judge). auto: split where the file has one, else cross or"
+        " subject, or 0.15 without subjects.",
     )
     augment: Literal["ours", "sparse", "peers", "release", "none"] = setting(
         "ours",

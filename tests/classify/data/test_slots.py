@@ -10,6 +10,7 @@ from dpcli.classify.data.augment import NONE
 from dpcli.classify.data.augment import SPARSE as CHANGE
 from dpcli.classify.data.clips import ClipSource, OneVideo
 from dpcli.classify.data.slots import changed_rows, in_slots, measured, preset_for, slot_rows
+from dpcli.classify.data.validation_split import about_people, carve_validation, cross_folds, default_rule
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
@@ -96,12 +97,43 @@ def test_a_batch_in_training_is_shared_by_the_members_in_its_order(tmp_path):
             layer.p = 0.0
     together = model.static_logits(clips)
     members = model.static.members
-    for k in range(5):
-        alone = members[k % 2](clips[k : k + 1])
-        assert torch.allclose(together[k], alone[0], atol=1e-5)
+    for k in range(2):
+        assert torch.allclose(together[k::2], torch.log_softmax(members[k](clips[k::2]), -1), atol=1e-5)
     mean = torch.softmax(model.eval().static_logits(clips), -1)
     expected = torch.stack([torch.softmax(one(clips), -1) for one in members]).mean(0)
     assert torch.allclose(mean, expected, atol=1e-6)
+
+
+def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
+    config = config_of(tmp_path, [video(str(k), seed=k) for k in range(6)])
+    reader = CloudsReader(tmp_path / "c.h5")
+    source = ClipSource(reader, range(6), config, timing="slots", folds={0: 0, 1: 1, 2: 0})
+    clips = torch.from_numpy(np.stack([source.load(source.video_clips(k, 1)[0], k) for k in range(6)]))
+    model = Kinet(config)
+    nobody = model.static._speakers(torch.tensor([0, 1, 0, -1, -1, -1]))
+    assert nobody.tolist() == [[False, True], [True, False], [False, True], [False, True], [True, False], [False, True]]
+    model.train().static_logits(clips[:1]).sum().backward()
+    grads = [sum(p.grad is not None for p in one.parameters()) for one in model.static.members]
+    assert grads[0] == 0 < grads[1]
+    scores = torch.softmax(model.eval().static_logits(clips), -1)
+    for k, member in ((0, 0), (1, 1), (2, 0)):
+        assert torch.allclose(
+            scores[k], torch.softmax(model.static.members[member](clips[k : k + 1]), -1)[0], atol=1e-6
+        )
+
+
+def test_whole_people_share_a_fold(tmp_path):
+    videos = [video(str(k), label=k % 2) for k in range(12)]
+    for k, one in enumerate(videos):
+        one.subject = k // 4
+    config_of(tmp_path, videos)
+    reader = CloudsReader(tmp_path / "c.h5")
+    found = cross_folds(reader, list(range(12)), 4, 0)
+    assert [len({found[k] for k in range(12) if k // 4 == person}) for person in range(3)] == [1, 1, 1]
+    assert sorted(set(found.values())) == [0, 1, 2]
+    chosen, judged = carve_validation(reader, "cross", 0)
+    assert chosen is judged and default_rule(reader, 4) == "cross" and default_rule(reader) == "subject"
+    assert about_people(reader, chosen, judged) == ""
 
 
 def test_the_data_choose_the_preset_unless_another_network_is_named(tmp_path):
