@@ -40,7 +40,8 @@ class Network:
     """Predicts layers by the trained network; the far side has the colors of the near one.
 
     model: a weights file, a folder of `train-prior`, or the name of a shipped network. The turn of the object, and how long
-    it is along the line of sight, are chosen for all frames together. The confidence is the probability that the layers are better than the inflation's.
+    it is along the line of sight, are chosen for all frames together. The confidence is the probability that the layers
+    are better than the inflation's.
     """
 
     name = "network"
