@@ -26,6 +26,7 @@ from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
+CUT = "videos that end before their container does (truncated: frames may be lost)"
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
@@ -152,8 +153,8 @@ class DepthVideos:
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
         notes |= video.notes
-        if video.missing:
-            notes[MISSING] = video.missing
+        if video.missing or video.ends_early:
+            notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0

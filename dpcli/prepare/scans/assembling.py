@@ -55,7 +55,7 @@ def assemble(
 
     color: every frame has one. time: seconds of each frame, f64 (T), or None. What is dropped is counted by reason.
     """
-    notes = dict(sum((Counter(cloud.notes) for cloud in clouds), Counter(clean(clouds))))
+    notes = dict(sum((Counter(cloud.dropped) for cloud in clouds), Counter(clean(clouds))))
     counts = np.array([len(cloud.points) for cloud in clouds], np.int64)
     kept, dropped = drop_empty_frames(str(item.path), counts)
     divisor, converted = lengths.divisor([clouds[t] for t in kept])

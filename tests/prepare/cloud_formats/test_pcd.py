@@ -126,4 +126,4 @@ def test_a_sensor_pose_is_told_and_not_applied(tmp_path, viewpoint, posed):
     text = header().replace("POINTS", f"VIEWPOINT {viewpoint}\nPOINTS") + "1 2 3\n4 5 6\n"
     (tmp_path / "a.pcd").write_text(text)
     cloud = read_pcd(tmp_path / "a.pcd")
-    assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.notes == ({POSED: 1} if posed else {})
+    assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.dropped == ({POSED: 1} if posed else {})

@@ -354,6 +354,12 @@ def test_warnings_name_the_frames(tmp_path, capsys):
     assert "leaves the picture in 2 frames: 1.png, 2.png" in capsys.readouterr().err
     video_clip(save(tmp_path / "single", pictures[:1]), SMALL)
     assert "one frame only" in capsys.readouterr().err
+    both = np.maximum(disc((14, 24), 8), disc((44, 24), 5))
+    video_clip(save(tmp_path / "two", [both, both, pictures[0]]), SMALL)
+    assert "several objects apart in 2 frames: 0.png, 1.png" in capsys.readouterr().err
+    crumb = np.maximum(disc((14, 24), 8), disc((44, 24), 2))
+    video_clip(save(tmp_path / "crumbs", [crumb, crumb, both]), SMALL)
+    assert "several objects" not in capsys.readouterr().err
     gap = save(tmp_path / "gap", pictures[:1] * 5)
     (gap / "2.png").unlink()
     video_clip(gap, SMALL)
