@@ -22,6 +22,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
+from dpcli.runtime.clips.images import require_plausible
 from dpcli.text_files import parse_json
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -241,6 +242,7 @@ class Gltf:
         )
         try:
             with Image.open(io.BytesIO(data)) as picture:
+                require_plausible(self.path, *picture.size, len(data))
                 return np.array(picture.convert("RGBA"))
         except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
             raise self.fail(f"texture {index} ({entry.get('mimeType', 'image')}) cannot be read: {error}") from None

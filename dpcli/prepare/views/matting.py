@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.runtime.clips.images import upright
+from dpcli.runtime.clips.images import open_image, upright
 
 TOLERANCE = 0.06  # of the value range: compression noise of a video stays below
 FAINT = 8  # alpha below is a leftover of compression or of a network, not the object
@@ -244,7 +244,7 @@ def read_mask(path: Path) -> np.ndarray:
     from PIL import Image
 
     try:
-        with Image.open(path) as stored:
+        with open_image(path) as stored:
             lossy, image = stored.format in ("JPEG", "WEBP", "AVIF"), upright(stored)
             if image.mode in ("RGBA", "LA", "PA") and image.getchannel("A").getextrema()[0] < 255:
                 return np.array(image.getchannel("A"))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.runtime.clips.images import open_image
 
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
 
@@ -25,17 +26,17 @@ def is_image_file(path: Path) -> bool:
 
 def animation_times(path: Path) -> tuple[float, ...]:
     """Returns the seconds at which each frame appears, from 0. Raises DataError when the file is damaged or one image."""
-    from PIL import Image
-
     times, now = [], 0.0
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             for index in range(getattr(image, "n_frames", 1)):
                 image.seek(index)
                 image.load()
                 times.append(now)
                 now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
             moves = image.format in ("GIF", "PNG", "WEBP", "AVIF")
+    except DataError:
+        raise
     except Exception as error:  # a damaged file raises nearly anything
         raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
@@ -45,9 +46,7 @@ def animation_times(path: Path) -> tuple[float, ...]:
 
 def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """Yields frames by rising index, each u8 (H,W,4) with straight alpha."""
-    from PIL import Image
-
-    with reading(path), Image.open(path) as image:
+    with reading(path), open_image(path) as image:
         for index in wanted:
             image.seek(index)
             picture = np.array(image.convert("RGBA"))
