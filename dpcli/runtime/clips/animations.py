@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
-from dpcli.runtime.clips.images import as_shown
+from dpcli.runtime.clips.images import as_shown, open_image
 from dpcli.runtime.clips.video_frames import video_frames
 
 _MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
@@ -30,11 +30,9 @@ def is_image_file(path: Path) -> bool:
 
 def animation_times(path: Path) -> tuple[float, ...]:
     """Returns the seconds at which each frame appears, from 0. Raises DataError when the file is damaged or one image."""
-    from PIL import Image
-
     times, now = [], 0.0
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             first = int(getattr(image, "default_image", False))  # what viewers show that can't play an APNG
             for index in range(first, getattr(image, "n_frames", 1)):
                 image.seek(index)
@@ -42,6 +40,8 @@ def animation_times(path: Path) -> tuple[float, ...]:
                 times.append(now)
                 now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
             moves = image.format in ("GIF", "PNG", "WEBP", "AVIF")
+    except DataError:
+        raise
     except Exception as error:  # a damaged file raises nearly anything
         raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
@@ -56,7 +56,7 @@ def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """
     from PIL import Image
 
-    with reading(path), Image.open(path) as image:
+    with reading(path), open_image(path) as image:
         profile = image.info.get("icc_profile")
         if image.format == "PNG":
             for frame in video_frames(path, wanted):
