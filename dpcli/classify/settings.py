@@ -27,7 +27,8 @@ NETWORK_PRESETS = {name: {"network": groups["network"]} for name, groups in PRES
 class TrainingSettings:
     """Holds all settings of a training run.
 
-    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise.
+    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise, or a network those of
+    another kind.
     """
 
     network: KinetConfig
@@ -41,6 +42,13 @@ class TrainingSettings:
             raise UsageError(
                 f"augment_speed = {speed:g}: speed changes random clips of consecutive frames; leave it out with --timing"
                 " uniform or clips_per_video = 0"
+            )
+
+        slots = self.network.backbone == "slots"
+        if slots != (self.run.timing == "slots") or (slots and self.schedule.epochs_dynamic):
+            raise UsageError(
+                f"backbone = {self.network.backbone} with timing = {self.run.timing} and epochs_dynamic ="
+                f" {self.schedule.epochs_dynamic}: slots belongs to slots, and has no dynamic stream; take --preset sparse"
             )
 
     def to_toml(self, command: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
+from dpcli.prepare.decode.mesh_counts import require_counts
 
 MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
 _PACKAGES = ("package://", "model://")  # of ROS and Gazebo: the folder of the robot, or one above it
@@ -81,6 +82,10 @@ def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
         raise DataError(f"{path}: its mesh {name} is missing")
     if file.suffix.lower() not in MESH_FORMATS:
         raise DataError(f"{path}: its mesh {name} is of an unknown format; expected one of {' '.join(MESH_FORMATS)}")
+    try:
+        require_counts(file)
+    except DataError as error:
+        raise DataError(f"{path}: its mesh {error}") from None
     try:
         options = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
         mesh = trimesh.load(file, force="mesh", process=False, resolver=files_inside(file, root), **options)

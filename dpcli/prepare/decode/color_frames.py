@@ -94,11 +94,20 @@ def frame_numbers(stems: Sequence[str]) -> list[int]:
     return [ranks[k] for k in range(len(stems))]
 
 
+def integers(name: str) -> list[int]:
+    """Returns the integers in a name, from left to right.
+
+    >>> integers("cam2_007.png")
+    [2, 7]
+    """
+    return [int(word) for word in re.findall(r"\d+", name)]
+
+
 def _telling_columns(stems: Sequence[str]) -> list[list[int]]:
     """Returns the columns of integers in the names that aren't the same everywhere, or the last one if all are; []
     where names hold none, or not equally many.
     """
-    rows = [[int(word) for word in re.findall(r"\d+", stem)] for stem in stems]
+    rows = [integers(stem) for stem in stems]
     if not rows or not rows[0] or len({len(row) for row in rows}) != 1:
         return []
     columns = [list(column) for column in zip(*rows)]

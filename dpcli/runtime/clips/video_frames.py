@@ -16,6 +16,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
+from dpcli.runtime.clips.container_ends import ends_early
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
@@ -26,7 +27,7 @@ VIDEO_SUFFIXES = (
 # files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
 VIDEO_FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
-    "dv,mxf,nut"
+    "dv,mxf,nut,apng"
 )
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
@@ -144,33 +145,47 @@ def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
     """Returns how many frames of its first video a file declares beyond the `count` that were decoded, 0 where it is whole.
 
     times: seconds of the decoded frames f64 (count), None where they are not known. Frames that an edit list hides are no
-    loss; one is none either, since containers count differently.
+    loss; one is none either, since containers count differently, unless the file ends early.
     """
+    cut = ends_early(path)
     container, stream = _open(path)
     with closing(container):
-        declared, held = _declared_and_held(path, container, stream, count, times)
-    return declared - held if declared > held + 1 else 0
+        declared, held = _declared_and_held(path, container, stream, count, times, cut)
+    return declared - held if declared > held + (not cut) else 0
 
 
 def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | None, failed: bool) -> None:
-    """Raises DataError when the file declares more frames than it holds; frames that an edit list hides are no loss."""
-    declared, held = (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times)
-    if failed or declared > held + 1:
+    """Raises DataError when the file declares more frames than it holds; frames that an edit list hides are no loss.
+
+    Warns where it ends early and nothing tells how many frames it had.
+    """
+    cut = ends_early(path)
+    declared, held = (
+        (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times, cut)
+    )
+    if failed or declared > held + (not cut):
         of = f" of its {declared}" if declared else ""
         raise DataError(
             f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
+    if cut:
+        log.warn(f"{path}: the file ends before its container does; frames behind the {held} that it holds may be lost")
 
 
-def _declared_and_held(path: Path, container, stream, count: int, times: np.ndarray | None) -> tuple[int, int]:
-    """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it."""
-    if stream.frames > count + 1:
+def _declared_and_held(
+    path: Path, container, stream, count: int, times: np.ndarray | None, cut: bool
+) -> tuple[int, int]:
+    """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it; cut: it ends early."""
+    if stream.frames > count + (not cut):
         return stream.frames, _packets(path)
     if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
         seconds = float(container.duration or 0) / 1e6
-        estimate = 0 if lasts(times, seconds) else round(seconds * float(stream.average_rate))
-        return (estimate if estimate > 1.05 * count + 3 else 0), count  # some containers round their duration up
+        estimate = round(seconds * float(stream.average_rate))
+        if cut:
+            return estimate, count
+        sure = estimate > 1.05 * count + 3 and not lasts(times, seconds)  # some containers round their duration up
+        return (estimate if sure else 0), count
     return stream.frames, count
 
 

@@ -267,11 +267,14 @@ def test_masks_cut_a_busy_background(tmp_path):
             np.testing.assert_array_equal(found[0, frame][8:56][strong][:, :3], busy[frame][strong])
             assert found[0, frame][8:56][discs[frame][..., 3] < 8].max() == 0
     save(tmp_path / "short", [discs[0][..., 3]])
+    for number in (0, 1):  # of two objects in each frame
+        save(tmp_path / "each", [picture[..., 3] for picture in discs], f"{{}}_{number}.png")
     save(tmp_path / "wide", [np.zeros((10, 10), np.uint8)] * 3)
     save(tmp_path / "inverse", [255 - picture[..., 3] for picture in discs])
     save(tmp_path / "empty", [np.zeros((48, 64), np.uint8)] * 3)
     for name, message in (
         ("short", "1 masks for 3 frames"),
+        ("each", "masks for 3 frames; expected one for each, named alike, with all its objects"),
         ("wide", "10x10.*64x48"),
         ("inverse", "inverted"),
         ("empty", "an empty mask"),
@@ -351,6 +354,12 @@ def test_warnings_name_the_frames(tmp_path, capsys):
     assert "leaves the picture in 2 frames: 1.png, 2.png" in capsys.readouterr().err
     video_clip(save(tmp_path / "single", pictures[:1]), SMALL)
     assert "one frame only" in capsys.readouterr().err
+    both = np.maximum(disc((14, 24), 8), disc((44, 24), 5))
+    video_clip(save(tmp_path / "two", [both, both, pictures[0]]), SMALL)
+    assert "several objects apart in 2 frames: 0.png, 1.png" in capsys.readouterr().err
+    crumb = np.maximum(disc((14, 24), 8), disc((44, 24), 2))
+    video_clip(save(tmp_path / "crumbs", [crumb, crumb, both]), SMALL)
+    assert "several objects" not in capsys.readouterr().err
     gap = save(tmp_path / "gap", pictures[:1] * 5)
     (gap / "2.png").unlink()
     video_clip(gap, SMALL)

@@ -10,6 +10,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View
+from dpcli.npy_files import map_npy
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, one_series, upright
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
@@ -83,10 +84,7 @@ class ArraySource(Source):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except Exception as error:  # a damaged header raises nearly anything
-            raise DataError(f"{path}: not a readable .npy array ({error})") from None
+        array = map_npy(path)
         array = array[None] if array.ndim == 4 else array
         known = array.dtype == np.uint8 or array.dtype.kind == "f"
         if array.ndim != 5 or array.shape[-1] not in (3, 4) or not known or array.size == 0:
