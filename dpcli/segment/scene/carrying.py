@@ -23,13 +23,15 @@ _APART = 1.5  # meters between pieces of one object
 class MovingObject:
     """Holds an object: its points in each frame, numbers i64, and its motion, f64 (4,4) in the world, from `start` to it.
 
-    saved: what its motion explains better than standing still, in points that a frame contradicts.
+    saved: what its motion explains better than standing still, in points that a frame contradicts. steady: whether it
+    could be carried without a jerk.
     """
 
     start: int
     points: dict[int, np.ndarray]
     motion: dict[int, np.ndarray]
     saved: float = 0.0
+    steady: bool = True
 
     @property
     def size(self) -> int:
@@ -66,6 +68,7 @@ def carry(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -
         if t != one.start:
             before, step = step, refine(points, there, step)
             if not _alike(points, before, step, _JERK):
+                one.steady = False
                 return
         members = _members(moved(points, step), there)
         if len(members) == 0 or (there.cost(moved(points, step))[0] < 0.9 * UNSEEN).mean() < _FOUND:

@@ -14,6 +14,7 @@ from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.world import Frame, World
 
+_FEWEST = 50  # points of a frame that shows anything of a scene
 _FAR = 40.0  # meters: a sensor has some point nearer than this
 _JUMPS = 0.12  # share of neighboring beams that may end at different ranges, seen from where the sensor was
 
@@ -48,7 +49,7 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
 
     sensor: places f64 (3) in the frames' coordinates where the sensor may have been; the first one that fits is taken.
     """
-    filled = [t for t, frame in enumerate(frames) if len(frame)]
+    filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
     labels = [np.zeros(len(frame), np.int64) for frame in frames]
     poses, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], []
     if len(filled) > 1:
@@ -57,7 +58,8 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
         for number, one in enumerate(found, 1):
             for t, points in one.points.items():
                 labels[filled[t]][points] = number
-        poses[filled] = turn.T @ own @ turn
+        before = np.maximum(np.searchsorted(filled, np.arange(len(frames)), side="right") - 1, 0)
+        poses = (turn.T @ own @ turn)[before]  # frames that show nothing are where the one before was
         objects = [_in_input_axes(one, filled, turn) for one in found]
     return SceneExplanation(labels, poses, objects, [filled[t] for t in apart])
 

@@ -68,7 +68,7 @@ class SceneSegmenter(Segmenter):
         """Warns of frames whose place is unknown, since they overlap with none before them."""
         if apart:
             log.warn(
-                f"{name}: frame {', '.join(map(str, apart))} overlaps too little with the one before to tell how the"
+                f"{name}: frame {', '.join(map(str, apart))}: too little in common with the frame before to tell how the"
                 " sensor moved; it is taken to move on as before, and nothing is compared across the gap"
             )
 
