@@ -11,6 +11,8 @@ from dpcli.segment.scene.object_motion import refine
 from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _MARGIN = 0.35  # meters around an object's moved points in which a frame's points are its own
+_CLOSE = 0.15  # the same for points that may as well stand
+_STANDING = 0.15  # mean cost of standing still below which a point may as well stand
 _AROUND = 1.0  # meters around its box in which points in doubt are its own
 _FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
 _FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
@@ -88,12 +90,18 @@ def _alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, limits: tu
 
 
 def _members(moved_points: np.ndarray, frame: Frame) -> np.ndarray:
-    """Returns the raised points i64 of a frame, in no object yet, around an object's moved points."""
-    margin = max(_MARGIN, float(np.median(frame.tolerance(moved_points))))
+    """Returns the raised points i64 of a frame, in no object yet, around an object's moved points.
+
+    Those that may as well stand must lie closer, lest an object takes along what it passes.
+    """
+    tolerance = float(np.median(frame.tolerance(moved_points)))
+    margin = max(_MARGIN, tolerance)
     near = _inside(frame, moved_points, margin)
     if len(near) == 0:
         return near
-    return near[np.isfinite(cKDTree(moved_points).query(frame.points[near], distance_upper_bound=margin)[0])]
+    distance = cKDTree(moved_points).query(frame.points[near], distance_upper_bound=margin)[0]
+    standing = frame.doubt[near] < _STANDING
+    return near[distance < np.where(standing, max(_CLOSE, 0.5 * tolerance), margin)]
 
 
 def _inside(frame: Frame, points: np.ndarray, margin: float) -> np.ndarray:
