@@ -17,6 +17,7 @@ _AROUND = 1.0  # meters around its box in which points in doubt are its own
 _FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
 _FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
 _JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one another may differ
+_UNSTEADY = 2.5  # times the evidence for something that could only be carried with a jerk
 _ALIKE = (0.3, 0.25)  # the same for two pieces of one object
 _APART = 1.5  # meters between pieces of one object
 
@@ -25,15 +26,15 @@ _APART = 1.5  # meters between pieces of one object
 class MovingObject:
     """Holds an object: its points in each frame, numbers i64, and its motion, f64 (4,4) in the world, from `start` to it.
 
-    saved: what its motion explains better than standing still, in points that a frame contradicts. steady: whether it
-    could be carried without a jerk.
+    saved: what its motion explains better than standing still, in points that a frame contradicts. demand: times
+    the usual evidence that it needs, more than 1 for pieces of a larger cluster, and what could only be carried with a jerk.
     """
 
     start: int
     points: dict[int, np.ndarray]
     motion: dict[int, np.ndarray]
     saved: float = 0.0
-    steady: bool = True
+    demand: float = 1.0
 
     @property
     def size(self) -> int:
@@ -70,7 +71,7 @@ def carry(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -
         if t != one.start:
             before, step = step, refine(points, there, step)
             if not _alike(points, before, step, _JERK):
-                one.steady = False
+                one.demand *= _UNSTEADY
                 return
         members = _members(moved(points, step), there)
         if len(members) == 0 or (there.cost(moved(points, step))[0] < 0.9 * UNSEEN).mean() < _FOUND:

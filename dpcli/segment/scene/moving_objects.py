@@ -17,8 +17,8 @@ _TALLEST = 5.0
 _DOUBT = 0.12  # mean cost of standing still above which a cluster is looked at
 _GAIN = 0.15  # mean saving of the motion per point and frame, in points that a frame contradicts
 _THROUGH = 0.05  # share of an object's points that frames must see through, in the mean
-_SHARE = 0.4  # share of the cost of standing still that a motion must save
-_UNSTEADY = 2.5  # times the evidence for something that could only be carried with a jerk
+_SHARE = (0.4, 0.6)  # share of the cost of standing still that a motion must save, the second where more is demanded
+_PIECE = 2.0  # times the evidence for the smaller piece of a cluster
 _FLAT = 0.4  # meters, and gaps between rows of beams: what is flatter, or lower above the ground, is a bump or a mirror
 _ROWS = 0.7
 _VEHICLE = 4.0  # meters around the sensor that its own vehicle takes up
@@ -32,11 +32,11 @@ def find_moving_objects(world: World, settings: SceneSettings) -> list[MovingObj
         frame.doubt, frame.free = measure_doubt(world, t)
     found: list[MovingObject] = []
     for t, frame in enumerate(world.frames):
-        for own in _propose(frame):
+        for own, demand in _propose(frame):
             own = own[frame.label[own] == 0]
             if len(own) < _FEWEST or (frame.free[own] > 0).sum() < max(_FEW_FREE, _THROUGH * len(own) / 2):
                 continue
-            one = _explain(own, t, world, settings)
+            one = _explain(own, t, world, settings, demand)
             if one is not None:
                 found.append(one)
                 world.label(one, len(found))
@@ -63,10 +63,11 @@ def measure_doubt(world: World, t: int) -> tuple[np.ndarray, np.ndarray]:
     return cost, free
 
 
-def _propose(frame: Frame) -> list[np.ndarray]:
-    """Returns the points i64 of clusters in doubt, those that are seen through most first.
+def _propose(frame: Frame) -> list[tuple[np.ndarray, float]]:
+    """Returns the points i64 of clusters in doubt, those that are seen through most first, and the evidence demanded.
 
-    Those points of a cluster that are in doubt are proposed by themselves, too: something may pass by what stands.
+    Those points of a cluster that are in doubt are proposed by themselves, too: something may pass by what stands. But so
+    look windows and leaves; a small piece of a cluster needs more evidence.
     """
     raised, proposals = frame.raised, []
     points, doubt, free = frame.points[raised], frame.doubt[raised], frame.free[raised] > 0
@@ -76,17 +77,21 @@ def _propose(frame: Frame) -> list[np.ndarray]:
             continue
         extent = np.ptp(points[own], axis=0)
         if max(extent[:2]) <= _LARGEST and extent[2] <= _TALLEST and doubt[own].mean() > _DOUBT:
-            proposals.append(own)
+            proposals.append((own, 1.0))
         doubtful = own[free[own] | (doubt[own] > 0.9 * UNSEEN)]
         if len(doubtful) < 0.8 * len(own):
             inner = groups(cluster(points[doubtful], reach[doubtful], frame.across))
-            proposals += [doubtful[few] for few in inner]
-    proposals.sort(key=lambda own: -free[own].sum())
-    return [raised[own] for own in proposals]
+            pieces = [doubtful[few] for few in inner]
+            proposals += [(piece, _PIECE if len(piece) < 0.5 * len(own) else 1.0) for piece in pieces]
+    proposals.sort(key=lambda proposal: -free[proposal[0]].sum())
+    return [(raised[own], demand) for own, demand in proposals]
 
 
-def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings) -> MovingObject | None:
-    """Returns the object of these points of frame t, carried through all frames, or None where they may as well stand."""
+def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings, demand: float) -> MovingObject | None:
+    """Returns the object of these points of frame t, carried through all frames, or None where they may as well stand.
+
+    demand: times the usual evidence that it needs.
+    """
     around, frame = world.around(t), world.frames[t]
     if not around:
         return None
@@ -98,7 +103,7 @@ def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings) -> 
         cost = np.mean([world.frames[u].cost(moved(points, motion))[0].mean() for u, motion in motions.items()])
         if cost < least:
             best, least = motions, float(cost)
-    one = MovingObject(t, {t: own}, {t: np.eye(4)})
+    one = MovingObject(t, {t: own}, {t: np.eye(4)}, demand=demand)
     for u, motion in best.items():
         carry(one, t, u - t, motion, world)
     return one if _judge(one, world, settings) else None
@@ -125,8 +130,8 @@ def _judge(one: MovingObject, world: World, settings: SceneSettings) -> bool:
         through, count = through + free[kept].sum(), count + int(kept.sum())
         upright = upright or _stands_upright(one.points[t], frame)
     one.saved = float(saved)
-    least = 1.0 if one.steady else _UNSTEADY
-    enough = saved >= max(least * settings.evidence, least * _GAIN * count, _SHARE * still)
+    share = _SHARE[0] if one.demand == 1 else _SHARE[1]
+    enough = saved >= max(one.demand * settings.evidence, one.demand * _GAIN * count, share * still)
     seen_through = through >= max(settings.evidence, _THROUGH * count)
     return bool(enough and seen_through and upright and not _on_board(one, world))
 
