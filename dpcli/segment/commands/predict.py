@@ -207,6 +207,14 @@ def _predict_sequences(
         taken.run(work, load, write, workers)
 
 
+def told_of_scenes(parts: str) -> list[str]:
+    """Returns a line for each sequence of a parts file of scenes: the sensor's motion, moving objects, their speeds."""
+    from dpcli.segment.scene.report import scene_lines
+
+    with PartsReader(Path(parts)) as reader:
+        return scene_lines(reader)
+
+
 def _close(target: Path, drawings: Drawings) -> int:
     """Draws what was written and tells what was passed over; returns the number of sequences."""
     with PartsReader(target) as made:
