@@ -12,7 +12,7 @@ from dpcli.cli.options import Device, Force, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.runtime.settings.catalog import Given
 
-_EVERYDAY = ("init", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
+_EVERYDAY = ("init", "fine_tune", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
 
 
 @options_of(TRAINING, _EVERYDAY, presets={**PRESETS, "auto": PRESETS["quick"]}, preset="auto")
