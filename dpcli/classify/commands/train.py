@@ -23,7 +23,7 @@ from dpcli.classify.data.validation_split import (
     cross_folds,
     default_rule,
 )
-from dpcli.classify.data.videos import report_short
+from dpcli.classify.data.videos import report_backward, report_short
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
@@ -129,6 +129,7 @@ def _train(
     folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
     report_short(videos.training, settings.network.num_frames)
+    report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, folder).to(device)
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
