@@ -29,6 +29,7 @@ from dpcli.classify.network.model_file import ModelInfo, find_model, load_model,
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
 from dpcli.classify.training.fine_tune import resolved, settings_from
+from dpcli.classify.training.forests import grow_forests
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
@@ -144,6 +145,10 @@ def _train(
         processes.wait()  # the others find the folder as it is to be
         trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
         trainer.run()
+        if settings.network.backbone == "slots":
+            info.config = grow_forests(trainer.model, videos.training, seed)
+            if processes.first:
+                save_model(folder.file("best.safetensors"), trainer.model, info)
         if processes.first and videos.validation is not None:
             _add_confidence(trainer, info, videos.validation, folder)
     accuracy = trainer.validate() if videos.validation is not None else {}
