@@ -29,13 +29,31 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
     columns = [sequence.extra[name] for name in fields if name in sequence.extra]
     missing = [np.zeros(len(times))] * (len(fields) - len(columns))
     values = np.column_stack([sequence.points - middle, *columns, *missing]).astype(np.float64)
-    whole = np.quantile(values, _LEVELS, axis=0)
-    slots = _slots(values, times * _SLOTS // max(sequence.num_frames, 1), whole)
-    middles = slots[:, len(_LEVELS) // 2]
-    counts = np.bincount(times * _SLOTS // max(sequence.num_frames, 1), minlength=_SLOTS) / max(len(times), 1)
     size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *middle]
-    found = np.concatenate([size, counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
+    found = np.concatenate([size, _described(values, times * _SLOTS // max(sequence.num_frames, 1))])
     return np.nan_to_num(found).clip(-_LARGEST, _LARGEST)
+
+
+def clip_descriptors(clips: np.ndarray) -> np.ndarray:
+    """Returns the descriptors f32 (B,D) of clips of sparse clouds, f32 (B,T,P,5+F) as `data/slots.py` makes them: as of videos,
+    without what they say of place and length."""
+    found = []
+    for clip in clips:
+        slot, place = np.nonzero(clip[..., 3] > 0)
+        rows = clip[slot, place] if len(slot) else np.zeros((1, clip.shape[-1]), np.float32)
+        within = (slot + 0.5 if len(slot) else np.zeros(1)) + rows[:, 4]
+        times = np.clip(within / len(clip) * _SLOTS, 0, _SLOTS - 1).astype(int)
+        found.append(_described(rows[:, [0, 1, 2, *range(5, rows.shape[1])]].astype(np.float64), times))
+    return np.stack(found).astype(np.float32)
+
+
+def _described(values: np.ndarray, slot: np.ndarray) -> np.ndarray:
+    """Returns what the points' values f64 (N,C) are like in all and in each slot, i (N): shares, quantiles, shifts."""
+    whole = np.quantile(values, _LEVELS, axis=0)
+    slots = _slots(values, slot, whole)
+    middles = slots[:, len(_LEVELS) // 2]
+    counts = np.bincount(slot, minlength=_SLOTS) / max(len(slot), 1)
+    return np.concatenate([counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
 
 
 def _slots(values: np.ndarray, slot: np.ndarray, whole: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from dpcli.cli.settings_options import options_of
 from dpcli.runtime.settings.catalog import Given
 from dpcli.standard_streams import printable
 
-_EVERYDAY = ("init", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
+_EVERYDAY = ("init", "fine_tune", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
 
 
 @options_of(TRAINING, _EVERYDAY, presets={**PRESETS, "auto": PRESETS["quick"]}, preset="auto")
