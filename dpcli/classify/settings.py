@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from dpcli.classify.data.augment import AUGMENTATIONS, Augmentation
+from dpcli.classify.data.validation_split import CROSS
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES, backbone_changes
 from dpcli.classify.training.run_settings import RunSettings
@@ -27,7 +28,8 @@ NETWORK_PRESETS = {name: {"network": groups["network"]} for name, groups in PRES
 class TrainingSettings:
     """Holds all settings of a training run.
 
-    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise.
+    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise, or a network those of
+    another kind.
     """
 
     network: KinetConfig
@@ -41,6 +43,17 @@ class TrainingSettings:
             raise UsageError(
                 f"augment_speed = {speed:g}: speed changes random clips of consecutive frames; leave it out with --timing"
                 " uniform or clips_per_video = 0"
+            )
+
+        if self.run.validation == CROSS and self.network.members < 2:
+            raise UsageError(
+                "--validation cross: needs a network of several members, as preset sparse has; give another rule"
+            )
+        slots = self.network.backbone == "slots"
+        if slots != (self.run.timing == "slots") or (slots and self.schedule.epochs_dynamic):
+            raise UsageError(
+                f"backbone = {self.network.backbone} with timing = {self.run.timing} and epochs_dynamic ="
+                f" {self.schedule.epochs_dynamic}: slots belongs to slots, and has no dynamic stream; take --preset sparse"
             )
 
     def to_toml(self, command: str) -> str:

@@ -23,6 +23,7 @@ from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
+from dpcli.store.schema import kept_name
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 _WORTH_WORKERS = 500  # clips; fewer are scored by one process before a second has started
@@ -150,7 +151,7 @@ def _score_videos(
     reader, chosen = source.reader, source.sequences
 
     def load(place: int) -> tuple[int, CloudSequence]:
-        return chosen[place], reader.read(chosen[place], fields=())
+        return chosen[place], reader.read(chosen[place], fields=tuple(map(kept_name, source.config.columns)))
 
     def write(place: int, video: VideoScores) -> dict[str, float]:
         i = video.sequence

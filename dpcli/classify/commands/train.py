@@ -14,7 +14,15 @@ import torch
 from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import about_people, carve_validation, class_table, default_rule
+from dpcli.classify.data.slots import measured, preset_for
+from dpcli.classify.data.validation_split import (
+    CROSS,
+    about_people,
+    carve_validation,
+    class_table,
+    cross_folds,
+    default_rule,
+)
 from dpcli.classify.data.videos import report_short
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
@@ -37,6 +45,7 @@ from dpcli.runtime.whole_file import write_whole
 from dpcli.store import CloudsReader, input_file
 
 SETTINGS_FILE = "settings.toml"
+AUTO = "auto"  # the preset that the data choose
 _FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
 
 
@@ -76,13 +85,19 @@ def train(
     processes but the first. Raises UsageError for settings that don't fit together or a folder with another run, DataError
     for data that can't be learned from.
     """
-    settings = training_settings(given)
+    training_settings(_with_preset(given, "quick"))  # what is wrong in any file is refused before it is read
     if data == "-" and from_environment().count > 1:
         raise UsageError("several processes can't share a pipe: give a file instead of -")
     chosen = choose_device(device)
-    settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
     with input_file(data) as path, process_group(chosen) as processes:
+        settings = training_settings(_with_preset(given, preset_for(CloudsReader(path), given.values)))
+        settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
+
+
+def _with_preset(given: Given, preset: str) -> Given:
+    """Returns what was given with a preset in place of `auto`."""
+    return replace(given, preset=preset) if given.preset == AUTO else given
 
 
 def _train(
@@ -127,7 +142,12 @@ def _forest(videos: _Videos, seed: int) -> float | None:
     source, held = videos.training, videos.validation
     if held is None or not _FOREST[0] <= len(source.sequences) <= _FOREST[1]:
         return None
-    return forest_accuracy(source.reader, list(source.sequences), list(held.sequences), seed)
+    groups = [(list(source.sequences), list(held.sequences))]
+    if source.folds:
+        of = source.folds
+        groups = [([i for i in of if of[i] != k], [i for i in of if of[i] == k]) for k in sorted(set(of.values()))]
+    right = [len(judged) * forest_accuracy(source.reader, learned, judged, seed) for learned, judged in groups]
+    return sum(right) / sum(len(judged) for _, judged in groups)
 
 
 def _add_confidence(trainer: Trainer, info: ModelInfo, validation: ClipSource, folder: RunFolder) -> None:
@@ -158,11 +178,15 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     reader = CloudsReader(path)
     settings = with_classes(settings, len(class_table(reader)))
     run = settings.run
-    rule = default_rule(reader) if run.validation == "auto" else run.validation
+    rule = default_rule(reader, settings.network.members) if run.validation == "auto" else run.validation
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
     _check_labels(reader, training, validation)
+    if run.timing == "slots":
+        settings = replace(settings, network=measured(settings.network, reader, training))
     options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
+    if rule == CROSS:
+        options["folds"] = cross_folds(reader, training, settings.network.members, seed)
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)

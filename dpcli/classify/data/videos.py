@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import carve_validation
+from dpcli.classify.data.validation_split import CROSS, carve_validation
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
@@ -36,6 +36,11 @@ def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int
     if rule == "none":
         raise UsageError(
             f"--split validation: {model_name} held no video out (--validation none); ask for another split"
+        )
+    if rule == CROSS:
+        raise UsageError(
+            f"--split validation: {model_name} learned from all videos, each judged by members that never saw it; the log of its"
+            " training has their accuracy (ask for another split)"
         )
     if not rule.startswith("subject") and info.notes.get("data") != provenance.file_digest(reader.path):
         raise DataError(

@@ -126,6 +126,7 @@ def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -
     """Returns the module whose gradients are averaged over processes; batch norms are synchronized by themselves."""
     config = model.config  # some switches leave parameters without a gradient
     unused = (stage == 1 and (config.merge == "cross" or not config.normals)) or config.backbone not in BACKBONES
+    unused |= config.members > 1  # a few clips may leave one of them without any
     where = [device.index] if device.type == "cuda" else None
     with warnings.catch_warnings():
         warnings.simplefilter(

@@ -15,7 +15,7 @@ from dpcli.runtime.settings.catalog import Given
 _EVERYDAY = ("init", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
 
 
-@options_of(TRAINING, _EVERYDAY, presets=PRESETS, preset="quick")
+@options_of(TRAINING, _EVERYDAY, presets={**PRESETS, "auto": PRESETS["quick"]}, preset="auto")
 def train(
     data: Annotated[str, typer.Argument(help="A clouds file with labels and a split 'train', or - for a pipe.")],
     output: Annotated[str, typer.Option("-o", "--output", help="Folder for weights, settings, logs and curves.")],
@@ -27,7 +27,8 @@ def train(
     """Train both streams: static, then dynamic on the frozen static weights. Running again continues a stopped run.
 
     Presets: thesis and release (its text and its published code), quick (a seventh of the operations, fits a CPU), tiny
-    (demo). The folder's settings.toml holds all settings; --config reads it back to an equal run.
+    (demo), sparse (at most 64 points a frame, as of a radar); auto takes sparse for such data, else quick. The folder's
+    settings.toml holds all settings; --config reads it back to an equal run.
 
     Several GPUs or machines: torchrun --nproc-per-node N -m dpcli classify train ...; the batch is shared among them.
     """

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import map_npy
 from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, unnamed_columns, without
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
@@ -21,13 +22,7 @@ _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coord
 
 def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads an array of rows, x y z first, or a structured one with fields of these names."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)  # a shape that the file has no room for fails at once
-    except Exception as error:  # ValueError, EOFError, tokenize.TokenError, SyntaxError of damaged headers
-        raise DataError(f"{path}: not a readable .npy array ({error})") from None
-    if not isinstance(array, np.ndarray):
-        raise DataError(f"{path}: not a readable .npy array (an archive)")
-    return _cloud_of_array(path, array, keep)
+    return _cloud_of_array(path, map_npy(path), keep)
 
 
 def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:

@@ -11,6 +11,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 
+BEYOND = "points beyond the number that their file's header says dropped"
+
 
 @dataclass
 class Cloud:
@@ -35,6 +37,16 @@ class Cloud:
         self.points = self.points[rows]
         self.color = None if self.color is None else self.color[rows]
         self.extra = {name: values[rows] for name, values in self.extra.items()}
+
+
+def require_points(path: Path, declared: int, found: int) -> dict[str, int]:
+    """Returns how many points lie behind those that a header declares, as `Cloud.dropped` has it; {} where none do.
+
+    found: how many points the file has room for. Raises DataError where they are fewer.
+    """
+    if found < declared:
+        raise DataError(f"{path}: truncated: its header says {declared} points, it has room for {found}")
+    return {BEYOND: found - declared} if found > declared else {}
 
 
 def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str] = ()) -> Cloud:

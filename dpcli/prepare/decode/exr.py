@@ -20,7 +20,7 @@ def read_exr(path: Path) -> np.ndarray:
         raise DataError(f"{path}: OpenEXR is needed to read it; pip install 'dpc-toolkit[exr]'") from None
     try:
         channels = {name: channel.pixels for name, channel in OpenEXR.File(str(path), True).channels().items()}
-    except RuntimeError:
+    except Exception:  # RuntimeError, and of a file that lost its end ValueError
         raise DataError(f"{path}: not a readable OpenEXR image (empty, truncated, or of another kind)") from None
     named = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth") or "depth" in name.lower()]
     chosen = next((choice for choice in (list(channels), named) if len(choice) == 1), list(channels))

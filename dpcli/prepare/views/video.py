@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
-from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, open_frames, read_rgba
+from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, integers, open_frames, read_rgba
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
@@ -275,11 +275,14 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
 def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
     """Finds a mask for every frame of the clip: by number where all numbers agree, else in order."""
     masks = open_frames(require_folder(folder, "a mask per frame, as images"))
-    if set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
+    numbered = all(number in integers(name) for number, name in zip(masks.numbers, masks.names))
+    if numbered and set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
         place = dict(zip(masks.numbers, masks.files))
         return tuple(place[number] for number in frames.numbers)
     if len(masks) != len(frames):
-        raise DataError(f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike")
+        raise DataError(
+            f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike, with all its objects"
+        )
     return masks.files
 
 

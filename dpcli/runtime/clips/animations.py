@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.runtime.clips.images import as_shown
+from dpcli.runtime.clips.video_frames import video_frames
 
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
 
@@ -30,7 +32,8 @@ def animation_times(path: Path) -> tuple[float, ...]:
     times, now = [], 0.0
     try:
         with Image.open(path) as image:
-            for index in range(getattr(image, "n_frames", 1)):
+            first = int(getattr(image, "default_image", False))  # what viewers show that can't play an APNG
+            for index in range(first, getattr(image, "n_frames", 1)):
                 image.seek(index)
                 image.load()
                 times.append(now)
@@ -44,11 +47,19 @@ def animation_times(path: Path) -> tuple[float, ...]:
 
 
 def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
-    """Yields frames by rising index, each u8 (H,W,4) with straight alpha."""
+    """Yields frames by rising index, each u8 (H,W,4) with straight alpha.
+
+    FFmpeg decodes APNG: Pillow lays one frame over another as if what is below were opaque.
+    """
     from PIL import Image
 
     with reading(path), Image.open(path) as image:
+        profile = image.info.get("icc_profile")
+        if image.format == "PNG":
+            for frame in video_frames(path, wanted):
+                yield np.array(as_shown(Image.fromarray(frame), profile)) if profile else frame
+            return
         for index in wanted:
             image.seek(index)
-            picture = np.array(image.convert("RGBA"))
+            picture = np.array(as_shown(image).convert("RGBA"))
             yield picture
