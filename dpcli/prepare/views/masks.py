@@ -8,7 +8,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.runtime.clips.images import upright
+from dpcli.runtime.clips.images import open_image, upright
 from dpcli.runtime.progress import log
 
 _SMALL_LABEL = 64  # no mask is that dark; values below are labels
@@ -27,10 +27,8 @@ def read_mask(path: Path) -> np.ndarray:
     Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits; 255 beside labels below
     64 is void, which is 0. Raises DataError when the file isn't readable, or when compression changed its labels.
     """
-    from PIL import Image
-
     try:
-        with Image.open(path) as stored:
+        with open_image(path) as stored:
             lossy, image = stored.format in ("JPEG", "WEBP", "AVIF"), upright(stored)
             if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
                 alpha = np.array(image.convert("RGBA").getchannel("A"))
