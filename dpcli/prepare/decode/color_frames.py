@@ -168,7 +168,9 @@ def read_rgba(path: Path) -> np.ndarray:
 def _to_rgba(image) -> np.ndarray:  # image: PIL.Image.Image
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
-        gray = np.clip(gray / (257.0 if gray.max(initial=0) > 255 else 1.0), 0, 255).round().astype(np.uint8)
+        top = gray.max(initial=0)
+        unit = 1 / 255 if image.mode == "F" and top <= 1 else 257.0 if top > 255 else 1.0
+        gray = np.clip(gray / unit, 0, 255).round().astype(np.uint8)
         return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
     return np.array(image.convert("RGBA"))
 

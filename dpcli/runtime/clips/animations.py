@@ -39,11 +39,13 @@ def animation_times(path: Path) -> tuple[float, ...]:
                 image.load()
                 times.append(now)
                 now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
-            moves = image.format in ("GIF", "PNG", "WEBP", "AVIF")
+            moves, form = image.format in ("GIF", "PNG", "WEBP", "AVIF"), image.format
     except DataError:
         raise
     except Exception as error:  # a damaged file raises nearly anything
         raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
+    if len(times) > 1 and form == "TIFF":
+        raise DataError(f"{path}: {len(times)} pages, which tell no times; write each into a folder as an image")
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
     return tuple(times)

@@ -58,6 +58,7 @@ ALPHA = {
     "animation.mov": ("-c:v", "qtrle", "-pix_fmt", "argb"),
     "png.mov": ("-c:v", "png", "-pix_fmt", "rgba"),
     "ffv1.mkv": ("-c:v", "ffv1", "-pix_fmt", "bgra"),
+    "tiff.mov": ("-c:v", "tiff", "-pix_fmt", "rgba"),  # with side data that PyAV doesn't know
 }
 
 
