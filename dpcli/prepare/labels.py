@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.text_numbers import decode_text
 from dpcli.prepare.reader import Item, split_called
 from dpcli.runtime.progress import log
 
@@ -87,6 +86,8 @@ def read_labels(path: Path) -> LabelTable:
     Commas, semicolons or tabs divide; further columns are passed over with a warning. Labels are whole numbers from 0,
     or words; words are numbered in alphabetical order. DataError names file and line.
     """
+    from dpcli.prepare.cloud_formats.text_numbers import decode_text
+
     try:
         text = decode_text(path).lstrip("\ufeff")
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
