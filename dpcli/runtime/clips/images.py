@@ -13,7 +13,7 @@ from dpcli.errors import DataError
 from dpcli.runtime.progress import log
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif")
-_PIXELS, _PIXELS_A_BYTE = 1 << 24, 200  # that any picture may have; and as many times its bytes beyond them
+_PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many times its bytes beyond them
 _NAMED = 6  # series at most in a message
 
 
