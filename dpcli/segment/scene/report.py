@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.segment.pictures import Look
+from dpcli.segment.scene.ground import find_up
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsReader, PartsSample
 
 _NAMED = 8  # objects of a sequence that are named one by one
+_SHOWN = 30.0  # meters around the middle that a picture shows
 
 
 def scene_lines(reader: PartsReader) -> list[str]:
@@ -40,3 +43,16 @@ def _speed(sequence: CloudSequence, said: PartsSample, part: int, unit: str) -> 
     step = f"{np.median(steps):.2f} {unit} a frame"
     rate = np.median(np.array(steps) / np.where(np.array(times) > 0, times, np.nan))
     return f"{step} ({rate:.1f} {unit}/s)" if np.isfinite(rate) else step
+
+
+def picture_of_scene(sequence: CloudSequence) -> tuple[CloudSequence, Look]:
+    """Returns what a picture shows of a scene, what stands without a color, and from where: obliquely from above."""
+    middle = np.median(sequence.points, axis=0)
+    reach = np.linalg.norm(sequence.points - middle, axis=1)
+    shown = np.flatnonzero(reach <= max(_SHOWN, float(np.percentile(reach, 20))))
+    offsets = np.searchsorted(shown, sequence.frame_offsets)
+    up = find_up(sequence.frame(0).astype(np.float64), None)[0]
+    axis = int(np.abs(up).argmax())
+    sequence.take_points(shown, offsets)
+    sequence.part = np.where(sequence.part == 0, -1, sequence.part).astype(np.int16)
+    return sequence, Look(cell=420, up=("-" if up[axis] < 0 else "") + "xyz"[axis], elevation=np.deg2rad(50.0))
