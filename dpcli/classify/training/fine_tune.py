@@ -53,7 +53,12 @@ def settings_from(info: ModelInfo, reader: CloudsReader, part: str | None) -> di
         fine_tune=chosen,
         validate_every=max(1, epochs // 10),
     )
-    return {**base, "network": info.config, "schedule": schedule, "run": replace(base["run"], timing=info.timing)}
+    return {
+        **base,
+        "network": info.config.changed(forest=(0, 0)),
+        "schedule": schedule,
+        "run": replace(base["run"], timing=info.timing),
+    }
 
 
 def resolved(schedule: Schedule, reader: CloudsReader) -> Schedule:

@@ -58,7 +58,7 @@ def test_the_number_of_videos_chooses_what_learns(videos, part, tmp_path):
         info = ModelInfo(network_config(Given("tiny", sets={"frames": 2}), 3), ["a", "b", "c"], "uniform")
         base = settings_from(info, reader, None)
     schedule = base["schedule"]
-    assert schedule.fine_tune == part and base["run"].timing == "uniform" and base["network"] is info.config
+    assert schedule.fine_tune == part and base["run"].timing == "uniform" and base["network"] == info.config
     assert 5 <= schedule.epochs <= 100 and schedule.epochs * 2 * videos <= 12_000
 
 

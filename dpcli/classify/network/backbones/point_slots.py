@@ -11,9 +11,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from dpcli.classify.data.descriptors import clip_descriptors
 from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
 from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.descriptors import clip_descriptors
 from dpcli.classify.network.forest import Forest
 from dpcli.classify.network.layers import ClipLinear
 from dpcli.errors import UsageError
@@ -39,6 +39,7 @@ class PointSlots(Backbone):
         super().__init__()
         self.config, self.tap_widths = config, ()
         self.members = nn.ModuleList(_Member(config) for _ in range(config.members))
+        self.register_buffer("forest_share", torch.tensor(0.0))  # of the logarithm of a score
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
         """Returns the points (B,N,3) as they are: one grouping without neighborhoods."""
@@ -54,7 +55,7 @@ class PointSlots(Backbone):
         for member, asked in zip(self.members, speakers.T):
             if asked.any():
                 which = asked.nonzero()[:, 0]
-                total = total.index_add(0, which, member.scores(clips[which]).to(total))
+                total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
         return torch.log(total.clamp(min=_LEAST) / speakers.sum(1, keepdim=True))
 
     def _speakers(self, unseen: Tensor) -> Tensor:
@@ -91,13 +92,13 @@ class _Member(nn.Module):
         self.forest = Forest(*config.forest, config.num_classes)
         nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
 
-    def scores(self, clips: Tensor) -> Tensor:
-        """Returns the probabilities (B,C); outside of training the geometric mean of the layers' and, once it has grown, the
+    def scores(self, clips: Tensor, share: Tensor) -> Tensor:
+        """Returns the probabilities (B,C); outside of training the geometric mean of the layers' and, with its share, the
         forest's."""
         logits = self(clips)
-        if not self.training and self.forest.feature.numel():
+        if not self.training and share > 0:
             described = torch.from_numpy(clip_descriptors(clips.cpu().numpy())).to(clips.device)
-            logits = (torch.log_softmax(logits, -1) + torch.log(self.forest(described))) / 2
+            logits = (1 - share) * torch.log_softmax(logits, -1) + share * torch.log(self.forest(described))
         return torch.softmax(logits, -1)
 
     def forward(self, clips: Tensor) -> Tensor:
