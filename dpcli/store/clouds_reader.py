@@ -134,6 +134,12 @@ class CloudsReader:
         """Counts the points of each sequence, i64 (S)."""
         return np.diff(self._frame_offsets[self._sequence_offsets])
 
+    def times(self, index: int) -> np.ndarray | None:
+        """Returns when the frames of sequence `index` were taken, f64 (T), without its points; None where the file doesn't say."""
+        if "time" not in self.fields:
+            return None
+        return self._set("time")[int(self._sequence_offsets[index]) : int(self._sequence_offsets[index + 1])]
+
     @property
     def file(self) -> h5py.File:
         """Opens the file in this process unless it is open, and returns the handle."""

@@ -152,6 +152,7 @@ class DepthVideos:
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
+        notes |= video.notes
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale
@@ -173,8 +174,8 @@ class DepthVideos:
         """Returns the frames of an item, and the camera that a recording describes."""
         if not item.extra["recording"]:
             return read_depth_video(item.path, self.stride, item.extra["series"]), None
-        frames, time, camera = read_recorded_depth(item.path, self.topic, self.stride)
-        return DepthVideo(frames, time), camera
+        read, camera = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes), camera
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
@@ -236,10 +237,7 @@ class DepthVideos:
                 f"no times are written: {', '.join(silent[:3])} {'say' if silent[1:] else 'says'} none (--fps)"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
-        unlabeled = [item.name for item in items if item.label < 0]
-        if self._table and unlabeled:
-            lines.append(f"{len(unlabeled)} without a label in {self.labels}: {', '.join(unlabeled[:5])}")
-        return lines
+        return lines + (self._table.unnamed(items) if self._table else [])
 
 
 def _tells_time(item: Item) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
-from dpcli.prepare.meshes.mesh_counts import require_counts
+from dpcli.prepare.decode.mesh_counts import require_counts
 from dpcli.prepare.reader import natural_key, require_folder
 
 

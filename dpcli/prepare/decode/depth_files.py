@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -41,13 +41,15 @@ class DepthVideo:
     """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known.
 
     missing: how many more frames the file declares than it holds, such as a recording that was cut. ends_early: the file
-    stops before its container does, whether or not it says how many frames there were.
+    stops before its container does, whether or not it says how many frames there were. notes: counts of what else is
+    missing or doubtful.
     """
 
     frames: np.ndarray
     time: np.ndarray | None = None
     missing: int = 0
     ends_early: bool = False
+    notes: dict[str, int] = field(default_factory=dict)
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture

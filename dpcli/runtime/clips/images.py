@@ -1,4 +1,4 @@
-"""Images in the folder of a clip: turned as their camera was held, and sorted into the series that their names tell."""
+"""Images in the folder of a clip: upright and in sRGB, as they are shown, and sorted into the series that their names tell."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 
 from dpcli.errors import DataError
@@ -47,6 +48,28 @@ def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image
     from PIL import ImageOps
 
     return ImageOps.exif_transpose(image)
+
+
+def as_shown(image, profile: bytes | None = None):  # image: PIL.Image.Image -> PIL.Image.Image
+    """Returns the image upright and in sRGB: colors of a wide gamut or of print are converted by their ICC profile.
+
+    profile: the one of an image that lost it. A damaged one is passed over, as browsers do.
+    """
+    from PIL import ImageCms
+
+    image = upright(image)
+    profile = profile or image.info.get("icc_profile")
+    if not profile or image.mode not in ("RGB", "RGBA", "CMYK", "P"):
+        return image
+    try:
+        own = ImageCms.ImageCmsProfile(BytesIO(profile))
+        if "srgb" in ImageCms.getProfileDescription(own).lower():
+            return image
+        image = image.convert("RGBA") if image.mode == "P" else image
+        mode = "RGBA" if image.mode == "RGBA" else "RGB"
+        return ImageCms.profileToProfile(image, own, ImageCms.createProfile("sRGB"), outputMode=mode)
+    except (ImageCms.PyCMSError, OSError):
+        return image
 
 
 def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: bool = False) -> list[Path]:

@@ -12,7 +12,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.npy_files import map_npy
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, one_series, open_image, upright
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
 
@@ -68,7 +68,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, bool]:
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = "A" in image.getbands() or "transparency" in image.info
-            return np.asarray(upright(image).convert("RGBA")), has_alpha
+            return np.asarray(as_shown(image).convert("RGBA")), has_alpha
     except DataError:
         raise
     except Exception as error:  # a damaged image raises nearly anything, and one of a vast size DecompressionBombError
