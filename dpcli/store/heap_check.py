@@ -20,7 +20,8 @@ _made_here: set[tuple[int, int, int]] = set()
 
 
 def check_heaps(path: Path) -> None:
-    """Raises DataError where a heap's free space takes no bytes, which libhdf5 would pass over without an end.
+    """Raises DataError where a heap's free space takes no bytes, which libhdf5 would pass over without an end, or a heap
+    claims more than the file has.
 
     Also where lengths are not of 8 bytes each, as all of ours and nearly all others are, since heaps would lie otherwise.
     Files that are not HDF5 pass: whoever opens them says so. Files of more than 128 MiB are searched at both ends only. A
@@ -62,8 +63,13 @@ def _check_once(path: Path, _place: int, _size: int, _changed: int) -> None:
 
 
 def _check_heap(path: Path, data: mmap.mmap, place: int) -> None:
-    """Goes from object to object as libhdf5 does; what leads out of the heap it finds by itself."""
+    """Goes from object to object as libhdf5 does; what leads out of the heap it finds by itself, but makes room for a heap first."""
     end = place + int.from_bytes(data[place + 8 : place + 16], "little")
+    if end > len(data):
+        raise DataError(
+            f"{path}: the HDF5 file is damaged (its heap of texts at byte {place} claims {end - place} bytes, a file of"
+            f" {len(data)} bytes can't hold them); make or copy it again"
+        )
     at = place + _HEAD
     while at + _OBJECT.size <= min(end, len(data)):
         number, _, _, size = _OBJECT.unpack_from(data, at)

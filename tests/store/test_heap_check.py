@@ -60,6 +60,32 @@ def test_a_zeroed_heap_is_a_damaged_file(tmp_path, dpc, command, keep):
     assert time.monotonic() - started < 30
 
 
+def test_a_heap_larger_than_the_file_is_refused_before_room_is_made_for_it(tmp_path):
+    path = clouds(tmp_path / "c.h5")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, heaps(data)[-1] + 8, 1 << 30)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="claims 1073741824 bytes, a file of"):
+        CloudsReader(path)
+
+
+@pytest.mark.parametrize("chunks", [None, (2,)])
+def test_a_text_longer_than_the_file_is_refused_before_room_is_made_for_it(chunks, tmp_path):
+    path = clouds(tmp_path / "c.h5")
+    with h5py.File(path, "a") as file:
+        names = file["class_names"][:]
+        del file["class_names"]
+        item = file.create_dataset("class_names", data=names, dtype=h5py.string_dtype(), chunks=chunks)
+        file.flush()
+        place = item.id.get_offset() if chunks is None else item.id.get_chunk_info(0).byte_offset
+    CloudsReader(path).close()
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, place, 1 << 30)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="a text of /class_names claims 1073741824 bytes"):
+        CloudsReader(path)
+
+
 def test_every_heap_is_looked_at(tmp_path):
     path = clouds(tmp_path / "c.h5")
     whole = path.read_bytes()
