@@ -20,7 +20,8 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-4.3 table-4.4 table-4.5 table-4.6 table-5.1 table-5.2
+.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-4.3 table-4.4 table-4.5 table-4.6 table-5.1
+.PHONY: table-5.2 figure-5.3
 .PHONY: segments prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
@@ -41,6 +42,7 @@ help:
 	@echo "make table-4.4 KITTI_SF=folder, table-4.5 KITTI_DET=folder, table-4.6 SEMANTICKITTI=folder  objects of streets"
 	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, five rows and those of the thesis; hours"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
+	@echo "make figure-5.3 MESHES=folder the same clips, control points and weight of temporal preservation; an hour and a half"
 	@echo "make prior MESHES=folder      the shape network, trained and shown from the sides; many hours"
 	@echo "make fuzz [SEED=1 INPUTS=10000 MINUTES=20 ONLY=\"prepare depth\"]  damaged files, then odd options: none ends as a bug"
 	@echo "make soak [MINUTES=60]        a long stream, 60,000 samples, 256 shards: speed, memory and open files stay as they are"
@@ -208,10 +210,16 @@ table-5.1: $(READY)
 	$(if $(MESHES)$(ARTEMIS),,$(error make table-5.1 needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
 	$(BIN)/python -m dpcli.reproduce.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
 
-# Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files. Stopped, it goes on where it was.
+# Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files; T52: words for the program. Stopped, it
+# goes on where it was.
 table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2
+	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2 $(T52)
+
+# Figure 5.3 of the thesis on the same clips: the number of control points, and the weight of temporal preservation.
+figure-5.3: $(READY)
+	$(if $(MESHES),,$(error make figure-5.3 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
+	$(BIN)/python -m dpcli.reproduce.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
 
 # The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
 HELD_OUT := dpcli/reproduce/held_out_models.txt

@@ -34,9 +34,19 @@ _TINY = {
 }
 
 
-def _preset(network: KinetConfig, schedule: Schedule, augment: str) -> dict[str, Any]:
+_SPARSE = {
+    "backbone": "slots",
+    "num_frames": 16,
+    "points_per_frame": 24,
+    "widths": ((64, 64), (96,)),
+    "dropout": 0.4,
+    "members": 4,
+}
+
+
+def _preset(network: KinetConfig, schedule: Schedule, augment: str, **run_settings: Any) -> dict[str, Any]:
     """Returns the groups of settings of a preset with the augmentation of that name."""
-    run = RunSettings(augment=augment)
+    run = RunSettings(augment=augment, **run_settings)
     return {"network": network, "schedule": schedule, "augmentation": AUGMENTATIONS[augment], "run": run}
 
 
@@ -49,6 +59,21 @@ PRESETS = {
     ),
     "quick": _preset(KinetConfig(**_SMALL), Schedule(80, 60, batch=8, weight_decay=0.01, label_smoothing=0.1), "ours"),
     "tiny": _preset(KinetConfig(**_TINY), Schedule(20, 40, batch=8, learning_rate=2e-3, weight_decay=0.01), "ours"),
+    "sparse": _preset(
+        KinetConfig(**_SPARSE),
+        Schedule(
+            25,
+            0,
+            batch=64,
+            learning_rate=2e-3,
+            weight_decay=0.02,
+            label_smoothing=0.1,
+            clips_per_video=16,
+            validate_every=5,
+        ),
+        "sparse",
+        timing="slots",
+    ),
 }
 
 # What `variant` means: the fields in which the published code differs from the thesis's text, with the values of each.

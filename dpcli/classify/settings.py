@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from dpcli.classify.data.augment import AUGMENTATIONS, Augmentation
+from dpcli.classify.data.validation_split import CROSS
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES, backbone_changes
 from dpcli.classify.training.run_settings import RunSettings
@@ -27,7 +28,8 @@ NETWORK_PRESETS = {name: {"network": groups["network"]} for name, groups in PRES
 class TrainingSettings:
     """Holds all settings of a training run.
 
-    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise.
+    Raises UsageError where an augmentation of the speed meets clips whose frames are chosen otherwise, or a network those of
+    another kind.
     """
 
     network: KinetConfig
@@ -43,6 +45,19 @@ class TrainingSettings:
                 " uniform or clips_per_video = 0"
             )
 
+        if self.run.validation == CROSS and self.network.members < 2:
+            raise UsageError(
+                "--validation cross: needs a network of several members, as preset sparse has; give another rule"
+            )
+        if self.schedule.fine_tune != "all" and not self.run.init:
+            raise UsageError(f"--fine-tune {self.schedule.fine_tune}: goes on from a model; name it with --init")
+        slots = self.network.backbone == "slots"
+        if slots != (self.run.timing == "slots") or (slots and self.schedule.epochs_dynamic):
+            raise UsageError(
+                f"backbone = {self.network.backbone} with timing = {self.run.timing} and epochs_dynamic ="
+                f" {self.schedule.epochs_dynamic}: slots belongs to slots, and has no dynamic stream; take --preset sparse"
+            )
+
     def to_toml(self, command: str) -> str:
         """Returns the settings as TOML, which `--config` reads back. command: the words that the first line names."""
         return TRAINING.to_toml({one.name: getattr(self, one.name) for one in fields(self)}, command)
@@ -54,8 +69,11 @@ def network_config(given: Given, classes: int) -> KinetConfig:
     return NETWORK.resolve(base, Given(config=_all_values(given)))["network"].changed(num_classes=classes)
 
 
-def training_settings(given: Given) -> TrainingSettings:
-    """Returns the preset's settings with what was given over them. Raises UsageError where they don't fit together."""
+def training_settings(given: Given, base: Mapping[str, Any] | None = None) -> TrainingSettings:
+    """Returns the preset's settings, or those of other groups, with what was given over them.
+
+    Raises UsageError where they don't fit together.
+    """
     values = _all_values(given)
     if values.get("pretrain"):
         if values.get("frames", 1) != 1 or values.get("epochs_dynamic", 0) != 0:
@@ -63,7 +81,7 @@ def training_settings(given: Given) -> TrainingSettings:
                 "pretrain trains the static stream on clips of one frame; leave out --frames and epochs_dynamic"
             )
         values |= {"frames": 1, "temporal_radius": 0, "epochs_dynamic": 0}  # a single cloud a video
-    return TrainingSettings(**TRAINING.resolve(PRESETS[given.preset or ""], Given(config=values)))
+    return TrainingSettings(**TRAINING.resolve(base or PRESETS[given.preset or ""], Given(config=values)))
 
 
 def with_classes(settings: TrainingSettings, classes: int) -> TrainingSettings:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from dpcli.classify.data.descriptors import descriptors
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
@@ -43,16 +44,22 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
     """Trains a forest on the descriptors of a file's videos, and judges it on its test split; scores go to `output`.
 
     Without a test split the videos are judged in turn, by a forest that saw neither them nor, where the file knows
-    people, their person. Raises DataError where nothing has a label, or a class has too few videos.
+    people, their person. Raises DataError where nothing has a label, or a class has too few videos, UsageError, before
+    anything is computed, for an output that exists.
     """
     refuse_repeats([data, *([output] if output else [])])
+    if output not in (None, "-") and Path(str(output)).exists() and not force:
+        raise UsageError(f"{output}: exists already; --force replaces it")
     with ExitStack() as stack:
         path = stack.enter_context(input_file(data))
         reader = stack.enter_context(CloudsReader(path))
         known = np.flatnonzero(reader.labels >= 0)
         if not len(known):
             raise DataError(f"{path}: no video has a label; prepare them with --labels TABLE or --label-from-folder")
-        values, labels = descriptors(reader, known.tolist()), reader.labels[known]
+        labels = reader.labels[known]
+        if len(set(labels.tolist())) < 2:
+            raise DataError(f"{path}: all labeled videos are of one class; expected at least two classes to tell apart")
+        values = descriptors(reader, known.tolist())
         scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
         for learned, judged in rounds:

@@ -11,7 +11,7 @@ from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.data.videos import check_classes, report_short, select_videos
+from dpcli.classify.data.videos import check_classes, report_backward, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.video_scores import VideoScores, predict_videos
@@ -23,6 +23,7 @@ from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
+from dpcli.store.schema import kept_name
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 _WORTH_WORKERS = 500  # clips; fewer are scored by one process before a second has started
@@ -78,6 +79,7 @@ def predict(
         sequences = select_videos(reader, task.split, info, task.model)
         source = ClipSource(reader, sequences, info.config, timing=info.timing, drop_short=drop_short, seed=task.seed)
         report_short(source, info.config.num_frames)
+        report_backward(reader, source.sequences)
         config = _record(task, weights, info, source, clips_per_video)
         confidence = None if reject_below is None else choose_confidence(info.notes, reject_below, task.model)
         if confidence is not None:
@@ -150,7 +152,7 @@ def _score_videos(
     reader, chosen = source.reader, source.sequences
 
     def load(place: int) -> tuple[int, CloudSequence]:
-        return chosen[place], reader.read(chosen[place], fields=())
+        return chosen[place], reader.read(chosen[place], fields=tuple(map(kept_name, source.config.columns)))
 
     def write(place: int, video: VideoScores) -> dict[str, float]:
         i = video.sequence

@@ -8,6 +8,7 @@ from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import load_model
 from dpcli.classify.network_cost import measure
 from dpcli.classify.settings import network_config
+from dpcli.errors import UsageError
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.settings.catalog import Given
 
@@ -23,4 +24,8 @@ def profile(model: str | None, given: Given, classes: int, steps: bool, device: 
         network = load_model(model, given.values.get("backbone"))[0]
     else:
         network = Kinet(network_config(given, classes)).eval()
+    if network.config.backbone == "slots":
+        raise UsageError(
+            "profile counts the operations of neighborhoods, and the backbone slots has none; give another"
+        )
     return measure(network.to(chosen), chosen, steps)

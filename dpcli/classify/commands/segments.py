@@ -92,7 +92,7 @@ def _cutting(info: ModelInfo, options: SegmentOptions, model: str) -> Cutting:
 
 
 def _predictors(model: Kinet, info: ModelInfo, how: Cutting, task: ModelTask) -> Callable[[], StreamPredictor]:
-    device, window = choose_device(task.device), how.window if info.timing == "uniform" else None
+    device, window = choose_device(task.device), how.window if info.timing != "clips" else None
 
     def new() -> StreamPredictor:
         return StreamPredictor(model, info, window=window, hop=how.hop, seed=task.seed, device=device)

@@ -14,12 +14,22 @@ import torch
 from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import about_people, carve_validation, class_table, default_rule
-from dpcli.classify.data.videos import report_short
+from dpcli.classify.data.slots import measured, preset_for
+from dpcli.classify.data.validation_split import (
+    CROSS,
+    about_people,
+    carve_validation,
+    class_table,
+    cross_folds,
+    default_rule,
+)
+from dpcli.classify.data.videos import report_backward, report_short
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
+from dpcli.classify.training.fine_tune import resolved, settings_from
+from dpcli.classify.training.forests import grow_forests
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
@@ -37,6 +47,7 @@ from dpcli.runtime.whole_file import write_whole
 from dpcli.store import CloudsReader, input_file
 
 SETTINGS_FILE = "settings.toml"
+AUTO = "auto"  # the preset that the data choose
 _FOREST = 20, 5000  # training videos, from and to, that a forest is trained on for comparison
 
 
@@ -76,13 +87,32 @@ def train(
     processes but the first. Raises UsageError for settings that don't fit together or a folder with another run, DataError
     for data that can't be learned from.
     """
-    settings = training_settings(given)
+    training_settings(_with_preset(given, "quick"))  # what is wrong in any file is refused before it is read
     if data == "-" and from_environment().count > 1:
         raise UsageError("several processes can't share a pipe: give a file instead of -")
     chosen = choose_device(device)
-    settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
     with input_file(data) as path, process_group(chosen) as processes:
+        settings = _chosen_settings(given, CloudsReader(path))
+        settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
+
+
+def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
+    """Returns the settings, with what the data choose where a person left it to them."""
+    if given.preset == AUTO and given.values.get("init"):
+        values = given.values
+        _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
+        base = settings_from(info, reader, values.get("fine_tune"))
+        sets = {name: value for name, value in given.sets.items() if name != "fine_tune"}
+        flags = {name: value for name, value in given.flags.items() if name != "fine_tune"}
+        return training_settings(Given("quick", given.config, sets, flags), base)
+    settings = training_settings(_with_preset(given, preset_for(reader, given.values)))
+    return replace(settings, schedule=resolved(settings.schedule, reader))
+
+
+def _with_preset(given: Given, preset: str) -> Given:
+    """Returns what was given with a preset in place of `auto`."""
+    return replace(given, preset=preset) if given.preset == AUTO else given
 
 
 def _train(
@@ -100,6 +130,7 @@ def _train(
     folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
     report_short(videos.training, settings.network.num_frames)
+    report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, folder).to(device)
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
@@ -114,6 +145,10 @@ def _train(
         processes.wait()  # the others find the folder as it is to be
         trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
         trainer.run()
+        if settings.network.backbone == "slots":
+            info.config = grow_forests(trainer.model, videos.training, seed)
+            if processes.first:
+                save_model(folder.file("best.safetensors"), trainer.model, info)
         if processes.first and videos.validation is not None:
             _add_confidence(trainer, info, videos.validation, folder)
     accuracy = trainer.validate() if videos.validation is not None else {}
@@ -127,7 +162,12 @@ def _forest(videos: _Videos, seed: int) -> float | None:
     source, held = videos.training, videos.validation
     if held is None or not _FOREST[0] <= len(source.sequences) <= _FOREST[1]:
         return None
-    return forest_accuracy(source.reader, list(source.sequences), list(held.sequences), seed)
+    groups = [(list(source.sequences), list(held.sequences))]
+    if source.folds:
+        of = source.folds
+        groups = [([i for i in of if of[i] != k], [i for i in of if of[i] == k]) for k in sorted(set(of.values()))]
+    right = [len(judged) * forest_accuracy(source.reader, learned, judged, seed) for learned, judged in groups]
+    return sum(right) / sum(len(judged) for _, judged in groups)
 
 
 def _add_confidence(trainer: Trainer, info: ModelInfo, validation: ClipSource, folder: RunFolder) -> None:
@@ -158,11 +198,15 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     reader = CloudsReader(path)
     settings = with_classes(settings, len(class_table(reader)))
     run = settings.run
-    rule = default_rule(reader) if run.validation == "auto" else run.validation
+    rule = default_rule(reader, settings.network.members) if run.validation == "auto" else run.validation
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
     _check_labels(reader, training, validation)
+    if run.timing == "slots" and not settings.network.scales:
+        settings = replace(settings, network=measured(settings.network, reader, training))
     options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
+    if rule == CROSS:
+        options["folds"] = cross_folds(reader, training, settings.network.members, seed)
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
@@ -270,4 +314,5 @@ def _announce(device: torch.device, processes: Processes, videos: _Videos, setti
     log.info(
         f"training on {where}: {videos.counts[0]} videos, {videos.counts[1]} for validation ({settings.run.validation});"
         f" epochs {schedule.epochs} + {schedule.epochs_dynamic}"
+        + (f"; of {settings.run.init} learns: {schedule.fine_tune}" if settings.run.init else "")
     )

@@ -67,6 +67,10 @@ class Augmentation:
         >>> bool((NONE(clip, np.random.default_rng(0)) == clip).all())
         True
         """
+        return self._drop(self.moved(points, rng), rng)
+
+    def moved(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Returns the points f32 (T,P,3) in other places, none of them dropped."""
         linear = np.diag(rng.uniform(1 - self.scale, 1 + self.scale, 3 if self.per_axis else 1) * np.ones(3))
         angles = np.clip(rng.normal(0, 1, 3), -3, 3) * self.tilt
         angles[1] += rng.uniform(-self.turn, self.turn)
@@ -77,7 +81,7 @@ class Augmentation:
             moved += (rng.standard_normal(moved.shape, np.float32) * self.jitter).clip(
                 -3 * self.jitter, 3 * self.jitter
             )
-        return self._drop(moved, rng)
+        return moved
 
     def frame_steps(self, frames: int, rng: np.random.Generator) -> np.ndarray:
         """Returns the numbers int (frames) of a clip's frames counted from its first, at a random speed; 0, 1, 2 ... without
@@ -100,7 +104,8 @@ class Augmentation:
 NONE = Augmentation(0.0, False, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 PEERS = replace(NONE, scale=0.1, per_axis=True, origin=True)
 RELEASE = replace(NONE, scale=0.1, tilt=0.06, dropout=0.2)
-AUGMENTATIONS = {"ours": Augmentation(), "peers": PEERS, "release": RELEASE, "none": NONE}
+SPARSE = Augmentation(scale=0.25, turn=0.4, tilt=0.1, shift=0.15, jitter=0.05, dropout=0.4, crop=0.15, speed=0.35)
+AUGMENTATIONS = {"ours": Augmentation(), "sparse": SPARSE, "peers": PEERS, "release": RELEASE, "none": NONE}
 
 
 def _rotation(angles: np.ndarray) -> np.ndarray:

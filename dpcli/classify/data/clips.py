@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from dpcli.classify.data.augment import NONE, Augmentation
+from dpcli.classify.data.slots import changed_rows, in_slots, signed_columns, slot_rows
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudSequence, CloudsReader
+from dpcli.store.schema import kept_name
 
 
 @dataclass(frozen=True)
@@ -63,18 +65,26 @@ class OneVideo:
     def __init__(self, number: int, sequence: CloudSequence) -> None:
         self.path, self.names = sequence.name, {number: sequence.name}
         self.frame_counts = {number: sequence.num_frames}
+        self.fields = tuple(sequence.extra)
         self._sequence = sequence
 
     def read(self, number: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
-        """Returns some frames of the sequence, without any field."""
-        return CloudSequence.from_frames(self._sequence.name, [self._sequence.frame(t) for t in frames])
+        """Returns some frames of the sequence, with the columns among `fields`."""
+        own = self._sequence
+        found = CloudSequence.from_frames(own.name, [own.frame(t) for t in frames])
+        for name in fields:
+            shown = [own.extra[name][own.frame_offsets[t] : own.frame_offsets[t + 1]] for t in frames]
+            found.extra[name] = np.concatenate(shown)
+        return found
 
 
 class ClipSource:
     """Loads clips of some sequences of a `clouds` file as arrays that a network takes. Picklable, for DataLoader workers.
 
-    `timing` is `clips` (consecutive frames, as MSR-Action3D's peers) or `uniform` (frames spread over the whole video).
-    `dropped` lists the videos left out because they are shorter than a clip (only with `drop_short`).
+    `timing` is `clips` (consecutive frames, as MSR-Action3D's peers), `uniform` (frames spread over the whole video) or `slots`
+    (all frames, in as many equal parts as a clip has). `dropped` lists the videos left out because they are shorter than a
+    clip (only with `drop_short`). `folds`: the member of the network that must not learn from a sequence in slots. Raises
+    DataError where none is left, or the file lacks columns that the network reads.
     """
 
     def __init__(
@@ -87,14 +97,19 @@ class ClipSource:
         augmentation: Augmentation = NONE,
         drop_short: bool = False,
         seed: int = 0,
+        folds: Mapping[int, int] | None = None,
     ) -> None:
+        self.folds = folds or {}
         self.reader, self.config, self.timing = reader, config, timing
         self.augmentation, self.drop_short, self.seed = augmentation, drop_short, seed
+        check_columns(reader, config)
         lengths = reader.frame_counts
-        short = [s for s in sequences if lengths[s] < config.num_frames]
+        self._rows: dict[int, np.ndarray] = {}  # of whole videos: sparse ones are small
+        short = [s for s in sequences if lengths[s] < config.num_frames and timing != "slots"]
         self.dropped = [reader.names[s] for s in short] if drop_short else []
         self.padded = [] if drop_short else [reader.names[s] for s in short]
-        self.sequences = [s for s in sequences if not drop_short or lengths[s] >= config.num_frames]
+        left_out = set(short) if drop_short else set()
+        self.sequences = [s for s in sequences if s not in left_out]
         if not self.sequences:
             raise DataError(
                 f"{reader.path}: no video has {config.num_frames} frames; use fewer --frames or pad short videos"
@@ -107,6 +122,8 @@ class ClipSource:
     def video_clips(self, sequence: int, count: int | None) -> list[Clip]:
         """Returns the clips of one video: every start, or `count`."""
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
+        if self.timing == "slots":
+            return [Clip(sequence, shown) for shown in _looks(length, count or _LOOKS)]
         if self.timing == "uniform":
             return [Clip(sequence, uniform_frames(length, frames, i / (count or 1))) for i in range(count or 1)]
         return [Clip(sequence, clip_frames(length, frames, start)) for start in clip_starts(length, frames, count)]
@@ -122,6 +139,8 @@ class ClipSource:
 
     def _random_clip(self, sequence: int, rng: np.random.Generator) -> Clip:
         length, frames = int(self.reader.frame_counts[sequence]), self.config.num_frames
+        if self.timing == "slots":
+            return Clip(sequence, tuple(range(length)))
         if self.timing == "uniform":
             lost = int(rng.uniform(0, self.augmentation.crop) * length)
             start = int(rng.integers(lost + 1))
@@ -134,12 +153,49 @@ class ClipSource:
     def load(self, clip: Clip, *key: int) -> np.ndarray:
         """Returns the clip's points f32 (T,P,3); `key` (an epoch and a position, say) seeds the choice of points and the augmentation."""
         rng = generator(self.seed, ClassifyStream.POINTS, *key)
+        if self.timing == "slots":
+            return self._slots(clip, rng)
         sequence = self.reader.read(clip.sequence, clip.frames, fields=())
         points = np.stack(
             [sample_points(sequence.frame(t), self.config.points_per_frame, rng) for t in range(len(clip.frames))]
         )
         points = normalize(points, self.config.normalize)
         return points if self.augmentation == NONE else self.augmentation(points, rng)
+
+    def _slots(self, clip: Clip, rng: np.random.Generator) -> np.ndarray:
+        config, number = self.config, clip.sequence
+        whole = clip.frames == tuple(range(int(self.reader.frame_counts[number])))
+        rows = self._rows.get(number) if whole else None
+        if rows is None:
+            fields = tuple(map(kept_name, config.columns))
+            rows = slot_rows(self.reader.read(number, clip.frames, fields=fields), config)
+            if whole and self.augmentation != NONE:
+                self._rows[number] = rows
+        made = in_slots(changed_rows(rows, self.augmentation, signed_columns(config), rng), config, rng)
+        if number in self.folds:
+            made[..., 3] *= 2 + self.folds[number]  # 1 says no more than that there is a point
+        return made
+
+
+_LOOKS = 4  # at a video in slots
+_END = 0.08  # of its frames that a look leaves out at an end
+
+
+def _looks(length: int, count: int) -> list[tuple[int, ...]]:
+    """Returns the frames of up to `count` looks at a video: whole, without its end, without its beginning, without both."""
+    cut = int(_END * length)
+    shown = ((0, length), (0, length - cut), (cut, length), (cut, length - cut))
+    return [tuple(range(*ends)) for ends in dict.fromkeys(shown[:count])]
+
+
+def check_columns(reader: CloudsReader | OneVideo, config: KinetConfig) -> None:
+    """Raises DataError where a file, or a stream, lacks columns that the network reads."""
+    missing = [name for name in config.columns if kept_name(name) not in getattr(reader, "fields", ())]
+    if missing:
+        raise DataError(
+            f"{reader.path}: no column {', '.join(missing)}, which the network reads of every point; prepare the file with"
+            f" --keep-fields {','.join(config.columns)}"
+        )
 
 
 def sample_points(frame: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:

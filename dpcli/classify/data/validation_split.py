@@ -9,6 +9,8 @@ from dpcli.errors import DataError, UsageError
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
 
+CROSS = "cross"  # every video is judged by members of a network that never saw it
+
 
 def labeled(reader: CloudsReader, split: str) -> list[int]:
     """Returns the sequences of this split that have a label. Raises DataError when there are none."""
@@ -31,12 +33,14 @@ def _instead(reader: CloudsReader) -> str:
 def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[int], list[int]]:
     """Returns the training and the validation sequences, both of the split `train` but for the rule `split`.
 
-    `rule`: `none`; `split` (the file's own split `validation`); `subject` (the training subject with the highest number);
-    `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
+    `rule`: `none`; `cross` (all videos do both, see `cross_folds`); `split` (the file's own); `subject` (the training subject
+    with the highest number); `subjects:3,5`; `fold:3/10` (see `folds`); or a fraction such as `0.15`, drawn for each class.
     """
     chosen = labeled(reader, "train")
     if rule == "none":
         return chosen, []
+    if rule == CROSS:
+        return chosen, chosen
     if rule == "split":
         return chosen, labeled(reader, "validation")
     if rule.startswith("fold"):
@@ -51,7 +55,7 @@ def carve_validation(reader: CloudsReader, rule: str, seed: int) -> tuple[list[i
         share = -1
     if not 0 < share < 1:
         raise UsageError(
-            f"--validation {rule}: expected none, split, subject, subjects:3,5, fold:3/10 or a fraction such as 0.15"
+            f"--validation {rule}: expected none, split, cross, subject, subjects:3,5, fold:3/10 or a fraction such as 0.15"
         )
     return _stratified(reader, chosen, share, seed)
 
@@ -105,6 +109,14 @@ def folds(labels: np.ndarray, subjects: np.ndarray, count: int, seed: int) -> np
     return fold
 
 
+def cross_folds(reader: CloudsReader, chosen: list[int], members: int, seed: int) -> dict[int, int]:
+    """Returns the member, of `members`, that must not learn from each of the videos: whole people where at least two are known."""
+    subjects = reader.subjects[chosen]
+    people = len(set(subjects.tolist()))
+    count = min(members, people) if people > 1 and subjects.min() >= 0 else min(members, len(chosen))
+    return dict(zip(chosen, folds(reader.labels[chosen], subjects, count, seed).tolist()))
+
+
 def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> tuple[list[int], list[int]]:
     try:
         which, count = (int(word) for word in rule.removeprefix("fold:").split("/"))
@@ -120,11 +132,13 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
     return [i for i, k in zip(chosen, of) if k != which], [i for i, k in zip(chosen, of) if k == which]
 
 
-def default_rule(reader: CloudsReader) -> str:
-    """Returns `split` when the file has labeled validation videos, `subject` when the training videos have several known subjects,
-    else 15 % of each class."""
+def default_rule(reader: CloudsReader, members: int = 1) -> str:
+    """Returns `split` when the file has labeled validation videos, `cross` for a network of several members, `subject`
+    when the training videos have several known subjects, else 15 % of each class."""
     if any(name == "validation" and label >= 0 for name, label in zip(reader.splits, reader.labels)):
         return "split"
+    if members > 1:
+        return CROSS
     subjects = {int(reader.subjects[i]) for i in labeled(reader, "train")}
     return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
 
@@ -134,6 +148,8 @@ def about_people(reader: CloudsReader, training: list[int], validation: list[int
     learned, judged = ({int(reader.subjects[i]) for i in some} for some in (training, validation))
     if not judged:
         return ""
+    if training is validation and min(judged) >= 0 and len(judged) > 1:
+        return ""  # each by networks that saw other people
     if min(learned | judged) < 0:
         return (
             "the file doesn't say who is seen; if the same people train and validate, people never seen come out lower"

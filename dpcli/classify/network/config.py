@@ -36,8 +36,8 @@ class KinetConfig:
     )
     backbone: str = setting(
         "pointnet2",
-        "Static network: pointnet2, dgcnn, spidercnn, or your own as module:Class (docs/backbones.md). Another than the"
-        " preset's brings sizes of its own.",
+        "Static network: pointnet2, dgcnn, spidercnn, slots (for sparse clouds, without a dynamic stream), or your own as"
+        " module:Class (docs/backbones.md). Another than the preset's brings sizes of its own.",
     )
     centroids: tuple[int, int] = setting(
         (1024, 512),
@@ -106,11 +106,25 @@ class KinetConfig:
         "softmax", "What is averaged over both streams: probabilities (softmax, the thesis), or logits."
     )
     dropout: float = setting(0.0, "Dropout before each head's last layer.", least=0, below=1)
+    members: int = setting(1, "Networks whose scores are averaged (backbone slots).", least=1, most=64)
+    columns: tuple[str, ...] = ()  # what the file keeps of a point that the backbone slots reads; follows from the data
+    forest: tuple[int, int] = (
+        0,
+        0,
+    )  # trees and nodes of a tree beside each member of the backbone slots, grown from the data
+    scales: tuple[float, ...] = ()  # unit of length, then middle and spread of each column; follow from the data
 
     def __post_init__(self) -> None:
         if self.num_classes < 1:
             raise UsageError(f"number of classes {self.num_classes}: expected at least 1")
         check(self)
+        if self.num_frames * self.points_per_frame > _MOST_POINTS:
+            raise UsageError(
+                f"{self.num_frames} frames x {self.points_per_frame} points: expected at most {_MOST_POINTS} points in a clip"
+            )
+        if self.backbone == "slots":
+            self._check_columns()
+            return
         if self.backbone == "pointnet2":
             self._check_centroids()
         if self.xyz_group and self.group_size < 3:
@@ -121,10 +135,6 @@ class KinetConfig:
         if self.own_static_groups and self.backbone != "pointnet2":
             raise UsageError(
                 f"static_temporal_radius = {self.static_radius}: {self.backbone}'s one graph serves both streams; leave it out"
-            )
-        if self.num_frames * self.points_per_frame > _MOST_POINTS:
-            raise UsageError(
-                f"{self.num_frames} frames x {self.points_per_frame} points: expected at most {_MOST_POINTS} points in a clip"
             )
         self._check_reach("temporal_radius", self.temporal_radius)
         self._check_reach("static_temporal_radius", self.static_radius)
@@ -139,6 +149,16 @@ class KinetConfig:
         near = min(reach, self.num_frames) * self.points_per_frame
         if self.neighbors > near:
             raise UsageError(f"neighbors = {self.neighbors}: the frames within {name} = {radius} hold {near} points")
+
+    def _check_columns(self) -> None:
+        if min(self.forest) < 0:
+            raise UsageError(f"forest = {self.forest}: expected the numbers of trees and of nodes")
+        if self.scales and (len(self.scales) != 1 + 2 * len(self.columns) or min(self.scales[0::2]) <= 0):
+            raise UsageError(
+                f"scales = {self.scales}: expected a unit, and middle and spread of each of {self.columns}"
+            )
+        if len(self.widths) != 2 or [len(one) for one in self.widths] != [2, 1]:
+            raise UsageError(f"widths = {self.widths}: expected two of a point's layers and a slot's, as in 64,64/128")
 
     def _check_centroids(self) -> None:
         first, second = self.centroids

@@ -19,14 +19,18 @@ class Kinet(nn.Module):
         super().__init__()
         self.config = config
         self.static = build_backbone(config)
-        self.dynamic = Kinematics(config, self.static.tap_widths)
+        # a backbone that shows no activations has no dynamic stream
+        self.dynamic = Kinematics(config, self.static.tap_widths) if self.static.tap_widths else nn.Identity()
 
     def group(self, points: Tensor) -> list[Grouping]:
-        """Returns the neighborhoods of a batch of clips: points (B,T,P,3), frame after frame."""
-        return self.static.group(*clip_points(points))
+        """Returns the neighborhoods of a batch of clips: points (B,T,P,3+F), frame after frame."""
+        groups = self.static.group(*clip_points(points[..., :3]))
+        if points.shape[-1] > 3:
+            groups[0].columns = points[..., 3:].flatten(1, 2)
+        return groups
 
     def static_logits(self, points: Tensor) -> Tensor:
-        """Returns the static stream's logits (B,C) of clips (B,T,P,3)."""
+        """Returns the static stream's logits (B,C) of clips (B,T,P,3+F)."""
         return self.static(self.group(points))
 
     def dynamic_logits(self, points: Tensor, groups: list[Grouping] | None = None) -> Tensor:

@@ -64,8 +64,8 @@ def load_model(name: str | Path, backbone: str | None = None) -> tuple[Kinet, Mo
         )
     notes, names = (header_value(path, header, *one) for one in (("notes", dict), ("class_names", list)))
     timing = header.get("timing")
-    if timing not in ("clips", "uniform"):
-        raise DataError(f"{path}: timing = {timing!r}, expected clips or uniform; copy it again")
+    if timing not in ("clips", "uniform", "slots"):
+        raise DataError(f"{path}: timing = {timing!r}, expected clips, uniform or slots; copy it again")
     if len(names) != config.num_classes or not all(isinstance(name, str) and name.isprintable() for name in names):
         raise DataError(f"{path}: class_names = {names!r:.80}, expected {config.num_classes} names; copy it again")
     streams = notes.get("streams", list(STREAMS))

@@ -22,7 +22,7 @@ from dpcli.store import CloudSequence
 class Window:
     """Holds the last `size` frames of one video without end, read by number as from a `clouds` file: what ClipSource asks for."""
 
-    names, path = ("stream",), Path("stream")
+    names, path, fields = ("stream",), Path("stream"), ()
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -67,13 +67,13 @@ def window_size(info: ModelInfo, window: int | None) -> int:
     Raises UsageError for a window that the model can't use.
     """
     needed = info.config.num_frames
-    if info.timing != "uniform":
+    if info.timing == "clips":
         if window not in (None, needed):
             raise UsageError(f"--window {window}: this model takes {needed} consecutive frames; leave the option out")
         return needed
     if window is None:
         raise UsageError(
-            f"this model takes {needed} frames spread over a whole video, and a stream has no whole: name the frames to look back at,"
+            f"this model looks at a whole video in {needed} parts, and a stream has no whole: name the frames to look back at,"
             " about as many as an action lasts (--window 40, say)"
         )
     if window < needed:
@@ -100,6 +100,11 @@ class StreamPredictor:
     ) -> None:
         if hop < 1:
             raise UsageError(f"--hop {hop}: expected at least 1 frame")
+        if info.config.columns:
+            raise UsageError(
+                f"this model reads {', '.join(info.config.columns)} of every point, which a stream of places doesn't carry;"
+                " predict videos (without --stream and --segments)"
+            )
         self.model, self.info, self.hop, self.device = model.to(device), info, hop, device
         self.window = Window(window_size(info, window))
         self._source = ClipSource(self.window, [0], info.config, timing=info.timing, seed=seed)
@@ -109,7 +114,9 @@ class StreamPredictor:
 
     def warm_up(self) -> None:
         """Predicts one made-up clip: loading kernels takes a second that the first prediction need not wait for."""
-        shape = (1, self.info.config.num_frames, self.info.config.points_per_frame, 3)
+        config = self.info.config
+        numbers = 5 + len(config.columns) if self.info.timing == "slots" else 3
+        shape = (1, config.num_frames, config.points_per_frame, numbers)
         self._scores(torch.from_numpy(generator(0).random(shape, np.float32)))
 
     def add(self, points: np.ndarray) -> Prediction | None:
@@ -131,6 +138,8 @@ class StreamPredictor:
         """Returns the clip that ends at the newest frame, by frame numbers."""
         count, frames = self.window.count, self.info.config.num_frames
         first = count - len(self.window)
+        if self.info.timing == "slots":
+            return Clip(0, tuple(range(first, count)))
         if self.info.timing == "uniform":
             return Clip(0, tuple(first + t for t in uniform_frames(count - first, frames)))
         return Clip(0, clip_frames(count, frames, first))

@@ -16,8 +16,10 @@ class RunSettings:
     Raises UsageError where two starts are given.
     """
 
-    timing: Literal["clips", "uniform"] = setting(
-        "clips", "Frames of a clip: consecutive ones (clips), or spread over the video (uniform)."
+    timing: Literal["clips", "uniform", "slots"] = setting(
+        "clips",
+        "Frames of a clip: consecutive ones (clips), or spread over the video (uniform), or all of them in as many equal parts"
+        " (slots, which the backbone slots reads).",
     )
     drop_short: bool = setting(
         False, "Leave out videos shorter than a clip, as other methods do, instead of padding them."
@@ -25,12 +27,13 @@ class RunSettings:
     validation: str = setting(
         "auto",
         "Videos that validate: split (the file's own validation videos); or carved from the training videos by subject,"
-        " subjects:3,5, fold:3/10 (counted from 0) or a fraction such as 0.15; or none. auto: split where the file has one,"
-        " else subject, or 0.15 without subjects.",
+        " subjects:3,5, fold:3/10 (counted from 0) or a fraction such as 0.15; or none; or cross (preset"
+        " sparse: all videos train, and members that never saw them judge). auto: split where the file has one, else cross or"
+        " subject, or 0.15 without subjects.",
     )
-    augment: Literal["ours", "peers", "release", "none"] = setting(
+    augment: Literal["ours", "sparse", "peers", "release", "none"] = setting(
         "ours",
-        "Random changes of training clips, which the augment_... settings then change one by one: ours; peers (axis scales from"
+        "Random changes of training clips, which the augment_... settings then change one by one: ours; sparse; peers (axis scales from"
         " the camera, as other methods have on MSR-Action3D); release (the published code's); or none.",
     )
     pretrain: bool = setting(

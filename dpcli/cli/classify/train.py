@@ -11,11 +11,12 @@ from dpcli.classify.settings import TRAINING
 from dpcli.cli.options import Device, Force, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.runtime.settings.catalog import Given
+from dpcli.standard_streams import printable
 
-_EVERYDAY = ("init", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
+_EVERYDAY = ("init", "fine_tune", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
 
 
-@options_of(TRAINING, _EVERYDAY, presets=PRESETS, preset="quick")
+@options_of(TRAINING, _EVERYDAY, presets={**PRESETS, "auto": PRESETS["quick"]}, preset="auto")
 def train(
     data: Annotated[str, typer.Argument(help="A clouds file with labels and a split 'train', or - for a pipe.")],
     output: Annotated[str, typer.Option("-o", "--output", help="Folder for weights, settings, logs and curves.")],
@@ -27,7 +28,8 @@ def train(
     """Train both streams: static, then dynamic on the frozen static weights. Running again continues a stopped run.
 
     Presets: thesis and release (its text and its published code), quick (a seventh of the operations, fits a CPU), tiny
-    (demo). The folder's settings.toml holds all settings; --config reads it back to an equal run.
+    (demo), sparse (at most 64 points a frame, as of a radar); auto takes sparse for such data, else quick. The folder's
+    settings.toml holds all settings; --config reads it back to an equal run.
 
     Several GPUs or machines: torchrun --nproc-per-node N -m dpcli classify train ...; the batch is shared among them.
     """
@@ -43,4 +45,4 @@ def train(
         if result.forest is not None:
             typer.echo(f"a random forest on hand-made descriptors: {100 * result.forest:.1f} % (dpc classify baseline)")
         if result.caveat:
-            typer.echo(f"note: {result.caveat}")
+            typer.echo(printable(f"note: {result.caveat}"))

@@ -11,7 +11,7 @@ import pytest
 
 from dpcli.classify.commands import baseline as command
 from dpcli.classify.data.descriptors import descriptor
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from dpcli.store.schema import kept_name
 
@@ -45,7 +45,7 @@ def write(path, *, videos=8, splits=True, people=True, labels=UP, field=False, l
     return str(path)
 
 
-def test_what_moves_in_another_way_is_told_and_scores_are_written(tmp_path):
+def test_what_moves_in_another_way_is_told_and_scores_are_written(tmp_path, monkeypatch):
     data, output = write(tmp_path / "a.h5"), tmp_path / "s.h5"
     result = command.baseline(data, output=str(output))
     assert (result.learned, result.judged, result.classes) == (18, 6, 3) and result.accuracy > 0.8
@@ -54,6 +54,9 @@ def test_what_moves_in_another_way_is_told_and_scores_are_written(tmp_path):
     assert scores.class_names == list(UP) and set(scores.splits) == {"test"}
     assert np.abs(scores.scores.sum(1) - 1).max() < 1e-5
     assert (scores.scores.argmax(1) == scores.labels).sum() == result.right
+    monkeypatch.setattr(command, "descriptors", None)  # nothing may be computed for what can't be written
+    with pytest.raises(UsageError, match="exists already; --force"):
+        command.baseline(data, output=str(output))
     with CloudsReader(data) as reader:
         assert set(scores.names) == {name for name, split in zip(reader.names, reader.splits) if split == "test"}
 
@@ -87,6 +90,8 @@ def test_people_of_both_splits_are_told(tmp_path):
 def test_too_few_videos_are_refused_by_name(tmp_path):
     with pytest.raises(DataError, match="a class of one video and no test split"):
         command.baseline(write(tmp_path / "a.h5", splits=False, people=False, lone=True))
+    with pytest.raises(DataError, match="all labeled videos are of one class"):
+        command.baseline(write(tmp_path / "one.h5", labels=("up",)))
     with CloudsWriter(tmp_path / "b.h5") as writer:
         writer.write(CloudSequence.from_frames("v", [np.zeros((1, 3), np.float32)]))
     with pytest.raises(DataError, match="no video has a label"):

@@ -21,6 +21,7 @@ BACKBONES = {
     "pointnet2": "dpcli.classify.network.backbones.pointnet2:PointNet2",
     "dgcnn": "dpcli.classify.network.backbones.dgcnn:DGCNN",
     "spidercnn": "dpcli.classify.network.backbones.spidercnn:SpiderCNN",
+    "slots": "dpcli.classify.network.backbones.point_slots:PointSlots",
 }
 
 
@@ -33,6 +34,7 @@ class Grouping:
     centers: Tensor  # (B,M,3)
     center_times: Tensor  # (B,M)
     idx: Tensor  # (B,M,K) i64 into the N points
+    columns: Tensor | None = None  # (B,N,F) what clips say of a point beside its place
 
     def neighbor_times(self) -> Tensor:
         """Returns the frame number of each neighbor, (B,M,K)."""
@@ -54,7 +56,8 @@ class Stage:
 class Backbone(nn.Module, ABC):
     """Classifies point clouds: a static network. Built as `Class(config)`; `config.num_classes` is the width of its logits.
 
-    `tap_widths` are the channels of the activations that `taps` shows, a tuple a stage. The points that a stage groups are
+    `tap_widths` are the channels of the activations that `taps` shows, a tuple a stage; () for a network without a dynamic
+    stream. The points that a stage groups are
     the centroids of the stage before (in DGCNN: all points, every time).
     """
 
@@ -100,7 +103,7 @@ def build_backbone(config: KinetConfig) -> nn.Module:
     """Returns the static network that `config.backbone` names."""
     network = resolve_backbone(config.backbone)(config)
     widths = getattr(network, "tap_widths", None)
-    if not widths or not all(isinstance(width, int) for stage in widths for width in stage):
+    if widths != () and (not widths or not all(isinstance(width, int) for stage in widths for width in stage)):
         raise UsageError(f"backbone = {config.backbone}: tap_widths = {widths!r}, expected integers, a tuple a stage")
     return network
 

@@ -1,0 +1,144 @@
+"""A network for sparse clouds, such as a radar's: the points of each slot of time become one feature, and layers over
+time read the slots in their order.
+
+A slot is a set of points as PointNet (Qi et al., 2017) reads it. A few points say little about a surface, so this backbone
+has no neighborhoods and nothing that a dynamic stream could fit: what moves how is in the points' columns (a radar's
+Doppler speed) and in the order of the slots.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
+from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.descriptors import clip_descriptors
+from dpcli.classify.network.forest import Forest
+from dpcli.classify.network.layers import ClipLinear
+from dpcli.errors import UsageError
+
+_REACH = 3  # slots that a layer over time sees
+_STEPS = (1, 2, 4)  # between these slots, a layer each
+_DROPPED = 0.1  # after each layer over time
+_LEAST = 1e-12  # the probability that 0 is taken for
+
+
+class PointSlots(Backbone):
+    """Classifies by the mean of `members` equal networks.
+
+    In training each learns from its own share of a batch, so that all of them cost what one network costs; their errors
+    differ, and the mean of their scores has fewer. Beside each stands a forest on descriptors of the videos that it learned
+    from: another kind of errors. A clip may be marked with the member that must not learn from it, and
+    alone says what it shows then: so all videos train, and all are judged by a network that never saw them. Reads of the
+    config: num_frames (slots), points_per_frame, widths (the layers of a point; the width of a slot), columns, members,
+    dropout.
+    """
+
+    def __init__(self, config: KinetConfig) -> None:
+        super().__init__()
+        self.config, self.tap_widths = config, ()
+        self.members = nn.ModuleList(_Member(config) for _ in range(config.members))
+        self.register_buffer("forest_share", torch.tensor(0.0))  # of the logarithm of a score
+
+    def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
+        """Returns the points (B,N,3) as they are: one grouping without neighborhoods."""
+        nothing = times.new_zeros((len(points), 0, 0), dtype=torch.long)
+        return [Grouping(points, times, points[:, :0], times[:, :0], nothing)]
+
+    def forward(self, groups: list[Grouping]) -> Tensor:
+        """Class logits (B,C): the logarithm of the mean scores of the members that `_speakers` names."""
+        clips = torch.cat([groups[0].points, groups[0].columns], -1)
+        clips = clips.unflatten(1, (self.config.num_frames, self.config.points_per_frame))
+        speakers = self._speakers(clips[..., 3].amax((1, 2)).long() - 2)
+        total = clips.new_zeros(len(clips), self.config.num_classes)
+        for member, asked in zip(self.members, speakers.T):
+            if asked.any():
+                which = asked.nonzero()[:, 0]
+                total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
+        return torch.log(total.clamp(min=_LEAST) / speakers.sum(1, keepdim=True))
+
+    def _speakers(self, unseen: Tensor) -> Tensor:
+        """Returns who says something about which clip, bool (B,K): in training one member, not the one that must not see it;
+        else that one, or all where a clip has no mark.
+
+        unseen: the members that must not see the clips, i64 (B), below 0 where there is none.
+        """
+        count, marked = len(self.members), unseen >= 0
+        everyone = torch.arange(count, device=unseen.device)
+        if not self.training:
+            return (everyone == unseen[:, None]) | ~marked[:, None]
+        turn = torch.arange(len(unseen), device=unseen.device)
+        others = (unseen + 1 + turn % max(count - 1, 1)) % count
+        return everyone == torch.where(marked, others, turn % count)[:, None]
+
+    def taps(self, groups: list[Grouping]) -> tuple[list[Stage], Tensor]:
+        """Raises UsageError: there are no neighborhoods to look at."""
+        raise UsageError("the backbone slots has no neighborhoods and no dynamic stream; ask for what its scores say")
+
+
+class _Member(nn.Module):
+    """Classifies clips (B,T,P,5+F): place, more than 0 where there is a point, time within the slot, columns."""
+
+    def __init__(self, config: KinetConfig) -> None:
+        super().__init__()
+        first, second = config.widths[0]
+        width = config.widths[1][0]
+        self.points = nn.Sequential(*_layer(4 + len(config.columns), first), *_layer(first, second))
+        self.slots = nn.Sequential(*_layer(2 * second + 1, width))
+        self.position = nn.Parameter(torch.zeros(config.num_frames, width))
+        self.over_time = nn.ModuleList(_OverTime(width, step) for step in _STEPS)
+        self.dropout, self.classify = nn.Dropout(config.dropout), ClipLinear(2 * width, config.num_classes)
+        self.forest = Forest(*config.forest, config.num_classes)
+        nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
+
+    def scores(self, clips: Tensor, share: Tensor) -> Tensor:
+        """Returns the probabilities (B,C); outside of training the geometric mean of the layers' and, with its share, the
+        forest's."""
+        logits = self(clips)
+        if not self.training and share > 0:
+            described = torch.from_numpy(clip_descriptors(clips.cpu().numpy())).to(clips.device)
+            logits = (1 - share) * torch.log_softmax(logits, -1) + share * torch.log(self.forest(described))
+        return torch.softmax(logits, -1)
+
+    def forward(self, clips: Tensor) -> Tensor:
+        """Returns the logits (B,C) of the layers alone."""
+        here = clips[..., 3].flatten().nonzero()[:, 0]
+        known = self.points(torch.cat([clips[..., :3], clips[..., 4:]], -1).flatten(0, 2).index_select(0, here))
+        values = known.new_zeros(clips[..., 3].numel(), known.shape[-1]).index_copy(0, here, known)
+        values, count = values.view(*clips.shape[:3], -1), (clips[..., 3:4] > 0).sum(2).to(values)
+        pooled = [values.sum(2) / count.clamp(min=1), values.amax(2), torch.log1p(count)]  # values are not below 0
+        found = self.slots(torch.cat(pooled, -1).flatten(0, 1)).view(*count.shape[:2], -1) + self.position
+        for layer in self.over_time:
+            found = found + layer(found)
+        return self.classify(self.dropout(torch.cat([found.mean(1), found.amax(1)], -1)))
+
+
+class _OverTime(nn.Module):
+    """Reads each slot together with the slots before and after it, `step` apart: (B,T,W) to the same shape."""
+
+    def __init__(self, width: int, step: int) -> None:
+        super().__init__()
+        self.mix = nn.Conv1d(width, width, _REACH, padding=step * (_REACH // 2), dilation=step)
+        self.norm, self.dropout = _Norm(width), nn.Dropout(_DROPPED)
+
+    def forward(self, slots: Tensor) -> Tensor:
+        """Returns what is added to the slots."""
+        mixed = self.mix(slots.transpose(1, 2)).transpose(1, 2)
+        return self.dropout(torch.relu(self.norm(mixed.flatten(0, 1)).view_as(mixed)))
+
+
+class _Norm(nn.BatchNorm1d):
+    """Normalizes as a BatchNorm1d; a batch of one row, such as a video's only point, as outside of training."""
+
+    def forward(self, rows: Tensor) -> Tensor:
+        """Returns rows (R,C) normalized."""
+        if len(rows) > 1:
+            return super().forward(rows)
+        return nn.functional.batch_norm(
+            rows, self.running_mean, self.running_var, self.weight, self.bias, False, 0.0, self.eps
+        )
+
+
+def _layer(inputs: int, outputs: int) -> tuple[nn.Module, ...]:
+    return nn.Linear(inputs, outputs), _Norm(outputs), nn.ReLU()

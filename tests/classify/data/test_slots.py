@@ -1,0 +1,163 @@
+"""Clips of sparse clouds: what of a video gets into which slot, whatever its place, unit and outliers; and who reads it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.classify.data.augment import NONE
+from dpcli.classify.data.augment import SPARSE as CHANGE
+from dpcli.classify.data.clips import ClipSource, OneVideo
+from dpcli.classify.data.slots import changed_rows, in_slots, measured, preset_for, slot_rows
+from dpcli.classify.data.validation_split import about_people, carve_validation, cross_folds, default_rule
+from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.settings import network_config
+from dpcli.errors import DataError, UsageError
+from dpcli.runtime.settings.catalog import Given
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store.schema import kept_name
+
+SPEED = kept_name("speed")
+SMALL = {"frames": 4, "points": 8, "widths": ((8, 8), (16,)), "members": 2, "dropout": 0.0}
+
+
+def video(name="v", frames=12, points=3, place=(0.0, 0.0, 2.0), scale=1.0, seed=0, label=0):
+    """A video whose points rise through time, with one 30 m away; the column is 1 in its first half, -1 then."""
+    rng = np.random.default_rng(seed)
+    made = [place + scale * rng.normal((0, 0.1 * t, 0), 0.1, (points, 3)) for t in range(frames)]
+    made[1][0] += 30 * scale
+    sequence = CloudSequence.from_frames(name, [one.astype(np.float32) for one in made], label=label, split="train")
+    sequence.extra = {SPEED: np.repeat(np.where(np.arange(frames) < frames / 2, 1, -1), points).astype(np.float32)}
+    return sequence
+
+
+def config_of(tmp_path, videos, fields=(SPEED,)):
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a", "b"], fields=list(fields)) as writer:
+        for one in videos:
+            writer.write(one)
+    reader = CloudsReader(tmp_path / "c.h5")
+    return measured(network_config(Given("sparse", sets=SMALL), 2), reader, list(range(len(reader))))
+
+
+def test_slots_hold_the_video_in_its_order_about_its_median_without_what_is_far(tmp_path, capsys):
+    config = config_of(tmp_path, [video()])
+    assert config.columns == ("speed",) and config.scales[1:] == (0.0, 1.0)  # both signs: 0 is the middle
+    assert "(1 of 36)" in capsys.readouterr().err
+    clip = in_slots(slot_rows(video(), config), config, np.random.default_rng(0))
+    assert clip.shape == (4, 8, 6) and clip[..., 3].sum() == 32  # 8 of each slot's 9 points, or all 8
+    heights = [slot[slot[:, 3] > 0, 1].mean() for slot in clip]
+    assert heights == sorted(heights) and np.abs(clip[..., :3]).max() < 3
+    assert (clip[:2, :, 5] == 1).all() and (clip[2:, :, 5] == -1).all()
+    assert np.abs(clip[..., 4]).max() <= 0.5
+
+
+def test_place_and_unit_of_the_data_make_no_difference(tmp_path):
+    config = config_of(tmp_path, [video()])
+    elsewhere = video(place=(5.0, -3.0, 9.0))
+    assert np.allclose(slot_rows(video(), config), slot_rows(elsewhere, config), atol=1e-4)
+    millimeters = video(place=(0.0, 0.0, 2000.0), scale=1000.0)
+    again = config.changed(scales=(config.scales[0] * 1000, *config.scales[1:]))
+    assert np.allclose(slot_rows(video(), config), slot_rows(millimeters, again), atol=1e-3)
+
+
+@pytest.mark.parametrize("points", [1, 2])
+def test_a_video_of_one_frame_or_point_makes_a_clip(tmp_path, points):
+    config = config_of(tmp_path, [video()])
+    single = CloudSequence.from_frames("s", [np.full((points, 3), 7, np.float32)])
+    single.extra = {SPEED: np.full(points, np.nan, np.float32)}
+    rows = slot_rows(single, config)
+    clip = in_slots(changed_rows(rows, CHANGE, [0], np.random.default_rng(0)), config, np.random.default_rng(0))
+    assert clip[..., 3].sum() == points and np.isfinite(clip).all()
+    model = Kinet(config)
+    for mode in (model.train(), model.eval()):
+        assert torch.isfinite(mode.static_logits(torch.from_numpy(clip)[None])).all()
+
+
+def test_changes_keep_the_order_in_time_and_change_speeds_together(tmp_path):
+    config = config_of(tmp_path, [video(frames=40)])
+    rows = slot_rows(video(frames=40), config)
+    assert changed_rows(rows, NONE, [0], np.random.default_rng(0)) is rows
+    changed = changed_rows(rows, CHANGE, [0], np.random.default_rng(1))
+    assert len(changed) < len(rows) and (np.diff(changed[:, 3]) >= 0).all()
+    assert len(np.unique(np.abs(changed[:, 4]))) == 1 and not np.allclose(np.abs(changed[:, 4]), 1)
+    assert np.allclose(rows, slot_rows(video(frames=40), config))  # the rows themselves stay
+
+
+def test_a_batch_in_training_is_shared_by_the_members_in_its_order(tmp_path):
+    config = config_of(tmp_path, [video()])
+    model = Kinet(config)
+    clips = torch.from_numpy(
+        np.stack([in_slots(slot_rows(video(seed=k), config), config, np.random.default_rng(0)) for k in range(5)])
+    )
+    model.train()
+    torch.manual_seed(0)
+    for layer in model.modules():
+        if isinstance(layer, torch.nn.Dropout):
+            layer.p = 0.0
+    together = model.static_logits(clips)
+    members = model.static.members
+    for k in range(2):
+        assert torch.allclose(together[k::2], torch.log_softmax(members[k](clips[k::2]), -1), atol=1e-5)
+    mean = torch.softmax(model.eval().static_logits(clips), -1)
+    expected = torch.stack([torch.softmax(one(clips), -1) for one in members]).mean(0)
+    assert torch.allclose(mean, expected, atol=1e-6)
+
+
+def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
+    config = config_of(tmp_path, [video(str(k), seed=k) for k in range(6)])
+    reader = CloudsReader(tmp_path / "c.h5")
+    source = ClipSource(reader, range(6), config, timing="slots", folds={0: 0, 1: 1, 2: 0})
+    clips = torch.from_numpy(np.stack([source.load(source.video_clips(k, 1)[0], k) for k in range(6)]))
+    model = Kinet(config)
+    nobody = model.static._speakers(torch.tensor([0, 1, 0, -1, -1, -1]))
+    assert nobody.tolist() == [[False, True], [True, False], [False, True], [False, True], [True, False], [False, True]]
+    model.train().static_logits(clips[:1]).sum().backward()
+    grads = [sum(p.grad is not None for p in one.parameters()) for one in model.static.members]
+    assert grads[0] == 0 < grads[1]
+    scores = torch.softmax(model.eval().static_logits(clips), -1)
+    for k, member in ((0, 0), (1, 1), (2, 0)):
+        assert torch.allclose(
+            scores[k], torch.softmax(model.static.members[member](clips[k : k + 1]), -1)[0], atol=1e-6
+        )
+
+
+def test_whole_people_share_a_fold(tmp_path):
+    videos = [video(str(k), label=k % 2) for k in range(12)]
+    for k, one in enumerate(videos):
+        one.subject = k // 4
+    config_of(tmp_path, videos)
+    reader = CloudsReader(tmp_path / "c.h5")
+    found = cross_folds(reader, list(range(12)), 4, 0)
+    assert [len({found[k] for k in range(12) if k // 4 == person}) for person in range(3)] == [1, 1, 1]
+    assert sorted(set(found.values())) == [0, 1, 2]
+    chosen, judged = carve_validation(reader, "cross", 0)
+    assert chosen is judged and default_rule(reader, 4) == "cross" and default_rule(reader) == "subject"
+    assert about_people(reader, chosen, judged) == ""
+
+
+def test_the_data_choose_the_preset_unless_another_network_is_named(tmp_path):
+    config_of(tmp_path, [video()])
+    sparse = CloudsReader(tmp_path / "c.h5")
+    assert preset_for(sparse, {}) == "sparse" and preset_for(sparse, {"epochs": 3}) == "sparse"
+    assert preset_for(sparse, {"backbone": "dgcnn"}) == "quick" and preset_for(sparse, {"init": "x"}) == "quick"
+    (tmp_path / "dense").mkdir()
+    config_of(tmp_path / "dense", [video(points=65)])
+    assert preset_for(CloudsReader(tmp_path / "dense" / "c.h5"), {}) == "quick"
+
+
+def test_a_file_without_the_columns_is_refused(tmp_path):
+    config = config_of(tmp_path, [video()])
+    bare = video()
+    bare.extra = {}
+    with pytest.raises(DataError, match="no column speed.*--keep-fields speed"):
+        ClipSource(OneVideo(0, bare), [0], config, timing="slots")
+    assert ClipSource(OneVideo(0, video()), [0], config, timing="slots").load(
+        ClipSource(OneVideo(0, video()), [0], config, timing="slots").video_clips(0, None)[0], 0
+    ).shape == (4, 8, 6)
+
+
+def test_the_backbone_has_no_activations_to_explain(tmp_path):
+    config = config_of(tmp_path, [video()])
+    with pytest.raises(UsageError, match="no neighborhoods"):
+        Kinet(config).eval()(torch.zeros(1, 4, 8, 6))
