@@ -1,4 +1,4 @@
-"""What points are like in all and in slots of time: the hand-made numbers that forests classify by."""
+"""The hand-made numbers that forests classify by: quantiles of a video's points in all and in slots of time."""
 
 from __future__ import annotations
 
