@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 from dpcli.errors import DataError
 
 _ABSOLUTE = re.compile(r"\s*(/|[A-Za-z]:|file:|[A-Za-z][A-Za-z0-9+.-]*://)", re.IGNORECASE)
+_LONGEST = 4095  # bytes of a path and, below, 255 of a name: Linux takes no more
 
 
 def as_utf8(text: str) -> str:
@@ -40,7 +42,7 @@ def path_inside(root: Path | None, folder: Path, name: str) -> Path:
     absolute path, with a drive or as an address (``file://``), or through a link. root None: it may.
     """
     plain = name.replace("\\", "/")
-    if "\0" in plain or any(len(part.encode("utf-8", "surrogateescape")) > 255 for part in plain.split("/")):
+    if not _can_be(str(folder / plain)):
         raise DataError(f"the name {name[:80]!r} cannot be a file's; expected a path below {as_utf8(str(folder))}")
     if root is None:
         return folder / plain.removeprefix("file://")
@@ -55,3 +57,12 @@ def path_inside(root: Path | None, folder: Path, name: str) -> Path:
             " are opened"
         )
     return place
+
+
+def _can_be(path: str) -> bool:
+    """Returns whether a system could have a file of this path: no NUL, no half letters, not too long."""
+    try:
+        raw = os.fsencode(path)
+    except UnicodeEncodeError:
+        return False
+    return b"\0" not in raw and len(raw) <= _LONGEST and all(len(part) <= 255 for part in raw.split(b"/"))

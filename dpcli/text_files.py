@@ -1,13 +1,14 @@
-"""Small text and JSON files of people and programs, read so that what is wrong with one is said with its name."""
+"""Small text, JSON and TOML files of people and programs, read so that what is wrong with one is said with its name."""
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
-from dpcli.errors import DataError
+from dpcli.errors import DataError, DpcError
 
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
@@ -45,3 +46,20 @@ def parse_json(text: str | bytes, where: object) -> Any:
     except (ValueError, RecursionError) as error:
         raise DataError(f"{where}: is not JSON ({error})") from None
     return value
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Returns the content of a TOML file; DataError when it is none. Before Python 3.11 the reader is a package of its own."""
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        try:
+            import tomli as tomllib
+        except ImportError:
+            raise DpcError("reading TOML on Python 3.10 needs a package: pip install tomli") from None
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise DataError(f"{path}: not TOML ({error})") from None
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file") from None

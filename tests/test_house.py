@@ -14,6 +14,7 @@ COMMON = {
     "config_diff",
     "errors",
     "file_lock",
+    "npy_files",
     "path_names",
     "regular_files",
     "text_files",

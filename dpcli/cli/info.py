@@ -87,7 +87,7 @@ def _write_page(path: Path, found: dict[str, Any], page: Path, **choice: Any) ->
 
 def _settings_beside(model: Path) -> dict[str, Any]:
     """Returns the settings of the run that made the weights, by group, where its folder holds them."""
-    from dpcli.runtime.toml_file import read_toml
+    from dpcli.text_files import read_toml
 
     file = model.parent / "settings.toml"
     return {"settings": read_toml(file)} if file.is_file() else {}

@@ -64,8 +64,9 @@ class FitRun:
             self.preview(self.optimizer.model)
 
     def _restore(self, state: dict) -> None:
-        self.seconds, self.recent = state["spent"], state["recent"]
-        self.optimizer.restore(state)
+        with self.folder.restoring():
+            self.seconds, self.recent = state["spent"], state["recent"]
+            self.optimizer.restore(state)
 
     def _take_step(self) -> StepResult:
         try:

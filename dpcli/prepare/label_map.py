@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError
-from dpcli.runtime.toml_file import read_toml
-from dpcli.text_files import read_json
+from dpcli.text_files import read_json, read_toml
 
 
 @dataclass(frozen=True)

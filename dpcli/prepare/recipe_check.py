@@ -28,7 +28,7 @@ from typing import Any
 from dpcli.errors import DataError
 from dpcli.prepare.reader import require_folder
 from dpcli.runtime.progress import log
-from dpcli.runtime.toml_file import read_toml
+from dpcli.text_files import read_toml
 
 RECIPES = Path(__file__).resolve().parents[1] / "data_recipes"  # a link to the top folder; in a package a copy
 _KEYS = {"path", "what", "count", "each", "bytes", "optional", "instead_of"}

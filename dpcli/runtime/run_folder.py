@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
@@ -15,6 +16,7 @@ from dpcli.config_diff import differences
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.file_lock import open_alone
 from dpcli.runtime.progress import log
+from dpcli.runtime.torch_files import load_plain
 from dpcli.runtime.whole_file import DiskFull, disk_full, whole_file
 from dpcli.text_files import read_json
 
@@ -135,14 +137,21 @@ class RunFolder:
         path = self.path / "state.pt"
         if not path.exists():
             return None
-        try:
-            state = torch.load(path, weights_only=True, map_location="cpu")
-        except Exception as error:
-            raise DataError(
-                f"{path}: the saved state is damaged ({type(error).__name__}); --force starts over"
-            ) from None
-        self.rows = state["rows"]
+        with self.restoring():
+            state = load_plain(path)
+            self.rows = state["rows"]
         return state
+
+    @contextmanager
+    def restoring(self) -> Iterator[None]:
+        """Raises DataError where the block stumbles over the saved state, which is damaged then, or another run's."""
+        try:
+            yield
+        except (DataError, LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+            said = " ".join(str(error).split())[:200]
+            raise DataError(
+                f"{self.path / 'state.pt'}: the saved state is damaged ({said or type(error).__name__}); --force starts over"
+            ) from None
 
     def tell_continuing(self, where: str | None) -> None:
         """Says where an earlier run goes on; None: at its end."""

@@ -10,6 +10,7 @@ from dpcli.runtime.settings.fields import check, setting
 from dpcli.segment.baselines.settings import ClassicalSettings
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.network.config import Precision
+from dpcli.segment.scene.settings import SceneSettings
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class PredictSettings(NamedTuple):
     refinement: Refinement = Refinement()
     precision: Precision = Precision()
     multibody: MultibodySettings = MultibodySettings()
+    scene: SceneSettings = SceneSettings()
 
 
 CATALOG = Catalog(
@@ -64,4 +66,5 @@ CATALOG = Catalog(
     refinement=Refinement,
     precision=Precision,
     multibody=MultibodySettings,
+    scene=SceneSettings,
 )

@@ -271,6 +271,10 @@ class SceneOrigin(NamedTuple):
 
 
 def scene_origin(path: str | Path) -> SceneOrigin:
-    """Reads where a scene comes from, and nothing of the scene itself. DataError as `open_store`."""
+    """Reads where a scene comes from, and nothing of the scene itself. DataError as `open_store`, and without seed, source or unit."""
     with open_store(path, ["gaussians"]) as file:
-        return SceneOrigin(root_attributes(file), read_provenance(file))
+        attributes = root_attributes(file)
+        absent = [name for name in ("seed", "source", "length_unit") if name not in attributes]
+        if absent:
+            raise DataError(f"{path}: no attribute {absent[0]!r}; another program changed the file, make it again")
+        return SceneOrigin(attributes, read_provenance(file))

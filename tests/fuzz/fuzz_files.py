@@ -257,10 +257,14 @@ def report(place: Path, asked: argparse.Namespace, all_cases: Sequence[Case]) ->
     """Fuzzes, prints the counts, writes a case for each cause; returns how many causes there are."""
     outcomes: dict[str, Counter] = {}
     found: dict[str, list[Finding]] = {}
-    for name, code, findings in results(place, all_cases, asked):
+    for done, (name, code, findings) in enumerate(results(place, all_cases, asked), start=1):
         outcomes.setdefault(name, Counter())["bad" if findings else f"exit {code}"] += 1
         for one in findings:
+            if one.cause not in found:
+                print(f"after {done} inputs: {one.cause}: {one.case.name}", flush=True)
             found.setdefault(one.cause, []).append(one)
+        if done % 1000 == 0:
+            print(f"{done} inputs", flush=True)
     for name, counts in sorted(outcomes.items()):
         print(f"{name:28} {sum(counts.values()):6}  " + ", ".join(f"{n} {what}" for what, n in sorted(counts.items())))
     bench = Bench(place / "seeds", place / "smaller")

@@ -43,6 +43,25 @@ sys.addaudithook(_note)  # every file that Python opens; what C libraries open i
 
 
 CUBE = "mtllib {}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl m\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+DAE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="1"/><up_axis>Y_UP</up_axis></asset>
+<library_images><image id="i"><init_from>{}</init_from></image></library_images>
+<library_effects><effect id="e"><profile_COMMON>
+<newparam sid="s"><surface type="2D"><init_from>i</init_from></surface></newparam>
+<newparam sid="t"><sampler2D><source>s</source></sampler2D></newparam>
+<technique sid="c"><lambert><diffuse><texture texture="t" texcoord="UV"/></diffuse></lambert></technique>
+</profile_COMMON></effect></library_effects>
+<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="f" count="9">0 0 0 1 0 0 0 1 0</float_array><technique_common>
+<accessor source="#f" count="3" stride="3"><param name="X" type="float"/><param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="1" material="m"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+</mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="w"><node><instance_geometry url="#g"><bind_material><technique_common>
+<instance_material symbol="m" target="#m"/></technique_common></bind_material></instance_geometry></node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#w"/></scene></COLLADA>"""
 NAMES = {
     "up": "../{up}secret",
     "absolute": "{outside}/secret",
@@ -55,6 +74,10 @@ NAMES = {
     "share of Windows": "\\\\server\\secret",
     "up, of Windows": "..\\{up}secret",
     "down and up": "x/../../{up}secret",
+    "NUL": "secret\0.png",
+    "too long a name": "s" * 300,
+    "too long a path": "s/" * 3000 + "secret",
+    "white space before": " {outside}/secret",
     "link": "link",
     "link to a folder": "folder_link/secret",
 }
@@ -86,6 +109,8 @@ def mesh_text(kind: str, name: str) -> bytes:
         return CUBE.format(name).encode()
     if kind == "gltf":
         return gltf(name).encode()
+    if kind == "dae":
+        return DAE.format(name).encode()
     if kind == "ply":
         head = "ply\nformat ascii 1.0\ncomment TextureFile {}\nelement vertex 3\nproperty float x\nproperty float y\n"
         return (
@@ -156,7 +181,7 @@ def read_artemis(raw: Path, name: str) -> Iterable[str]:
     (raw / "Intrinsic.inf").write_text("0\n1 0 0\n0 1 0\n0 0 1\n")
     (raw / "sequences").write_text(f"{name} 3\n")
     items = {item.name: item for item in ArtemisIndex(raw).items()}
-    return [items[name].problem]
+    return [items[name.strip()].problem]
 
 
 READERS = {
@@ -165,6 +190,7 @@ READERS = {
     "mtllib of an obj of a urdf": (read_mesh_of_urdf("obj"), False),
     "texture of a ply of a urdf": (read_mesh_of_urdf("ply"), False),
     "gltf of a room": (read_mesh_of_room("gltf"), True),
+    "picture of a dae of a urdf": (read_mesh_of_urdf("dae"), False),
     "mtllib of an obj of a room": (read_mesh_of_room("obj"), False),
     "texture of a ply of a room": (read_mesh_of_room("ply"), False),
     "buffer of a gltf": (read_animation, True),
@@ -203,6 +229,13 @@ def test_no_reader_leaves_the_folder(reader, kind, tmp_path):
 @pytest.mark.parametrize("name", ["a/b.png", "a\\b.png", "./a/b.png", "a/../a/b.png", "odd:name.png", "a b/ü.png"])
 def test_names_within_stay(tmp_path, name):
     assert path_inside(tmp_path, tmp_path, name).resolve().is_relative_to(tmp_path.resolve())
+
+
+@pytest.mark.parametrize("name", ["a\0.png", "\ud800", "a/\udfff", "s" * 256, "s/" * 2048 + "s"])
+@pytest.mark.parametrize("inside", [True, False])
+def test_what_no_file_is_called_is_said(inside, name, tmp_path):
+    with pytest.raises(DataError, match="cannot be a file's"):
+        path_inside(tmp_path if inside else None, tmp_path, name)
 
 
 @pytest.mark.parametrize("name", ["/etc/hostname", "file:///etc/hostname", "../x", "..\\x"])

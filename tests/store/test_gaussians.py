@@ -114,6 +114,15 @@ def test_bad_headers_are_named(changes, says):
         replace(toy_scene(), **changes).validate()
 
 
+@pytest.mark.parametrize("name", ["seed", "source", "length_unit"])
+def test_a_scene_without_an_origin_is_bad_data(name, tmp_path):
+    write_scene(tmp_path / "scene.h5", toy_scene())
+    with h5py.File(tmp_path / "scene.h5", "a") as file:
+        del file.attrs[name]
+    with pytest.raises(DataError, match=f"no attribute '{name}'"):
+        scene_origin(tmp_path / "scene.h5")
+
+
 def test_a_damaged_file_is_refused(tmp_path):
     path = tmp_path / "scene.h5"
     write_scene(path, toy_scene())

@@ -26,10 +26,10 @@ class Messages:
     def make(self, kind: str, /, **values: Any) -> Any:
         return self.store.types[kind](**values)
 
-    def header(self, stamp: int) -> Any:
+    def header(self, stamp: int, place: str = "sensor") -> Any:
         time = self.make("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
         sequence = {"seq": 0} if self.ros1 else {}
-        return self.make("std_msgs/msg/Header", stamp=time, frame_id="sensor", **sequence)
+        return self.make("std_msgs/msg/Header", stamp=time, frame_id=place, **sequence)
 
     def cloud(
         self, points: np.ndarray, stamp: int = START, *, height: int = 1, padding: int = 0, big: bool = False
@@ -111,10 +111,15 @@ class Messages:
         )
 
 
-def write_recording(path: Path, kind: str, messages: Messages, content: list[tuple[str, int, Any]]) -> Path:
-    """Writes (topic, nanoseconds, message) as a ROS 1 bag, or as a ROS 2 bag in MCAP or SQLite; returns what to read."""
+def write_recording(
+    path: Path, kind: str, messages: Messages, content: list[tuple[str, int, Any]], packed: str = ""
+) -> Path:
+    """Writes (topic, nanoseconds, message) as a ROS 1 bag, or as a ROS 2 bag in MCAP or SQLite; returns what to read.
+
+    packed: BZ2 or LZ4 in ROS 1; FILE, MESSAGE or STORAGE (MCAP's own) in ROS 2.
+    """
     from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -123,6 +128,10 @@ def write_recording(path: Path, kind: str, messages: Messages, content: list[tup
     else:
         writer = Writer2(path, version=9, storage_plugin=StoragePlugin[kind.upper()])
         serialize = messages.store.serialize_cdr
+    if packed and kind == "bag":
+        writer.set_compression(Writer1.CompressionFormat[packed])
+    elif packed:
+        writer.set_compression(CompressionMode[packed], CompressionFormat.ZSTD)
     with writer:
         connections: dict[str, Any] = {}
         for topic, time, message in content:

@@ -1,4 +1,4 @@
-"""The hand-made numbers that forests classify by: quantiles of a video's points in all and in slots of time."""
+"""Points in all and in slots of time: the hand-made numbers that forests classify by."""
 
 from __future__ import annotations
 

@@ -60,7 +60,8 @@ class Trainer:
         """Trains from wherever the folder's state says to the end of the dynamic stage; does nothing when it is there."""
         state = self.folder.load_state()
         if state is not None:
-            self._restore(state)
+            with self.folder.restoring():
+                self._restore(state)
         if self.stage == 2:
             return
         for stage in range(self.stage, 2):

@@ -34,6 +34,12 @@ def predict(
     fast: Annotated[
         bool, typer.Option("--fast", help="Use the shipped network, frame by frame: the same as --method network.")
     ] = False,
+    scene: Annotated[
+        bool,
+        typer.Option(
+            "--scene", help="Find what moves on its own in lidar scans of streets: the same as --method scene."
+        ),
+    ] = False,
     given: Given,
     picture: Picture = None,
     turntable: Annotated[
@@ -48,8 +54,10 @@ def predict(
     force: Force = False,
 ) -> None:
     """Find the parts of every point, the same through all frames, each part's rigid motion, and the flow between frames."""
-    settings = PredictSettings(**CATALOG.resolve(PredictSettings()._asdict(), _choose_network(given, model, fast)))
-    from dpcli.segment.commands.predict import Drawings, predict_file
+    settings = PredictSettings(
+        **CATALOG.resolve(PredictSettings()._asdict(), _choose_method(given, model, fast, scene))
+    )
+    from dpcli.segment.commands.predict import Drawings, predict_file, told_of_scenes
 
     drawings = Drawings(picture, turntable, ply)
     sequences = predict_file(
@@ -65,13 +73,18 @@ def predict(
     )
     if output != "-":
         typer.echo(f"{output}: parts of {sequences} sequences")
+        for line in told_of_scenes(output) if settings.classical.method == "scene" else ():
+            typer.echo(line)
 
 
-def _choose_network(given: Given, model: str | None, fast: bool) -> Given:
-    """Returns what was given with the method network where `--model` or `--fast` ask for it and no method is named."""
-    named = given.values.get("method", "network")
-    if fast and named != "network":
-        raise UsageError(f"--fast: it means --method network, but --method {named} was given; leave one out")
-    if (model is None and not fast) or "method" in given.values:
+def _choose_method(given: Given, model: str | None, fast: bool, scene: bool) -> Given:
+    """Returns what was given with the method that `--model`, `--fast` or `--scene` ask for, unless one is named."""
+    asked = [("--fast", "network")] * fast + [("--scene", "scene")] * scene
+    named = given.values.get("method")
+    for flag, method in asked:
+        other = f"--method {named}" if named not in (None, method) else "--fast" if len(asked) > 1 else ""
+        if other:
+            raise UsageError(f"{flag}: it means --method {method}, but {other} was given; leave one out")
+    if named is not None or (model is None and not asked):
         return given
-    return replace(given, flags={**given.flags, "method": "network"})
+    return replace(given, flags={**given.flags, "method": asked[0][1] if asked else "network"})

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from dpcli.errors import DataError
 from dpcli.evaluate.networks.weights import check_file, find_weights, weights_named
+from dpcli.runtime.torch_files import load_plain
 
 if TYPE_CHECKING:
     import torch
@@ -52,8 +53,10 @@ def _read(path: Path, script: bool) -> Any:
             warnings.simplefilter("ignore")  # about old formats, which published files have
             if script:
                 return torch.jit.load(str(path), map_location="cpu").state_dict()
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # pickle, zip, safetensors and torch each have their own
+            return load_plain(path)
+    except DataError:
+        raise
+    except Exception as error:  # safetensors and torch each have their own
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise DataError(f"{path}: not a plain state dict, or not whole ({reason[:150]})") from None
 

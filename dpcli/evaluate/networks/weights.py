@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime.toml_file import read_toml
+from dpcli.text_files import read_toml
 
 LIST = Path(__file__).with_name("weights.toml")
 FOLDER_VARIABLE = "DPC_WEIGHTS"

@@ -12,7 +12,7 @@ from typing import Any
 from dpcli.errors import UsageError
 from dpcli.evaluate.metric_titles import title_of
 from dpcli.evaluate.report.blocks import Cell, Table, is_number, table
-from dpcli.runtime.toml_file import read_toml
+from dpcli.text_files import read_toml
 
 _FACTOR = {("fraction", "percent"): 100.0, ("", "1/100 length unit"): 100.0}
 _WORDS = {"percent": "%", "1": "", "1/100 length unit": "\u00d7100"}

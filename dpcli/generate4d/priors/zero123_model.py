@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.torch_files import check_members, load_plain
 
 EXAMPLE_ID = "ashawkey/zero123-xl-diffusers"
 CAMERA_SCALARS = 4
@@ -181,6 +182,8 @@ def _network(library: str, name: str, folder: Path, half: bool, **options: Any) 
     if library == "diffusers":
         options["low_cpu_mem_usage"] = False  # True needs another package, accelerate
     try:
+        if not safe:
+            check_members(folder / file)
         network, report = getattr(importlib.import_module(library), name).from_pretrained(
             folder, output_loading_info=True, **options
         )
@@ -197,8 +200,10 @@ def _camera_projection(folder: Path, half: bool) -> torch.nn.Linear:
     file, _, safe = weight_file([path.name for path in folder.iterdir()], half)
     try:
         path = folder / file
-        tensors = load_file(path) if safe else torch.load(path, map_location="cpu", weights_only=True)
+        tensors = load_file(path) if safe else load_plain(path)
         weight, bias = tensors["proj.weight"], tensors["proj.bias"]
+    except DataError:
+        raise
     except Exception as error:  # as above
         raise DataError(f"{folder / file}: expected tensors proj.weight and proj.bias ({_first_line(error)})") from None
     if weight.ndim != 2 or bias.shape != weight.shape[:1]:

@@ -86,10 +86,11 @@ class ShapePrior(Protocol):
 
 def points_of(layers: ShapeLayers, camera: Camera, least_presence: float = 0.5) -> SurfacePoints:
     """Returns the oriented points of all layers whose presence is at least `least_presence`, in the world's axes."""
-    found = np.nonzero(np.repeat(layers.presence >= least_presence, 2, axis=0))
+    present = np.repeat(layers.presence >= least_presence, 2, axis=0)
+    found = np.nonzero(present)
     layer, row, column = found
-    points = camera.ray_points(layers.depth)
-    normals = np.stack([_normals(grid, index % 2 == 1) for index, grid in enumerate(points)])
+    points = camera.ray_points(np.where(present, layers.depth, 1.0))
+    normals = np.stack([_normals(grid, own, index % 2 == 1) for index, (grid, own) in enumerate(zip(points, present))])
     rotation = camera.world_to_camera[:3, :3]
     return SurfacePoints(
         camera.to_world(points[found]).astype(np.float32),
@@ -100,10 +101,30 @@ def points_of(layers: ShapeLayers, camera: Camera, least_presence: float = 0.5) 
     )
 
 
-def _normals(points: np.ndarray, back: bool) -> np.ndarray:  # [H, W, 3] -> [H, W, 3]
-    """Returns unit normals of a grid of points, toward the camera, or away from it at the back."""
-    down, right = np.gradient(points, axis=(0, 1))
+def _normals(points: np.ndarray, present: np.ndarray, back: bool) -> np.ndarray:  # [H, W, 3] -> [H, W, 3]
+    """Returns unit normals of a grid of points, toward the camera, or away from it at the back; present: bool (H,W).
+
+    Neighbors that aren't present don't count; a point without neighbors faces the camera.
+    """
+    down, right = (_slope(points, present, axis) for axis in (0, 1))
     normal = np.cross(down, right)  # x right, y down, z forward: down x right looks back at the camera
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    toward = -points / np.linalg.norm(points, axis=-1, keepdims=True)
+    normal = np.where(length > 1e-12, normal / np.maximum(length, 1e-12), toward)
     away = (normal * points).sum(-1, keepdims=True) > 0
     return np.where(away != back, -normal, normal)
+
+
+def _slope(points: np.ndarray, present: np.ndarray, axis: int) -> np.ndarray:  # [H, W, 3] -> [H, W, 3]
+    """Returns the mean difference of each point to its present neighbors along an axis; where there are none, that of the
+    rays at the point's own depth.
+    """
+    step = np.diff(points, axis=axis)
+    both = present.take(range(1, present.shape[axis]), axis) & present.take(range(present.shape[axis] - 1), axis)
+    step, both = step * both[..., None], both[..., None].astype(points.dtype)
+    edge = [(0, 0)] * 3
+    total, count = 0.0, 0.0
+    for edge[axis] in ((0, 1), (1, 0)):
+        total, count = total + np.pad(step, edge), count + np.pad(both, edge)
+    rays = points / points[..., 2:]
+    return np.where(count > 0, total / np.maximum(count, 1), np.gradient(rays, axis=axis) * points[..., 2:])

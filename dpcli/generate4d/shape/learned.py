@@ -11,11 +11,12 @@ from torch.nn import functional
 
 from dpcli.generate4d.shape.layers import INTERVALS, Camera, ShapeLayers
 from dpcli.generate4d.shape.model_file import DEFAULT, load_shape_model
-from dpcli.generate4d.shape.network import Encoded, ShapeNetwork
+from dpcli.generate4d.shape.network import Encoded, ShapeNetwork, tilted_plane
 from dpcli.generate4d.shape.silhouette import ball_thickness
 from dpcli.generate4d.shape.training.confidence import probability
 
 _FILL = 0.89  # of the cut-out's side is filled by the object, as in training
+_LENGTHEN, _LONGEST = 1.5, 3.0  # power of the thickness beside the inflation's; most that an object is stretched
 _TURN_COST = 1.0  # logarithm of probability, for an object that turns by one bin from a frame to the next
 
 
@@ -38,8 +39,9 @@ class _CutOut:
 class Network:
     """Predicts layers by the trained network; the far side has the colors of the near one.
 
-    model: a weights file, a folder of `train-prior`, or the name of a shipped network. The turn of the object is chosen
-    for all frames together. The confidence is the probability that the layers are better than the inflation's.
+    model: a weights file, a folder of `train-prior`, or the name of a shipped network. The turn of the object, and how long
+    it is along the line of sight, are chosen for all frames together. The confidence is the probability that the layers
+    are better than the inflation's.
     """
 
     name = "network"
@@ -80,11 +82,12 @@ class Network:
         mirrored[:, 0] = mirrored[:, 0].flip(-1)
         angles = choose_angles(model, (logits + mirrored) / 2)
         depth, second = self._decode(own, cut, angles)
-        angles = angles * torch.tensor([-1.0, 1.0])
-        depth2, second2 = (x.flip(-1) for x in self._decode(other, flipped, angles))
+        opposite = angles * torch.tensor([-1.0, 1.0])
+        depth2, second2 = (x.flip(-1) for x in self._decode(other, flipped, opposite))
         gains = (own.gain + other.gain) / 2
         confidence = [probability(float(gain), *self._confidence) for gain in gains]
-        return (depth + depth2) / 2, (second + second2) / 2, confidence
+        depth, second = (depth + depth2) / 2, (second + second2) / 2
+        return lengthened(depth, second, cut, tilted_plane(angles, cut.shape[-1])), second, confidence
 
     def _decode(self, encoded: Encoded, cut: Tensor, angles: Tensor) -> tuple[Tensor, Tensor]:
         depth, second = self._model.decode(encoded, cut, angles)
@@ -105,6 +108,21 @@ def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
     mean = (share * model.centers).sum(-1)
     spread = (share * (model.centers - mean[..., None]).square()).sum(-1).sqrt()
     return torch.where(mean.abs() > spread, mean, 0.0)
+
+
+def lengthened(depth: Tensor, second: Tensor, cut: Tensor, plane: Tensor) -> Tensor:
+    """Returns the layers (T,4,S,S) of a clip, stretched along the line of sight, away from the plane (T,1,S,S) of its turn.
+
+    Learned from mean errors, layers take the middle of all lengths that an object may have: seen from its end, one that
+    the network finds thicker than its inflation is longer yet, by about the power _LENGTHEN of how much thicker. All
+    frames say together how much that is, and where its middle lies. cut: the network's pictures (T,5,S,S).
+    """
+    mask, rest = cut[:, 3], depth - plane
+    inside = (rest[:, 1] - rest[:, 0] + (second > 0.5) * (rest[:, 3] - rest[:, 2])) * mask
+    thicker = inside.sum((1, 2)) / (2 * cut[:, 4] * mask).sum((1, 2)).clamp(min=1e-6)
+    stretch = float(thicker.median().clamp(1.0, _LONGEST ** (1 / _LENGTHEN))) ** _LENGTHEN
+    middle = rest[:, :2].mean(1)[mask > 0].median() if mask.any() else 0.0
+    return plane + middle + stretch * (rest - middle)
 
 
 def _passed_on(evidence: Tensor, turns: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ from dpcli.prepare.series import Series, about_series, is_hidden
 from dpcli.store import CloudSequence
 
 MISSING = "frames that videos declare and don't hold (truncated or damaged)"
+CUT = "videos that end before their container does (truncated: frames may be lost)"
 DEFAULT_FOV = 60.0  # degrees; between Kinect v1 (57) and most depth cameras of today (65 to 75)
 BACKGROUNDS = ("none", "median", "first")
 _OTHER_PICTURES = re.compile(
@@ -151,8 +152,9 @@ class DepthVideos:
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
-        if video.missing:
-            notes[MISSING] = video.missing
+        notes |= video.notes
+        if video.missing or video.ends_early:
+            notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale
         if self.background != "none":
             depth, unit = depth.astype(np.float32) * np.float32(unit), 1.0
@@ -172,8 +174,8 @@ class DepthVideos:
         """Returns the frames of an item, and the camera that a recording describes."""
         if not item.extra["recording"]:
             return read_depth_video(item.path, self.stride, item.extra["series"]), None
-        frames, time, camera = read_recorded_depth(item.path, self.topic, self.stride)
-        return DepthVideo(frames, time), camera
+        read, camera = read_recorded_depth(item.path, self.topic, self.stride)
+        return DepthVideo(np.stack(read.frames), read.time, notes=read.notes), camera
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
@@ -235,10 +237,7 @@ class DepthVideos:
                 f"no times are written: {', '.join(silent[:3])} {'say' if silent[1:] else 'says'} none (--fps)"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
-        unlabeled = [item.name for item in items if item.label < 0]
-        if self._table and unlabeled:
-            lines.append(f"{len(unlabeled)} without a label in {self.labels}: {', '.join(unlabeled[:5])}")
-        return lines
+        return lines + (self._table.unnamed(items) if self._table else [])
 
 
 def _tells_time(item: Item) -> bool:

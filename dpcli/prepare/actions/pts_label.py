@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.npy_files import map_npy
 from dpcli.prepare.actions.shrec17_lists import FINGERS, GESTURES, Entry, entries, find_lists, gesture_names
 from dpcli.prepare.decode.folder_listing import leads_out
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets, require_folder
@@ -24,10 +25,7 @@ _NVGESTURE = re.compile(r"(?:.*/)?(class_(\d+)/subject(\d+)_r\d+)")
 
 def read_array(path: Path) -> np.ndarray:
     """Reads the array (T,N,C) of a pts_label.npy, C >= 3: row, column, depth, then what isn't used. Raises DataError."""
-    try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise DataError(f"{path}: not a readable .npy array, perhaps truncated ({error})") from None
+    array = map_npy(path)
     if array.ndim != 3 or array.shape[2] < 3 or 0 in array.shape or array.dtype.kind not in "iuf":
         raise DataError(
             f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, points, 8): "

@@ -12,6 +12,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.meshes.surface_points import choose_on_surface, points_on
 
 _NEGLIGIBLE = 1e-3  # of the object's diameter: what moves by less doesn't move
+_LONG, _ENDLESS = 10, 1000  # diameters of the object: slides that are odd, and those that have no limits at all
 _CHECKED_STATES = 6  # values of a joint at which the place of the surface is compared
 
 
@@ -286,16 +287,30 @@ def sampling_weights(obj: ArticulatedObject, part: np.ndarray, least: float) -> 
 
 
 def finite_limits(obj: ArticulatedObject) -> ArticulatedObject:
-    """Gives slides without limits 0 to a quarter of the object's diameter, the other joints at their middles."""
-    endless = [i for i, joint in enumerate(obj.joints) if not np.isfinite(joint.lower + joint.upper)]
-    if not endless:
+    """Gives slides without limits 0 to a quarter of the object's diameter, the other joints at their middles.
+
+    A slide of a thousand diameters has none either; those of more than ten are noted.
+    """
+    slides = [i for i, joint in enumerate(obj.joints) if joint.kind == "prismatic" and joint.follows < 0]
+    if not slides or not len(obj.triangles):
         return obj
-    middle = [0.0 if i in endless else (joint.lower + joint.upper) / 2 for i, joint in enumerate(obj.joints)]
-    reach = obj.extent(obj.poses(obj.follow(np.array([middle])))[0])[1] / 2
+    diameter = 2 * _radius(obj, set(slides))
+    lengths = {i: obj.joints[i].upper - obj.joints[i].lower for i in slides}
+    endless = {i for i, length in lengths.items() if not length <= _ENDLESS * diameter}
+    long = [i for i in slides if i not in endless and lengths[i] > _LONG * diameter]
+    if long:
+        obj.notes["slides ten times as long as their object (are the limits in millimeters?)"] += len(long)
+    reach = _radius(obj, endless) / 2 if endless else 0.0
     for index in endless:
         obj.joints[index] = replace(obj.joints[index], lower=0.0, upper=reach)
         obj.notes["slides without limits (a quarter of the object's size taken)"] += 1
     return obj
+
+
+def _radius(obj: ArticulatedObject, closed: set[int]) -> float:
+    """Returns the radius of the object's sphere with the joints ``closed`` at 0, the others at their middles."""
+    middle = [0.0 if i in closed else (joint.lower + joint.upper) / 2 for i, joint in enumerate(obj.joints)]
+    return obj.extent(obj.poses(obj.follow(np.array([middle])))[0])[1]
 
 
 def require_surface(obj: ArticulatedObject) -> ArticulatedObject:

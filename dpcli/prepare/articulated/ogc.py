@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import map_npy
 from dpcli.path_names import path_inside
 from dpcli.prepare.reader import Item, Sample, describe, require_folder
 from dpcli.store import CloudSequence
@@ -28,16 +29,15 @@ def read_array(path: Path, kind: str, shape: tuple[int | None, ...]) -> np.ndarr
     Raises DataError; pickles are refused.
     """
     try:
-        array = np.load(path, allow_pickle=False)
+        array = map_npy(path)
     except FileNotFoundError:
         raise DataError(f"{path}: missing") from None
-    except (ValueError, EOFError) as error:
-        raise DataError(f"{path}: not a readable .npy array ({str(error).splitlines()[0]})") from None
-    good = isinstance(array, np.ndarray) and array.dtype.kind in kind and array.ndim == len(shape)
+    good = array.dtype.kind in kind and array.ndim == len(shape)
     if not good or 0 in array.shape or any(e not in (None, n) for e, n in zip(shape, array.shape, strict=True)):
-        found = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else "an archive"
         wanted = ", ".join("n" if length is None else str(length) for length in shape)
-        raise DataError(f"{path}: is {found}; expected {'floats' if kind == 'f' else 'whole numbers'} ({wanted})")
+        raise DataError(
+            f"{path}: is {array.dtype} {array.shape}; expected {'floats' if kind == 'f' else 'whole numbers'} ({wanted})"
+        )
     return array
 
 
@@ -129,9 +129,9 @@ def most_parts(raw: Path) -> int:
         if _misplaced(raw / "data", name):
             continue
         try:
-            objects = np.load(folder / "pose_00.npy", mmap_mode="r", allow_pickle=False).shape[0]
+            objects = map_npy(folder / "pose_00.npy").shape[0]
             most = max(most, int(read_segmentation(folder / "segm_00.npy", objects).max()) + 1, objects)
-        except (DataError, OSError, ValueError, EOFError):
+        except (DataError, OSError, IndexError):
             continue  # read() will say what is wrong with it
     return most
 

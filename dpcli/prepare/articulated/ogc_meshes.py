@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
+from dpcli.prepare.decode.mesh_counts import require_counts
 from dpcli.prepare.reader import natural_key, require_folder
 
 
@@ -47,6 +48,7 @@ def load_shape(path: Path, up: str) -> Shape:
     """
     import trimesh
 
+    require_counts(path)
     try:
         options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
         mesh = trimesh.load(path, force="mesh", process=False, resolver=files_inside(path, path.parent), **options)

@@ -17,8 +17,10 @@ from dpcli.path_names import path_inside
 from dpcli.prepare.articulated.articulated_sequence import Articulation, Study, draw_sequence, study
 from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
+from dpcli.prepare.articulated.urdf_meshes import is_missing
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe, natural_key
 
+_OTHERS = ("xacro", "sdf", "xml", "usd", "usda", "usdc", "mjcf")  # of robots that are no URDF
 _EXPECTED = "a .urdf file, or a folder of objects, each a folder with a mobility.urdf or another .urdf"
 
 
@@ -41,8 +43,10 @@ def find_objects(raw: Path) -> tuple[FoundObject, ...]:
     if not raw.exists():
         raise DataError(f"{raw}: does not exist; expected {_EXPECTED}")
     files = [raw] if raw.is_file() else _urdf_files(raw)
-    if not files or files[0].suffix.lower() != ".urdf":
-        raise DataError(f"{raw}: no URDF found; expected {_EXPECTED}")
+    if not files:
+        others = sorted(file.relative_to(raw).as_posix() for kind in _OTHERS for file in raw.rglob(f"*.{kind}"))
+        some = f" ({others[0]} is none; xacro makes a URDF of a .xacro)" if others else ""
+        raise DataError(f"{raw}: no URDF found{some}; expected {_EXPECTED}")
     found = [_describe(raw, path) for path in files]
     counts = Counter(f.name for f in found)
     found = [f if counts[f.name] == 1 else replace(f, name=_long_name(raw, f)) for f in found]
@@ -171,8 +175,8 @@ def _inspect(path: Path, root: Path | None, given: Path) -> tuple[str, int]:
     except DataError as error:
         return str(error), 0
     if missing:
-        more = f" and {len(missing) - 1} others" if len(missing) > 1 else ""
-        return f"{path}: its mesh {missing[0]}{more} is missing", 0
+        more = f", as are {len(missing) - 1} others" if len(missing) > 1 else ""
+        return f"{path}: its mesh {is_missing(path, missing[0], root)}{more}", 0
     if not skeleton.joints:
         return f"{path}: no movable joint (revolute, continuous or prismatic); nothing in it can move", 0
     return "", len(skeleton.joints)

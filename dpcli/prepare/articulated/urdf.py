@@ -18,6 +18,10 @@ from dpcli.prepare.articulated.urdf_meshes import geometry_triangles, resolve
 
 MOVABLE = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
+_TURNS = "hinges with limits more than two turns apart (one turn taken; are they degrees? a URDF has radians)"
+
+_SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
+_XACRO = "it is written in xacro; make a plain URDF of it first: xacro FILE > robot.urdf"
 
 
 @dataclass
@@ -38,8 +42,9 @@ def read_skeleton(path: Path, root: Path | None = None) -> Skeleton:
     """Parse a URDF and merge links joined by fixed joints. Raises DataError when it isn't a tree of links.
 
     Limits: a continuous joint gets +-180 degrees, so does a revolute joint without limits; where one of two limits is
-    given the other is 0, as the format has it; inverted ones are swapped; a slide without limits has infinite ones
-    here. Floating and planar joints are taken as fixed. All are noted. root: its meshes must lie in it.
+    given the other is 0, as the format has it; inverted ones are swapped; of more than a turn the one about 0 is taken;
+    a slide without limits has infinite ones here. Floating and planar joints are taken as fixed. All are noted.
+    root: its meshes must lie in it.
     """
     robot = _parse(path)
     _check_names(path, robot)
@@ -76,23 +81,27 @@ def missing_meshes(skeleton: Skeleton) -> list[str]:
 
 
 def _parse(path: Path) -> Any:
+    """Returns the robot of yourdfpy; cylinders that are ``round`` are capsules.
+
+    Raises DataError when the file is not a URDF, or is a xacro.
+    """
     from lxml import etree
     from yourdfpy import URDF
 
     logging.getLogger("yourdfpy.urdf").setLevel(logging.CRITICAL)
     utf8_path(path, "yourdfpy")
     try:
-        text = path.read_bytes()
+        text = path.read_bytes().lstrip(b" \t\r\n")
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     try:
         tree = etree.parse(BytesIO(text), etree.XMLParser(resolve_entities=False, no_network=True))
-        if tree.docinfo.internalDTD is not None:
-            raise DataError(f"{path}: it has a DOCTYPE, whose entities are not read; expected a plain URDF")
-        if tree.getroot().tag != "robot":
-            found = tree.getroot().tag
-            raise DataError(f"{path}: its root element is <{found}>; expected <robot>, this is not a URDF")
-        return URDF.load(BytesIO(text), build_scene_graph=False, load_meshes=False).robot
+        _make_plain(path, tree)
+        capsules = _capsules(tree.getroot())
+        robot = URDF.load(BytesIO(etree.tostring(tree)), build_scene_graph=False, load_meshes=False).robot
+        for link, kind, number in capsules:
+            getattr(robot.links[link], kind + "s")[number].geometry.cylinder.round = True
+        return robot
     except DataError:
         raise
     except (etree.LxmlError, OSError, LookupError) as error:  # such as bytes that are not of its encoding
@@ -103,6 +112,39 @@ def _parse(path: Path) -> Any:
         raise DataError(f"{path}: not well-formed XML ({problem}); expected a URDF{hint}") from None
     except Exception as error:  # an element or attribute that is absent or odd: one bad file must not end the others
         raise DataError(f"{path}: not a valid URDF: {type(error).__name__} {error}") from None
+
+
+def _make_plain(path: Path, tree: Any) -> None:
+    """Takes namespaces out of the elements' names, and removes collision shapes of unknown kinds."""
+    from lxml import etree
+
+    document, root = tree.docinfo.internalDTD, tree.getroot()
+    if document is not None and any(True for _ in document.iterentities()):
+        raise DataError(f"{path}: it has a DOCTYPE, whose entities are not read; expected a plain URDF")
+    elements = [element for element in root.iter() if isinstance(element.tag, str)]
+    if any(element.prefix == "xacro" or any("${" in v or "$(" in v for v in element.values()) for element in elements):
+        raise DataError(f"{path}: {_XACRO}")
+    for element in elements:
+        if element.prefix is None:
+            element.tag = element.tag.rpartition("}")[2]
+    etree.cleanup_namespaces(tree)
+    if root.tag != "robot":
+        raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
+    for shape in root.findall("link/collision"):
+        if any(isinstance(part.tag, str) and part.tag not in _SHAPES for part in shape.findall("geometry/*")):
+            shape.getparent().remove(shape)
+
+
+def _capsules(root: Any) -> list[tuple[int, str, int]]:
+    """Returns where capsules stand, (link, kind, number in it), and calls them cylinders: yourdfpy knows no capsules."""
+    found = []
+    for index, link in enumerate(root.findall("link")):
+        for kind in ("visual", "collision"):
+            for number, shape in enumerate(link.findall(kind)):
+                for solid in shape.findall("geometry/capsule"):
+                    solid.tag = "cylinder"
+                    found.append((index, kind, number))
+    return found
 
 
 def _check_names(path: Path, robot: Any) -> None:
@@ -182,7 +224,11 @@ def _limits(joint: Any) -> tuple[float, float, str]:
     odd = "joints with one limit (the other is 0)" if alone else ""
     odd = "joints with inverted limits (swapped)" if low > high else odd
     low, high = min(low, high), max(low, high)
-    return low, (min(high, low + 2 * np.pi) if joint.type == "revolute" else high), odd
+    if joint.type == "revolute" and high - low > 2 * np.pi:
+        odd = _TURNS if high - low > 4 * np.pi + 1e-2 else odd
+        middle = min(max(0.0, low + np.pi), high - np.pi)
+        low, high = middle - np.pi, middle + np.pi
+    return low, high, odd
 
 
 def _moves(joint: Any) -> bool:

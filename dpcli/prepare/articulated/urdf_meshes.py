@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
+from dpcli.prepare.decode.mesh_counts import require_counts
 
 MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
 _PACKAGES = ("package://", "model://")  # of ROS and Gazebo: the folder of the robot, or one above it
@@ -35,13 +37,16 @@ def geometry_triangles(path: Path, geometry: Any, root: Path | None, notes: Coun
 
 
 def _solid(geometry: Any) -> Any:
-    """Returns the mesh of a box, cylinder or sphere; None for what has no shape."""
+    """Returns the mesh of a box, cylinder, capsule or sphere; None for what has no shape."""
     import trimesh
 
     if geometry.box is not None:
         return trimesh.creation.box(extents=np.asarray(geometry.box.size, np.float64).reshape(3))
     if geometry.cylinder is not None:
-        return trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=48)
+        radius, length = float(geometry.cylinder.radius), float(geometry.cylinder.length)
+        if getattr(geometry.cylinder, "round", False):
+            return trimesh.creation.capsule(length, radius, (24, 48))
+        return trimesh.creation.cylinder(radius, length, sections=48)
     if geometry.sphere is not None:
         return trimesh.creation.icosphere(subdivisions=3, radius=geometry.sphere.radius)
     return None
@@ -58,12 +63,20 @@ def resolve(path: Path, name: str, root: Path | None) -> Path:
     in_package = name.startswith(_PACKAGES)
     plain = name.split("://", 1)[1] if in_package else name
     tails = [plain, plain.split("/", 1)[1]] if in_package and "/" in plain else [plain]
+    tails += [unquote(tail) for tail in tails if "%" in tail]
     folders = [path.parent]
     if in_package:
         above = list(path.resolve().parents)[1:4]
         folders += [folder for folder in above if root is None or folder.is_relative_to(root.resolve())]
     places = [_joined(path, root, folder, tail) for folder in folders for tail in tails]
-    return next((place for place in places if place.is_file()), places[-1] if len(tails) > 1 else places[0])
+    return next((place for place in places if place.is_file()), places[0])
+
+
+def is_missing(path: Path, name: str, root: Path | None) -> str:
+    """Returns what is said of a mesh that isn't there, and where it lies when that is outside ``root``."""
+    if root is not None and resolve(path, name, None).is_file():
+        return f"{name} lies outside the folder {root}: name a folder above it (or --allow-outside)"
+    return f"{name} is missing"
 
 
 def _joined(path: Path, root: Path | None, folder: Path, name: str) -> Path:
@@ -78,9 +91,13 @@ def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
 
     file = resolve(path, name, root)
     if not file.is_file():
-        raise DataError(f"{path}: its mesh {name} is missing")
+        raise DataError(f"{path}: its mesh {is_missing(path, name, root)}")
     if file.suffix.lower() not in MESH_FORMATS:
         raise DataError(f"{path}: its mesh {name} is of an unknown format; expected one of {' '.join(MESH_FORMATS)}")
+    try:
+        require_counts(file)
+    except DataError as error:
+        raise DataError(f"{path}: its mesh {error}") from None
     try:
         options = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
         mesh = trimesh.load(file, force="mesh", process=False, resolver=files_inside(file, root), **options)

@@ -11,6 +11,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 
+BEYOND = "points beyond the number that their file's header says dropped"
+
 
 @dataclass
 class Cloud:
@@ -18,8 +20,8 @@ class Cloud:
 
     color: (N,3) in the range the file has, or None (`colors.as_bytes` makes bytes of them). unit: what the file says its
     coordinates are in, as in `column_names.UNITS`, or "". extra: columns that were asked for, f32 (N) each. columns: the
-    names of those that points and colors came from. unread: the names of those that nobody asked for. dropped: points
-    that the file itself says don't count, by reason.
+    names of those that points and colors came from. unread: the names of those that nobody asked for. dropped:
+    counts of points that the file itself says don't count, by reason, and of what else it says and isn't used.
     """
 
     points: np.ndarray
@@ -35,6 +37,16 @@ class Cloud:
         self.points = self.points[rows]
         self.color = None if self.color is None else self.color[rows]
         self.extra = {name: values[rows] for name, values in self.extra.items()}
+
+
+def require_points(path: Path, declared: int, found: int) -> dict[str, int]:
+    """Returns how many points lie behind those that a header declares, as `Cloud.dropped` has it; {} where none do.
+
+    found: how many points the file has room for. Raises DataError where they are fewer.
+    """
+    if found < declared:
+        raise DataError(f"{path}: truncated: its header says {declared} points, it has room for {found}")
+    return {BEYOND: found - declared} if found > declared else {}
 
 
 def cloud_of_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[str] = ()) -> Cloud:

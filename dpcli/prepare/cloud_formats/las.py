@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, without
+from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_points, without
 from dpcli.prepare.cloud_formats.column_names import UNITS
 
 _COLORS = ("red", "green", "blue")
@@ -32,7 +32,7 @@ _GEO_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the points, with colors as stored: 16 bits, some of which hold bytes. Raises DataError when damaged."""
     laspy = _load_laspy()
-    _check_sizes(path)
+    room = _check_sizes(path)
     try:
         las = laspy.read(path)
     except Exception as error:  # laspy.errors.LaspyException, struct.error, ValueError, lazrs.LazrsError
@@ -50,7 +50,7 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     points = _scaled(las)
     if heights != unit:  # such as survey feet on the map and meters above sea
         points[:, 2] *= UNITS[heights] / UNITS[unit]
-    cloud = Cloud(points, color, unit, extra, unread=unread)
+    cloud = Cloud(points, color, unit, extra, unread=unread, dropped=require_points(path, len(points), room))
     withheld = np.asarray(las["withheld"]).astype(bool)
     if withheld.any():
         cloud.keep(~withheld)
@@ -81,8 +81,11 @@ def _scaled(las: Any) -> np.ndarray:
     return points.T
 
 
-def _check_sizes(path: Path) -> None:
-    """Raises DataError where the header counts more records than the file has room for: laspy would read on and on."""
+def _check_sizes(path: Path) -> int:
+    """Returns how many points a file has room for, those that its header counts where they are compressed.
+
+    Raises DataError where the header counts more records than that: laspy would read on and on.
+    """
     with path.open("rb") as file:
         head = file.read(375)
     size = path.stat().st_size
@@ -95,19 +98,25 @@ def _check_sizes(path: Path) -> None:
             f"{path}: truncated or damaged: its header says {records + late} records and points from byte {start} on, of"
             f" {size}"
         )
-    _check_points(path, head, start, size)
+    waves = struct.unpack_from("<Q", head, 227)[0] if head[25] >= 3 and len(head) >= 235 else 0
+    end = min((place for place in (late_start if late else 0, waves) if place > start), default=size)
+    return _room(path, head, start, min(end, size))
 
 
-def _check_points(path: Path, head: bytes, start: int, size: int) -> None:
-    """Raises DataError where the points, or the chunks of compressed ones, that a file counts have no room in it.
+def _room(path: Path, head: bytes, start: int, end: int) -> int:
+    """Returns how many points lie from byte ``start`` to ``end``; of compressed ones how many the header says, by returns or not.
 
-    head: at least 227 bytes. The parsers set memory aside for all of them, and the compressed one ends the process.
+    head: at least 227 bytes. Raises DataError where points, or the chunks of compressed ones, have no room: the parsers set
+    memory aside for all that are counted, and the compressed one ends the process.
     """
+    size = path.stat().st_size
     form, length, count = struct.unpack_from("<BHI", head, 104)
-    if head[25] >= 4 and len(head) >= 255:
-        count = struct.unpack_from("<Q", head, 247)[0]
-    what, room = "points", (size - start) // max(length, 1)
-    if form & 0xC0:  # compressed: the first 8 bytes say where the table of chunks lies, whose second number counts them
+    returns = struct.unpack_from("<5I", head, 111)
+    if head[25] >= 4 and len(head) >= 375:
+        count, *returns = struct.unpack_from("<16Q", head, 247)
+    said = max(count, sum(returns))
+    what, room = "points", (end - start) // max(length, 1)
+    if packed := form & 0xC0:  # the first 8 bytes say where the table of chunks lies, whose second number counts them
         with path.open("rb") as file:
             file.seek(start)
             file.seek(min(int.from_bytes(file.read(8), "little"), size))
@@ -115,6 +124,7 @@ def _check_points(path: Path, head: bytes, start: int, size: int) -> None:
         what, room, count = "chunks of points", size, int.from_bytes(table[4:], "little")
     if count > room:
         raise DataError(f"{path}: truncated or damaged: claims {count} {what}, which a file of {size} bytes can't hold")
+    return said if packed else room
 
 
 def _units(path: Path, las: Any) -> tuple[str, str]:

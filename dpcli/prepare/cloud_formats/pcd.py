@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, require_points
 from dpcli.prepare.cloud_formats.text_numbers import TextTable
 
 _DATA = ("ascii", "binary", "binary_compressed")
 _TYPES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _MOST_BYTES = 1 << 32  # of a compressed cloud, unpacked
+POSED = "frames with a sensor pose (VIEWPOINT of PCD), which is not applied: points stay in the axes they are stored in"
 
 
 @dataclass(frozen=True)
 class Header:
-    """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data."""
+    """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data.
+
+    posed: whether it tells where the sensor stood, other than at the origin of the points.
+    """
 
     kind: np.dtype
     points: int
     data: str
     length: int
     lines: int
+    posed: bool = False
 
 
 def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -34,22 +39,18 @@ def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
     data = path.read_bytes()
     header = _read_header(path, data)
     body = memoryview(data)[header.length :]
+    beyond: dict[str, int] = {}
     if header.data == "ascii":
-        columns = _read_text(path, bytes(body), header)
+        columns, beyond = _read_text(path, bytes(body), header)
     elif header.data == "binary":
-        found = len(body) // header.kind.itemsize
-        if found < header.points:
-            raise _truncated(path, header.points, found)
+        beyond = require_points(path, header.points, len(body) // header.kind.itemsize)
         rows = np.frombuffer(body, header.kind, header.points)
         columns = {name: rows[name] for name in header.kind.names or ()}
     else:
         columns = _read_compressed(path, body, header)
     shown = {name: column for name, column in columns.items() if not name.startswith("_")}  # padding
-    return cloud_of_columns(path, shown, keep)
-
-
-def _truncated(path: Path, declared: int, found: int) -> DataError:
-    return DataError(f"{path}: truncated: its header says {declared} points, it has room for {found}")
+    posed = {POSED: 1} if header.posed else {}
+    return replace(cloud_of_columns(path, shown, keep), dropped=beyond | posed)
 
 
 def _read_header(path: Path, data: bytes) -> Header:
@@ -64,13 +65,34 @@ def _read_header(path: Path, data: bytes) -> Header:
         if words and not words[0].startswith("#"):
             said[words[0].upper()] = words[1:]
         start, lines = end + 1, lines + 1
-    points = said.get("POINTS") or [str(np.prod([int(n) for key in ("WIDTH", "HEIGHT") for n in said.get(key, [])]))]
-    if not points[0].isdigit() or "WIDTH" not in said and "POINTS" not in said:
-        raise DataError(f"{path}: not a PCD point cloud: no number of points in its header")
+    points = _points(path, said)
     form = said["DATA"][0].lower() if said["DATA"] else ""
     if form not in _DATA:
         raise DataError(f"{path}: DATA {form}; expected {', '.join(_DATA)}")
-    return Header(_row_type(path, said), int(points[0]), form, start, lines)
+    return Header(_row_type(path, said), points, form, start, lines, _posed(said.get("VIEWPOINT", [])))
+
+
+def _points(path: Path, said: dict[str, list[str]]) -> int:
+    """Returns how many points a header says. Raises DataError where it doesn't, or WIDTH x HEIGHT and POINTS differ."""
+    numbers = {key: said[key][0] for key in ("WIDTH", "HEIGHT", "POINTS") if said.get(key)}
+    if not all(number.isdecimal() for number in numbers.values()) or not numbers.keys() & {"WIDTH", "POINTS"}:
+        raise DataError(f"{path}: not a PCD point cloud: no number of points in its header")
+    size = int(numbers["WIDTH"]) * int(numbers.get("HEIGHT", 1)) if "WIDTH" in numbers else None
+    points = int(numbers.get("POINTS", size or 0))
+    if size not in (None, points):
+        raise DataError(
+            f"{path}: its header says {points} points and WIDTH x HEIGHT of {size}; damaged, write it again"
+        )
+    return points
+
+
+def _posed(words: list[str]) -> bool:
+    """Returns whether a VIEWPOINT (x y z, quaternion w x y z) is more than the identity; PCL's loaders don't apply it either."""
+    try:
+        x, y, z, _, i, j, k = (float(word) for word in words)
+    except ValueError:
+        return False
+    return any((x, y, z, i, j, k))
 
 
 def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:
@@ -94,12 +116,12 @@ def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:
     return np.dtype(row)
 
 
-def _read_text(path: Path, body: bytes, header: Header) -> dict[str, np.ndarray]:
+def _read_text(path: Path, body: bytes, header: Header) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Returns the columns, and how many points lie behind them, as `require_points` does."""
     names = header.kind.names or ()
     table = TextTable(path, tuple(names), _lines(body), header.lines + 1, limit=header.points)
     values = table.columns(range(len(names)))
-    if len(values) < header.points:
-        raise _truncated(path, header.points, len(values))
+    beyond = require_points(path, header.points, table.rows if len(values) == header.points else len(values))
     columns = {}
     for k, name in enumerate(names):
         kind, column = header.kind[name], values[:, k]
@@ -108,7 +130,7 @@ def _read_text(path: Path, body: bytes, header: Header) -> dict[str, np.ndarray]
             name in ("rgb", "rgba") and kind.kind == "f" and (column >= 1).any()
         )  # whole numbers, as some write them
         columns[name] = column if packed or not whole else column.astype(kind)
-    return columns
+    return columns, beyond
 
 
 def _lines(body: bytes) -> str:
@@ -118,7 +140,7 @@ def _lines(body: bytes) -> str:
 def _read_compressed(path: Path, body: memoryview, header: Header) -> dict[str, np.ndarray]:
     """Returns the columns, which lie one after the other in one block packed by LZF."""
     if len(body) < 8:
-        raise _truncated(path, header.points, 0)
+        require_points(path, header.points + 1, 0)
     packed, size = struct.unpack("<II", body[:8])
     if size != header.points * header.kind.itemsize or size > _MOST_BYTES:
         raise DataError(

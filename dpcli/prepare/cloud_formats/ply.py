@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, require_points
 from dpcli.prepare.cloud_formats.text_numbers import TextTable
 
 _TYPES = {
@@ -21,37 +21,53 @@ _TYPES = {
 }
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _HEADER_BYTES = 1 << 20
+_LINE_END = 2  # bytes that some writers add at the end
 
 
 @dataclass
 class Element:
-    """Holds what a header says of one element; ``properties`` are names and numpy types, of lists the type is ""."""
+    """Holds what a header says of one element; ``properties`` are names and numpy types, of lists the type is "".
+
+    lists: of each list the numpy types of its length and of its numbers, by name.
+    """
 
     name: str
     count: int
     properties: list[tuple[str, str]] = field(default_factory=list)
+    lists: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
     def has_lists(self) -> bool:
         """Returns whether its rows have no common length."""
         return any(not kind for _, kind in self.properties)
 
+    def list_types(self, name: str, order: str) -> tuple[np.dtype, np.dtype]:
+        """Returns the types of a list's length and of its numbers."""
+        length, numbers = self.lists.get(name, ("u1", "i4"))
+        return np.dtype(order + length), np.dtype(order + numbers)
+
 
 def read_ply(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the vertices. Raises DataError when they end early, or hold what their types can't."""
     with path.open("rb") as file:
-        order, elements = _read_header(path, file)
+        order, elements = read_header(path, file)
         place = next((k for k, element in enumerate(elements) if element.name in ("vertex", "point")), None)
         if place is None:
             raise DataError(f"{path}: no element vertex in its header; expected a point cloud or a mesh")
-        vertex, before = elements[place], elements[:place]
+        vertex, before, behind = elements[place], elements[:place], elements[place + 1 :]
         if order and (vertex.has_lists or any(element.has_lists for element in before)):
             return cloud_of_columns(path, _read_with_lists(path, vertex), keep)
-        columns = _read_binary(path, file, order, vertex, before) if order else _read_text(path, file, vertex, before)
-    return cloud_of_columns(path, columns, keep)
+        if order:
+            columns, rest = _read_binary(path, file, order, vertex, before)
+        else:
+            columns, rest = _read_text(path, file, vertex, before, behind)
+        if order and behind:
+            _require_elements(path, file, order, behind)
+            rest = {}
+    return replace(cloud_of_columns(path, columns, keep), dropped=rest)
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
+def read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
     """Returns the byte order ("" for text) and the elements; the file stands behind the header."""
     head = file.read(_HEADER_BYTES)
     mark = 3 if head.startswith(b"\xef\xbb\xbf") else 0
@@ -69,6 +85,10 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, list[Element]]:
             elements.append(Element(words[1], int(words[2])))
         elif words[:1] == ["property"] and elements and len(words) >= 3:
             elements[-1].properties.append((words[-1], _property_type(path, words)))
+            if words[1] == "list" and len(words) == 5:
+                elements[-1].lists[words[-1]] = tuple(
+                    _property_type(path, ["", word, words[-1]]) for word in words[2:4]
+                )
     if order is None:
         raise DataError(
             f"{path}: its header names no format; expected ascii, binary_little_endian or binary_big_endian"
@@ -86,19 +106,72 @@ def _property_type(path: Path, words: list[str]) -> str:
 
 def _read_binary(
     path: Path, file: BinaryIO, order: str, vertex: Element, before: list[Element]
-) -> dict[str, np.ndarray]:
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
+    """Returns the columns, and how many points lie behind them, as `require_points` does; the file stands behind the rows."""
     skipped = sum(element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties) for element in before)
     names = _unique_names(path, vertex)
     kind = np.dtype([(name, order + kind) for name, (_, kind) in zip(names, vertex.properties)])
     start = file.tell() + skipped
     found = max(path.stat().st_size - start, 0) // kind.itemsize if kind.itemsize else 0
-    _require_all(path, vertex.count, found)
+    rest = require_points(path, vertex.count, found)
     file.seek(start)
     rows = np.fromfile(file, kind, vertex.count)
-    return {name: rows[name] for name in names}
+    return {name: rows[name] for name in names}, rest
 
 
-def _read_text(path: Path, file: BinaryIO, vertex: Element, before: list[Element]) -> dict[str, np.ndarray]:
+def _require_elements(path: Path, file: BinaryIO, order: str, elements: list[Element]) -> None:
+    """Raises DataError unless the elements behind the points fill the file: else the number of points is wrong, too."""
+    start, data = file.tell(), memoryview(file.read())
+    at = 0
+    for element in elements:
+        rows = element.count
+        if rows and (size := _row_size(data, at, order, element)) and _are_alike(data[at:], size, rows, order, element):
+            at, rows = at + rows * size, 0
+        while rows and at <= len(data):
+            at, rows = at + _row_size(data, at, order, element), rows - 1
+    if at > len(data) or len(data) - at > _LINE_END:
+        raise DataError(
+            f"{path}: {start + len(data)} bytes, but its header's counts take {start + at}{' or more' * (at > len(data))}:"
+            " truncated or damaged; copy it again"
+        )
+
+
+def _row_size(data: memoryview, start: int, order: str, element: Element) -> int:
+    """Returns the bytes of a row that begins at byte ``start``; more than there are where a list has no room or no corner."""
+    at = start
+    for name, kind in element.properties:
+        if kind:
+            at += np.dtype(kind).itemsize
+            continue
+        length, numbers = element.list_types(name, order)
+        if at + length.itemsize > len(data):
+            return len(data) + 1
+        count = int(np.frombuffer(data, length, 1, at)[0])
+        if count < name.startswith("vertex_ind"):
+            return len(data) + 1
+        at += length.itemsize + count * numbers.itemsize
+    return at - start
+
+
+def _are_alike(data: memoryview, size: int, rows: int, order: str, element: Element) -> bool:
+    """Returns whether all rows are as long as the first, ``size`` bytes, because their lists have as many numbers."""
+    if rows * size > len(data):
+        return not element.has_lists
+    table, at = np.frombuffer(data, np.uint8, rows * size).reshape(rows, size), 0
+    for name, kind in element.properties:
+        if kind:
+            at += np.dtype(kind).itemsize
+            continue
+        length, numbers = element.list_types(name, order)
+        if (table[:, at : at + length.itemsize] != table[0, at : at + length.itemsize]).any():
+            return False
+        at += length.itemsize + int(np.frombuffer(data, length, 1, at)[0]) * numbers.itemsize
+    return True
+
+
+def _read_text(
+    path: Path, file: BinaryIO, vertex: Element, before: list[Element], behind: list[Element]
+) -> tuple[dict[str, np.ndarray], dict[str, int]]:
     names = _unique_names(path, vertex)
     head = file.tell()
     body = file.read().decode("latin-1").replace("\r\n", "\n").replace("\r", "\n")
@@ -111,12 +184,20 @@ def _read_text(path: Path, file: BinaryIO, vertex: Element, before: list[Element
         first += rows[0][0] if rows else 0
     if vertex.has_lists:
         raise DataError(f"{path}: its vertices hold lists; expected one number for each property")
-    values = TextTable(path, tuple(names), body, first, limit=vertex.count).columns(range(len(names)))
-    _require_all(path, vertex.count, len(values))
-    return {
+    table = TextTable(path, tuple(names), body, first, limit=vertex.count)
+    values = table.columns(range(len(names)))
+    others = sum(element.count for element in behind)
+    found = max(table.rows - others, 0) if len(values) == vertex.count else len(values)
+    rest = require_points(path, vertex.count, found)
+    if rest and others:
+        raise DataError(
+            f"{path}: {table.rows} rows, but its header counts {vertex.count + others}; damaged, copy it again"
+        )
+    columns = {
         name: _typed(path, name, values[:, k], np.dtype(kind))
         for k, (name, (_, kind)) in enumerate(zip(names, vertex.properties))
     }
+    return columns, rest
 
 
 def _typed(path: Path, name: str, values: np.ndarray, kind: np.dtype) -> np.ndarray:
@@ -149,8 +230,3 @@ def _unique_names(path: Path, vertex: Element) -> list[str]:
     if len(set(names)) != len(names):
         raise DataError(f"{path}: a property is there twice: {', '.join(names)}"[:200])
     return names
-
-
-def _require_all(path: Path, declared: int, found: int) -> None:
-    if found < declared:
-        raise DataError(f"{path}: truncated: its header says {declared} points, it has room for {found}")

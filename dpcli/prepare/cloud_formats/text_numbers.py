@@ -58,6 +58,12 @@ class TextTable:
         rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip() and not line.lstrip().startswith(_COMMENT))
         return list(islice((row for row in rows if row[1] != self.header or not self.header), self.limit))
 
+    @property
+    def rows(self) -> int:
+        """Returns the number of rows of the whole text, those beyond ``limit`` too."""
+        lines = self.body.count("\n") + (not self.body.endswith("\n"))
+        return lines if lines == self.limit else len(replace(self, limit=None).numbered)
+
     @cached_property
     def width(self) -> int:
         """Returns the number of columns."""

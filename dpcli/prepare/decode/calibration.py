@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.npy_files import map_npy
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
@@ -51,6 +52,7 @@ _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that OR
 _AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have meant something else
 _ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 _COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
+_MOST_NUMBERS = 64  # in an array
 _EXPECTED = (
     'expected {"fx": .., "fy": .., "cx": .., "cy": ..} in pixels, a 3x3 or 4x4 matrix, or what RealSense, Open3D, ROS or'
     " COLMAP write"
@@ -169,9 +171,12 @@ def _number_or_text(text: str) -> Any:
 
 
 def _load_npy(path: Path) -> list[float]:
+    array = map_npy(path)
+    if array.size > _MOST_NUMBERS:
+        raise DataError(f"{path}: {array.size} numbers; {_EXPECTED}")
     try:
-        return [float(value) for value in np.load(path, allow_pickle=False).reshape(-1)]
-    except (OSError, ValueError, EOFError, TypeError) as error:
+        return [float(value) for value in array.reshape(-1)]
+    except (ValueError, TypeError) as error:
         raise DataError(f"{path}: not a readable .npy array ({error})") from None
 
 

@@ -5,19 +5,21 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import map_npy
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.deep_video import deep_frames
 from dpcli.prepare.decode.exr import read_exr
-from dpcli.prepare.decode.png import check_png, decode_gray_png
+from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
+from dpcli.runtime.clips.container_ends import ends_early
 from dpcli.runtime.clips.video_frames import missing_frames
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
@@ -38,12 +40,16 @@ _TICK = 0.0011  # seconds by which a container's time stamps may be off: it coun
 class DepthVideo:
     """Holds raw frames (T,H,W) u8, u16, or float, and the seconds of each since the first, f64 (T), None = not known.
 
-    missing: how many more frames the file declares than it holds, such as a recording that was cut.
+    missing: how many more frames the file declares than it holds, such as a recording that was cut. ends_early: the file
+    stops before its container does, whether or not it says how many frames there were. notes: counts of what else is
+    missing or doubtful.
     """
 
     frames: np.ndarray
     time: np.ndarray | None = None
     missing: int = 0
+    ends_early: bool = False
+    notes: dict[str, int] = field(default_factory=dict)
 
 
 def open_video(path: Path):  # -> cv2.VideoCapture
@@ -135,7 +141,7 @@ def _declared_frames(capture) -> int:
 def _missing(path: Path, declared: int, count: int, times: np.ndarray | None, stride: int) -> int:
     """Returns how many frames the file lacks; it is opened again only where OpenCV's guess of its length says more."""
     seen = count * stride  # but for the last few
-    return missing_frames(path, seen, times if stride == 1 else None) if declared > seen + 1 else 0
+    return missing_frames(path, seen, times if stride == 1 else None) if declared > seen else 0
 
 
 def _is_plain(stream: VideoStream) -> bool:
@@ -202,7 +208,7 @@ def read_image(path: Path) -> np.ndarray:
     image = decode_gray_png(data)
     if image is not None:
         return image
-    check_png(data, path)
+    check_picture(data, path)
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
     if not pages:
@@ -273,8 +279,8 @@ def says_depth(name: str) -> bool:
 def _is_frame(path: Path) -> bool:
     """Returns whether an array file holds one frame (H,W), by its header."""
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False).ndim == 2
-    except Exception:  # a damaged header raises nearly anything; reading the file says so
+        return map_npy(path).ndim == 2
+    except (DataError, OSError):  # reading the file says so
         return False
 
 
@@ -288,10 +294,7 @@ def _holds_depth(path: Path) -> bool:
 
 def read_array(path: Path, stride: int = 1) -> np.ndarray:
     """Reads a ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header raises nearly anything
-        raise DataError(f"{path}: not a readable .npy array ({type(error).__name__}: {error})") from None
+    array = map_npy(path)
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.dtype.kind not in "uif":
@@ -319,7 +322,7 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         frames, time, missing = read_timed_video(path, stride)
         if not frames:
             raise DataError(f"{path}: an empty video: no frame can be decoded")
-        video = DepthVideo(np.stack(frames), time, missing)
+        video = DepthVideo(np.stack(frames), time, missing, ends_early(path))
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:

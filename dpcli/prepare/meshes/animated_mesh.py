@@ -11,12 +11,13 @@ import numpy as np
 class Texture:
     """Holds a picture on a surface: sRGB u8 (H,W,4), alpha in the last channel; wrap: repeat | mirror | clamp.
 
-    change: f64 (2,3) affine map of the coordinates before they are looked up, or None.
+    change: f64 (2,3) affine map of the coordinates before they are looked up, or None. nearest: pixels are squares.
     """
 
     pixels: np.ndarray
     wrap: tuple[str, str] = ("repeat", "repeat")
     change: np.ndarray | None = None
+    nearest: bool = False
 
 
 @dataclass(frozen=True)

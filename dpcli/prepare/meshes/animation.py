@@ -12,7 +12,7 @@ from typing import Any
 from dpcli.errors import DataError
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
 from dpcli.prepare.meshes.filming import Filming, film
-from dpcli.prepare.meshes.gltf import read_gltf
+from dpcli.prepare.meshes.gltf import Gltf, read_gltf
 from dpcli.prepare.meshes.gltf_extensions import name_unread, refuse_required
 from dpcli.prepare.meshes.gltf_mesh import bake
 from dpcli.prepare.meshes.gltf_nodes import choose_clip, clip_names, read_clip
@@ -32,28 +32,43 @@ def _well_formed(path: Path) -> Iterator[None]:
         ) from error
 
 
-def list_clips(path: Path) -> list[tuple[str, float]]:
-    """Returns (name, seconds) of every clip of a file. Raises DataError when one is broken or there is none."""
+def list_clips(path: Path) -> list[tuple[str, float | None]]:
+    """Returns (name, seconds) of every clip of a file; None, with a warning, for one that is broken or moves nothing.
+
+    Raises DataError when the file is broken, or has no clip.
+    """
     with _well_formed(path):
         file = read_gltf(path)
         choose_clip(file, None)
-        clips = [read_clip(file, index) for index in range(len(clip_names(file)))]
-    return [(clip.name, clip.end - clip.start) for clip in clips]
+        return [(name, _seconds(file, index)) for index, name in enumerate(clip_names(file))]
+
+
+def _seconds(file: Gltf, index: int) -> float | None:
+    try:
+        with _well_formed(file.path):
+            clip = read_clip(file, index)
+    except DataError as error:
+        log.warn(str(error))
+        return None
+    return clip.end - clip.start
 
 
 def clip_outputs(path: Path, output: str) -> list[tuple[str, str]]:
     """Returns (clip, file) for every clip of a model: OUT.h5 becomes OUT_Walk.h5, OUT_Run.h5, ...
 
-    Characters that a file's name should not have become _; names that are the same then get their clip's number.
+    Characters that a file's name should not have become _; names that are the same then get their clip's number. Clips
+    that are broken, or move nothing, are passed over with a warning. Raises DataError when none is left.
     """
-    with _well_formed(path):
-        choose_clip(file := read_gltf(path), None)
-        names = clip_names(file)
+    clips = list_clips(path)
+    if all(seconds is None for _, seconds in clips):
+        raise DataError(f"{path}: none of its {len(clips)} clips can be read")
+    names = [name for name, _ in clips]
     short = [re.sub(r"[^\w.-]+", "_", name.split("|")[-1]).strip("_.")[:80] or "clip" for name in names]
     many = [key for key, count in Counter(name.lower() for name in short).items() if count > 1]
     short = [f"{name}_{index}" if name.lower() in many else name for index, name in enumerate(short)]
     place = Path(output)
-    return [(name, str(place.with_name(f"{place.stem}_{end}{place.suffix}"))) for name, end in zip(names, short)]
+    made = ((clip, place.with_name(f"{place.stem}_{end}{place.suffix}")) for clip, end in zip(clips, short))
+    return [(name, str(file)) for (name, seconds), file in made if seconds is not None]
 
 
 def load_animation(path: Path, clip: str | None, frames: int) -> AnimatedMesh:

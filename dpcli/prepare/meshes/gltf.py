@@ -22,6 +22,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
+from dpcli.prepare.meshes.other_formats import is_folder, not_gltf, refuse_other_formats
+from dpcli.runtime.clips.images import require_plausible
 from dpcli.text_files import parse_json
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -29,20 +31,6 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "M
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _MOST = 1 << 27  # entries: a damaged count must not fill the memory
 _SCHEME = re.compile(r"[a-zA-Z][a-zA-Z0-9+.-]*:")
-_FOREIGN = {  # how files of other formats begin
-    b"Kaydara FBX Binary": "FBX",
-    b"; FBX": "FBX",
-    b"PXR-USDC": "USD",
-    b"#usda": "USD",
-    b"BLENDER": "a Blender file",
-    b"PK\x03\x04": "a zip archive (or USDZ)",
-    b"\x1f\x8b": "a gzip archive (or a compressed Blender file)",
-    b"\x28\xb5\x2f\xfd": "a zstd archive (or a compressed Blender file)",
-    b"7z\xbc\xaf\x27\x1c": "a 7z archive",
-    b"Rar!": "a rar archive",
-    b"<?xml": "XML (COLLADA, perhaps)",
-    b"<COLLADA": "COLLADA",
-}
 MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 _UNPACKED = 4096  # bytes that one of compressed data may make
 
@@ -241,9 +229,21 @@ class Gltf:
         )
         try:
             with Image.open(io.BytesIO(data)) as picture:
-                return np.array(picture.convert("RGBA"))
-        except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError) as error:
+                require_plausible(self.path, *picture.size, len(data))
+                return _rgba(picture)
+        except UnidentifiedImageError:
+            kind = "KTX2" if data.startswith(b"\xabKTX 20\xbb") else entry.get("mimeType", "of an unknown kind")
+            raise self.fail(f"texture {index} is {kind}, which is not read; export it as PNG or JPEG") from None
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
             raise self.fail(f"texture {index} ({entry.get('mimeType', 'image')}) cannot be read: {error}") from None
+
+
+def _rgba(picture: Any) -> np.ndarray:
+    """Returns pixels u8 (H,W,4) of an opened picture; gray of 16 bits, which Pillow would cut off at 255, is scaled."""
+    if picture.mode.startswith("I"):
+        gray = (np.asarray(picture).astype(np.int64) // 257).astype(np.uint8)
+        return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
+    return np.array(picture.convert("RGBA"))
 
 
 def read_gltf(path: Path) -> Gltf:
@@ -251,24 +251,16 @@ def read_gltf(path: Path) -> Gltf:
     try:
         data = Path(path).read_bytes()
     except IsADirectoryError:
-        files = sorted(file.name for file in Path(path).glob("*.gl[bt]*"))
-        some = f"name one of its {len(files)} files, such as {files[0]}" if files else "expected a .glb or .gltf file"
-        raise DataError(f"{path}: a folder; {some}") from None
+        raise is_folder(Path(path)) from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-    foreign = next(
-        (what for start, what in _FOREIGN.items() if data.lstrip(b"\xef\xbb\xbf \n\r\t").startswith(start)), ""
-    )
-    if foreign:
-        raise DataError(
-            f"{path}: not a glTF file but {foreign}; unpack it, or open it in Blender and use File > Export > glTF 2.0"
-        )
+    refuse_other_formats(path, data)
     text, binary = _split_glb(path, data) if data[:4] == b"glTF" else (data, None)
     try:
-        tree = parse_json(text, path)
+        tree = parse_json(text.rstrip(b"\0"), path)  # some exporters fill the chunk up with them
         version = str(tree["asset"]["version"])
     except (DataError, KeyError, TypeError):
-        raise DataError(f"{path}: not a glTF file (no JSON with an asset version); expected .glb or .gltf") from None
+        raise not_gltf(Path(path)) from None
     if not version.startswith("2"):
         raise DataError(f"{path}: glTF version {version}; version 2 is read, convert the file")
     return Gltf(Path(path), tree, binary)
@@ -277,6 +269,8 @@ def read_gltf(path: Path) -> Gltf:
 def _split_glb(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """Returns JSON and binary chunk of a .glb (section 4)."""
     version, length = struct.unpack_from("<II", data, 4) if len(data) >= 12 else (0, 0)
+    if version == 1:
+        raise DataError(f"{path}: glTF version 1; version 2 is read, convert the file")
     if version != 2 or length > len(data):
         raise DataError(
             f"{path}: a .glb of version {version} and {length} bytes, of which {len(data)} are left; "

@@ -13,6 +13,7 @@ from dpcli.runtime.progress import log
 READ = {
     *MESHOPT,
     "EXT_mesh_gpu_instancing",
+    "EXT_texture_avif",
     "EXT_texture_webp",
     "KHR_animation_pointer",
     "KHR_draco_mesh_compression",
@@ -37,10 +38,7 @@ _UNSEEN = {  # what they say does not change a picture
     "VRM",
     "VRMC_vrm",
 }
-_ADVICE = {
-    "KHR_texture_basisu": "export its textures as PNG or JPEG",
-    "EXT_texture_avif": "export its textures as PNG or JPEG",
-}
+_ADVICE = {"KHR_texture_basisu": "export its textures as PNG or JPEG"}
 _IDENTITY = {"TRANSLATION": (0.0, 0.0, 0.0), "ROTATION": (0.0, 0.0, 0.0, 1.0), "SCALE": (1.0, 1.0, 1.0)}
 
 
@@ -53,11 +51,19 @@ def refuse_required(file: Gltf) -> None:
 
 
 def name_unread(file: Gltf) -> None:
-    """Warns of every extension the file uses that changes its picture and is not read, once each."""
-    unread = [name for name in dict.fromkeys(map(str, file.tree.get("extensionsUsed", []))) if name not in READ]
-    unread = [name for name in unread if name not in _UNSEEN]
+    """Warns of every extension the file uses that changes its picture and is not read, once each.
+
+    Those of its materials count, too, where its list of extensions lacks them.
+    """
+    used = [*file.tree.get("extensionsUsed", []), *(name for m in file.items("materials") for name in _names_of(m))]
+    unread = [name for name in dict.fromkeys(map(str, used)) if name not in READ | _UNSEEN]
     if unread:
         log.warn(f"{file.path}: not read, so the pictures may differ from a viewer's: {', '.join(unread)}")
+
+
+def _names_of(entry: dict[str, Any]) -> list[str]:
+    found = entry.get("extensions", {})
+    return list(found) if isinstance(found, dict) else []
 
 
 def instances(file: Gltf, node: int) -> np.ndarray | None:

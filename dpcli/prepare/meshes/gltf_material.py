@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.prepare.meshes.animated_mesh import Material, Texture
 from dpcli.prepare.meshes.gltf import Gltf
 
+_NEAREST = 9728
 _WRAP = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 
 
@@ -26,11 +27,13 @@ def to_srgb(color: np.ndarray) -> np.ndarray:
     return np.where(color <= 0.0031308, 12.92 * color, 1.055 * np.maximum(color, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def texture_sets(file: Gltf, index: int) -> tuple[int, int]:
-    """Returns the numbers of the texture coordinates that the base color and the emission of a material use."""
+def texture_sets(file: Gltf, index: int) -> tuple[int | None, int | None]:
+    """Returns the numbers of the texture coordinates that the base color and the emission of a material use.
+
+    None: it has no such texture.
+    """
     base, _, emission = _references(file, index)
-    first = _texture_set(base)
-    return first, _texture_set(emission) if emission else first
+    return _texture_set(base), _texture_set(emission)
 
 
 def read_material(file: Gltf, index: int) -> Material:
@@ -71,9 +74,8 @@ def _references(file: Gltf, index: int) -> tuple[dict[str, Any] | None, Any, dic
     return texture, color, entry.get("emissiveTexture")
 
 
-def _texture_set(reference: dict[str, Any] | None) -> int:
-    reference = reference or {}
-    return _change(reference).get("texCoord", reference.get("texCoord", 0))
+def _texture_set(reference: dict[str, Any] | None) -> int | None:
+    return None if reference is None else _change(reference).get("texCoord", reference.get("texCoord", 0))
 
 
 def _change(reference: dict[str, Any]) -> dict[str, Any]:
@@ -93,13 +95,13 @@ def _numbers(file: Gltf, index: int, values: Any, rest: tuple[int, ...]) -> tupl
 def _texture(file: Gltf, reference: dict[str, Any]) -> Texture:
     index, change = reference["index"], _change(reference)
     entry = file.item("textures", index)
-    webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
-    source = webp.get("source", entry.get("source"))
+    others = [entry.get("extensions", {}).get(name, {}) for name in ("EXT_texture_webp", "EXT_texture_avif")]
+    source = next((other["source"] for other in others if "source" in other), entry.get("source"))
     if source is None:
-        raise file.fail(f"texture {index} has no image that can be read (PNG, JPEG or WebP); export it again")
+        raise file.fail(f"texture {index} has no image that can be read; export its textures as PNG or JPEG")
     sampler = file.item("samplers", entry["sampler"]) if "sampler" in entry else {}
     wrap = tuple(_WRAP.get(sampler.get(key, 10497), "repeat") for key in ("wrapS", "wrapT"))
-    return Texture(file.image(source), wrap, _uv_matrix(change))
+    return Texture(file.image(source), wrap, _uv_matrix(change), sampler.get("magFilter") == _NEAREST)
 
 
 def _uv_matrix(change: dict[str, Any]) -> np.ndarray | None:

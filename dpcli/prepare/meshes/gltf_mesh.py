@@ -17,6 +17,7 @@ from dpcli.prepare.meshes.skinning import skin, vertex_normals
 from dpcli.runtime.progress import log
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_BRIGHTEST = 8.0  # of vertex colors: a little above 1 is light, far above it is another range
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
 _MOST_VERTICES = 20_000_000  # of all instances of a node
 
@@ -49,6 +50,8 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     """
     parent = node_parents(file)
     curves = Clip("still", 0.0, 0.0, {}) if clip is None else read_clip(file, clip)
+    if curves.passed:
+        log.warn(f"{file.path}: clip {curves.name!r} also changes what is not read: {', '.join(curves.passed)}")
     time = curves.sample_times(frames)
     poses, shown = node_poses(file, parent, curves, time), node_visibility(file, parent, curves, time)
     visible = [node for node in _scene_nodes(file) if shown[:, node].any()]
@@ -127,7 +130,8 @@ def _read_node(file: Gltf, index: int) -> list[_Piece]:
     primitives = file.item("meshes", node["mesh"]).get("primitives", [])
     kept = [p for p in primitives if p.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP, _FAN)]
     if len(kept) < len(primitives):
-        log.detail(f"{file.path}: {len(primitives) - len(kept)} sets of points or lines are left out")
+        left = f"{len(primitives) - len(kept)} of {len(primitives)} pieces"
+        log.warn(f"{file.path}: points and lines of {node_name(file, index)!r} are left out, {left}")
     skins = _read_skin(file, node["skin"]) if "skin" in node else None
     pieces = [_read_primitive(file, index, primitive, skins) for primitive in kept]
     transforms = instances(file, index)
@@ -191,8 +195,8 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
     computed = vertex_normals(positions, triangles)
     material = entry.get("material", -1)
     uv_set, emission_set = texture_sets(file, material)
-    color = read("COLOR_0", None, np.ones((count, 4), np.float32))
-    color = np.concatenate([color, np.ones((count, 4 - color.shape[1]), np.float32)], axis=1)
+    _name_lost(file, entry, (uv_set, emission_set), where)
+    color = _colors(file, read("COLOR_0", None, np.ones((count, 4), np.float32)), where)
     bones, weights, inverse_bind = _binding(file, node, attributes, positions, skins, where)
     targets, nowhere = entry.get("targets") or None, np.zeros((count, 2), np.float32)
     return _Piece(
@@ -210,6 +214,26 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
         targets and _deltas(file, targets, "NORMAL", count, where),
         read(f"TEXCOORD_{emission_set}", 2, nowhere),
     )
+
+
+def _name_lost(file: Gltf, entry: dict[str, Any], sets: tuple[int | None, int | None], where: str) -> None:
+    """Warns of textures without coordinates and of morph targets that change more than the shape."""
+    for number in sorted({number for number in sets if number is not None}):
+        if f"TEXCOORD_{number}" not in entry["attributes"]:
+            log.warn(f"{file.path}: {where} has no TEXCOORD_{number} for its texture, whose first corner is taken")
+    kinds = {key for target in entry.get("targets", []) for key in target} - {"POSITION", "NORMAL", "TANGENT"}
+    if kinds:
+        log.warn(f"{file.path}: {where}: its morph targets' {', '.join(sorted(kinds))} are not read")
+
+
+def _colors(file: Gltf, color: np.ndarray, where: str) -> np.ndarray:
+    """Returns vertex colors f32 (V,4); values up to 255 or 65535 that the file doesn't call normalized become 0..1."""
+    largest = color[:, :3].max()
+    if largest > _BRIGHTEST:
+        scale = 255 if largest < 256 else 65535
+        log.warn(f"{file.path}: {where}: vertex colors up to {largest:g} are taken as shares of {scale}")
+        color = color / np.float32(scale)
+    return np.concatenate([color, np.ones((len(color), 4 - color.shape[1]), np.float32)], axis=1)
 
 
 def _whole_normals(file: Gltf, normals: np.ndarray, computed: np.ndarray, where: str) -> np.ndarray:
@@ -242,11 +266,14 @@ def _triangles(file: Gltf, entry: dict[str, Any], count: int, where: str) -> np.
         corners = file.accessor(entry["indices"], f"indices of {where}", 1).astype(np.int64)
     if len(corners) and (corners.max() >= count or corners.min() < 0):
         raise file.fail(f"{where}: a triangle uses vertex {corners.max()} of {count}; the file is damaged")
-    mode = entry.get("mode", _TRIANGLES)
+    drawn = entry.get("mode", _TRIANGLES)
+    mode = _TRIANGLES if entry.get("indices") in file.decoded else drawn  # Draco's blocks hold triangles
     if len(corners) < 3:
         return np.zeros((0, 3), np.int64)
-    if mode == _STRIP:
-        return np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+    if mode == _STRIP:  # every second triangle is wound the other way
+        strip = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
+        strip[1::2] = strip[1::2, [0, 2, 1]]
+        return strip
     if mode == _FAN:
         return np.stack([np.full(len(corners) - 2, corners[0]), corners[1:-1], corners[2:]], axis=1)
     return corners[: len(corners) // 3 * 3].reshape(-1, 3)

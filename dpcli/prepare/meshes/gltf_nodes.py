@@ -20,12 +20,16 @@ _POINTER = re.compile(
 
 @dataclass(frozen=True)
 class Clip:
-    """Holds one animation. curves: (node, translation | rotation | scale | weights) -> Curve. Seconds."""
+    """Holds one animation. curves: (node, translation | rotation | scale | weights) -> Curve. Seconds.
+
+    passed: what it changes besides nodes, as pointers into the file.
+    """
 
     name: str
     start: float
     end: float
     curves: dict[tuple[int, str], Curve]
+    passed: tuple[str, ...] = ()
 
     def sample_times(self, frames: int) -> np.ndarray:
         """Returns `frames` times f64 (T) from the start on; the end is left out, in a loop it would repeat the first
@@ -41,7 +45,7 @@ def clip_names(file: Gltf) -> list[str]:
     """
     found: list[str] = []
     for index, entry in enumerate(file.items("animations")):
-        plain = str(entry.get("name") or f"clip {index}")
+        plain = str(entry.get("name") or "").strip() or f"clip {index}"
         plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in plain)
         name, number = plain, 1
         while name in found:
@@ -77,11 +81,12 @@ def choose_clip(file: Gltf, wanted: str | None) -> int:
 def read_clip(file: Gltf, index: int) -> Clip:
     """Reads the clip's curves. Raises DataError that names clip, node and key when one is broken."""
     entry, name = file.item("animations", index), clip_names(file)[index]
-    curves = {}
+    curves, passed = {}, []
     for channel in entry.get("channels", []):
         node, path = _target(channel.get("target", {}))
         if node is None or path not in (*_REST, "weights", "visible"):
-            continue  # what an extension moves; the specification says to pass it over
+            passed.append(str(path))  # what an extension moves; the specification says to pass it over
+            continue
         what = f"clip {name!r}, {path} of {node_name(file, node)!r}"
         try:
             sampler = entry["samplers"][channel["sampler"]]
@@ -92,21 +97,22 @@ def read_clip(file: Gltf, index: int) -> Clip:
         curves[node, path] = _read_curve(file, what, path, *keys[:2], interpolation)
     if not curves:
         raise file.fail(f"clip {name!r} moves nothing; choose another with --clip (see --list)")
-    return Clip(
-        name, float(min(c.times[0] for c in curves.values())), float(max(c.times[-1] for c in curves.values())), curves
-    )
+    start, end = min(c.times[0] for c in curves.values()), max(c.times[-1] for c in curves.values())
+    return Clip(name, float(start), float(end), curves, tuple(dict.fromkeys(passed)))
 
 
 def _target(target: dict[str, Any]) -> tuple[int | None, str | None]:
     """Returns node and property of a channel, where KHR_animation_pointer points at those of a node, too."""
     if target.get("path") != "pointer":
         return target.get("node"), target.get("path")
-    pointer = target.get("extensions", {}).get("KHR_animation_pointer", {}).get("pointer", "")
-    found = _POINTER.fullmatch(str(pointer))
-    return (int(found[1]), found[2]) if found else (None, None)
+    pointer = str(target.get("extensions", {}).get("KHR_animation_pointer", {}).get("pointer", ""))
+    found = _POINTER.fullmatch(pointer)
+    return (int(found[1]), found[2]) if found else (None, pointer)
 
 
 def _read_curve(file: Gltf, what: str, path: str, times: int, values: int, interpolation: str) -> Curve:
+    if interpolation not in ("LINEAR", "STEP", "CUBICSPLINE"):
+        raise file.fail(f"{what}: its keys are joined by {interpolation!r}; expected LINEAR, STEP or CUBICSPLINE")
     times = file.accessor(times, what, 1).astype(np.float64)
     if (np.diff(times) < 0).any():
         raise file.fail(f"{what}: its times do not rise; export the file again")

@@ -185,10 +185,16 @@ def _alpha(material: Material, alpha: np.ndarray) -> np.ndarray:
 
 
 def sample_texture(texture: Texture, uv: np.ndarray) -> np.ndarray:
-    """Looks up linear RGBA f32 (N,4) bilinearly; uv (N,2) with v downwards, (0, 0) the upper left corner."""
+    """Looks up linear RGBA f32 (N,4); uv (N,2) with v downwards, (0, 0) the upper left corner.
+
+    Between pixels it is bilinear, unless the texture shows the nearest.
+    """
     if texture.change is not None:
         uv = uv @ texture.change[:, :2].T + texture.change[:, 2]
     height, width = texture.pixels.shape[:2]
+    if texture.nearest:
+        column, row = (np.floor(uv[:, axis] * size).astype(np.int64) for axis, size in ((0, width), (1, height)))
+        return _linear(texture, _wrapped(row, height, texture.wrap[1]), _wrapped(column, width, texture.wrap[0]))
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     fx, fy = (x - x0)[:, None].astype(np.float32), (y - y0)[:, None].astype(np.float32)

@@ -2,44 +2,57 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
-
-import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.calibration import Calibration
 from dpcli.prepare.recordings.messages import CAMERA_KINDS, IMAGE_KINDS, calibration_of_message, depth_of_message
-from dpcli.prepare.recordings.recording import Message, Recording, message_times, open_recording
+from dpcli.prepare.recordings.recording import Recording, open_recording
+from dpcli.prepare.recordings.topic_frames import TopicFrames, read_topic
 
-_DEPTH_WORDS = ("depth", "range", "disparity")
+_SAYS_DEPTH = re.compile(r"depth|range|(?<![a-z])(tof|z16)(?![a-z])", re.IGNORECASE)
+_OTHER_IMAGES = re.compile(
+    r"colou?r|rgb|infra|mask|conf|amplitude|intensity|(?<![a-z])(ir|mono|gray|grey)(?![a-z])", re.IGNORECASE
+)
+_DISPARITY = re.compile("disp(arity|_?map)?(?![a-z])", re.IGNORECASE)
 
 
-def read_recorded_depth(
-    path: Path, topic: str = "", stride: int = 1
-) -> tuple[np.ndarray, np.ndarray | None, Calibration | None]:
-    """Returns frames (T,H,W) as stored, seconds since the first f64 (T) or None, and the camera or None.
+def read_recorded_depth(path: Path, topic: str = "", stride: int = 1) -> tuple[TopicFrames, Calibration | None]:
+    """Returns the frames, each (H,W) as stored and all alike, and the camera or None.
 
     topic: of the images, "" for the only one of depth. Raises DataError when there is none or it can't be read.
     """
     with open_recording(path) as recording:
         name = _depth_topic(recording, topic)
-        frames, stamps = [], []
-        for message in recording.messages(name, stride):
-            frames.append(depth_of_message(path, message.kind, message.content))
-            stamps.append((message.stamp, message.logged))
-        if len({(frame.shape, frame.dtype) for frame in frames}) > 1:
-            found = ", ".join(sorted({f"{f.shape[1]}x{f.shape[0]} {f.dtype}" for f in frames}))
+        if _DISPARITY.search(name) and not _SAYS_DEPTH.search(name):
+            raise DataError(
+                f"{path}: {name} holds disparities, not depth; depth is focal length x baseline / disparity"
+            )
+        read = read_topic(recording, name, stride, lambda one: depth_of_message(path, one.kind, one.content))
+        if len({(frame.shape, frame.dtype) for frame in read.frames}) > 1:
+            found = ", ".join(sorted({f"{f.shape[1]}x{f.shape[0]} {f.dtype}" for f in read.frames}))
             raise DataError(f"{path}: images of {name} differ in size or type: {found}; expected one kind")
-        return np.stack(frames), message_times(stamps), _camera(recording, name)
+        if read.frames[0].itemsize == 1 and not topic and not _SAYS_DEPTH.search(name):
+            raise DataError(f"{path}: {name} holds 8-bit images, hardly depth; if they are, name it with --topic")
+        return read, _camera(recording, name)
 
 
 def _depth_topic(recording: Recording, topic: str) -> str:
-    """Returns the topic that was asked for, the only one of images, or the only one of these whose name says depth."""
-    if not topic:
-        images = [name for name, (kind, count) in recording.topics.items() if kind in IMAGE_KINDS and count]
-        named = [name for name in images if any(word in name.lower() for word in _DEPTH_WORDS)]
-        if len(images) > 1 and len(named) == 1:
-            return named[0]
+    """Returns the topic that was asked for, or the only one of images that may be depth: by its name, or none is better.
+
+    A topic that repeats another one in compressed form is passed over.
+    """
+    images = [name for name, (kind, count) in recording.topics.items() if kind in IMAGE_KINDS and count]
+    images = [name for name in images if name.rpartition("/")[0] not in images]
+    named = [name for name in images if _SAYS_DEPTH.search(name)]
+    possible = named or [name for name in images if not _OTHER_IMAGES.search(name)]
+    if not topic and len(possible) == 1:
+        return possible[0]
+    if not topic and images and not possible:
+        raise DataError(
+            f"{recording.path}: by their names, no topic holds depth: {', '.join(images)}; if one does, name it with --topic"
+        )
     return recording.choose(topic, IMAGE_KINDS, "images")
 
 
@@ -51,5 +64,5 @@ def _camera(recording: Recording, topic: str) -> Calibration | None:
     if not above:
         return None
     nearest = max(above, key=lambda name: name.count("/"))
-    message: Message = next(recording.messages(nearest))
-    return calibration_of_message(recording.path, topic, message.content)
+    message = next(recording.messages(nearest), None)
+    return calibration_of_message(recording.path, topic, message.content) if message else None

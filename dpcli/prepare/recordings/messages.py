@@ -13,7 +13,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
 from dpcli.prepare.decode.calibration import Calibration, lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
-from dpcli.prepare.decode.png import check_png, decode_gray_png
+from dpcli.prepare.decode.png import check_picture, decode_gray_png
 
 CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2",)
 IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -21,6 +21,7 @@ CAMERA_KINDS = ("sensor_msgs/msg/CameraInfo",)
 _POINT_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PIXELS = {"16uc1": "u2", "mono16": "u2", "16sc1": "i2", "32sc1": "i4", "32fc1": "f4", "64fc1": "f8", "8uc1": "u1"}
 _PIXELS |= {"mono8": "u1", "z16": "u2"}
+_JPEG = b"\xff\xd8\xff"
 _DEPTH_HEADER = struct.Struct("<iff")  # before the PNG of image_transport's compressedDepth: format, and two numbers
 
 
@@ -94,13 +95,14 @@ def _compressed_depth(path: Path, form: str, data: bytes) -> np.ndarray:
 def _decoded(path: Path, form: str, data: bytes) -> np.ndarray:
     image = decode_gray_png(data)
     if image is None:
-        check_png(data, path)
+        check_picture(data, path)
         cv2 = load_cv2()
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:
         raise DataError(f"{path}: a compressed image ({form!r}) can't be decoded; it is damaged or of another kind")
-    if image.ndim != 2:
-        raise DataError(f"{path}: compressed images ({form!r}) are colored; expected depth; choose its --topic")
+    if image.ndim != 2 or data.startswith(_JPEG):
+        what = "colored" if image.ndim != 2 else "JPEG, which holds no depth"
+        raise DataError(f"{path}: compressed images ({form!r}) are {what}; expected depth; choose its --topic")
     return image
 
 
@@ -112,17 +114,18 @@ def calibration_of_message(path: Path, topic: str, content: Any) -> Calibration 
     matrix, lens, projection = (
         [float(v) for v in _either(content, name)] for name in ("k", "d", "p")
     )  # ROS 1 has them in capitals
-    if content.roi.x_offset or content.roi.y_offset:
-        raise DataError(f"{path}: the camera_info of {topic} is of a cut-out of the picture; give --intrinsics of it")
     rectified = "rect" in topic.rpartition("/")[2] or "rect" in topic.split("/")[-2:][0]
     numbers = (
         [projection[k] for k in (0, 5, 2, 6)] if rectified and any(projection) else [matrix[k] for k in (0, 4, 2, 5)]
     )
     if numbers[0] <= 0 or numbers[1] <= 0:
         return None
+    roi = content.roi  # a cut-out of the picture that the numbers are for; none where its size is 0
+    numbers[2:] = numbers[2] - roi.x_offset, numbers[3] - roi.y_offset
     bent = () if rectified else lens_coefficients(path, str(content.distortion_model), lens)
     camera = LensIntrinsics(*numbers, bent) if bent else Intrinsics(*numbers)
-    return Calibration(camera, int(content.width), int(content.height), source=f"{path}: camera_info")
+    size = int(roi.width or content.width), int(roi.height or content.height)
+    return Calibration(camera, *size, source=f"{path}: camera_info")
 
 
 def _either(content: Any, name: str) -> Any:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
-
-import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import path_inside
@@ -18,8 +17,10 @@ from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
 
 SUFFIXES = (".bag", ".mcap", ".db3")
+_IN_FOLDERS = (*SUFFIXES, *(f"{suffix}.zstd" for suffix in SUFFIXES))
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
+_MENDERS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,16 @@ class Message:
         stamp = getattr(getattr(self.content, "header", None), "stamp", None)
         return (stamp.sec * 10**9 + stamp.nanosec or None) if stamp is not None else None
 
+    @property
+    def place(self) -> str:
+        """Returns the name of the coordinate frame that its header tells, "" when it has none."""
+        return str(getattr(getattr(self.content, "header", None), "frame_id", "")).strip("/")
+
 
 def is_recording(path: Path) -> bool:
     """Returns whether a path is a recording: a file of its kind, or the folder of a ROS 2 bag."""
     if path.is_dir():
-        return (path / _METADATA).is_file() and any(one.suffix.lower() in SUFFIXES for one in path.iterdir())
+        return (path / _METADATA).is_file() and any(one.name.lower().endswith(_IN_FOLDERS) for one in path.iterdir())
     return path.suffix.lower() in SUFFIXES
 
 
@@ -68,10 +74,10 @@ def holds_only_recordings(path: Path, others: tuple[str, ...]) -> bool:
 
 
 class Recording:
-    """Reads one open recording; `open_recording` makes it."""
+    """Reads one open recording; `open_recording` makes it. ``read``: how many messages the latest pass found."""
 
     def __init__(self, path: Path, reader: Any) -> None:
-        self.path, self._reader = path, reader
+        self.path, self._reader, self.read = path, reader, 0
         self.topics: dict[str, tuple[str, int]] = {
             name: (str(info.msgtype), info.msgcount) for name, info in reader.topics.items()
         }  # name -> (type, number of messages)
@@ -106,17 +112,17 @@ class Recording:
         connections = [one for one in self._reader.connections if one.topic == topic]
         with _damage_named(self.path):
             raw_messages = self._reader.messages(connections=connections)
-        index = 0
+        self.read = 0
         while True:
             with _damage_named(self.path):
                 found = next(raw_messages, None)
                 if found is None:
                     return
                 connection, logged, raw = found
-                content = self._reader.deserialize(raw, connection.msgtype) if index % stride == 0 else None
+                content = self._reader.deserialize(raw, connection.msgtype) if self.read % stride == 0 else None
+            self.read += 1
             if content is not None:
                 yield Message(content, connection.msgtype, logged)
-            index += 1
 
 
 @contextmanager
@@ -132,13 +138,26 @@ def open_recording(path: Path) -> Iterator[Recording]:
             path_inside(path, path, one.name)
             if reason := why_unreadable(one):
                 raise DataError(f"{one}: {reason}; it was not opened")
-    with _damage_named(path):
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-        reader.open()
-    try:
-        yield Recording(path, reader)
-    finally:
-        reader.close()
+    with _small_suffix(path) as called:
+        with _damage_named(path):
+            reader = AnyReader([called], default_typestore=get_typestore(Stores.LATEST))
+            reader.open()
+        try:
+            yield Recording(path, reader)
+        finally:
+            reader.close()
+
+
+@contextmanager
+def _small_suffix(path: Path) -> Iterator[Path]:
+    """Gives a file a name whose suffix is in small letters, as rosbags wants it: itself, or a link for as long."""
+    if path.is_dir() or path.suffix == path.suffix.lower():
+        yield path
+        return
+    with TemporaryDirectory() as folder:
+        link = Path(folder, path.stem + path.suffix.lower())
+        link.symlink_to(path.absolute())
+        yield link
 
 
 @contextmanager
@@ -148,17 +167,9 @@ def _damage_named(path: Path) -> Iterator[None]:
         yield
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
+        mender = _MENDERS.get(path.suffix.lower())
+        hint = f"; if it was cut off, {mender} mends it" if mender else ""
         raise DataError(
-            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2 messages"
+            f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2"
+            f" messages{hint}"
         ) from None
-
-
-def message_times(stamps: Sequence[tuple[int | None, int]]) -> np.ndarray | None:
-    """Returns seconds since the first message, f64, of (nanoseconds in its header or None, nanoseconds in the recording).
-
-    Those of the headers count when all have them and they rise, else those of the recording; None when these don't rise.
-    """
-    for times in ([own for own, _ in stamps], [logged for _, logged in stamps]):
-        if all(time is not None for time in times) and all(a < b for a, b in zip(times, times[1:])):  # type: ignore[operator]
-            return np.array([time - times[0] for time in times], np.float64) * 1e-9  # type: ignore[operator]
-    return None

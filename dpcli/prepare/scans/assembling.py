@@ -114,7 +114,12 @@ def _doubts(low: np.ndarray, high: np.ndarray, some: np.ndarray | None) -> dict[
 
 
 def _colors(item: Item, clouds: list[Cloud]) -> np.ndarray:
+    colors = [cloud.color for cloud in clouds if cloud.color is not None]
+    if len(colors) < len(clouds):
+        raise DataError(
+            f"{item.path}: {len(clouds) - len(colors)} of {len(clouds)} frames have no colors, others have them"
+        )
     try:
-        return np.concatenate(as_bytes([cloud.color for cloud in clouds if cloud.color is not None]))
+        return np.concatenate(as_bytes(colors))
     except DataError as error:
         raise DataError(f"{item.path}: {error}") from None

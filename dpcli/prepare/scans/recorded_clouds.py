@@ -11,13 +11,17 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
-from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.cloud import without
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample
 from dpcli.prepare.recordings.messages import CLOUD_KINDS, cloud_of_message
-from dpcli.prepare.recordings.recording import find_recordings, message_times, open_recording
+from dpcli.prepare.recordings.recording import find_recordings, open_recording
+from dpcli.prepare.recordings.topic_frames import read_topic
 from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.store.schema import KEPT
+
+_WANTED = "clouds (PointCloud2)"
+_LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -79,17 +83,24 @@ class RecordedClouds:
             return labels_of_folders(self.raw, list(self._names), "CLASS/RECORDING")
         return read_labels(self.labels) if self.labels else None
 
-    @cached_property
+    @property
     def _has_color(self) -> bool:
+        return self._first[0]
+
+    @cached_property
+    def _first(self) -> tuple[bool, tuple[str, ...]]:
+        """Returns whether the first good cloud has colors, and which of its fields are not read."""
         for path in self._names.values():
             try:
                 with open_recording(path) as recording:
-                    topic = recording.choose(self.topic, CLOUD_KINDS, "clouds (PointCloud2)")
-                    first = next(recording.messages(topic))
-                    return cloud_of_message(path, first.content).color is not None
+                    topic = recording.choose(self.topic, CLOUD_KINDS, _WANTED)
+                    clouds = (cloud_of_message(path, message.content) for message in recording.messages(topic))
+                    first = next(clouds, None)
             except DataError:
                 continue  # a bad sample: the next one tells
-        return False
+            if first is not None:
+                return first.color is not None, without(first.unread, self.keep)
+        return False, ()
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when there is no recording."""
@@ -98,20 +109,21 @@ class RecordedClouds:
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
-        clouds: list[Cloud] = []
-        stamps: list[tuple[int | None, int]] = []
         with open_recording(item.path) as recording:
-            topic = recording.choose(self.topic, CLOUD_KINDS, "clouds (PointCloud2)")
-            for message in recording.messages(topic, self.stride):
-                clouds.append(cloud_of_message(item.path, message.content, self.keep))
-                stamps.append((message.stamp, message.logged))
-        if not clouds:
-            raise DataError(f"{item.path}: {topic} holds no messages")
-        time = np.arange(len(clouds)) * self.stride / self.fps if self.fps else message_times(stamps)
+            topic = recording.choose(self.topic, CLOUD_KINDS, _WANTED)
+            read = read_topic(
+                recording, topic, self.stride, lambda message: cloud_of_message(item.path, message.content, self.keep)
+            )
+        clouds = read.frames
+        time = np.arange(len(clouds)) * self.stride / self.fps if self.fps else read.time
         if time is None:
             raise DataError(f"{item.path}: the times of {topic} don't rise; give its rate with --fps")
-        return assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
+        sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
+        sample.notes |= read.notes
+        return sample
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds."""
-        return [f"{len(items)} recording{'s' if len(items) != 1 else ''} found"]
+        unread = f"; not read: {', '.join(self._first[1][:_LISTED])} (--keep-fields)" if self._first[1] else ""
+        lines = [f"{len(items)} recording{'s' if len(items) != 1 else ''} found{unread}"]
+        return lines + (self._table.unnamed(items) if self._table else [])

@@ -23,7 +23,8 @@ from dpcli.prepare.views.artemis_files import (
     read_poses,
     read_skin,
 )
-from dpcli.prepare.views.matting import clear_invisible, read_mask
+from dpcli.prepare.views.masks import read_mask
+from dpcli.prepare.views.matting import clear_invisible
 from dpcli.prepare.views.orbit_world import bounding_sphere, into_orbit, sphere_of_silhouettes, up_direction
 from dpcli.prepare.views.square_crop import Box, crop_around, touches_border, union, visible_box
 from dpcli.prepare.views.video import spread_frames

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import require_folder
+from dpcli.runtime.torch_files import load_plain
 from dpcli.text_files import read_text
 
 _IMAGE = ("img_{:04d}.jpg", "img_{:04d}.png")
@@ -185,10 +185,7 @@ def _tensor(path: Path) -> np.ndarray:
 
     if not path.is_file():
         raise DataError(f"{path}: missing; --tracks 0 goes without the voxels")
-    try:
-        value: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # the unpickler raises what it likes
-        raise DataError(f"{path}: not a file of plain tensors ({str(error).splitlines()[0][:120]}); refused") from None
+    value = load_plain(path)
     if not isinstance(value, torch.Tensor):
         raise DataError(f"{path}: holds a {type(value).__name__}, expected one tensor")
     return value.detach().numpy()

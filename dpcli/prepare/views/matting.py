@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.runtime.clips.images import upright
+from dpcli.prepare.views.masks import read_mask
 
 TOLERANCE = 0.06  # of the value range: compression noise of a video stays below
 FAINT = 8  # alpha below is a leftover of compression or of a network, not the object
@@ -19,9 +19,6 @@ _RIM = 2  # pixels on each side of an outline where object and background mix
 HOLES = ("auto", "keep", "cut")
 _GAP = 0.005  # of the object: what may be a gap between limbs
 _FLAT = 4.0  # gray levels that a gap may be off the background more than the background itself: noise of compression
-_SMALL_LABEL = 64  # no mask is that dark; values below are labels
-_LABELS = 64  # values at most in an image of labels
-_COLORFUL = 48  # gray levels between channels: more than compression does to a gray mask
 _SPECK = 1e-4  # of the picture: smaller islands are noise
 
 
@@ -234,51 +231,3 @@ def with_mask(rgba: np.ndarray, mask: Path, name: str) -> np.ndarray:
     if (border > 127).mean() > 0.9 and (alpha <= 127).any():
         raise DataError(f"{mask}: the mask covers the whole border: inverted? White (255) has to be the object")
     return clear_invisible(np.dstack([rgba[..., :3], alpha]))
-
-
-def read_mask(path: Path) -> np.ndarray:
-    """Reads u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of labels isn't 0.
-
-    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits.
-    """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as stored:
-            lossy, image = stored.format in ("JPEG", "WEBP", "AVIF"), upright(stored)
-            if image.mode in ("RGBA", "LA", "PA") and image.getchannel("A").getextrema()[0] < 255:
-                return np.array(image.getchannel("A"))
-            if image.mode in ("P", "1"):
-                return _where_labeled(np.array(image))
-            wide = image.mode[0] in "IF"
-            values = np.array(image if wide else image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"{path}: not a readable mask ({error}); export it again") from None
-    if values.ndim == 3:
-        spread = int(np.ptp(values, axis=2).max(initial=0))
-        if spread > _COLORFUL:
-            return _where_labeled(values.max(axis=2) > (127 if lossy else 0))
-        values = np.array(Image.fromarray(values).convert("L"))
-    top = values.max(initial=0)
-    if top < _SMALL_LABEL or not lossy and _are_labels(values):
-        return _where_labeled(values)
-    return np.clip(np.round(values / (257 if top > 255 else 1)), 0, 255).astype(np.uint8)
-
-
-def _where_labeled(labels: np.ndarray) -> np.ndarray:
-    return np.where(labels > 0, 255, 0).astype(np.uint8)
-
-
-def _are_labels(values: np.ndarray) -> bool:
-    """Returns whether gray values (H,W) are labels: few, and most pixels of those between the ends lie among their equals.
-
-    The soft outline of a mask has many values, and none of them fills a square of 3 pixels.
-    """
-    few = np.unique(values)
-    between = (values > 0) & (values != (65535 if few[-1] > 255 else 255))
-    if len(few) > _LABELS or not between.any():
-        return False
-    cv2 = load_cv2()
-    numbers, square = np.searchsorted(few, values).astype(np.uint16), np.ones((3, 3), np.uint8)
-    alike = cv2.erode(numbers, square) == cv2.dilate(numbers, square)
-    return float((alike & between).sum()) > 0.25 * float(between.sum())

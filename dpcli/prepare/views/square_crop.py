@@ -71,6 +71,14 @@ def visible_box(rgba: np.ndarray, island: float = 0.0) -> Box | None:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
+def pieces(rgba: np.ndarray, share: float) -> int:
+    """Returns how many pieces of the object lie apart, none smaller than this share of the largest."""
+    cv2 = load_cv2()
+    _, _, stats, _ = cv2.connectedComponentsWithStats((rgba[..., 3] >= VISIBLE).astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]  # row 0 is the background
+    return int((areas >= share * areas.max(initial=1)).sum())
+
+
 def touches_border(rgba: np.ndarray) -> bool:
     """Returns whether the object runs into the picture's border, along at least a hundredth of a side."""
     solid = rgba[..., 3] > 127

@@ -11,17 +11,18 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
-from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, open_frames, read_rgba
+from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, integers, open_frames, read_rgba
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
-from dpcli.prepare.views.square_crop import Crop, crop_around, touches_border, union, visible_box, whole_picture
+from dpcli.prepare.views.square_crop import Crop, crop_around, pieces, touches_border, union, visible_box, whole_picture
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
 from dpcli.store.views import ViewsHeader
 
 _LISTED = 8
 _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen the crop
+_OBJECT = 0.2  # of the largest piece: one that large, apart from it, is another object
 _NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
 
 
@@ -161,7 +162,7 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
     wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
     warn_gaps(frames, wanted)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
-    boxes, cut_off, good, empty = [], [], [], []
+    boxes, cut_off, good, empty, apart = [], [], [], [], []
     for index, rgba in zip(wanted, cutter.cut(wanted)):
         box = visible_box(rgba, _ISLAND)
         if box is None:
@@ -171,9 +172,16 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
         good.append(index)
         if cutter.mode != "keep" and touches_border(rgba):
             cut_off.append(index)
+        if pieces(rgba, _OBJECT) > 1:
+            apart.append(index)
     _report_empty(frames, empty, good, cutter.mode, options.on_error)
     if cut_off:
         log.warn(f"{frames.path}: the object leaves the picture in {_named(frames, cut_off)}; what is cut off is lost")
+    if 2 * len(apart) > len(good):
+        log.warn(
+            f"{frames.path}: several objects apart in {_named(frames, apart)}; everything after this takes them for one."
+            " Cut one out with --mask FOLDER"
+        )
     if cutter.options.holes == "auto" and any(cutter.gaps.values()):
         count = sum(gap > 0 for gap in cutter.gaps.values())
         log.info(f"{frames.path}: gaps in the object are see-through in {count} frames (--holes keep fills them)")
@@ -267,11 +275,14 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
 def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
     """Finds a mask for every frame of the clip: by number where all numbers agree, else in order."""
     masks = open_frames(require_folder(folder, "a mask per frame, as images"))
-    if set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
+    numbered = all(number in integers(name) for number, name in zip(masks.numbers, masks.names))
+    if numbered and set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
         place = dict(zip(masks.numbers, masks.files))
         return tuple(place[number] for number in frames.numbers)
     if len(masks) != len(frames):
-        raise DataError(f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike")
+        raise DataError(
+            f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike, with all its objects"
+        )
     return masks.files
 
 

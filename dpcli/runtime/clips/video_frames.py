@@ -16,22 +16,27 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
+from dpcli.runtime.clips.container_ends import ends_early
+from dpcli.runtime.clips.display_matrix import Matrix, as_it_plays, display_matrix
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".avi", ".webm", ".mkv", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg"),
-    *(".wmv", ".flv", ".ogv", ".3gp", ".y4m"),
+    *(".wmv", ".flv", ".ogv", ".3gp", ".y4m", ".asf", ".mxf", ".vob", ".dv", ".mjpg", ".mjpeg"),
 )
 # Formats of playlists aren't among them: they name other files, which nobody meant to be read.
 # files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
 VIDEO_FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
-    "dv,mxf,nut"
+    "dv,mxf,nut,apng,mjpeg,swf,rm"
 )
+_BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
+_ASSUMED_RATE = 25.0  # of such a stream, where it tells none
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
 _HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
 _MATRICES = (1, 4, 5, 6, 7, 9)  # in H.273: BT.709, FCC, BT.601 (two), SMPTE 240M, BT.2020
+_UNKNOWN_MATRICES = {8: "YCgCo", 11: "YDzDx", 14: "ICtCp", 15: "IPT-C2", 16: "YCgCo-Re", 17: "YCgCo-Ro"}
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
 _FULL_RANGE = 2
@@ -62,12 +67,13 @@ def video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """
     container, stream = _open(path)
     with closing(container):
-        frames = enumerate(_decoded(path, container, stream))
+        frames, matrix = enumerate(_decoded(path, container, stream)), None
         for index in wanted:
             frame = next((frame for at, frame in frames if at == index), None)
             if frame is None:
                 raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
-            yield _rgba(frame, stream.sample_aspect_ratio)
+            matrix = matrix or display_matrix(frame)  # one for all of them
+            yield _rgba(frame, stream.sample_aspect_ratio, matrix)
 
 
 @lru_cache(maxsize=4)
@@ -75,18 +81,22 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
     container, stream = _open(path)
     with closing(container):
         stamps, first, failed, alpha = [], None, False, False
+        bare = container.format.name in _BARE
         try:
             for frame in _decoded(path, container, stream):
                 first, alpha = first or frame, alpha or _is_transparent(frame)
                 # Frames that the decoder held back until the end know no time base of their own.
-                stamps.append(0.0 if frame.pts is None else float(frame.pts * stream.time_base))
+                stamps.append(0.0 if bare or frame.pts is None else float(frame.pts * stream.time_base))
         except DataError:
             failed = True
         if first is None:
             raise DataError(f"{path}: no frame can be decoded; the video is empty, truncated, or of an unknown codec")
-        rate = float(stream.average_rate or 0)
+        rate = float((stream.codec_context.framerate if bare else stream.average_rate) or 0)
+        if bare and rate == _ASSUMED_RATE:
+            log.info(f"{path}: a stream without a container: {rate:g} frames per second, if it tells no other (--fps)")
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
+        _require_known_colors(path, first)
         _tell_display(path, first, stream)
     return VideoLook(len(stamps), None if times is None else tuple(times.tolist()), alpha)
 
@@ -144,33 +154,48 @@ def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
     """Returns how many frames of its first video a file declares beyond the `count` that were decoded, 0 where it is whole.
 
     times: seconds of the decoded frames f64 (count), None where they are not known. Frames that an edit list hides are no
-    loss; one is none either, since containers count differently.
+    loss; one is none either, since containers count differently, unless the file ends early.
     """
+    cut = ends_early(path)
     container, stream = _open(path)
     with closing(container):
-        declared, held = _declared_and_held(path, container, stream, count, times)
-    return declared - held if declared > held + 1 else 0
+        declared, held = _declared_and_held(path, container, stream, count, times, cut)
+    return declared - held if declared > held + (not cut) else 0
 
 
 def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | None, failed: bool) -> None:
-    """Raises DataError when the file declares more frames than it holds; frames that an edit list hides are no loss."""
-    declared, held = (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times)
-    if failed or declared > held + 1:
+    """Raises DataError when the file declares more frames than it holds; frames that an edit list hides are no loss.
+
+    Warns where it ends early and nothing tells how many frames it had.
+    """
+    cut = ends_early(path)
+    declared, held = (
+        (stream.frames, count) if failed else _declared_and_held(path, container, stream, count, times, cut)
+    )
+    if failed or declared > held + (not cut):
         of = f" of its {declared}" if declared else ""
         raise DataError(
             f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
+    if cut:
+        log.warn(f"{path}: the file ends before its container does; frames behind the {held} that it holds may be lost")
 
 
-def _declared_and_held(path: Path, container, stream, count: int, times: np.ndarray | None) -> tuple[int, int]:
-    """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it."""
-    if stream.frames > count + 1:
+def _declared_and_held(
+    path: Path, container, stream, count: int, times: np.ndarray | None, cut: bool
+) -> tuple[int, int]:
+    """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it; cut: it ends early."""
+    if stream.frames > count + (not cut):
         return stream.frames, _packets(path)
     if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
-        seconds = float(container.duration or 0) / 1e6
-        estimate = 0 if lasts(times, seconds) else round(seconds * float(stream.average_rate))
-        return (estimate if estimate > 1.05 * count + 3 else 0), count  # some containers round their duration up
+        begins = float((stream.start_time or 0) * stream.time_base)  # some containers count their duration from 0
+        seconds = float(container.duration or 0) / 1e6 - max(begins, 0.0)
+        estimate = round(seconds * float(stream.average_rate))
+        if cut:
+            return estimate, count
+        sure = estimate > 1.05 * count + 3 and not lasts(times, seconds)  # some containers round their duration up
+        return (estimate if sure else 0), count
     return stream.frames, count
 
 
@@ -210,12 +235,27 @@ def lasts(times: np.ndarray, duration: float) -> bool:
     return len(steps) > 0 and duration - times[-1] <= max(2 * float(steps.max()), 0.1 * duration)
 
 
+def _require_known_colors(path: Path, frame) -> None:
+    """Raises DataError at colors in a space that isn't converted here, such as YCgCo of screen recorders."""
+    tag = int(frame.colorspace)
+    if tag in _UNKNOWN_MATRICES and not frame.format.is_rgb and not frame.format.name.startswith("gray"):
+        raise DataError(
+            f"{path}: its colors are {_UNKNOWN_MATRICES[tag]}; expected RGB, or YCbCr of BT.601, 709 or 2020; "
+            "ffmpeg -i IN -vf zscale=matrix=709 OUT converts some"
+        )
+
+
 def _tell_display(path: Path, frame, stream) -> None:
     aspect = stream.sample_aspect_ratio
     if aspect and aspect != 1:
         log.info(f"{path}: its pixels are {aspect.numerator}:{aspect.denominator}; stretched to square ones")
-    if frame.rotation:
+    a, b, c, d = display_matrix(frame)
+    if a * d < b * c:
+        log.info(f"{path}: mirrored, as it plays")
+    elif frame.rotation:
         log.info(f"{path}: turned by {frame.rotation % 360} degrees, as it plays")
+    if frame.interlaced_frame:
+        log.warn(f"{path}: interlaced: each frame shows two moments, line by line; ffmpeg -vf bwdif parts them")
     if int(frame.color_trc) in _HDR:
         log.warn(
             f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): tone-mapped to SDR as ITU-R BT.2390 has it; players "
@@ -225,7 +265,7 @@ def _tell_display(path: Path, frame, stream) -> None:
         log.info(f"{path}: colors of a wide gamut; converted to sRGB")
 
 
-def _rgba(frame, aspect) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
+def _rgba(frame, aspect, matrix: Matrix) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
     """Returns u8 (H,W,4) of a decoded frame as it is shown: full range, square pixels, turned."""
     width = round(frame.width * aspect) if aspect and aspect != 1 else frame.width
     options = {"threads": 1}  # more convert strips of their own: other rounding at other numbers of cores
@@ -240,7 +280,7 @@ def _rgba(frame, aspect) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fractio
         picture = np.concatenate((rgb, alpha.astype(np.uint8)), axis=-1)
     else:
         picture = _levels(frame, width, options)
-    return np.ascontiguousarray(np.rot90(picture, round(frame.rotation / 90)))
+    return as_it_plays(picture, matrix)
 
 
 def _levels(frame, width: int, options: dict[str, int]) -> np.ndarray:

@@ -15,7 +15,7 @@ from dpcli import __version__
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.settings import value_types as kinds
 from dpcli.runtime.settings.fields import Setting, nearest, settings_of, shown
-from dpcli.runtime.toml_file import read_toml
+from dpcli.text_files import read_toml
 
 
 @dataclass(frozen=True)

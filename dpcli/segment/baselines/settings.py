@@ -29,10 +29,11 @@ class ClassicalSettings:
     itself, the residual, ours, finds more where the whole object turns.
     """
 
-    method: Literal["multibody", "network", "dbscan", "ward", "ssc", "trajaffn"] = setting(
+    method: Literal["multibody", "scene", "network", "dbscan", "ward", "ssc", "trajaffn"] = setting(
         "multibody",
-        "Who says the parts: multibody (one set of rigid bodies explains all frames together), network (a trained part"
-        " network, frame by frame; --model or --fast choose it too), or a classical method.",
+        "Who says the parts: multibody (one set of rigid bodies explains all frames together), scene (streets: what moves"
+        " on its own in lidar scans or depth images; --scene chooses it too), network (a trained part network, frame by"
+        " frame; --model or --fast choose it too), or a classical method.",
     )
     parts: int | None = setting(
         None, "Number of parts that a classical --method cuts each frame into; none: it finds one.", least=1

@@ -22,8 +22,9 @@ from dpcli.runtime.whole_file import PICTURES, check_target
 from dpcli.segment.flow.estimators import estimate_flow_both_ways, find_estimator
 from dpcli.segment.multibody.segmenter import MultibodySegmenter
 from dpcli.segment.network.model_file import default_model
-from dpcli.segment.prediction import predict_parts
+from dpcli.segment.prediction import pairs_to_report, predict_parts
 from dpcli.segment.prediction_settings import PredictSettings, Refinement
+from dpcli.segment.scene.segmenter import SceneSegmenter
 from dpcli.segment.segmenters import ClassicalSegmenter, NetworkSegmenter, Segmenter
 from dpcli.segment.sequence_splits import sequences_of_split
 from dpcli.store import CloudSequence, CloudsReader, input_file, output_file
@@ -58,12 +59,17 @@ class PartsOfSequence:
     flow: str
     refinement: Refinement
     seed: int
+    length_unit: str
 
     def __call__(self, numbered: tuple[int, CloudSequence]) -> tuple[CloudSequence, PartsSample]:
         """Returns a sequence with its parts, and what else is said of it; its number in the file chooses the points."""
         index, sequence = numbered
-        estimate = partial(estimate_flow_both_ways, method=self.flow)
-        labels, sample = predict_parts(sequence, index, self.segmenter.get(), estimate, self.refinement, self.seed)
+        segmenter, estimate = self.segmenter.get(), partial(estimate_flow_both_ways, method=self.flow)
+        if isinstance(segmenter, SceneSegmenter):
+            pairs = pairs_to_report(sequence.num_frames, self.refinement.pairs)
+            labels, sample = segmenter.explain(sequence, pairs, self.length_unit)
+        else:
+            labels, sample = predict_parts(sequence, index, segmenter, estimate, self.refinement, self.seed)
         sequence.part = labels
         return sequence, sample
 
@@ -101,14 +107,14 @@ def predict_file(
         said = {"input": asdict(settings.input), "refinement": asdict(refinement)}
         if settings.classical.classical:
             said["classical"] = settings.classical.used()
-        elif settings.classical.method == "multibody":
-            said["multibody"] = asdict(settings.multibody)
+        elif settings.classical.method in ("multibody", "scene"):
+            said[settings.classical.method] = asdict(getattr(settings, settings.classical.method))
         config = {"settings": said, **segmenter.record()}
         inputs = {"clouds": path, **({"flow": estimator} if estimator else {})}
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         once = OncePerProcess(open_segmenter, json.dumps(entry["config"], default=str), segmenter)
         flow = str(estimator.resolve() if estimator else flow)
-        work = PartsOfSequence(once, flow, refinement, seed)
+        work = PartsOfSequence(once, flow, refinement, seed, reader.length_unit)
         fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
         if force or not _already_there(target, entry):
             with PartsWriter(
@@ -124,7 +130,7 @@ def predict_file(
                 resume=output != "-",
             ) as writer:
                 _predict_sequences(reader, sequences, work, writer, fields, spread)
-        return _close(target, drawings)
+        return _close(target, drawings, settings.classical.method == "scene")
 
 
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:
@@ -136,6 +142,8 @@ def _open_segmenter(settings: PredictSettings, model: str | None, device: str, s
         raise UsageError(f"amp = true: --method {classical.method} uses no network; add --fast, or leave it out")
     if model is not None:
         raise UsageError(f"--model {model}: --method {classical.method} uses no network; give one of both")
+    if classical.method == "scene":
+        return SceneSegmenter(settings.scene)
     if classical.method == "multibody":
         return MultibodySegmenter(settings.multibody, settings.input.flow in ("auto", "tracks"))
     points = settings.refinement.points
@@ -147,7 +155,7 @@ def _open_segmenter(settings: PredictSettings, model: str | None, device: str, s
 
 
 def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
-    """Returns the estimator of flow between frames, which multibody needs none of.
+    """Returns the estimator of flow between frames, which multibody and scene need none of.
 
     Raises UsageError for a flow that the method can't use, or tracks that the file lacks.
     """
@@ -158,9 +166,10 @@ def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
         )
     if flow == "tracks" and "track" not in reader.fields:
         raise UsageError(f"--flow tracks: {reader.path} has no field track; leave --flow out, and motions are searched")
-    if flow not in ("auto", "tracks", "icp") and method == "multibody":
+    own = {"multibody": ("auto", "tracks", "icp"), "scene": ("auto",)}
+    if flow not in own.get(method, (flow,)):
         raise UsageError(
-            f"--flow {flow}: multibody finds the motions itself; add --method network or a classical one, or leave it out"
+            f"--flow {flow}: {method} finds the motions itself; add --method network or a classical one, or leave it out"
         )
     return "icp" if flow in ("auto", "tracks") else flow
 
@@ -198,27 +207,40 @@ def _predict_sequences(
         taken.run(work, load, write, workers)
 
 
-def _close(target: Path, drawings: Drawings) -> int:
+def told_of_scenes(parts: str) -> list[str]:
+    """Returns a line for each sequence of a parts file of scenes: the sensor's motion, moving objects, their speeds."""
+    from dpcli.segment.scene.report import scene_lines
+
+    with PartsReader(Path(parts)) as reader:
+        return scene_lines(reader)
+
+
+def _close(target: Path, drawings: Drawings, scene: bool) -> int:
     """Draws what was written and tells what was passed over; returns the number of sequences."""
     with PartsReader(target) as made:
         for line in skipped_lines(made.skipped):
             log.warn(line)
         if len(made):
-            _draw(target, drawings)
+            _draw(target, drawings, scene)
         return len(made)
 
 
-def _draw(target: Path, drawings: Drawings) -> None:
-    """Draws what was just written."""
+def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
+    """Draws what was just written; scenes from above."""
     if drawings == Drawings():
         return
     from dpcli.draw.ply import write_ply_frames
     from dpcli.segment.pictures import parts_picture, turntable
+    from dpcli.segment.scene.report import picture_of_scene
 
     with PartsReader(target) as reader:
         if drawings.picture is not None:
             shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _ROWS)).astype(int))
-            parts_picture(drawings.picture, [reader.read(int(i)) for i in shown])
+            sequences, look = [reader.read(int(i)) for i in shown], None
+            if scene:
+                sequences, looks = zip(*map(picture_of_scene, sequences))
+                look = looks[0]
+            parts_picture(drawings.picture, sequences, look=look)
         if drawings.turntable is not None:
             turntable(drawings.turntable, reader.read(0))
         if drawings.ply is not None:

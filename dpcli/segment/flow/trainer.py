@@ -62,7 +62,8 @@ class FlowTrainer:
         """
         state = self.folder.load_state()
         if state is not None:
-            self._restore(state)
+            with self.folder.restoring():
+                self._restore(state)
         self.model.train()
         with Progress("flow", self.steps, "step") as bar:
             bar.skip(self.step)

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError, reading
+from dpcli.npy_files import map_npy
 from dpcli.runtime.whole_file import disk_full, reserve
 
 _FIRST, _NOW, _KNOWN = "flows_first.npy", "flows.npy", "flows_known.npy"
@@ -97,11 +98,11 @@ def first_flows(folder: Path, pairs: int, points: int) -> tuple[np.ndarray, np.n
     Raises UsageError where there is nothing, or flows of other pairs.
     """
     try:
-        first, known = (np.load(folder / name, mmap_mode="r") for name in (_FIRST, _KNOWN))
-    except (OSError, ValueError) as error:
+        first, known = (map_npy(folder / name) for name in (_FIRST, _KNOWN))
+    except (OSError, DataError) as error:
         raise UsageError(f"flows_of = {folder}: no flows of a `dpc segment train` run there ({error})") from None
     shape = (pairs, 2, points, 3)
-    if first.shape != shape:
+    if first.shape != shape or known.shape != shape[:1] or first.dtype.kind != "f" or known.dtype != np.uint8:
         raise UsageError(f"flows_of = {folder}: flows of {first.shape} pairs, frames, points; here {shape}")
     return first, known
 
@@ -120,7 +121,8 @@ def _open(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.nd
 def _map_file(path: Path, shape: tuple[int, ...], dtype: type, fresh: bool) -> np.ndarray:
     """Returns the array of a file, mapped into memory; a new one where it is `fresh` or has another shape."""
     if not fresh and path.exists():
-        array = np.lib.format.open_memmap(path, "r+")
+        with reading(path):
+            array = np.lib.format.open_memmap(path, "r+")
         if array.shape == shape:
             return array
     return np.lib.format.open_memmap(path, "w+", dtype, shape)

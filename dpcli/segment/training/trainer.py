@@ -72,7 +72,8 @@ class Trainer:
         first = self.settings.run.flows_of
         self.flows = FlowStore(self.folder.path, *shape, state is None, Path(first) if first else None)
         if state is not None:
-            self._restore(state)
+            with self.folder.restoring():
+                self._restore(state)
         finished = self.epoch >= self.schedule.epochs  # by an earlier run
         total = self.schedule.epochs * self._steps() * self.schedule.batch
         with Progress("train parts", total, "pair") as bar:

@@ -195,7 +195,7 @@ def test_torchscript_only_where_it_is_expected(tmp_path):
     torch.jit.trace(model, torch.zeros(1, 3, 8, 8)).save(str(tmp_path / "script.pt"))
     found = load_tensors(tmp_path / "script.pt", script=True)
     assert same({name: found[name] for name in model.state_dict()}, model.state_dict())
-    with pytest.raises(DataError, match="not a plain state dict"):
+    with pytest.raises(DataError, match="its members claim"):  # its code is packed
         load_tensors(tmp_path / "script.pt")
 
 
@@ -220,7 +220,7 @@ def test_load_state_refuses(tmp_path):
     save_file(state, tmp_path / "cut.safetensors")
     (tmp_path / "cut.safetensors").write_bytes((tmp_path / "cut.safetensors").read_bytes()[:100])
     for name in ("hostile", "bare", "module", "list", "empty", "numbers", "cut"):
-        with pytest.raises(DataError, match=f"{name}.pth: not a plain state dict") as caught:
+        with pytest.raises(DataError, match=f"{name}.pth: not a (plain state dict|file of plain tensors)") as caught:
             load_tensors(tmp_path / f"{name}.pth")
         assert "\n" not in str(caught.value)
     with pytest.raises(DataError, match="cut.safetensors: not a plain state dict"):

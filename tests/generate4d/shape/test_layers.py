@@ -90,3 +90,20 @@ def test_an_empty_frame_has_no_points():
         layers = prior.layers(np.zeros((1, 4, 16, 16), np.float32), camera)[0]
         assert len(points_of(layers, camera).position) == 0
         assert not splats_of(layers, camera).draw(torch.eye(4), torch.eye(3), 8, 8).any()
+
+
+@pytest.mark.parametrize("absent", [0.0, np.nan, 50.0])
+def test_normals_look_at_no_absent_neighbor(absent):
+    """True layers: whatever stands where no interval is, points and their discs stay those of the object."""
+    camera = Camera(pinhole(0.5, 96, 96), orbit_pose(0.7, 0.2, 4.0))
+    whole = Inflated().layers(_disc(96, 30), camera)[0]
+    layers = replace(whole, depth=np.where(np.repeat(whole.presence > 0.5, 2, axis=0), whole.depth, absent))
+    points = points_of(layers, camera)
+    outward = (points.normal * points.position).sum(1) / np.linalg.norm(points.position, axis=1)
+    assert np.linalg.norm(points.normal, axis=1) == pytest.approx(1, abs=1e-5)
+    assert np.quantile(outward, 0.01) > 0.7  # the outermost points too
+    assert torch.isfinite(splats_of(layers, camera).quaternion).all()
+    alone = replace(layers, presence=np.zeros_like(layers.presence))
+    alone.presence[0, 48, 48] = 1
+    facing = points_of(alone, camera).normal @ camera.world_to_camera[2, :3]
+    assert facing == pytest.approx([-1, 1], abs=0.01)

@@ -9,7 +9,7 @@ import torch
 from dpcli.errors import DataError, UsageError
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.layers import Camera, points_of
-from dpcli.generate4d.shape.learned import Network
+from dpcli.generate4d.shape.learned import Network, lengthened
 from dpcli.generate4d.shape.model_file import load_shape_model, save_shape_model
 from dpcli.generate4d.shape.network import ShapeNetwork
 from dpcli.generate4d.shape.silhouette import Inflated
@@ -53,6 +53,24 @@ def test_without_knowledge_it_inflates(weights):
         assert np.abs(found.depth[:2] - plain.depth[:2])[:, inside].mean() < 0.05 * unit
         assert found.confidence == pytest.approx(0.5) and np.array_equal(found.presence[0], plain.presence[0])
         assert np.array_equal(found.color, plain.color)
+
+
+def test_what_is_thicker_than_its_inflation_is_longer_yet():
+    """Two frames of a box: all of a clip is stretched alike, away from its turned plane, and nothing is made shorter."""
+    cut = torch.zeros(2, 5, 16, 16)
+    cut[:, 3, 4:12, 4:12] = 1
+    cut[:, 4] = 0.1 * cut[:, 3]
+    plane, second = 0.3 * torch.linspace(-1, 1, 16).expand(2, 1, 16, 16), torch.zeros(2, 16, 16)
+
+    def box(half: float) -> torch.Tensor:
+        return 0.05 + plane + torch.tensor([-half, half, half, half])[:, None, None]
+
+    inside = cut[:, None, 3].expand(-1, 4, -1, -1) > 0
+    for half, becomes in ((0.2, 0.2 * 2**1.5), (0.1, 0.1), (0.06, 0.06), (0.9, 2.7)):
+        found = lengthened(box(half), second, cut, plane)
+        assert found[inside].numpy() == pytest.approx(box(becomes)[inside].numpy(), abs=1e-5)
+    empty = lengthened(box(0.2), second, 0 * cut, plane)
+    assert torch.isfinite(empty).all()
 
 
 def test_layers_are_in_order_where_weights_are_random(tmp_path):

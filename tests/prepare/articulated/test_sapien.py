@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
 
@@ -87,9 +88,16 @@ def test_limits(tmp_path):
     assert limits(limits="0.7 -0.5") == (-0.5, 0.7, {"joints with inverted limits (swapped)": 1})
     assert limits(limits="") == (-np.pi, np.pi, {"hinges without limits (+-180 degrees taken)": 1})
     assert limits(kind="continuous", limits="0 1") == (-np.pi, np.pi, {})
-    assert limits(limits="0 100")[:2] == (0, 2 * np.pi)
+    degrees = "hinges with limits more than two turns apart (one turn taken; are they degrees? a URDF has radians)"
+    assert limits(limits="0 100") == (0, 2 * np.pi, {degrees: 1})
+    assert limits(limits="-90 90") == limits(limits="-1e16 1e16") == (-np.pi, np.pi, {degrees: 1})
+    assert limits(limits="-6.2832 6.2832") == (-np.pi, np.pi, {})
     studied = study(load(two(tmp_path, kind="prismatic", limits="")), Articulation())
     assert 0.2 < studied.obj.joints[0].upper < 1 and "slides without limits" in str(studied.notes)
+    endless = study(load(two(tmp_path, kind="prismatic", limits="-1e16 1e16")), Articulation())
+    assert endless.obj.joints[0].upper == studied.obj.joints[0].upper and endless.notes == studied.notes
+    millimeters = study(load(two(tmp_path, kind="prismatic", limits="0 400")), Articulation())
+    assert millimeters.obj.joints[0].upper == 400 and "slides ten times as long as" in str(millimeters.notes)
 
 
 def test_equal_limits_and_floating_joints_are_fixed(tmp_path):
@@ -318,6 +326,9 @@ def test_collada_is_read_in_meters_whatever_unit_it_declares(meter, name):
         (b"\0" * 99, "not well-formed XML"),
         (b'<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/hostname">]><robot name="r">&x;</robot>', "it has a DOCTYPE"),
         (b'<robot name="r"><link/></robot>', ""),
+        (b'<robot xmlns:xacro="http://ros.org/x"><xacro:include filename="arm.xacro"/></robot>', "written in xacro"),
+        (b'<robot name="r"><link name="${prefix}base"/></robot>', "xacro FILE > robot.urdf"),
+        (b'<sdf version="1.7"><model name="m"/></sdf>', "its root element is <sdf>"),
         (b'<robot name="r"><link name="a"/><link name="a"/></robot>', "two links have the name 'a'"),
     ],
 )
@@ -356,6 +367,56 @@ def test_solids_without_a_size_are_refused(shape, tmp_path):
     path = write_urdf(tmp_path / "r.urdf", *elements)
     with pytest.raises(DataError, match="r.urdf: "):
         load(path)
+
+
+@pytest.mark.parametrize(
+    "before, robot",
+    [
+        ('\n\n<?xml version="1.0"?>', "robot"),
+        ('<?xml version="1.0"?><!DOCTYPE robot><!-- made by hand --><?pi x?>', "robot"),
+        ("\ufeff", "robot"),
+        ("", 'robot xmlns="http://www.ros.org"'),
+        ("", 'robot xmlns:xacro="http://ros.org/wiki/xacro" xmlns:sensor="http://x/s"'),
+    ],
+)
+def test_urdfs_as_other_programs_write_them(before, robot, tmp_path):
+    path = two(tmp_path)
+    text = path.read_text().split("?>", 1)[1].replace("<robot ", f"<{robot} ")
+    extra = '<gazebo reference="a"><material>x</material></gazebo><transmission name="t"/>'
+    path.with_name("robot.xml").write_text(before + text.replace("</robot>", extra + "</robot>"), encoding="utf-8")
+    (item,) = Sapien(tmp_path / "robot.xml", pairs_per_object=1).items()
+    assert not item.problem and len(load(item.path).joints) == 1
+
+
+def test_capsules_are_drawn_and_odd_collisions_passed_over(tmp_path):
+    odd = link("b", "<cone radius='1'/>", kind="collision").replace("</link>", "").replace('<link name="b">', "")
+    capsule = link("b", '<capsule radius="0.5" length="2"/>', xyz="0 0 1").replace("</link>", odd + "</link>")
+    path = write_urdf(tmp_path / "r.urdf", link("a", box(1, 1, 1)), capsule, joint("j", "a", "b"))
+    obj = load(path)
+    assert obj.body_areas == pytest.approx([6, 3 * np.pi], rel=0.01)
+    low, high = (f(obj.triangles[obj.body_of_triangle == 1].reshape(-1, 3), axis=0) for f in (np.min, np.max))
+    np.testing.assert_allclose((low, high), [[-0.5, -0.5, -0.5], [0.5, 0.5, 2.5]], atol=1e-6)
+
+
+def test_a_folder_of_other_robot_formats_names_one(tmp_path):
+    (tmp_path / "urdf").mkdir()
+    (tmp_path / "urdf" / "arm.urdf.xacro").write_text("<robot/>")
+    with pytest.raises(DataError, match="no URDF found .urdf/arm.urdf.xacro is none; xacro makes a URDF"):
+        find_objects(tmp_path)
+
+
+def test_names_of_ros_packages_and_of_browsers(tmp_path):
+    pack = tmp_path / "my_robot"
+    (pack / "meshes").mkdir(parents=True)
+    (pack / "meshes" / "a cube.obj").write_text(CUBE_OBJ)
+    shape = '<mesh filename="package://my_robot/meshes/a%20cube.obj"/>'
+    elements = [link("a", shape), link("b", box(1, 1, 1)), joint("j", "a", "b")]
+    path = write_urdf(pack / "urdf" / "r.urdf", *elements)
+    for raw, problem in ((pack, ""), (path, "lies outside the folder .*/urdf: name a folder above it")):
+        assert re.search(problem, Sapien(raw).items()[0].problem) and bool(Sapien(raw).items()[0].problem) == bool(
+            problem
+        )
+    assert not Sapien(path, allow_outside=True).items()[0].problem
 
 
 def test_names_written_on_windows(tmp_path):

@@ -459,8 +459,8 @@ def test_what_is_no_gltf_at_all(tmp_path):
     (tmp_path / "a.glb").write_bytes(b"PK\x03\x04 a zip")
     (tmp_path / "empty.gltf").write_bytes(b"")
     for name, word in (
-        ("a.glb", "not a glTF file but a zip archive"),
-        ("empty.gltf", "not a glTF"),
+        ("a.glb", "not a glTF file but a damaged zip archive"),
+        ("empty.gltf", "the file is empty"),
         ("none.glb", "cannot be read"),
         ("", "folder; name one"),
     ):

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
+import re
+import struct
+import zipfile
 from dataclasses import replace
 from urllib.parse import quote
 
@@ -13,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
-from dpcli.prepare.meshes.animation import list_clips, load_animation
+from dpcli.prepare.meshes.animation import clip_outputs, list_clips, load_animation
 from dpcli.prepare.meshes.filming import Filming, film, ground_truth
 from dpcli.prepare.meshes.gltf import read_gltf
 from dpcli.prepare.meshes.skinning import Curve
@@ -223,6 +227,103 @@ def test_extensions_that_change_the_picture_are_named_once(tmp_path, capsys):
         load(file, tmp_path)
 
 
+@pytest.mark.parametrize("target, named", [("/materials/0/emissiveFactor", True), ("/nodes/0/translation", False)])
+def test_what_a_clip_changes_besides_nodes_is_named(tmp_path, capsys, target, named):
+    file = quad()
+    file.animate(0, "pointer", [0, 1], [[0, 0, 0], [1, 0, 0]])
+    extension = {"KHR_animation_pointer": {"pointer": target}}
+    file.tree["animations"][0]["channels"][1]["target"] = {"path": "pointer", "extensions": extension}
+    mesh = load(file, tmp_path, frames=2)
+    assert (f"also changes what is not read: {target}" in capsys.readouterr().err) is named
+    assert np.ptp(mesh.positions[:, 0, 0]) == (0.0 if named else 0.5)
+
+
+def test_extensions_of_materials_are_named_where_the_file_forgot_to(tmp_path, capsys):
+    file = quad()
+    file.tree["materials"][0]["extensions"] = {"KHR_materials_transmission": {}, "KHR_materials_unlit": {}}
+    load(file, tmp_path)
+    assert "may differ from a viewer's: KHR_materials_transmission\n" in capsys.readouterr().err
+
+
+# surfaces
+
+
+@pytest.mark.parametrize("mode, corners", [(5, [0, 1, 3, 2]), (6, [0, 1, 2, 3]), (4, [0, 1, 2, 0, 2, 3])])
+@pytest.mark.parametrize("turned, seen", [(False, 1.0), (True, 0.0)])
+def test_strips_and_fans_are_seen_from_their_front_alone(tmp_path, mode, corners, turned, seen):
+    file = quad()
+    file.tree["meshes"][0]["primitives"][0] |= {"indices": file.add(corners, "u1"), "mode": mode}
+    file.tree["nodes"][0]["rotation"] = [0, int(turned), 0, int(not turned)]
+    assert (look(load(file, tmp_path))[..., 3] == 255).mean() == seen
+
+
+@pytest.mark.parametrize(
+    "values, dtype, more, red",
+    [
+        ([55, 0, 0], "u1", {"normalized": True}, 55 / 255),
+        ([55, 0, 0, 255], "u1", {}, 55 / 255),
+        ([14135, 0, 0], "u2", {}, 55 / 255),
+        ([55.0, 0, 0], "f4", {}, 55 / 255),
+        ([1.5, 0, 0], "f4", {}, 1.5),
+    ],
+)
+def test_vertex_colors_of_every_range(tmp_path, capsys, values, dtype, more, red):
+    file = quad()
+    file.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = file.add([values] * 4, dtype, **more)
+    np.testing.assert_allclose(load(file, tmp_path).color[0], [red, 0, 0, 1], rtol=1e-6)
+    assert ("are taken as shares of" in capsys.readouterr().err) is (max(values) > 8 and not more)
+
+
+@pytest.mark.parametrize("nearest, middle", [(True, [255, 0, 0]), (False, [188, 0, 188])])
+def test_pixels_of_a_texture_are_squares_where_the_file_says_so(tmp_path, nearest, middle):
+    file = quad()
+    file.picture(np.array([[[255, 0, 0, 255], [0, 0, 255, 255]]], np.uint8))
+    file.tree["samplers"], file.tree["textures"][0]["sampler"] = [{"magFilter": 9728 if nearest else 9729}], 0
+    image = look(load(file, tmp_path))
+    np.testing.assert_allclose(image[32, 31, :3].astype(int), middle, atol=3)
+
+
+@pytest.mark.parametrize("how", ["PNG", "AVIF", "WEBP"])
+def test_textures_of_16_bits_and_of_newer_formats(tmp_path, how):
+    from PIL import Image
+
+    file, data = quad(), io.BytesIO()
+    picture = Image.fromarray(np.full((8, 8), 128 * 257, np.uint16)) if how == "PNG" else Image.new("L", (8, 8), 128)
+    picture.convert(picture.mode if how == "PNG" else "RGB").save(data, how)
+    file.picture(np.zeros((1, 1, 4), np.uint8))
+    file.tree["images"] = [{"bufferView": file.view(data.getvalue())}]
+    if how != "PNG":
+        name = f"EXT_texture_{how.lower()}"
+        file.tree["textures"] = [{"extensions": {name: {"source": 0}}}]
+        file.tree["extensionsRequired"] = [name]
+    np.testing.assert_allclose(look(load(file, tmp_path))[32, 32, :3].astype(int), [128] * 3, atol=1)
+
+
+def test_textures_that_cannot_be_read_are_named_by_kind(tmp_path):
+    file = quad()
+    file.picture(np.zeros((1, 1, 4), np.uint8))
+    file.tree["images"] = [{"bufferView": file.view(b"\xabKTX 20\xbb" + bytes(80))}]
+    with pytest.raises(DataError, match="texture 0 is KTX2, which is not read; export it as PNG or JPEG"):
+        load(file, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        ({"mode": 1}, "points and lines of 'square' are left out, 1 of 2 pieces"),
+        ({"targets": [{"COLOR_0": 0}]}, "its morph targets' COLOR_0 are not read"),
+        ({"attributes": {"POSITION": 0}}, "has no TEXCOORD_0 for its texture"),
+    ],
+)
+def test_what_is_left_out_is_named(tmp_path, capsys, change, words):
+    file = quad()
+    file.picture(np.zeros((1, 1, 4), np.uint8))
+    pieces = file.tree["meshes"][0]["primitives"]
+    pieces.append({**pieces[0], **change})
+    load(file, tmp_path)
+    assert words in capsys.readouterr().err
+
+
 # normals and keys
 
 
@@ -259,6 +360,28 @@ def named(*names: str) -> GlbFile:
     clip = file.tree["animations"][0]
     file.tree["animations"] = [{**clip, "name": name} for name in names]
     return file
+
+
+def test_one_odd_clip_does_not_end_the_others(tmp_path, capsys):
+    file = named("good", "empty", " ", "broken")
+    clips = file.tree["animations"]
+    clips[1] = {"name": "empty", "channels": [], "samplers": []}
+    clips[3] = {**clips[3], "samplers": [{**clips[3]["samplers"][0], "input": file.add([0, np.nan])}]}
+    path = file.write(tmp_path / "m.glb")
+    assert list_clips(path) == [("good", 1.0), ("empty", None), ("clip 2", 1.0), ("broken", None)]
+    assert [clip for clip, _ in clip_outputs(path, "v.h5")] == ["good", "clip 2"]
+    told = capsys.readouterr().err
+    assert "clip 'empty' moves nothing" in told and "clip 'broken', translation of 'square': NaN" in told
+    clips[0] = clips[2] = clips[1]
+    with pytest.raises(DataError, match="none of its 4 clips can be read"):
+        clip_outputs(file.write(path), "v.h5")
+
+
+def test_keys_joined_in_an_unknown_way_are_refused(tmp_path):
+    file = quad(shift=1.0)
+    file.tree["animations"][0]["samplers"][0]["interpolation"] = "BEZIER"
+    with pytest.raises(DataError, match="joined by 'BEZIER'; expected LINEAR, STEP or CUBICSPLINE"):
+        load(file, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -361,20 +484,69 @@ def test_embedded_bytes_in_every_spelling(tmp_path_factory, gap, width, padded, 
     assert read.accessor(0, "x").tolist() == [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
 
 
+def archive(*names: str) -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as file:
+        for name in names:
+            file.writestr(name, b"x")
+    return data.getvalue()
+
+
 @pytest.mark.parametrize(
-    "start, word",
+    "name, data, words",
     [
-        (b"Kaydara FBX Binary  \0", "FBX"),
-        (b"; FBX 7.3.0 project file", "FBX"),
-        (b"PXR-USDC\0", "USD"),
-        (b"#usda 1.0", "USD"),
-        (b"PK\x03\x04", "zip"),
-        (b"BLENDER-v300", "Blender"),
-        (b"\x28\xb5\x2f\xfd", "compressed Blender"),
-        (b'<?xml version="1.0"?><COLLADA>', "COLLADA"),
+        ("m.fbx", b"Kaydara FBX Binary  \0", "FBX; open it in Blender and use File > Export > glTF 2.0"),
+        ("m.fbx", b"\n; FBX 7.3.0 project file", "FBX"),
+        ("m.fbx", b"; made by hand\nFBXHeaderExtension:  {", "FBX"),
+        ("m.usd", b"PXR-USDC\0", "USD; open it in Blender"),
+        ("m.usd", b"#usda 1.0", "USD"),
+        ("m.usdz", archive("m.usdc", "0/wood.png"), "USDZ; open it in Blender"),
+        ("m.3mf", archive("[Content_Types].xml", "3D/3dmodel.model"), "3MF; it holds one shape"),
+        ("m.zip", archive("scene.bin", "a/scene.gltf"), "a zip archive; unpack it, and name a/scene.gltf"),
+        ("m.zip", archive("m.max"), "a zip archive without a glTF"),
+        ("m.zip", archive("m.glb")[:40], "a damaged zip archive"),
+        ("m.blend", b"BLENDER-v300", "Blender file; open it in Blender"),
+        ("m.blend", b"\x28\xb5\x2f\xfd", "compressed Blender"),
+        ("m.dae", b'<?xml version="1.0"?><COLLADA>', "COLLADA"),
+        ("m.abc", b"Ogawa\xff", "Alembic; open it in Blender"),
+        ("m.bvh", b"HIERARCHY\nROOT Hips", "BVH, motion without a surface"),
+        ("m.obj", b"# made\nv 0 0 0\n", "OBJ; it holds one shape that stands still"),
+        ("m.stl", b"solid x\n", "STL; it holds one shape"),
+        ("m.stl", bytes(80) + b"\1\0\0\0" + bytes(50), "STL; it holds one shape"),
+        ("m.mp4", b"\0\0\0\x18ftypmp42", "a video; use `dpc prepare video`"),
+        ("m.glb", b"<!DOCTYPE HTML><html>", "a web page; download it again"),
+        ("m.glb", b"version https://git-lfs.github.com/spec/v1", "Git LFS; fetch the file itself"),
+        ("m.gltf", "{}".encode("utf-16"), "UTF-16; save it as UTF-8"),
     ],
 )
-def test_files_of_other_formats_are_told_what_to_do(tmp_path, start, word):
-    (tmp_path / "m.glb").write_bytes(start + bytes(99))
-    with pytest.raises(DataError, match=f"not a glTF file but .*{word}.*File > Export > glTF 2.0"):
+def test_files_of_other_formats_are_told_what_to_do(tmp_path, name, data, words):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(DataError, match="not a glTF file but .*" + re.escape(words)):
+        read_gltf(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "names, words",
+    [
+        (["b.glb", "a.vrm"], "name one of its 2 files, such as a.vrm"),
+        (["f_1.obj", "f_2.obj", "f.mtl"], "a folder of 2 files such as f_1.obj, not a glTF file; it holds one shape"),
+        ([], "expected a .glb or .gltf file"),
+    ],
+)
+def test_a_folder_names_what_is_in_it(tmp_path, names, words):
+    for name in names:
+        (tmp_path / name).touch()
+    with pytest.raises(DataError, match=re.escape(words)):
+        read_gltf(tmp_path)
+
+
+def test_a_container_filled_up_with_zeros_and_an_empty_one(tmp_path):
+    data = quad().bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    text = data[20 : 20 + size].rstrip() + bytes(4 + size - len(data[20 : 20 + size].rstrip()))
+    longer = data[:8] + struct.pack("<II", len(data) + 4, len(text)) + data[16:20] + text + data[20 + size :]
+    (tmp_path / "m.glb").write_bytes(longer)
+    assert load_animation(tmp_path / "m.glb", None, 1).positions.shape == (1, 4, 3)
+    (tmp_path / "m.glb").write_bytes(b"")
+    with pytest.raises(DataError, match="the file is empty"):
         read_gltf(tmp_path / "m.glb")

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,7 +16,9 @@ from dpcli.errors import DataError
 from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.decode.calibration import Calibration
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
-from dpcli.prepare.recordings.messages import cloud_of_message
+from dpcli.prepare.recordings.messages import calibration_of_message, cloud_of_message
+from dpcli.prepare.recordings.recording import find_recordings, holds_only_recordings
+from dpcli.prepare.recordings.topic_frames import LACKING, LOGGED, SEVERAL_PLACES, SORTED
 from dpcli.prepare.scans.recorded_clouds import RecordedClouds
 from tests.support.recording_helpers import KINDS, START, TYPES, Messages, write_recording
 
@@ -51,6 +56,85 @@ def test_clouds_of_every_kind_of_recording_with_the_times_of_their_headers(tmp_p
     np.testing.assert_array_equal(sequence.points, np.concatenate([f.view("f4").reshape(-1, 3) for f in frames]))
     np.testing.assert_allclose(sequence.time, [0, 0.1, 0.35], atol=1e-9)
     assert reader.fields == ("time",)
+
+
+PACKED = [
+    ("bag", "BZ2"),
+    ("bag", "LZ4"),
+    ("mcap", "FILE"),
+    ("mcap", "MESSAGE"),
+    ("mcap", "STORAGE"),
+    ("sqlite3", "FILE"),
+]
+
+
+@pytest.mark.parametrize(("kind", "packed"), [*PACKED, ("sqlite3", "MESSAGE"), ("bag", "")])
+def test_packed_recordings_and_suffixes_in_capitals(tmp_path, kind, packed):
+    make = Messages(kind)
+    path = write_recording(tmp_path / "run", kind, make, scans(make, [0, 1, 2]), packed)
+    if not packed:
+        path = path.rename(path.with_suffix(".BAG"))
+    assert holds_only_recordings(path, ()) and find_recordings(tmp_path) == [path]
+    sequence = read(RecordedClouds(path)).sequence
+    np.testing.assert_array_equal(sequence.points, np.concatenate([rows(t) for t in range(3)]))
+
+
+def rows(number: int) -> np.ndarray:
+    """The points of scan ``number``, f32 (N,3)."""
+    return points_of(4 + number, seed=number).view("f4").reshape(-1, 3)
+
+
+def scans(make: Messages, taken: list[int], places: str = "a", clock: int = START) -> list:
+    """Scans 0, 1, ..., recorded every tenth of a second; ``taken``: in which tenth their headers say."""
+    content = []
+    for number, tenth in enumerate(taken):
+        message = make.cloud(points_of(4 + number, seed=number))
+        message.header = make.header(clock + tenth * 10**8, places[number % len(places)])
+        content.append(("/lidar", START + number * 10**8, message))
+    return content
+
+
+@pytest.mark.parametrize(
+    ("taken", "clock", "order", "note"),
+    [
+        ([0, 1, 3], 10**9, [0, 1, 2], None),  # since the sensor was switched on
+        ([0, 2, 1, 3], START, [0, 2, 1, 3], SORTED),
+        ([0, 1, 1, 3], START, [0, 1, 2, 3], LOGGED),
+        ([0, 900, 1, 2], START, [0, 1, 2, 3], LOGGED),  # a clock that was set while it recorded
+    ],
+)
+def test_frames_have_the_order_and_times_of_their_headers(tmp_path, taken, clock, order, note):
+    make = Messages("bag")
+    sample = read(RecordedClouds(write_recording(tmp_path / "run", "bag", make, scans(make, taken, clock=clock))))
+    np.testing.assert_array_equal(sample.sequence.points, np.concatenate([rows(number) for number in order]))
+    tenths = sorted(taken) if note != LOGGED else range(len(taken))
+    np.testing.assert_allclose(sample.sequence.time, np.array(tenths) / 10, atol=1e-9)
+    assert sample.notes == ({note: 1} if note else {})
+
+
+def test_scans_of_several_sensors_in_one_topic_and_lost_messages_are_told(tmp_path):
+    make = Messages("sqlite3")
+    path = write_recording(tmp_path / "run", "sqlite3", make, scans(make, [0, 1, 2], places="ab"))
+    (table,) = path.glob("*.db3")
+    with closing(sqlite3.connect(table)) as base, base:
+        base.execute("DELETE FROM messages WHERE id = 2")
+    assert read(RecordedClouds(path)).notes == {LACKING: 1}
+    with closing(sqlite3.connect(table)) as base, base:
+        base.execute("DELETE FROM messages")
+    with pytest.raises(DataError, match="/lidar declares 3 messages and holds none"):
+        read(RecordedClouds(path))
+    several = write_recording(tmp_path / "two", "sqlite3", make, scans(make, [0, 1, 2], places="ab"))
+    assert read(RecordedClouds(several)).notes == {SEVERAL_PLACES: 1}
+
+
+def test_fields_that_are_not_read_are_named_and_colors_are_on_all_frames(tmp_path):
+    make = Messages("mcap")
+    bright = np.dtype([*XYZ.descr, ("intensity", "u2"), ("ring", "u1"), ("rgb", "u4")])
+    content = [("/c", START + t, make.cloud(points_of(4, kind))) for t, kind in enumerate((bright, XYZ))]
+    reader = RecordedClouds(write_recording(tmp_path / "run", "mcap", make, content[:1]), keep=("ring",))
+    assert reader.summary(reader.items()) == ["1 recording found; not read: intensity (--keep-fields)"]
+    with pytest.raises(DataError, match="1 of 2 frames have no colors"):
+        read(RecordedClouds(write_recording(tmp_path / "two", "mcap", make, content)))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -205,6 +289,58 @@ def test_images_that_are_no_depth_are_named(tmp_path, frame, encoding, message):
         read(DepthVideos(inputs=(path,), fov=60))
 
 
+IR, PLAIN, JPEG = "/kinect/ir/image_raw", "/usb_cam/image_raw", "mono8; jpeg compressed "
+
+
+@pytest.mark.parametrize(
+    ("topic", "encoding", "message"),
+    [
+        (PLAIN, "mono8", "/usb_cam/image_raw holds 8-bit images, hardly depth; if they are, name it with --topic"),
+        (IR, "mono16", "no topic holds depth: /kinect/ir/image_raw; if one does, name it"),
+        (PLAIN + "/compressed", JPEG, "are JPEG, which holds no depth"),
+        ("/stereo/disparity", "32FC1", "/stereo/disparity holds disparities, not depth"),
+        ("/d/depth", "16UC1; compressedDepth rvl", "compressedDepth rvl'; expected compressedDepth as PNG"),
+    ],
+)
+def test_pictures_of_cameras_are_no_depth(tmp_path, topic, encoding, message):
+    make = Messages("bag")
+    gray = (depth16() // 20).astype({"mono16": "u2", "32FC1": "f4"}.get(encoding, "u1"))
+    if ";" in encoding:
+        image = make.compressed(gray, form=encoding)
+        image.data = np.frombuffer(cv2.imencode(".jpg", gray)[1].tobytes(), np.uint8)
+    else:
+        image = make.image(gray, encoding=encoding)
+    path = write_recording(tmp_path / "run", "bag", make, [(topic, START, image)])
+    with pytest.raises(DataError, match=message):
+        read(DepthVideos(inputs=(path,), fov=60))
+    if encoding.startswith("mono") and ";" not in encoding:
+        assert read(DepthVideos(inputs=(path,), fov=60, topic=topic)).sequence.num_frames == 1
+    depth = [("/cam/depth", START, make.image(depth16()))]
+    packed = [("/cam/depth/compressedDepth", START, make.compressed(depth16()))]
+    path = write_recording(
+        tmp_path / "both", "bag", make, [(topic.replace("depth", "x"), START, image), *depth, *packed]
+    )
+    assert read(DepthVideos(inputs=(path,), fov=60)).sequence.points.shape == (16 * 12, 3)
+
+
+@pytest.mark.parametrize(
+    ("roi", "binned", "size", "center"),
+    [
+        ((0, 0, 0, 0), 1, (16, 12), (8, 6)),
+        ((0, 0, 16, 12), 1, (32, 24), (8, 6)),  # a corner of the picture, not the picture at half size
+        ((4, 2, 16, 12), 1, (32, 24), (4, 4)),
+        ((0, 0, 0, 0), 2, (32, 24), ((8 + 0.5) / 2 - 0.5, (6 + 0.5) / 2 - 0.5)),
+    ],
+)
+def test_cut_outs_and_binned_pixels_of_camera_info(roi, binned, size, center):
+    make = Messages("mcap")
+    info = make.camera(K, *size)
+    info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height = roi
+    info.binning_x = info.binning_y = binned
+    camera = calibration_of_message(Path("run"), "/d/image", info).of_pictures(16, 12)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (500 / binned, 510 / binned, *center)
+
+
 @pytest.mark.parametrize("kind", ["bag", "mcap"])
 @pytest.mark.parametrize("kept", [0, 10, 300, 0.7])
 def test_damaged_recordings_are_refused_by_name(tmp_path, kind, kept):
@@ -214,5 +350,6 @@ def test_damaged_recordings_are_refused_by_name(tmp_path, kind, kept):
     file = path if kind == "bag" else next(path.glob("*.mcap"))
     whole = file.read_bytes()
     file.write_bytes(whole[: kept if isinstance(kept, int) else int(kept * len(whole))])
-    with pytest.raises(DataError, match="not a readable recording"):
+    mender = {"bag": "rosbag reindex", "mcap": "mcap recover"}[kind]
+    with pytest.raises(DataError, match=f"not a readable recording .*if it was cut off, {mender} mends it"):
         read(RecordedClouds(file))

@@ -17,7 +17,7 @@ from dpcli.ops.cameras import orbit_of
 from dpcli.prepare.decode.color_frames import frame_numbers, open_frames
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.square_crop import Crop, crop_around, resize, visible_box
-from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip
+from dpcli.prepare.views.transforms_json import is_transforms, transforms_clip, transforms_config
 from dpcli.prepare.views.video import VideoOptions, spread_frames, video_clip
 from dpcli.runtime.clips.video_frames import frame_times, lasts
 from dpcli.store import ViewsReader
@@ -267,11 +267,14 @@ def test_masks_cut_a_busy_background(tmp_path):
             np.testing.assert_array_equal(found[0, frame][8:56][strong][:, :3], busy[frame][strong])
             assert found[0, frame][8:56][discs[frame][..., 3] < 8].max() == 0
     save(tmp_path / "short", [discs[0][..., 3]])
+    for number in (0, 1):  # of two objects in each frame
+        save(tmp_path / "each", [picture[..., 3] for picture in discs], f"{{}}_{number}.png")
     save(tmp_path / "wide", [np.zeros((10, 10), np.uint8)] * 3)
     save(tmp_path / "inverse", [255 - picture[..., 3] for picture in discs])
     save(tmp_path / "empty", [np.zeros((48, 64), np.uint8)] * 3)
     for name, message in (
         ("short", "1 masks for 3 frames"),
+        ("each", "masks for 3 frames; expected one for each, named alike, with all its objects"),
         ("wide", "10x10.*64x48"),
         ("inverse", "inverted"),
         ("empty", "an empty mask"),
@@ -351,6 +354,12 @@ def test_warnings_name_the_frames(tmp_path, capsys):
     assert "leaves the picture in 2 frames: 1.png, 2.png" in capsys.readouterr().err
     video_clip(save(tmp_path / "single", pictures[:1]), SMALL)
     assert "one frame only" in capsys.readouterr().err
+    both = np.maximum(disc((14, 24), 8), disc((44, 24), 5))
+    video_clip(save(tmp_path / "two", [both, both, pictures[0]]), SMALL)
+    assert "several objects apart in 2 frames: 0.png, 1.png" in capsys.readouterr().err
+    crumb = np.maximum(disc((14, 24), 8), disc((44, 24), 2))
+    video_clip(save(tmp_path / "crumbs", [crumb, crumb, both]), SMALL)
+    assert "several objects" not in capsys.readouterr().err
     gap = save(tmp_path / "gap", pictures[:1] * 5)
     (gap / "2.png").unlink()
     video_clip(gap, SMALL)
@@ -551,6 +560,63 @@ def test_a_moving_camera_is_told_apart(tmp_path):
         transforms_clip(folder, SMALL)
 
 
+FOCAL = 0.5 * 64 / np.tan(0.7 / 2)
+LENS = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 32, "cy": 24, "w": 64, "h": 48}
+DIALECTS = {
+    "nerfstudio": lambda d: d.update(**LENS, camera_model="OPENCV", k1=0.0, p1=0.0, applied_transform=[[1, 0, 0, 0]]),
+    "instant-ngp": lambda d: d.update(**LENS, camera_angle_y=0.5, aabb_scale=4, offset=[0, 0, 0], is_fisheye=False),
+    "of larger pictures": lambda d: d.update({key: 2 * value for key, value in LENS.items()}),
+    "a lens a frame": lambda d: [frame.update({key: 2 * LENS[key] for key in LENS}) for frame in d["frames"]],
+    "vertical angle": lambda d: d.update(camera_angle_y=2 * np.arctan(24 / FOCAL) + 0 * d.pop("camera_angle_x")),
+    "3 x 4": lambda d: [frame.update(transform_matrix=frame["transform_matrix"][:3]) for frame in d["frames"]],
+    "other names": lambda d: [
+        frame.update(file_path=frame["file_path"].replace("./train/", ".\\train\\..\\train\\") + ".png")
+        for frame in d["frames"]
+    ],
+}
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
+    folder, _ = blender_folder(tmp_path / "scene", cameras=2)
+    path = folder / "transforms_train.json"
+    expected = transforms_clip(folder, SMALL).header
+    data = json.loads(path.read_text())
+    DIALECTS[dialect](data)
+    path.write_text(json.dumps(data))
+    for named in (folder, path):
+        clip = transforms_clip(named, SMALL)
+        np.testing.assert_allclose(clip.header.intrinsics, expected.intrinsics)
+        np.testing.assert_allclose(clip.header.world_to_camera, expected.world_to_camera)
+        np.testing.assert_allclose(clip.header.time, expected.time)
+        assert clip.header.name == "scene"
+
+
+@pytest.mark.parametrize(
+    ("times", "fps", "seconds", "said"),
+    [
+        ((0, 0.25, 1), None, (0, 0.03125, 0.125), "0 to 1 are taken for shares of a clip of 16 frames per second"),
+        ((0, 0.5, 2.5), None, (0, 0.5, 2.5), "0 to 2.5 are taken for seconds"),
+        ((0, 0.5, 2.5), 10, (0, 0.04, 0.2), "0 to 2.5 are taken for shares of a clip of 10 frames per second"),
+        ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames, 10 per second"),
+    ],
+)
+def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys, times, fps, seconds, said):
+    folder, _ = blender_folder(tmp_path / "scene", cameras=2)
+    path = folder / "transforms_train.json"
+    data = json.loads(path.read_text())
+    for number, frame in enumerate(data["frames"]):
+        frame["time"] = times[number % 3]
+    data["test_filenames"] = [frame["file_path"] for frame in data["frames"][3:]]
+    path.write_text(json.dumps(data))
+    header = transforms_clip(folder, VideoOptions(size=64, fps=fps)).header
+    np.testing.assert_allclose(header.time, seconds)
+    assert said in capsys.readouterr().err and header.role == ["reference", "test"]
+    before = transforms_config(folder, SMALL)
+    path.write_text(json.dumps({**data, "camera_angle_x": 0.8}))
+    assert transforms_config(folder, SMALL) != before  # the cameras are an input, too
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -559,7 +625,17 @@ def test_a_moving_camera_is_told_apart(tmp_path):
         (lambda d: d["frames"][0].pop("transform_matrix"), "no 'transform_matrix'"),
         (lambda d: d["frames"][0].update(file_path="train/none"), "no such image"),
         (lambda d: d["frames"][0].update(file_path="../../x"), "outside the folder"),
-        (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4 x 4"),
+        (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4 x 4 numbers, nor 3 x 4"),
+        (lambda d: d["frames"][0].update(time=None), "a still scene"),
+        (lambda d: d["frames"][0].update(time="soon"), "time 'soon'; expected a number"),
+        (lambda d: d["frames"][0].update(time=1e300), "time 1e.300; expected shares"),
+        (lambda d: d.update(fl_x=float("nan")), "fl_x nan; expected a number"),
+        (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
+        (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),
+        (lambda d: d["frames"][1].update(time=0), "r_0_1.png and r_0_0.png are of one camera at one time, 0"),
+        (lambda d: d["frames"][1].update(fl_x=90), "the camera moves or zooms"),
+        (lambda d: d.update(ftheta_p1=0.001), "ftheta_p1 0.001; expected pictures without lens"),
+        (lambda d: d.update(rolling_shutter=[0, 0, 0.1, 0]), "rolling_shutter"),
         (lambda d: d["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()), "not a camera-to-world"),
         (lambda d: d.update(frames=[]), "no frames"),
         (lambda d: d.update(k1=-0.1, camera_model="OPENCV"), "k1 -0.1; expected pictures without lens distortion"),

@@ -212,3 +212,28 @@ def test_what_pillow_writes(form, width, height, alpha, data):
         read = np.stack(list(frames.read(range(len(frames)))))
     assert_like(read, rgba, error)
     np.testing.assert_allclose(frames.times, np.cumsum([0, *lasting[:-1]]) / 1000, atol=2e-3)
+
+
+@pytest.mark.parametrize("disposal", [0, 1, 2])
+@pytest.mark.parametrize("blend", [0, 1])
+@pytest.mark.parametrize("other_still", [False, True])
+def test_frames_of_an_apng_lie_over_one_another_as_browsers_have_them(tmp_path, disposal, blend, other_still):
+    """Soft alpha over what is below; the image for viewers that play none is no frame."""
+    soft = pictures(4, 32, 24, True)
+    soft[..., 3] = np.linspace(0, 255, 32)[None, None] * (np.arange(4)[:, None, None] + 1) / 4
+    images = [Image.fromarray(picture) for picture in soft]
+    words = {"disposal": disposal, "blend": blend, "default_image": other_still, "duration": 100}
+    images[3 if other_still else 0].save(
+        tmp_path / "a.png", save_all=True, append_images=images[not other_still :], **words
+    )
+    below, shown = Image.new("RGBA", (32, 24)), []
+    for image in images:
+        shown.append(Image.alpha_composite(below, image) if blend else image)
+        below = (shown[-1], Image.new("RGBA", (32, 24)), below)[disposal]
+    frames = open_frames(tmp_path / "a.png")
+    read = np.stack(list(frames.read(range(len(frames)))))
+    expected = np.stack([np.asarray(one) for one in shown])
+    np.testing.assert_array_equal(read[..., 3], expected[..., 3])
+    light = [colors[..., :3] * (colors[..., 3:] / 255) for colors in (read, expected)]  # faint colors are rounded
+    np.testing.assert_allclose(*light, atol=2)
+    np.testing.assert_allclose(frames.times, [0, 0.1, 0.2, 0.3])

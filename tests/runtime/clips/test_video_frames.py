@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
-from dpcli.prepare.views.matting import read_mask
+from dpcli.prepare.views.masks import read_mask
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
 SIDE, COUNT = 64, 8
@@ -58,6 +58,7 @@ ALPHA = {
     "animation.mov": ("-c:v", "qtrle", "-pix_fmt", "argb"),
     "png.mov": ("-c:v", "png", "-pix_fmt", "rgba"),
     "ffv1.mkv": ("-c:v", "ffv1", "-pix_fmt", "bgra"),
+    "tiff.mov": ("-c:v", "tiff", "-pix_fmt", "rgba"),  # with side data that PyAV doesn't know
 }
 
 
@@ -89,13 +90,23 @@ SUFFIXES = {
     "k.wmv": ("-c:v", "wmv2", "-q:v", 2),
     "k.y4m": ("-pix_fmt", "yuv420p"),
     "no_suffix": (*PLAIN, "-f", "mp4"),
+    "k.swf": ("-c:v", "flv", "-q:v", 2),
+    "k.rm": ("-c:v", "rv20", "-q:v", 2),
+    "k.h264": PLAIN,
+    "hevc_without_suffix": ("-pix_fmt", "yuv420p", "-c:v", "libx265", "-x265-params", "log-level=none", "-f", "hevc"),
+    "k.mjpg": ("-c:v", "mjpeg", "-q:v", 2, "-f", "mjpeg"),
 }
+RATE_UNKNOWN = ("k.mjpg",)
 
 
 @pytest.mark.parametrize("name", SUFFIXES)
 def test_the_decoder_says_what_can_be_read_not_the_suffix(pictures, tmp_path, name):
     frames = open_frames(film(pictures, tmp_path / name, *SUFFIXES[name]))
     assert len(frames) == COUNT
+    if name in RATE_UNKNOWN:
+        assert frames.times is None
+    else:
+        np.testing.assert_allclose(frames.times, np.arange(COUNT) / 10, atol=2e-3)
     first = next(iter(frames.read([0])))
     assert np.abs(first[28, 18, :3].astype(int) - (200, 30, 30)).max() < 24
 
@@ -109,6 +120,13 @@ def test_a_trimmed_clip_has_the_frames_that_play(pictures, tmp_path):
     assert np.abs(last[28, 18 + 4 * (COUNT - 1), :3].astype(int) - (200, 30, 30)).max() < 24
 
 
+@pytest.mark.parametrize("name", ["late.mkv", "late.webm", "late.nut", "late.ts"])
+def test_a_clip_that_begins_late_is_whole(pictures, tmp_path, name):
+    codec = ("-c:v", "libvpx", "-pix_fmt", "yuv420p", "-b:v", "2M") if name.endswith("webm") else PLAIN
+    path = film(pictures, tmp_path / name, *codec, "-output_ts_offset", 3)
+    np.testing.assert_allclose(look_at_video(path).times, np.arange(COUNT) / 10, atol=2e-3)
+
+
 def test_a_truncated_clip_is_no_trimmed_one(pictures, tmp_path):
     path = film(pictures, tmp_path / "t.mp4", *PLAIN, "-g", 2, "-movflags", "+faststart", "-qp", 0)
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.75)])
@@ -120,10 +138,17 @@ def test_square_pixels_and_rotation_are_what_plays(pictures, tmp_path, capfd):
     wide = film(pictures, tmp_path / "wide.mp4", *PLAIN, "-vf", "setsar=2/1")
     assert decoded(wide).shape[1:3] == (SIDE, 2 * SIDE) and "2:1" in capfd.readouterr().err
     straight = film(pictures, tmp_path / "straight.mp4", *PLAIN)
-    ffmpeg("-display_rotation", 90, "-i", straight, "-c", "copy", tmp_path / "turned.mp4")
-    turned, upright = decoded(tmp_path / "turned.mp4"), decoded(straight)
-    assert min(np.abs(np.rot90(upright, k, (1, 2)).astype(int) - turned).max() for k in (1, 3)) < 8
-    assert "turned by" in capfd.readouterr().err
+    plays = {
+        ("-display_rotation", 90): lambda p: np.rot90(p, 1, (1, 2)),
+        ("-display_rotation", 180): lambda p: p[:, ::-1, ::-1],
+        ("-display_hflip",): lambda p: p[:, :, ::-1],
+        ("-display_vflip",): lambda p: p[:, ::-1],
+        ("-display_rotation", 90, "-display_hflip"): lambda p: p[:, ::-1, ::-1].transpose(0, 2, 1, 3),
+    }
+    for words, turn in plays.items():
+        ffmpeg(*words, "-i", straight, "-c", "copy", tmp_path / "turned.mp4")
+        np.testing.assert_array_equal(decoded(tmp_path / "turned.mp4"), turn(decoded(straight)))
+        assert ("mirrored" if "flip" in str(words) else "turned by") in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("matrix, number", [("bt709", 1), ("smpte170m", 6), ("bt2020nc", 9)])
@@ -137,21 +162,22 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
+def test_colors_that_are_not_converted_are_refused(pictures, tmp_path):
+    tag = ("-bsf:v", "h264_metadata=matrix_coefficients=8")
+    with pytest.raises(DataError, match="its colors are YCgCo; expected RGB, or YCbCr"):
+        look_at_video(film(pictures, tmp_path / "c.mp4", *PLAIN, *tag))
+
+
+def test_interlaced_lines_are_told(pictures, tmp_path, capfd):
+    words = ("-c:v", "mpeg2video", "-r", 25, "-vf", "setfield=tff,interlace", "-flags", "+ilme+ildct")
+    look_at_video(film(pictures, tmp_path / "i.ts", *words))
+    assert "interlaced: each frame shows two moments" in capfd.readouterr().err
+
+
 def test_an_hdr_clip_is_named(pictures, tmp_path, capfd):
     tags = "setparams=color_trc=arib-std-b67:color_primaries=bt2020:colorspace=bt2020nc"
     look_at_video(film(pictures, tmp_path / "hdr.mp4", *PLAIN, "-vf", tags))
     assert "HDR" in capfd.readouterr().err
-
-
-def test_images_are_upright_as_their_exif_says(tmp_path):
-    rgb = np.zeros((20, 40, 3), np.uint8)
-    rgb[:, :10] = (255, 0, 0)
-    turned = Image.fromarray(np.rot90(rgb).copy())
-    exif = turned.getexif()
-    exif[0x0112] = 6  # to be turned by 90 degrees clockwise
-    turned.save(tmp_path / "0.png", exif=exif)
-    read = read_rgba(tmp_path / "0.png")
-    assert read.shape == (20, 40, 4) and tuple(read[10, 4, :3]) == (255, 0, 0)
 
 
 def test_two_series_of_a_folder_are_named(pictures, tmp_path):
@@ -196,24 +222,80 @@ def test_a_folder_of_videos_lists_them(pictures, tmp_path):
     assert said.split("\n")[:-1] == [str(folder / "a.mp4"), str(folder / "b.mp4")]
 
 
-@pytest.mark.parametrize("kind", ["few values", "palette", "colors", "16 bits", "small values"])
-def test_masks_of_labels_are_opaque_wherever_the_label_is_not_zero(tmp_path, kind):
-    labels = np.zeros((48, 64), np.uint8)
-    labels[8:24, 8:40], labels[24:40, 20:50] = 1, 2
-    image = {
-        "few values": Image.fromarray(np.array([0, 38, 200], np.uint8)[labels]),
-        "palette": Image.fromarray(labels).convert("P"),
-        "colors": Image.fromarray(np.array([[0, 0, 0], [128, 0, 0], [0, 128, 0]], np.uint8)[labels]),
-        "16 bits": Image.fromarray(np.array([0, 300, 40_000], np.uint16)[labels]),
-        "small values": Image.fromarray(labels),
-    }[kind]
-    image.save(tmp_path / "m.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where(labels > 0, 255, 0))
+LABELS = np.zeros((48, 64), np.uint8)
+LABELS[8:24, 8:40], LABELS[24:40, 20:50] = 1, 2
 
 
-def test_a_soft_mask_stays_soft(tmp_path):
+def colors_of(*rgb: tuple[int, int, int]) -> Image.Image:
+    return Image.fromarray(np.array([(0, 0, 0), *rgb], np.uint8)[LABELS])
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        pytest.param(Image.fromarray(np.array([0, 38, 200], np.uint8)[LABELS]), id="few values"),
+        pytest.param(Image.fromarray(np.array([0, 128, 255], np.uint8)[LABELS]), id="instances"),
+        pytest.param(Image.fromarray(LABELS).convert("P"), id="palette"),
+        pytest.param(Image.fromarray(LABELS > 0), id="1 bit"),
+        pytest.param(colors_of((128, 0, 0), (0, 128, 0)), id="colors"),
+        pytest.param(colors_of((0, 0, 1), (2, 0, 0)), id="numbers in colors"),
+        pytest.param(Image.fromarray(np.array([0, 300, 40_000], np.uint16)[LABELS]), id="16 bits"),
+        pytest.param(Image.fromarray(np.array([0, 1000, 1000], np.uint16)[LABELS]), id="one label of 16 bits"),
+        pytest.param(Image.fromarray(np.array([0, 70_000, 80_000], np.int32)[LABELS]), id="32 bits"),
+        pytest.param(Image.fromarray(np.array([0, 1, 1], np.float32)[LABELS]), id="floats"),
+        pytest.param(Image.fromarray(LABELS), id="small values"),
+    ],
+)
+def test_masks_of_labels_are_opaque_wherever_the_label_is_not_zero(tmp_path, image):
+    image.save(tmp_path / "m.tif")
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.tif"), np.where(LABELS > 0, 255, 0))
+
+
+@pytest.mark.parametrize("image", [colors_of((128, 0, 0), (230, 25, 75)), colors_of((128, 128, 128), (255, 255, 255))])
+@pytest.mark.parametrize("suffix", ["jpg", "webp"])
+def test_labels_that_were_compressed_are_told_from_soft_masks(tmp_path, image, suffix):
+    image.save(tmp_path / f"m.{suffix}", quality=75)
+    wrong = read_mask(tmp_path / f"m.{suffix}") != np.where(LABELS > 0, 255, 0)
+    assert wrong.mean() < 0.01
+    soft = Image.fromarray(np.where(LABELS > 0, 255, 0).astype(np.uint8)).filter(ImageFilter.GaussianBlur(5))
+    soft.save(tmp_path / f"s.{suffix}", quality=90)
+    np.testing.assert_allclose(read_mask(tmp_path / f"s.{suffix}"), np.asarray(soft).astype(int), atol=12)
+
+
+def test_void_is_no_object_and_is_told(tmp_path, capfd):
+    labels = LABELS.copy()
+    labels[LABELS != np.roll(LABELS, 1, 1)] = 255
+    Image.fromarray(labels).save(tmp_path / "m.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where((labels > 0) & (labels < 255), 255, 0))
+    assert "255 beside labels below 64 is void" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("values", "name", "message"),
+    [
+        (LABELS, "m.jpg", "labels up to [1-9] in a file that was compressed with loss"),
+        (np.arange(48 * 64, dtype=np.uint16).reshape(48, 64), "m.png", "a mask with values up to 3071; expected 255"),
+    ],
+)
+def test_masks_that_cannot_be_told_are_refused(tmp_path, values, name, message):
+    Image.fromarray(values).save(tmp_path / name)
+    with pytest.raises(DataError, match=message):
+        read_mask(tmp_path / name)
+
+
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency"])
+def test_a_soft_mask_stays_soft(tmp_path, kind):
     y, x = np.mgrid[:48, :64]
     soft = np.clip(255 * (16.5 - np.hypot(x - 32, y - 24)), 0, 255).round().astype(np.uint8)
     soft = np.asarray(Image.fromarray(soft).resize((128, 96), Image.Resampling.BICUBIC))
-    Image.fromarray(soft).save(tmp_path / "m.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), soft)
+    image = {
+        "8 bits": Image.fromarray(soft),
+        "16 bits": Image.fromarray(soft.astype(np.uint16) * 257),
+        "floats": Image.fromarray(soft.astype(np.float32) / 255),
+        "alpha": Image.fromarray(np.stack([soft * 0, soft], -1)),
+        "transparency": Image.fromarray(soft).convert("P"),
+    }[kind]
+    name, words = ("m.tif", {}) if kind == "floats" else ("m.png", {})
+    words = {"transparency": bytes(range(256))} if kind == "transparency" else words
+    image.save(tmp_path / name, **words)
+    np.testing.assert_array_equal(read_mask(tmp_path / name), soft)

@@ -60,9 +60,10 @@ def animation(
         )
 
 
-def _print_clips(clips: list[tuple[str, float]], as_json: bool) -> None:
+def _print_clips(clips: list[tuple[str, float | None]], as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps({"clips": [{"name": name, "seconds": round(seconds, 6)} for name, seconds in clips]}))
+        rows = [{"name": name, "seconds": None if time is None else round(time, 6)} for name, time in clips]
+        typer.echo(json.dumps({"clips": rows}))
         return
-    for number, (name, seconds) in enumerate(clips):
-        typer.echo(f"{number:3}  {seconds:7.2f} s  {name}")
+    for number, (name, time) in enumerate(clips):
+        typer.echo(f"{number:3}  {'      -' if time is None else f'{time:7.2f}'} s  {name}")

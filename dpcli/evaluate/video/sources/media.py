@@ -10,8 +10,9 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View
+from dpcli.npy_files import map_npy
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, one_series, upright
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
 
@@ -62,14 +63,12 @@ def _view_of_folder(name: str) -> View:
 
 def _read_image(path: Path) -> tuple[np.ndarray, bool]:
     """Returns rgba u8 (H,W,4), and whether the file has an alpha channel. DataError when unreadable or not 8-bit color."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = "A" in image.getbands() or "transparency" in image.info
-            return np.asarray(upright(image).convert("RGBA")), has_alpha
+            return np.asarray(as_shown(image).convert("RGBA")), has_alpha
     except DataError:
         raise
     except Exception as error:  # a damaged image raises nearly anything, and one of a vast size DecompressionBombError
@@ -83,10 +82,7 @@ class ArraySource(Source):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        except Exception as error:  # a damaged header raises nearly anything
-            raise DataError(f"{path}: not a readable .npy array ({error})") from None
+        array = map_npy(path)
         array = array[None] if array.ndim == 4 else array
         known = array.dtype == np.uint8 or array.dtype.kind == "f"
         if array.ndim != 5 or array.shape[-1] not in (3, 4) or not known or array.size == 0:

@@ -66,7 +66,8 @@ class ShapeTrainer:
         """
         state = self.folder.load_state()
         if state is not None:
-            self._restore(state)
+            with self.folder.restoring():
+                self._restore(state)
         sizes = self.schedule
         rounds = math.ceil(sizes.steps / self.per_round)
         if self.step < sizes.steps:

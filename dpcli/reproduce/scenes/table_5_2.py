@@ -1,9 +1,10 @@
 """Table 5.2 of the thesis on animated meshes: rows (a) to (e), each fitted and scored by `dpc` commands.
 
-    python -m dpcli.reproduce.table_5_2 MESHES OUT [--clips Cow:Gallop,...] [--size 128] [--jobs 2]
+    python -m dpcli.reproduce.scenes.table_5_2 MESHES OUT [--clips Cow:Gallop,...] [--size 128] [--prior views] [--jobs 2]
 
-MESHES: a folder of .glb files (searched below it). Every fit sees the input view and four more views of the animation;
-scores are from four azimuths that no fit sees. What is done already is not done again.
+MESHES: a folder of .glb files (searched below it). With --prior views every fit sees the input view and four more views of
+the animation, with another prior the input view alone; scores are from four azimuths that no fit sees. What is done already
+is not done again.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -33,7 +35,7 @@ dpc = partial(runs.dpc, threads=1)  # a clip each in as many processes as there 
 
 
 def film(meshes: Path, clip: str, out: Path, size: int) -> Path:
-    """The views file of `Model:Clip`."""
+    """Returns the views file of `Model:Clip`, which it makes when it isn't there."""
     model, motion = clip.split(":")
     found = sorted(meshes.rglob(f"{model}.glb"))
     if not found:
@@ -60,25 +62,29 @@ def film(meshes: Path, clip: str, out: Path, size: int) -> Path:
     return path
 
 
-def score(views: Path, row: str, out: Path, steps: tuple[int, int], seed: int) -> dict:
-    """Fit one row to one clip and score it; from the file when that was done before."""
-    scene = out / f"{views.stem}{row[:3]}seed{seed}.h5"
+def score(views: Path, name: str, settings: Sequence[str], out: Path, given: argparse.Namespace) -> dict:
+    """Returns the scores of one fit to one clip, from its file when that was done before.
+
+    name: of the fit, in its files' names; settings: what it changes, each `NAME=VALUE`.
+    """
+    prior = "" if given.prior == "views" else given.prior
+    scene = out / f"{views.stem}{name}{prior}seed{given.seed}.h5"
     result = scene.with_suffix(".json")
     if not result.exists():
         if not scene.exists():
-            settings = [f"dense_steps={steps[0]}", f"sparse_steps={steps[1]}", "most_gaussians=6000"]
-            settings += [f"{switch}=false" for switch in OFF[row]]
+            dense, sparse = given.steps.split(",")
+            settings = [f"dense_steps={dense}", f"sparse_steps={sparse}", "most_gaussians=6000", *settings]
             words = [word for value in settings for word in ("--set", value)]
-            dpc(
-                "generate4d", "fit", views, "-o", scene, "--preset", "quick", "--prior", "views", "--seed", seed, *words
-            )
+            common = ("--preset", "quick", "--prior", given.prior, "--seed", given.seed)
+            dpc("generate4d", "fit", views, "-o", scene, *common, *words)
         text = dpc("evaluate", "video", scene, "--truth", views, "--metrics", "psnr,ssim,parts,tracks", "--json")
         result.write_text(text)
-    return json.loads(result.read_text())["metrics"]
+    told = json.loads(result.read_text())
+    return {**told["metrics"], "counts": told["denominators"]}
 
 
-def _mean(values: list[dict], *keys: str) -> float:
-    """Mean over clips of the number that the keys lead to."""
+def mean_score(values: list[dict], *keys: str) -> float:
+    """Returns the mean over clips of the number that the keys lead to."""
     total = 0.0
     for value in values:
         for key in keys:
@@ -98,31 +104,44 @@ def table(scores: dict[str, list[dict]], clips: int) -> str:
     for row, values in scores.items():
         psnr, ssim = THESIS[row[:3]]
         lines.append(
-            f"| {row} | {_mean(values, 'per_role', 'test', 'psnr'):.2f} | {_mean(values, 'per_role', 'test', 'ssim'):.4f} |"
-            f" {_mean(values, 'per_role', 'reference', 'psnr'):.2f} | {_mean(values, 'parts', 'adjusted_rand_index'):.3f} |"
-            f" {_mean(values, 'tracks', 'epe_of_diameter'):.4f} | {psnr} | {ssim} |"
+            f"| {row} | {mean_score(values, 'per_role', 'test', 'psnr'):.2f} | {mean_score(values, 'per_role', 'test', 'ssim'):.4f} |"
+            f" {mean_score(values, 'per_role', 'reference', 'psnr'):.2f} | {mean_score(values, 'parts', 'adjusted_rand_index'):.3f} |"
+            f" {mean_score(values, 'tracks', 'epe_of_diameter'):.4f} | {psnr} | {ssim} |"
         )
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Fits and scores the rows that the command line asks for, and prints the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """Returns the words that a program of fits to animated meshes takes."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("meshes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--clips", default=CLIPS)
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--steps", default="300,500")
+    parser.add_argument("--prior", default="views")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
-    given = parser.parse_args()
+    return parser
+
+
+def fit_all(given: argparse.Namespace, fits: Mapping[str, tuple[str, Sequence[str]]]) -> dict[str, list[dict]]:
+    """Returns the scores of all clips for each fit. fits: row -> name in the files, settings (see `score`)."""
     given.out.mkdir(parents=True, exist_ok=True)
-    steps = tuple(int(word) for word in given.steps.split(","))
     views = [film(given.meshes, clip, given.out, given.size) for clip in given.clips.split(",")]
     with ThreadPoolExecutor(given.jobs) as pool:
-        running = {row: [pool.submit(score, path, row, given.out, steps, given.seed) for path in views] for row in OFF}
-        scores = {row: [job.result() for job in jobs] for row, jobs in running.items()}
-    text = table(scores, len(views))
+        running = {
+            row: [pool.submit(score, path, name, settings, given.out, given) for path in views]
+            for row, (name, settings) in fits.items()
+        }
+        return {row: [job.result() for job in jobs] for row, jobs in running.items()}
+
+
+def main() -> None:
+    """Fits and scores all rows, and prints the table."""
+    given = parser_of(__doc__).parse_args()
+    rows = {row: (row[:3], [f"{switch}=false" for switch in off]) for row, off in OFF.items()}
+    text = table(fit_all(given, rows), len(given.clips.split(",")))
     (given.out / "table.md").write_text(text + "\n")
     print(text)
 

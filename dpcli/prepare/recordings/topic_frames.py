@@ -1,0 +1,79 @@
+"""Frames of one topic of a recording, in the order in which they were taken, and what of them is doubtful."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.recordings.recording import Message, Recording
+
+_DELAY = 10**9  # ns by which the delay from taking to recording may vary where messages overtake each other
+LACKING = "messages that recordings declare and lack"
+SORTED = "recordings whose frames were sorted by the times in their headers"
+LOGGED = "recordings whose times are those of recording, since the times in their headers don't rise"
+SEVERAL_PLACES = "recordings whose frames come from several sensors (frame_id), each around its own origin"
+Frame = TypeVar("Frame")
+
+
+@dataclass
+class TopicFrames(Generic[Frame]):
+    """Holds decoded frames in the order of their times: seconds since the first f64 (T), None where nothing tells them.
+
+    notes: counts of what is missing or doubtful, as a Sample has them.
+    """
+
+    frames: list[Frame]
+    time: np.ndarray | None
+    notes: dict[str, int] = field(default_factory=dict)
+
+
+def read_topic(recording: Recording, topic: str, stride: int, decode: Callable[[Message], Frame]) -> TopicFrames[Frame]:
+    """Reads every ``stride``-th message of a topic. Raises DataError when none can be read."""
+    frames: list[Frame] = []
+    stamps: list[tuple[int | None, int]] = []
+    places: set[str] = set()
+    for message in recording.messages(topic, stride):
+        frames.append(decode(message))
+        stamps.append((message.stamp, message.logged))
+        places.add(message.place)
+    declared = recording.topics[topic][1]
+    if not frames:
+        raise DataError(f"{recording.path}: {topic} declares {declared} messages and holds none")
+    order, time, notes = message_times(stamps)
+    if recording.read < declared:
+        notes[LACKING] = declared - recording.read
+    if len(places) > 1:
+        notes[SEVERAL_PLACES] = 1
+    return TopicFrames([frames[place] for place in order], time, notes)
+
+
+def message_times(stamps: Sequence[tuple[int | None, int]]) -> tuple[list[int], np.ndarray | None, dict[str, int]]:
+    """Returns the order of messages, their seconds since the first f64 (T) or None, and notes.
+
+    stamps: (nanoseconds in the header or None, nanoseconds of recording). Headers count where all have a time and these
+    rise, or differ and only overtook each other on their way; else the times of recording, where they rise.
+    """
+    order = list(range(len(stamps)))
+    own, logged = [own for own, _ in stamps], [logged for _, logged in stamps]
+    known = [time for time in own if time is not None]
+    if len(known) == len(own):
+        if _rise(known):
+            return order, _seconds(known), {}
+        delays = [late - time for time, late in zip(known, logged)]
+        if len(set(known)) == len(known) and max(delays) - min(delays) <= _DELAY:
+            order.sort(key=lambda place: known[place])
+            return order, _seconds(sorted(known)), {SORTED: 1}
+    notes = {LOGGED: 1} if known else {}
+    return (order, _seconds(logged), notes) if _rise(logged) else (order, None, {})
+
+
+def _rise(times: Sequence[int]) -> bool:
+    return all(a < b for a, b in zip(times, times[1:]))
+
+
+def _seconds(times: Sequence[int]) -> np.ndarray:
+    return np.array([time - times[0] for time in times], np.float64) * 1e-9

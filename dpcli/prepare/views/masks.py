@@ -1,0 +1,128 @@
+"""Masks in image files: soft ones as they are, and images of labels, opaque wherever there is one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.runtime.clips.images import open_image, upright
+from dpcli.runtime.progress import log
+
+_SMALL_LABEL = 64  # no mask is that dark; values below are labels
+_LABELS = 64  # values at most in an image of labels
+_VOID = 255  # beside small labels: nobody decided, such as the outlines of PASCAL VOC
+_COLORFUL = 48  # gray levels between channels: more than compression does to a gray mask
+_NOISE = 32  # gray levels: compression leaves no more where nothing is
+_RIPPLE = 24  # gray levels between neighbors within a label, after compression
+_BIN, _MOST_BINS = 16, 4  # gray levels, and how many such bins hold the labels of a compressed image
+_SAID: set[str] = set()
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Reads u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of labels isn't 0.
+
+    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits; 255 beside labels below
+    64 is void, which is 0. Raises DataError when the file isn't readable, or when compression changed its labels.
+    """
+    try:
+        with open_image(path) as stored:
+            lossy, image = stored.format in ("JPEG", "WEBP", "AVIF"), upright(stored)
+            if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+                alpha = np.array(image.convert("RGBA").getchannel("A"))
+                if alpha.min(initial=255) < 255:
+                    return alpha
+            if image.mode in ("P", "1"):
+                return _opaque_labels(path, np.array(image))
+            wide = image.mode[0] in "IF"
+            values = np.array(image if wide else image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise DataError(f"{path}: not a readable mask ({error}); export it again") from None
+    return _of_colors(path, values, lossy) if values.ndim == 3 else _of_values(path, values, lossy)
+
+
+def _of_colors(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
+    """Returns the mask u8 (H,W) of colors u8 (H,W,3): by their brightest channel, where they tell labels apart."""
+    brightest = values.max(axis=2)
+    if int(np.ptp(values, axis=2).max(initial=0)) > _COLORFUL:
+        return _opaque(brightest > (_half_of_lowest(brightest) if lossy else 0))
+    if brightest.max(initial=0) < _SMALL_LABEL:
+        return _of_values(path, brightest, lossy)
+    from PIL import Image
+
+    return _of_values(path, np.array(Image.fromarray(values).convert("L")), lossy)
+
+
+def _of_values(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:
+    """Returns the mask u8 (H,W) of gray values (H,W) of any type."""
+    top = values.max(initial=0)
+    if values.dtype.kind == "f" and top <= 1:
+        return np.round(255 * values.clip(0, 1)).astype(np.uint8)
+    if lossy and 0 < top < _SMALL_LABEL:
+        raise DataError(
+            f"{path}: labels up to {top} in a file that was compressed with loss, which changed them; export them as PNG"
+        )
+    if lossy and _are_compressed_labels(values):
+        return _opaque(values > _half_of_lowest(values))
+    if top < _SMALL_LABEL or not lossy and _are_labels(values):
+        return _opaque_labels(path, values)
+    if 256 <= top < 32768:
+        raise DataError(f"{path}: a mask with values up to {top}; expected 255 for the object, or 65535, or labels")
+    return np.clip(np.round(values / (257 if top > 255 else 1)), 0, 255).astype(np.uint8)
+
+
+def _opaque(where: np.ndarray) -> np.ndarray:
+    return np.where(where, 255, 0).astype(np.uint8)
+
+
+def _opaque_labels(path: Path, labels: np.ndarray) -> np.ndarray:
+    """Returns 255 wherever the label isn't 0, nor void: 255 beside labels that are small. Of void the log tells."""
+    void = labels == _VOID
+    others = labels[(labels > 0) & ~void]
+    if not void.any() or not len(others) or others.max() >= _SMALL_LABEL:
+        return _opaque(labels > 0)
+    with log.each_once(_SAID):
+        log.info(f"{path.parent}: masks: 255 beside labels below {_SMALL_LABEL} is void, which is no object")
+    return _opaque((labels > 0) & ~void)
+
+
+def _are_labels(values: np.ndarray) -> bool:
+    """Returns whether gray values (H,W) are labels: few, and most pixels of those between the ends lie among their equals.
+
+    The soft outline of a mask has many values, and none of them fills a square of 3 pixels.
+    """
+    few = np.unique(values)
+    between = (values > 0) & (values != max(few[-1], 255))
+    if len(few) > _LABELS or not between.any():
+        return len(few) == 2 and 255 < few[-1] < 65535
+    cv2 = load_cv2()
+    numbers, square = np.searchsorted(few, values).astype(np.uint16), np.ones((3, 3), np.uint8)
+    alike = cv2.erode(numbers, square) == cv2.dilate(numbers, square)
+    return float((alike & between).sum()) > 0.25 * float(between.sum())
+
+
+def _are_compressed_labels(values: np.ndarray) -> bool:
+    """Returns whether gray values u8 (H,W) were labels before compression: those between the ends lie among their like, and
+    these are of few gray levels, where a soft mask has all.
+    """
+    between = (values > _NOISE) & (values < 255 - _NOISE)
+    levels = values[between & _level(values)]
+    if len(levels) <= 0.25 * np.count_nonzero(between):
+        return False
+    bins = np.sort(np.bincount(levels // _BIN))[::-1]
+    return bool(bins[:_MOST_BINS].sum() > 0.8 * len(levels))
+
+
+def _level(values: np.ndarray) -> np.ndarray:
+    """Returns bool (H,W): whether a pixel and its eight neighbors are nearly alike."""
+    cv2 = load_cv2()
+    square = np.ones((3, 3), np.uint8)
+    return cv2.dilate(values, square).astype(np.int16) - cv2.erode(values, square) <= _RIPPLE
+
+
+def _half_of_lowest(values: np.ndarray) -> int:
+    """Returns half the gray level of the darkest label that fills a region of u8 (H,W), above the noise of compression."""
+    levels = values[(values > _NOISE) & _level(values)]
+    return int(np.percentile(levels, 5)) // 2 if len(levels) else 127

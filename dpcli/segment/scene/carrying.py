@@ -1,0 +1,168 @@
+"""Objects carried through the frames: their points and motions in each, and which of them are one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dpcli.segment.scene.object_motion import refine
+from dpcli.segment.scene.world import UNSEEN, Frame, World
+
+_MARGIN = 0.35  # meters around an object's moved points in which a frame's points are its own
+_CLOSE = 0.15  # the same for points that may as well stand
+_STANDING = 0.15  # mean cost of standing still below which a point may as well stand
+_AROUND = 1.0  # meters around its box in which points in doubt are its own
+_FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
+_FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
+_JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one another may differ
+_UNSTEADY = 2.5  # times the evidence for something that could only be carried with a jerk
+_ALIKE = (0.3, 0.25)  # the same for two pieces of one object
+_APART = 1.5  # meters between pieces of one object
+
+
+@dataclass
+class MovingObject:
+    """Holds an object: its points in each frame, numbers i64, and its motion, f64 (4,4) in the world, from `start` to it.
+
+    saved: what its motion explains better than standing still, in points that a frame contradicts. demand: times
+    the usual evidence that it needs, more than 1 for pieces of a larger cluster, and what could only be carried with a jerk.
+    """
+
+    start: int
+    points: dict[int, np.ndarray]
+    motion: dict[int, np.ndarray]
+    saved: float = 0.0
+    demand: float = 1.0
+
+    @property
+    def size(self) -> int:
+        """The number of its points in all frames."""
+        return sum(map(len, self.points.values()))
+
+    def between(self, source: int, target: int) -> np.ndarray:
+        """Returns its motion f64 (4,4) from a frame to another one, in the world."""
+        return extended(self.motion, target) @ np.linalg.inv(extended(self.motion, source))
+
+
+def moved(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Returns points f64 (N,3) after a motion (4,4)."""
+    return points @ motion[:3, :3].T + motion[:3, 3]
+
+
+def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
+    """Returns the motion to a frame; to one that is not known, with the nearest step repeated."""
+    if frame in known or len(known) < 2:
+        return known.get(frame, next(iter(known.values())))
+    numbers = np.array(sorted(known))
+    edge = int(numbers[np.abs(numbers - frame).argmin()])
+    inner = int(numbers[np.argsort(np.abs(numbers - edge), kind="stable")[1]])
+    step = known[edge] @ np.linalg.inv(known[inner])
+    step = step if edge > inner else np.linalg.inv(step)
+    return np.linalg.matrix_power(step, frame - edge) @ known[edge]
+
+
+def carry(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -> None:
+    """Carries an object from frame t over `way` frames again and again, as far as it is met; `step` (4,4): its first."""
+    while 0 <= t + way < len(world.frames) and world.run[t + way] == world.run[t]:
+        here, there = world.frames[t], world.frames[t + way]
+        points = here.points[one.points[t]]
+        if t != one.start:
+            before, step = step, refine(points, there, step)
+            if not _alike(points, before, step, _JERK):
+                one.demand *= _UNSTEADY
+                return
+        members = _members(moved(points, step), there)
+        if len(members) == 0 or (there.cost(moved(points, step))[0] < 0.9 * UNSEEN).mean() < _FOUND:
+            return
+        t += way
+        one.motion[t] = step @ one.motion[t - way]
+        one.points[t] = members
+
+
+def _alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, limits: tuple[float, float]) -> bool:
+    """Returns whether two motions (4,4) take the corners of the box around points (N,3) to about the same places."""
+    low, high = points.min(0), points.max(0)
+    corners = np.stack(np.meshgrid(*zip(low, high)), -1).reshape(-1, 3)
+    ways = [moved(corners, motion) - corners for motion in (first, second)]
+    apart = np.linalg.norm(ways[0] - ways[1], axis=1).max()
+    return bool(apart <= limits[0] + limits[1] * np.linalg.norm(ways[0].mean(0)))
+
+
+def _members(moved_points: np.ndarray, frame: Frame) -> np.ndarray:
+    """Returns the raised points i64 of a frame, in no object yet, around an object's moved points.
+
+    Those that may as well stand must lie closer, lest an object takes along what it passes.
+    """
+    tolerance = float(np.median(frame.tolerance(moved_points)))
+    margin = max(_MARGIN, tolerance)
+    near = _inside(frame, moved_points, margin)
+    if len(near) == 0:
+        return near
+    distance = cKDTree(moved_points).query(frame.points[near], distance_upper_bound=margin)[0]
+    standing = frame.doubt[near] < _STANDING
+    return near[distance < np.where(standing, max(_CLOSE, 0.5 * tolerance), margin)]
+
+
+def _inside(frame: Frame, points: np.ndarray, margin: float) -> np.ndarray:
+    """Returns the raised points i64 of a frame, in no object yet, in the box around points (N,3)."""
+    free = frame.raised[frame.label[frame.raised] == 0]
+    own = frame.points[free]
+    return free[np.all((own > points.min(0) - margin) & (own < points.max(0) + margin), axis=1)]
+
+
+def claim_around(one: MovingObject, world: World) -> None:
+    """Gives an object the points in doubt around it, and those right below it, in every frame that it was met in."""
+    for t, frame in enumerate(world.frames):
+        if t in one.points and len(one.points[t]):
+            near = _inside(frame, frame.points[one.points[t]], _AROUND)
+            near = near[(frame.doubt[near] > 0.9 * UNSEEN) | (frame.free[near] > 0)]
+            one.points[t] = np.union1d(np.union1d(one.points[t], near), _feet(one.points[t], frame))
+
+
+def _feet(own: np.ndarray, frame: Frame) -> np.ndarray:
+    """Returns the points i64 of a frame near the ground that lie right below an object's points (its wheels, its feet)."""
+    low = np.flatnonzero((frame.height >= _FOOT[1] * frame.raised_above) & (frame.height < frame.raised_above))
+    low = low[frame.label[low] == 0]
+    tree = cKDTree(frame.points[own][:, :2])
+    return low[np.isfinite(tree.query(frame.points[low][:, :2], distance_upper_bound=_FOOT[0])[0])]
+
+
+def merge_alike(found: list[MovingObject], world: World) -> list[MovingObject]:
+    """Returns the objects with pieces of one joined: those that touch, or follow one another, and move alike."""
+    merged: list[MovingObject] = []
+    for one in sorted(found, key=lambda one: -one.size):
+        whole = next((other for other in merged if _one_body(other, one, world)), None)
+        if whole is None:
+            merged.append(one)
+            continue
+        for t, points in one.points.items():
+            if t not in whole.points:
+                whole.motion[t] = one.between(one.start, t) @ _bridge(whole, one)
+            whole.points[t] = np.union1d(whole.points.get(t, points[:0]), points)
+        whole.saved += one.saved
+    return merged
+
+
+def _bridge(whole: MovingObject, one: MovingObject) -> np.ndarray:
+    """Returns the motion f64 (4,4) of the whole from its own start to that of a piece."""
+    return extended(whole.motion, one.start)
+
+
+def _one_body(whole: MovingObject, one: MovingObject, world: World) -> bool:
+    """Returns whether a piece touches a larger one where that goes, and moves as it does."""
+    gaps = []
+    for t, own in one.points.items():
+        frame = world.frames[t]
+        if not len(own) or world.run[t] != world.run[whole.start]:
+            return False
+        near = min(whole.points, key=lambda u: (abs(u - t), u))
+        body = moved(world.frames[near].points[whole.points[near]], whole.between(near, t))
+        if len(body) == 0:
+            return False
+        gaps.append(float(np.median(cKDTree(body).query(frame.points[own])[0])))
+        for u in one.points:
+            if abs(u - t) == 1 and not _alike(frame.points[own], whole.between(t, u), one.between(t, u), _ALIKE):
+                return False
+    return min(gaps) < _APART

@@ -1,0 +1,83 @@
+"""Ego motion: the sensor's own motion between frames, by point-to-plane ICP on what stands."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dpcli.ops.open3d_import import load_open3d
+
+_SCALES = ((1.0, 3.0), (0.5, 1.2), (0.3, 0.5))  # voxel and farthest partner, meters
+_STEP = 2.5  # meters between the starts of the search
+_STEPS = {0: 20, 1: 20, 2: 30}
+_BETTER = 0.97  # of the misfit of standing still that a motion must leave, or the sensor stood
+_NEAR = 0.5  # meters: a point this near to the other frame's has a partner
+OVERLAP = 0.3  # share of points with a partner below which two frames are not of one place
+
+
+def register_frames(frames: list[np.ndarray], ground: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the pose of each frame, f64 (T,4,4), frame to frame 0's coordinates, and the overlap f64 (T-1) of neighbors.
+
+    frames: f64 (N_t,3), z up, meters; ground: bool (N_t). ICP starts at the same motion as before, at no motion, and
+    at some motions around. Frames without overlap stay where the motion before takes them.
+    """
+    clouds = [_thin_frame(frame, own) for frame, own in zip(frames, ground)]
+    poses, shares, before = [np.eye(4)], [], np.eye(4)
+    for source, target in zip(clouds[1:], clouds):
+        motion, share = _register_pair(source, target, before)
+        shares.append(share)
+        before = motion if share >= OVERLAP else before
+        poses.append(poses[-1] @ before)
+    return np.stack(poses), np.array(shares)
+
+
+def _thin_frame(points: np.ndarray, ground: np.ndarray) -> list:
+    """Returns the frame at every scale with normals; ground is kept in larger voxels, since it says nothing of the way."""
+    open3d = load_open3d()
+    clouds = []
+    for voxel, _ in _SCALES:
+        cloud = open3d.geometry.PointCloud()
+        for own, size in ((points[~ground], voxel), (points[ground], 3 * voxel)):
+            cloud += open3d.geometry.PointCloud(open3d.utility.Vector3dVector(own)).voxel_down_sample(size)
+        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(3 * voxel, 20))
+        clouds.append(cloud)
+    return clouds
+
+
+def _register_pair(source: list, target: list, before: np.ndarray) -> tuple[np.ndarray, float]:
+    """Returns the motion f64 (4,4) of the source onto the target, and the share of its points with a partner there."""
+    if min(len(source[-1].points), len(target[-1].points)) < 10:
+        return before, 0.0
+    starts = [before, np.eye(4)]
+    for x, y in product((-_STEP, 0, _STEP), repeat=2):
+        start = before.copy()
+        start[:2, 3] += x, y
+        starts.append(start)
+    tree = cKDTree(np.asarray(target[1].points))
+    found = [_icp(source[0], target[0], start, 0) for start in starts]
+    some = sorted(found, key=lambda motion: _misfit(source[1], tree, motion)[0])[:2]
+    ends = []
+    for motion in some:
+        for scale in (1, 2):
+            motion = _icp(source[scale], target[scale], motion, scale)
+        ends.append((*_misfit(source[1], tree, motion), motion))
+    rest = (*_misfit(source[1], tree, np.eye(4)), np.eye(4))
+    misfit, share, motion = min(ends, key=lambda end: end[0])
+    return (motion, share) if misfit < _BETTER * rest[0] else (rest[2], rest[1])
+
+
+def _icp(source, target, start: np.ndarray, scale: int) -> np.ndarray:
+    registration = load_open3d().pipelines.registration
+    farthest = _SCALES[scale][1]
+    loss = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(farthest / 2))
+    criteria = registration.ICPConvergenceCriteria(1e-6, 1e-6, _STEPS[scale])
+    return registration.registration_icp(source, target, farthest, start, loss, criteria).transformation.copy()
+
+
+def _misfit(source, tree: cKDTree, motion: np.ndarray) -> tuple[float, float]:
+    """Returns the mean distance to the target, cut at twice `_NEAR`, and the share of points nearer than `_NEAR`."""
+    moved = np.asarray(source.points) @ motion[:3, :3].T + motion[:3, 3]
+    distance = tree.query(moved, distance_upper_bound=2 * _NEAR)[0]
+    return float(np.minimum(distance, 2 * _NEAR).mean()), float((distance < _NEAR).mean())

@@ -1,0 +1,105 @@
+"""The explanation of a scene: labels of all points, and the rigid motions of what stands and of what moves on its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dpcli.segment.scene.carrying import MovingObject, extended
+from dpcli.segment.scene.ego_motion import OVERLAP, register_frames
+from dpcli.segment.scene.ground import find_up, height_above_ground, level
+from dpcli.segment.scene.line_of_sight import range_jumps
+from dpcli.segment.scene.moving_objects import find_moving_objects
+from dpcli.segment.scene.settings import SceneSettings
+from dpcli.segment.scene.world import Frame, World
+
+_SURE = 50.0  # points explained better that make an object two thirds surer
+_FEWEST = 50  # points of a frame that shows anything of a scene
+_FAR = 40.0  # meters: a sensor has some point nearer than this
+_JUMPS = 0.12  # share of neighboring beams that may end at different ranges, seen from where the sensor was
+
+
+@dataclass
+class SceneExplanation:
+    """Holds what was found: labels i64 of each frame's points, 0 for all that stands, and the motions.
+
+    pose: f64 (T,4,4), frame to world, in the input's own coordinates and unit; objects: motion f64 (4,4) in that world
+    from its first frame to each that it was met in; confidence: of each, 0.5 to 1. apart: frames that overlap with none
+    before them. dropped: objects beyond the most that are kept.
+    """
+
+    labels: list[np.ndarray]
+    pose: np.ndarray
+    objects: list[dict[int, np.ndarray]]
+    confidence: list[float]
+    apart: list[int]
+    dropped: int
+
+    def motion(self, part: int, source: int, target: int) -> np.ndarray:
+        """Returns the rigid motion f64 (4,4) of a part, 0 for what stands, from one frame's coordinates to another's.
+
+        An object that was not met in one of the two frames keeps its motion between the nearest frames it was met in.
+        """
+        moved = np.eye(4)
+        if part > 0:
+            known = self.objects[part - 1]
+            moved = extended(known, target) @ np.linalg.inv(extended(known, source))
+        return np.linalg.inv(self.pose[target]) @ moved @ self.pose[source]
+
+
+def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings) -> SceneExplanation:
+    """Returns what stands and what moves in frames f64 (N_t,3), meters, in the order of time.
+
+    sensor: places f64 (3) in the frames' coordinates where the sensor may have been; the first one that fits is taken.
+    """
+    filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
+    labels = [np.zeros(len(frame), np.int64) for frame in frames]
+    poses, found, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], [], []
+    dropped = 0
+    if len(filled) > 1:
+        world, own, turn, apart = _build_world([frames[t] for t in filled], sensor, settings)
+        every = find_moving_objects(world, settings)
+        found, dropped = every[: settings.most_objects], max(len(every) - settings.most_objects, 0)
+        for number, one in enumerate(found, 1):
+            for t, points in one.points.items():
+                labels[filled[t]][points] = number
+        before = np.maximum(np.searchsorted(filled, np.arange(len(frames)), side="right") - 1, 0)
+        poses = (turn.T @ own @ turn)[before]  # frames that show nothing are where the one before was
+        objects = [_in_input_axes(one, filled, turn) for one in found]
+    confidence = [1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found]
+    return SceneExplanation(labels, poses, objects, confidence, [filled[t] for t in apart], dropped)
+
+
+def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> dict[int, np.ndarray]:
+    """Returns the object's motions in axes that were turned (4,4) upright before, by the numbers of all frames."""
+    return {filled[t]: turn.T @ motion @ turn for t, motion in one.motion.items()}
+
+
+def _build_world(
+    frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings
+) -> tuple[World, np.ndarray, np.ndarray, list[int]]:
+    """Returns the registered frames, their poses f64 (T,4,4) in upright axes, the turn (4,4) to these, and frames apart."""
+    largest = max(frames, key=len)
+    eye = next((place for place in sensor if _may_be_sensor(largest, place)), None)
+    turn = np.eye(4)
+    turn[:3, :3] = level(find_up(largest, eye)[0])
+    upright = [frame @ turn[:3, :3].T for frame in frames]
+    heights = [height_above_ground(frame) for frame in upright]
+    poses, overlap = register_frames(upright, [height < settings.ground for height in heights])
+    run = np.concatenate([[0], np.cumsum(overlap < OVERLAP)])
+    world = [
+        Frame(
+            frame @ pose[:3, :3].T + pose[:3, 3],
+            height,
+            None if eye is None else pose[:3, :3] @ (turn[:3, :3] @ eye) + pose[:3, 3],
+            settings.ground,
+        )
+        for frame, height, pose in zip(upright, heights, poses)
+    ]
+    return World(world, run, settings.window), poses, turn, [int(t) + 1 for t in np.flatnonzero(overlap < OVERLAP)]
+
+
+def _may_be_sensor(points: np.ndarray, place: np.ndarray) -> bool:
+    """Returns whether a frame looks as if taken from a place (3): neighboring beams mostly end at about the same range."""
+    return bool(np.linalg.norm(points - place, axis=1).min() < _FAR and range_jumps(points, place) < _JUMPS)

@@ -1,0 +1,70 @@
+"""Lines of sight: the places that a frame looked through, so that nothing was there."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+_NEIGHBORS = 6
+_SAMPLE = 4000  # points that tell where the sensor stood
+
+
+class LineOfSight:
+    """Tells which places a sensor looked through. Points are f64 (N,3), z up, in the sensor's frame; `origin` (3) is its eye.
+
+    Directions are compared in units of the distance between beams, along rows and across them.
+    """
+
+    def __init__(self, points: np.ndarray, origin: np.ndarray):
+        self._origin = origin
+        direction, self._range = self._directions(points)
+        self.across, self.along = _beam_spacing(direction)
+        self._scale = np.array([1 / (2 * self.along), 1 / (0.8 * self.across)])
+        self._tree = cKDTree(self._scaled(direction), boxsize=[2 * np.pi * self._scale[0], 0])
+
+    def _directions(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        way = points - self._origin
+        flat = np.hypot(way[:, 0], way[:, 1])
+        return np.stack([np.arctan2(way[:, 1], way[:, 0]), np.arctan2(way[:, 2], flat)], 1), np.hypot(flat, way[:, 2])
+
+    def _scaled(self, direction: np.ndarray) -> np.ndarray:
+        turned = np.stack([np.mod(direction[:, 0], 2 * np.pi), direction[:, 1]], 1) * self._scale
+        turned[:, 0] = np.minimum(turned[:, 0], np.nextafter(2 * np.pi * self._scale[0], 0))
+        return turned
+
+    def beside(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the range (M) of places (M,3), and those f64 (M,K) of the beams beside them, infinite where none is."""
+        direction, reach = self._directions(places)
+        index = self._tree.query(self._scaled(direction), k=_NEIGHBORS, distance_upper_bound=1.0)[1]
+        return reach, np.append(self._range, np.inf)[index]
+
+    def look(self, places: np.ndarray, margin: np.ndarray) -> np.ndarray:
+        """Returns bool (M): whether all beams beside a place (M,3), two at least, end more than `margin` (M) behind it."""
+        reach, ends = self.beside(places)
+        return (np.isfinite(ends).sum(1) >= 2) & (ends.min(1) > reach + margin)
+
+
+def _beam_spacing(direction: np.ndarray) -> tuple[float, float]:
+    """Returns the angles between rows of beams and along a row, radians, from the directions (N,2) of a frame's points."""
+    degree = np.radians(1)
+    sector = np.floor(direction[:, 0] / (0.5 * degree)).astype(int)
+    order = np.lexsort((direction[:, 1], sector))
+    gap = np.diff(direction[order, 1])[np.diff(sector[order]) == 0]
+    gap = gap[gap > 0.05 * degree]
+    across = float(np.clip(np.median(gap) if len(gap) else degree, 0.1 * degree, 2.5 * degree))
+    cells = np.unique(np.stack([sector, np.floor(direction[:, 1] / across).astype(int)]), axis=1).shape[1]
+    along = cells * 0.5 * degree / max(len(direction), 1)
+    return across, float(np.clip(along, 0.08 * degree, degree))
+
+
+def range_jumps(points: np.ndarray, origin: np.ndarray) -> float:
+    """Returns the share of neighboring beams that end at ranges a tenth apart and more, were the sensor at `origin` (3).
+
+    It is small at the true place, where only outlines of objects count, and larger elsewhere, whence far and near mix.
+    """
+    sight = LineOfSight(points, origin)
+    some = points[np.linspace(0, len(points) - 1, min(len(points), _SAMPLE)).astype(int)]
+    reach, ends = sight.beside(some)
+    known = np.isfinite(ends)
+    jumps = np.abs(np.log(np.where(known, ends, 1) / np.maximum(reach, 1e-9)[:, None])) > 0.1
+    return float((jumps & known).sum() / max(known.sum(), 1))

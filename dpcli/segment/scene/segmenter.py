@@ -1,0 +1,92 @@
+"""The segmenter of scenes: every point gets a label, 0 for all that stands, and every moving object a number."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from dpcli.runtime.progress import log
+from dpcli.segment.scene.explain import explain_scene
+from dpcli.segment.scene.settings import SceneSettings
+from dpcli.segment.segmenters import Flows, Segmenter
+from dpcli.store import CloudSequence
+from dpcli.store.parts import PartsSample
+
+_METERS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0}
+
+
+@dataclass(frozen=True)
+class SceneSegmenter(Segmenter):
+    """Explains lidar scans and depth images of streets: the sensor's own motion, and objects that move on their own."""
+
+    settings: SceneSettings
+    needs_flows: ClassVar[bool] = False
+
+    @property
+    def slots(self) -> int:
+        """The background and the most objects of a sequence."""
+        return self.settings.most_objects + 1
+
+    def segment(self, frames: list[Tensor], flows: Flows) -> list[Tensor]:
+        """Returns labels as masks of zeros and ones, of frames (N_t,3) in meters seen from their origin."""
+        found = explain_scene([np.float64(frame) for frame in frames], [np.zeros(3)], self.settings)
+        return [torch.nn.functional.one_hot(torch.from_numpy(own), self.slots).float() for own in found.labels]
+
+    def explain(
+        self, sequence: CloudSequence, pairs: list[tuple[int, int]], length_unit: str
+    ) -> tuple[np.ndarray, PartsSample]:
+        """Returns the labels i16 (P) of a sequence, and masks, motions and flow of the pairs of frames, in its own unit.
+
+        Frames are looked at in the order of `time` where it is known; units that are no lengths count as meters.
+        """
+        count, unit = sequence.num_frames, _METERS.get(length_unit, 1.0)
+        order = np.arange(count) if sequence.time is None else np.argsort(sequence.time, kind="stable")
+        to_meters = np.diag([unit, unit, unit, 1.0])
+        to_meters[:3, 3] = -unit * np.median(sequence.points, axis=0)
+        clouds = [_moved(np.float64(sequence.frame(t)), to_meters) for t in range(count)]
+        origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
+        found = explain_scene([clouds[t] for t in order], list(_moved(origins, to_meters)), self.settings)
+        place = np.argsort(order)
+        self._tell(sequence.name, [int(order[t]) for t in found.apart], found.dropped)
+        label = np.concatenate([found.labels[place[t]] for t in range(count)])
+        motions, flows = np.tile(np.eye(4), (len(pairs), self.slots, 1, 1)), []
+        for own, (i, j) in zip(motions, pairs):
+            for part in range(len(found.objects) + 1):
+                own[part] = found.motion(part, place[i], place[j])
+            target = _moved_by_parts(clouds[i], found.labels[place[i]], own)
+            flows.append(np.float32((target - clouds[i]) / unit))
+        motions = np.linalg.inv(to_meters) @ motions @ to_meters
+        sure = np.eye(self.slots, dtype=np.float32)
+        for part, confidence in enumerate(found.confidence, 1):
+            sure[part, [0, part]] = 1 - confidence, confidence
+        sample = PartsSample(sure[label], np.array(pairs, np.int32).reshape(-1, 2), np.float32(motions), flows)
+        return label.astype(np.int16), sample
+
+    def _tell(self, name: str, apart: list[int], dropped: int) -> None:
+        """Warns of frames whose place is unknown, since they overlap with none before them, and of objects left out."""
+        if dropped:
+            log.warn(
+                f"{name}: {dropped} moving objects beyond the largest {self.settings.most_objects} are taken to stand;"
+                " --set most_objects= keeps more"
+            )
+        if apart:
+            log.warn(
+                f"{name}: frame {', '.join(map(str, apart))}: too little in common with the frame before to tell how the"
+                " sensor moved; it is taken to move on as before, and nothing is compared across the gap"
+            )
+
+
+def _moved(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    return points @ motion[:3, :3].T + motion[:3, 3]
+
+
+def _moved_by_parts(points: np.ndarray, label: np.ndarray, motions: np.ndarray) -> np.ndarray:
+    """Returns points f64 (N,3) that follow the motions (K,4,4) of their labels (N)."""
+    target = np.empty_like(points)
+    for part in np.unique(label):
+        target[label == part] = _moved(points[label == part], motions[part])
+    return target

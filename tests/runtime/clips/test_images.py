@@ -1,0 +1,85 @@
+"""Images as they are shown: upright, and colors of a profile as sRGB, in folders and in animations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from tests.support.color_profile import BT709, P3, color_profile, to_xyz
+
+TURNS = {
+    2: lambda rgb: rgb[:, ::-1],
+    3: lambda rgb: rgb[::-1, ::-1],
+    5: lambda rgb: rgb.transpose(1, 0, 2),
+    6: lambda rgb: np.rot90(rgb),
+    8: lambda rgb: np.rot90(rgb, -1),
+}
+
+
+@pytest.mark.parametrize("orientation", TURNS)
+def test_images_are_upright_as_their_exif_says(tmp_path, orientation):
+    rgb = np.zeros((20, 40, 3), np.uint8)
+    rgb[:8, :10], rgb[:8, 30:] = (255, 0, 0), (0, 0, 255)
+    turned = Image.fromarray(np.ascontiguousarray(TURNS[orientation](rgb)))
+    exif = turned.getexif()
+    exif[0x0112] = orientation
+    turned.save(tmp_path / "0.png", exif=exif)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "0.png")[..., :3], rgb)
+
+
+def shown(rgb: np.ndarray, primaries, gamma: float) -> np.ndarray:
+    """sRGB codes u8 (...,3) of codes in these primaries, by the definitions."""
+    light = (rgb / 255.0) ** gamma @ (np.linalg.inv(to_xyz(BT709)) @ to_xyz(primaries)).T
+    light = light.clip(0, 1)
+    return np.round(255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))
+
+
+WIDE = {
+    "png": {},
+    "webp": {"lossless": True, "exact": True},
+    "tif": {},
+    "avif": {"quality": 100, "subsampling": "4:4:4"},
+}
+
+
+@pytest.mark.parametrize(
+    ("suffix", "moves"), [*((suffix, False) for suffix in WIDE), ("png", True), ("webp", True), ("avif", True)]
+)
+def test_colors_of_a_profile_are_shown_in_srgb(tmp_path, suffix, moves):
+    rgba = np.full((2, 16, 24, 4), (120, 90, 60, 200), np.uint8)
+    rgba[1, :, 12:, :3] = (100, 140, 90)
+    images = [Image.fromarray(picture) for picture in rgba]
+    words = WIDE[suffix] | {"icc_profile": color_profile(P3, 1.8)}
+    if moves:
+        images[0].save(tmp_path / f"a.{suffix}", save_all=True, append_images=images[1:], duration=100, **words)
+        read = np.stack(list(open_frames(tmp_path / f"a.{suffix}").read([0, 1])))
+    else:
+        images[1].save(tmp_path / f"a.{suffix}", **words)
+        read = read_rgba(tmp_path / f"a.{suffix}")[None]
+    np.testing.assert_allclose(read[..., :3], shown(rgba[-len(read) :, ..., :3], P3, 1.8), atol=3)
+    assert (read[..., 3] == 200).all()
+
+
+@pytest.mark.parametrize("profile", [color_profile(P3, name=b"sRGB IEC61966-2.1"), b"no profile at all"])
+def test_images_that_are_srgb_or_have_a_damaged_profile_stay(tmp_path, profile):
+    Image.new("RGB", (8, 8), (120, 90, 60)).save(tmp_path / "a.png", icc_profile=profile)
+    assert tuple(read_rgba(tmp_path / "a.png")[0, 0]) == (120, 90, 60, 255)
+
+
+@pytest.mark.parametrize("gray", [np.float32(0.4), np.float32(102), np.uint16(102 * 257), np.uint16(102)])
+def test_gray_of_any_type_has_its_own_range(tmp_path, gray):
+    values = np.zeros((8, 8), gray.dtype)
+    values[2:] = gray
+    Image.fromarray(values).save(tmp_path / "a.tif")
+    read = read_rgba(tmp_path / "a.tif")
+    assert read[0, 0].tolist() == [0, 0, 0, 255] and read[4, 4].tolist() == [102, 102, 102, 255]
+
+
+def test_pages_of_a_tiff_are_no_clip(tmp_path):
+    images = [Image.new("RGB", (8, 8), (k, 0, 0)) for k in range(3)]
+    images[0].save(tmp_path / "a.tif", save_all=True, append_images=images[1:])
+    with pytest.raises(DataError, match="3 pages, which tell no times; write each into a folder"):
+        open_frames(tmp_path / "a.tif")
