@@ -20,7 +20,8 @@ BENCH_DATA ?= $(or $(MSRACTION),$(wildcard ../shared/data/msraction3d))
 
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-4.3 table-5.1 table-5.2 figure-5.3
+.PHONY: help venv demo test bench fuzz kills lint clean table-4.1 table-4.2 table-4.3 table-4.4 table-4.5 table-4.6 table-5.1
+.PHONY: table-5.2 figure-5.3
 .PHONY: segments prior table-3.1 table-3.2 table-3.3 table-3.4 table-3.5 figure-3.5 figure-3.8 table-A.1 figure-A.4
 
 help:
@@ -38,6 +39,7 @@ help:
 	@echo "make table-4.1 SAPIEN=folder  the switches of unsupervised training, six rows; hours"
 	@echo "make table-4.2 SAPIEN=folder  rigid parts on categories never seen, all methods; an hour and a half"
 	@echo "make table-4.3 MESHES=folder | OGC=folder  rigid parts of rooms, all methods"
+	@echo "make table-4.4 KITTI_SF=folder, table-4.5 KITTI_DET=folder, table-4.6 SEMANTICKITTI=folder  objects of streets"
 	@echo "make table-5.1 MESHES=folder | ARTEMIS=folder  4D scenes of one view, five rows and those of the thesis; hours"
 	@echo "make table-5.2 MESHES=folder  4D scenes of animated meshes, rows (a) to (e); an hour"
 	@echo "make figure-5.3 MESHES=folder the same clips, control points and weight of temporal preservation; an hour and a half"
@@ -188,31 +190,44 @@ table-4.3: $(READY)
 	$(if $(MESHES)$(OGC),,$(error make table-4.3 needs MESHES=folder, models to furnish rooms with, or OGC=folder, with OGC-DR and OGC-DRSV in it))
 	$(BIN)/python -m dpcli.reproduce.table_4_3 table/4.3 $(if $(OGC),--ogc "$(OGC)",--meshes "$(MESHES)") $(T43)
 
+# Tables 4.4 to 4.6, objects of KITTI's streets; T44, T45, T46: words for the program. Stopped, they go on where they were.
+table-4.4: $(READY)
+	$(if $(KITTI_SF),,$(error make table-4.4 needs KITTI_SF=folder, with training/disp_occ_0, flow_occ, instance, ... in it))
+	$(BIN)/python -m dpcli.reproduce.street_tables table/4.4 --kitti-sf "$(KITTI_SF)" $(T44)
+
+table-4.5: $(READY)
+	$(if $(KITTI_DET),,$(error make table-4.5 needs KITTI_DET=folder, with training/velodyne, label_2, calib in it))
+	$(BIN)/python -m dpcli.reproduce.street_tables table/4.5 --kitti-det "$(KITTI_DET)" $(T45)
+
+table-4.6: $(READY)
+	$(if $(SEMANTICKITTI),,$(error make table-4.6 needs SEMANTICKITTI=folder, with dataset/sequences/00 ... 10 in it))
+	$(BIN)/python -m dpcli.reproduce.street_tables table/4.6 --semantickitti "$(SEMANTICKITTI)" $(T46)
+
 # Table 5.1 on ARTEMIS' animals (ARTEMIS names their folder) or on animated meshes; T51: words for the program.
 MESHES ?=
 ARTEMIS ?=
 table-5.1: $(READY)
 	$(if $(MESHES)$(ARTEMIS),,$(error make table-5.1 needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
-	$(BIN)/python -m dpcli.reproduce.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
+	$(BIN)/python -m dpcli.reproduce.scenes.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
 
 # Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files; T52: words for the program. Stopped, it
 # goes on where it was.
 table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2 $(T52)
+	$(BIN)/python -m dpcli.reproduce.scenes.table_5_2 "$(MESHES)" table/5.2 $(T52)
 
 # Figure 5.3 of the thesis on the same clips: the number of control points, and the weight of temporal preservation.
 figure-5.3: $(READY)
 	$(if $(MESHES),,$(error make figure-5.3 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
+	$(BIN)/python -m dpcli.reproduce.scenes.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
 
 # The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
-HELD_OUT := dpcli/reproduce/held_out_models.txt
+HELD_OUT := dpcli/reproduce/scenes/held_out_models.txt
 PRIOR ?= --set bfloat16=true
 prior: $(READY)
 	$(if $(MESHES),,$(error make prior needs MESHES=folder, a folder with the models of $(HELD_OUT) and many others below it))
 	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)
-	$(BIN)/python -m dpcli.reproduce.prior_sides "$(MESHES)" prior --models prior/run
+	$(BIN)/python -m dpcli.reproduce.scenes.prior_sides "$(MESHES)" prior --models prior/run
 
 fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz.fuzz_files fuzz/files $(if $(SEED),--seed $(SEED)) $(if $(INPUTS),--inputs $(INPUTS)) \

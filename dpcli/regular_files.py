@@ -12,6 +12,8 @@ from pathlib import Path
 
 from dpcli.errors import DataError
 
+_EXPECTED = ", expected a regular file"
+
 
 def why_unreadable(path: Path) -> str:
     """Returns why a path must not be opened, "" where it may be: it is a file, a folder, or nothing that exists.
@@ -28,7 +30,7 @@ def why_unreadable(path: Path) -> str:
         )
     kinds = {stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
     kind = kinds.get(stat.S_IFMT(mode), "")
-    return f"{kind}, expected a regular file" if kind else ""
+    return f"{kind}{_EXPECTED}" if kind else ""
 
 
 _refusing = False  # whether this process is inside `regular_files_only`
@@ -36,14 +38,15 @@ _refusing = False  # whether this process is inside `regular_files_only`
 
 @contextmanager
 def regular_files_only() -> Iterator[None]:
-    """Raises DataError in the block where something opens a FIFO, which would wait for ever; pipes of the shell are let be.
+    """Raises DataError in the block where something opens a FIFO, which would wait for ever, or a link to a device, which has
+    no end; pipes of the shell are let be.
 
     So no reader and no library (NumPy, Pillow, zipfile) needs to ask first about the files that lie in a sample's folder.
     """
     global _refusing
-    if _refuse_fifo not in _installed:
-        sys.addaudithook(_refuse_fifo)
-        _installed.add(_refuse_fifo)
+    if _refuse_odd not in _installed:
+        sys.addaudithook(_refuse_odd)
+        _installed.add(_refuse_odd)
     before, _refusing = _refusing, True
     try:
         yield
@@ -51,10 +54,10 @@ def regular_files_only() -> Iterator[None]:
         _refusing = before
 
 
-def _refuse_fifo(event: str, arguments: tuple) -> None:
+def _refuse_odd(event: str, arguments: tuple) -> None:
     if _refusing and event == "open" and isinstance(arguments[0], (str, bytes)):
         path = os.fsdecode(arguments[0])
-        if not path.startswith(("/dev/", "/proc/")) and (reason := why_unreadable(Path(path))).startswith("a FIFO"):
+        if not path.startswith(("/dev/", "/proc/")) and (reason := why_unreadable(Path(path))).endswith(_EXPECTED):
             raise DataError(f"{path}: {reason}; it was not opened")
 
 

@@ -62,14 +62,14 @@ PRESETS = {
     "sparse": _preset(
         KinetConfig(**_SPARSE),
         Schedule(
-            100,
+            25,
             0,
             batch=64,
             learning_rate=2e-3,
             weight_decay=0.02,
             label_smoothing=0.1,
-            clips_per_video=4,
-            validate_every=10,
+            clips_per_video=16,
+            validate_every=5,
         ),
         "sparse",
         timing="slots",

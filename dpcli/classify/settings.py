@@ -49,6 +49,8 @@ class TrainingSettings:
             raise UsageError(
                 "--validation cross: needs a network of several members, as preset sparse has; give another rule"
             )
+        if self.schedule.fine_tune != "all" and not self.run.init:
+            raise UsageError(f"--fine-tune {self.schedule.fine_tune}: goes on from a model; name it with --init")
         slots = self.network.backbone == "slots"
         if slots != (self.run.timing == "slots") or (slots and self.schedule.epochs_dynamic):
             raise UsageError(
@@ -67,8 +69,11 @@ def network_config(given: Given, classes: int) -> KinetConfig:
     return NETWORK.resolve(base, Given(config=_all_values(given)))["network"].changed(num_classes=classes)
 
 
-def training_settings(given: Given) -> TrainingSettings:
-    """Returns the preset's settings with what was given over them. Raises UsageError where they don't fit together."""
+def training_settings(given: Given, base: Mapping[str, Any] | None = None) -> TrainingSettings:
+    """Returns the preset's settings, or those of other groups, with what was given over them.
+
+    Raises UsageError where they don't fit together.
+    """
     values = _all_values(given)
     if values.get("pretrain"):
         if values.get("frames", 1) != 1 or values.get("epochs_dynamic", 0) != 0:
@@ -76,7 +81,7 @@ def training_settings(given: Given) -> TrainingSettings:
                 "pretrain trains the static stream on clips of one frame; leave out --frames and epochs_dynamic"
             )
         values |= {"frames": 1, "temporal_radius": 0, "epochs_dynamic": 0}  # a single cloud a video
-    return TrainingSettings(**TRAINING.resolve(PRESETS[given.preset or ""], Given(config=values)))
+    return TrainingSettings(**TRAINING.resolve(base or PRESETS[given.preset or ""], Given(config=values)))
 
 
 def with_classes(settings: TrainingSettings, classes: int) -> TrainingSettings:

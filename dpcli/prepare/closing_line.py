@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.prepare.median import median
 from dpcli.store import CloudsReader
 
 _SEQUENCES, _FRAMES = 16, 3  # looked at, spread evenly: the line takes milliseconds, however large the file
@@ -36,17 +37,17 @@ def _lengths(reader: CloudsReader) -> list[str]:
     for place in places:
         frames = _spread(int(reader.frame_counts[place]), _FRAMES)
         points = np.concatenate([reader.read(place, [t], fields=()).points for t in frames])
-        distances.append(float(np.median(np.sqrt(np.einsum("ij,ij->i", points, points)))))
+        distances.append(float(median(np.sqrt(np.einsum("ij,ij->i", points, points)))))
         extents.append([np.ptp(points[:, axis]) for axis in range(3)])  # NumPy is slow along short rows
         left -= len(points)
         if left < 0:
             break
     long = len(reader.length_unit) > _LONG_UNIT
     unit = f" {reader.length_unit}" if reader.length_unit and not long else ""
-    extent = " x ".join(_number(value) for value in np.median(extents, axis=0))
+    extent = " x ".join(_number(value) for value in median(np.array(extents)))
     shown = [f"extent {extent}{unit}"]
     if not reader.shifts[places].any():  # else the origin is no sensor
-        shown.insert(0, f"median distance {_number(float(np.median(distances)))}{unit}")
+        shown.insert(0, f"median distance {_number(float(median(np.array(distances))))}{unit}")
     return [*shown[:-1], f"{shown[-1]} ({reader.length_unit})"] if long else shown
 
 
@@ -68,7 +69,7 @@ def _frames(reader: CloudsReader) -> str:
     ends = np.cumsum(counts)[:-1] - 1
     steps = np.delete(steps, ends[ends < len(steps)])
     steps = steps[steps > 0]
-    return f"{shown} at {_number(float(1 / np.median(steps)))} fps" if len(steps) else shown
+    return f"{shown} at {_number(float(1 / median(steps)))} fps" if len(steps) else shown
 
 
 def _shifts(reader: CloudsReader) -> list[str]:

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
-from dpcli.prepare.reader import SPLIT_FOLDERS, Item
+from dpcli.prepare.reader import Item, split_called
+from dpcli.runtime.progress import log
 
 _COLUMNS = ("name", "label", "subject", "split")
+_CALLED = {"file": "name", "filename": "name", "path": "name", "video": "name", "sample": "name"} | {
+    "class": "label",
+    "category": "label",
+    "person": "subject",
+    "subset": "split",
+}
+_SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}$")  # of files; 1.5 in a name is a number
+_WHOLE = re.compile(r"^(-?\d+)\.0+$")  # as programs write a column of numbers that has a gap
 
 
 @dataclass(frozen=True)
@@ -33,36 +44,73 @@ class LabelTable:
     def apply(self, items: list[Item]) -> list[Item]:
         """Returns items with the table's fields; one it doesn't name keeps label -1.
 
-        Raises DataError when it names a stranger.
+        Names may lack the suffix of a sample's, or have one more. Raises DataError when it names a stranger.
         """
-        strangers = sorted(self.rows.keys() - {item.name for item in items})
+        found = _told_apart(item.name for item in items)
+        places = {written: found.get(_plain(written)) or found.get(_stem(written)) for written in self.rows}
+        strangers = sorted(written for written, name in places.items() if not name)
         if strangers:
             known = ", ".join(item.name for item in items[:3])
             raise DataError(f"{self.path}: names {strangers[0]!r}, which is not among the samples ({known}, ...)")
-        rows = ((item, self.rows.get(item.name)) for item in items)
+        twice = [name for name, count in Counter(places.values()).items() if count > 1]
+        if twice:
+            raise DataError(f"{self.path}: names {twice[0]!r} twice, with and without its suffix")
+        own = {places[written]: row for written, row in self.rows.items()}
+        rows = ((item, own.get(item.name)) for item in items)
         return [replace(i, label=r.label, subject=r.subject, split=r.split) if r else i for i, r in rows]
+
+    def unnamed(self, items: list[Item]) -> list[str]:
+        """Returns a line for the log about the samples that the table doesn't name; none when it names all."""
+        names = [item.name for item in items if item.label < 0 and not item.problem]
+        return [f"{len(names)} without a label in {self.path}: {', '.join(names[:5])}"] if names else []
+
+
+def _plain(name: str) -> str:
+    return name.replace("\\", "/").removeprefix("./")
+
+
+def _stem(name: str) -> str:
+    return _SUFFIX.sub("", _plain(name))
+
+
+def _told_apart(names: Iterable[str]) -> dict[str, str]:
+    """Returns the names of samples by themselves, and by what they are without a suffix where that is one sample's."""
+    names = list(names)
+    stems = Counter(map(_stem, names))
+    return {_stem(name): name for name in names if stems[_stem(name)] == 1} | {name: name for name in names}
 
 
 def read_labels(path: Path) -> LabelTable:
     """Reads columns ``name,label[,subject][,split]`` with a header line, or the first two without one.
 
-    Labels are whole numbers from 0, or words; words are numbered in alphabetical order. DataError names file and line.
+    Commas, semicolons or tabs divide; further columns are passed over with a warning. Labels are whole numbers from 0,
+    or words; words are numbered in alphabetical order. DataError names file and line.
     """
+    from dpcli.prepare.cloud_formats.text_numbers import decode_text
+
     try:
-        lines = [
-            [cell.strip() for cell in row] for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines())
-        ]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        text = decode_text(path).lstrip("\ufeff")
+        first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
+        divider = next((mark for mark in ",;\t" if mark in first), ",")
+        lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
+    except (OSError, csv.Error) as error:
         raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
     numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
+    while numbered and numbered[0][1][0].startswith("#"):  # comments above the header
+        numbered.pop(0)
     header = list(_COLUMNS[:2])
-    if numbered and "name" in numbered[0][1]:
-        header = numbered.pop(0)[1]
-        if "label" not in header or set(header) - set(_COLUMNS):
-            raise DataError(f"{path}:1: columns {','.join(header)}; expected name,label and perhaps subject, split")
+    if numbered and (names := _header(numbered[0][1])):
+        header = names
+        if "label" not in header or len(set(header)) < len(header):
+            found = ",".join(numbered[0][1])
+            raise DataError(f"{path}:{numbered[0][0]}: columns {found}; expected name,label and perhaps subject, split")
+        numbered.pop(0)
+        if others := [name for name in header if name and name not in _COLUMNS]:
+            log.warn(f"{path}: columns not read: {', '.join(others)}")
     records: dict[str, dict[str, str]] = {}
     for number, row in numbered:
         record = dict(zip(header, row, strict=False))
+        row = row[: len(header)] if not any(row[len(header) :]) else row  # a line may end with the divider
         if len(row) != len(header) or not record["name"] or not record["label"]:
             raise DataError(f"{path}:{number}: {','.join(row)!r}; expected {','.join(header)}")
         if record["name"] in records:
@@ -71,6 +119,14 @@ def read_labels(path: Path) -> LabelTable:
     if not records:
         raise DataError(f"{path}: no rows; expected {','.join(header)}")
     return _number_labels(path, records)
+
+
+def _header(row: list[str]) -> list[str]:
+    """Returns the columns that a first line names, those we know as we call them; [] when it is no header."""
+    names = [_CALLED.get(cell.lower(), cell.lower()) for cell in row]
+    while names and not names[-1]:
+        names.pop()
+    return names if "name" in names else []
 
 
 def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTable:
@@ -89,9 +145,9 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
             f"{root}: {short[0]!r} lies in no folder of its class; --label-from-folder expects {layout}, or"
             f" train/{layout} and test/{layout}, below what is given"
         )
-    deep = [name for name, own in parts.items() if own[0] in SPLIT_FOLDERS and len(own) > least]
+    deep = [name for name, own in parts.items() if split_called(own[0]) and len(own) > least]
     divided = len(deep) == len(parts)
-    meant = len({parts[name][0] for name in deep}) > 1 or all(own[0] in SPLIT_FOLDERS for own in parts.values())
+    meant = len({parts[name][0] for name in deep}) > 1 or all(split_called(own[0]) for own in parts.values())
     if deep and meant and not divided:  # else `train` may be a class among others
         odd = [name for name in parts if name not in set(deep)]
         raise DataError(
@@ -100,12 +156,14 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
         )
     classes = {name: own[1 if divided else 0] for name, own in parts.items()}
     class_names = sorted(set(classes.values()))
-    splits = {name: SPLIT_FOLDERS[own[0]] if divided else "" for name, own in parts.items()}
+    splits = {name: split_called(own[0]) if divided else "" for name, own in parts.items()}
     rows = {name: Row(class_names.index(own), -1, splits[name]) for name, own in classes.items()}
     return LabelTable(root, rows, class_names)
 
 
 def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable:
+    for record in records.values():
+        record["label"] = _WHOLE.sub(r"\1", record["label"])
     words = [record["label"] for record in records.values()]
     if all(_is_number(word) for word in words):
         class_names = [str(k) for k in range(_plausible(path, records) + 1)]
@@ -123,7 +181,7 @@ def _number_labels(path: Path, records: dict[str, dict[str, str]]) -> LabelTable
         if not _is_number(subject) or len(subject) > 10 or int(subject) >= 1 << 31:
             raise DataError(f"{where}: subject {subject[:30]!r}; expected a whole number below 2^31")
         split = record.get("split", "")
-        rows[name] = Row(label, int(subject), SPLIT_FOLDERS.get(split, split))
+        rows[name] = Row(label, int(subject), split_called(split) or split)
     return LabelTable(path, rows, class_names)
 
 

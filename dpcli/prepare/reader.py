@@ -14,7 +14,13 @@ from dpcli.errors import DataError
 from dpcli.store import CloudSequence
 
 SPLITS = ("train", "validation", "test")
-SPLIT_FOLDERS = {**dict(zip(SPLITS, SPLITS)), "val": "validation"}  # split of a folder that people call so
+_SPLIT_WORDS = {
+    **dict(zip(SPLITS, SPLITS)),
+    "training": "train",
+    "val": "validation",
+    "valid": "validation",
+    "testing": "test",
+}
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,15 @@ class Sample:
 
     sequence: CloudSequence
     notes: dict[str, int] = field(default_factory=dict)
+
+
+def split_called(word: str) -> str:
+    """Returns the split that people call by this word, in any case, as a folder or in a table; "" when it is none.
+
+    >>> [split_called(word) for word in ("Train", "val", "testing", "wave")]
+    ['train', 'validation', 'test', '']
+    """
+    return _SPLIT_WORDS.get(word.strip().lower(), "")
 
 
 class Reader(Protocol):

@@ -9,13 +9,12 @@ done once; the table FOLDER/table.md is written again after every method.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
 from dpcli.reproduce import runs
+from dpcli.reproduce.part_tables import rows, score
 
-METRICS = ("ap", "pq", "f1", "pre", "rec", "miou", "ri")
 VIEWS = {"full": ("ogc-dr", "OGC-DR"), "single view": ("ogc-drsv", "OGC-DRSV")}
 METHODS = ("multibody", "network", "ssc", "trajaffn", "ward", "dbscan")
 THESIS = {  # percent, full / single view, by METRICS
@@ -38,36 +37,13 @@ def prepare(view: str, options: argparse.Namespace) -> Path:
     return path
 
 
-def score(data: Path, method: str, points: int) -> dict:
-    """Returns the metrics of a method on the test rooms, as shares of 1, with their intervals."""
-    parts = data.with_name(f"{data.stem}-{method}.h5")
-
-    def work() -> dict:
-        runs.dpc("segment", "predict", data, "-o", parts, "--method", method, "--points", points, "--split", "test")
-        return json.loads(runs.dpc("evaluate", "segmentation", parts, "--truth", data, "--split", "test", "--json"))
-
-    return runs.once(parts.with_suffix(".json"), [runs.digest(data), method, points], work)
-
-
 def table(found: dict[str, dict[str, dict]], about: str) -> str:
     """Returns Markdown with a part for each view: our methods, then the thesis's numbers, percent."""
     lines = []
     for place, (view, by_method) in enumerate(found.items()):
-        lines += [f"## {view}", "", "| |" + "|".join(f" {name.upper()} " for name in METRICS) + "| AP, 95 % |"]
-        lines += ["|---|" + "---|" * (len(METRICS) + 1)]
-        for method, result in by_method.items():
-            values = [result["metrics"][name] for name in METRICS]
-            cells = [runs.DASH if value is None else f"{100 * value:.1f}" for value in values]
-            lines.append(f"| {method} | {' | '.join([*cells, _interval(result)])} |")
-        for name, numbers in THESIS.items():
-            lines.append(f"| *{name}, thesis* | {' | '.join([*map(str, numbers[place]), runs.DASH])} |")
-        lines.append("")
+        thesis = {name: numbers[place] for name, numbers in THESIS.items()}
+        lines += [f"## {view}", "", *rows(by_method, thesis), ""]
     return "\n".join([*lines, about, ""])
-
-
-def _interval(result: dict) -> str:
-    found = result.get("intervals", {}).get("metrics", {}).get("ap")
-    return f"{100 * found[0]:.1f} – {100 * found[1]:.1f}" if found else runs.DASH
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -97,7 +73,7 @@ def main(argv: list[str] | None = None) -> None:
         data = prepare(view, options)
         for method in chosen:
             print(f"table 4.3: {view}, {method}", file=sys.stderr)
-            found[view][method] = score(data, method, options.points)
+            found[view][method] = score(data, method, options.points, "test")
             runs.write_text(target, table(found, about))
     print(target.read_text(), end="")
 

@@ -169,6 +169,11 @@ def _lost(how: str = "") -> LostWorker:
     return LostWorker(f"the process that worked on it died ({why}), and so did the one that tried it again")
 
 
+def on_second(work: Callable[[Any], Any], pair: tuple[Any, Any]) -> Any:
+    """Returns ``work`` of a pair's second: for items that travel with their number. A worker loads this module anyway."""
+    return work(pair[1])
+
+
 def ordered_map(
     function: Callable[[Any], Any],
     items: Iterable[Any],

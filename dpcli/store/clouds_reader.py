@@ -56,6 +56,11 @@ class CloudsReader:
             )
         if not len(self.names) == len(self.splits) == len(self._sequence_offsets) - 1:
             raise DataError(f"{self.path}: {len(self.names)} names for {len(self._sequence_offsets) - 1} sequences")
+        if len(set(self.names)) != len(self.names):
+            twice = next(name for k, name in enumerate(self.names) if name in self.names[:k])
+            raise DataError(
+                f"{self.path}: the name {twice!r} is there twice; names identify samples, make the file again"
+            )
         if self.class_names and len(self.labels) and self.labels.max() >= len(self.class_names):
             worst = int(self.labels.argmax())
             raise DataError(
@@ -96,6 +101,11 @@ class CloudsReader:
         column = self._data(file, name, ())[:]
         if len(column) != len(self.names):
             raise DataError(f"{self.path}: {name} has {len(column)} rows for {len(self.names)} names")
+        if column.min(initial=-1) < -1:
+            worst = int(column.argmin())
+            raise DataError(
+                f"{self.path}: {name} {column[worst]} of {self.names[worst]!r}, expected -1 (unknown) or 0, 1, ..."
+            )
         return column
 
     def _offsets(self, file: h5py.File, name: str, end: int | None) -> np.ndarray:
@@ -123,6 +133,12 @@ class CloudsReader:
     def point_counts(self) -> np.ndarray:
         """Counts the points of each sequence, i64 (S)."""
         return np.diff(self._frame_offsets[self._sequence_offsets])
+
+    def times(self, index: int) -> np.ndarray | None:
+        """Returns when the frames of sequence `index` were taken, f64 (T), without its points; None where the file doesn't say."""
+        if "time" not in self.fields:
+            return None
+        return self._set("time")[int(self._sequence_offsets[index]) : int(self._sequence_offsets[index + 1])]
 
     @property
     def file(self) -> h5py.File:
@@ -176,7 +192,7 @@ class CloudsReader:
                 f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
             )
         shift = self.shifts[index]
-        return CloudSequence(
+        made = CloudSequence(
             self.names[index],
             values.pop("points"),
             np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
@@ -188,6 +204,11 @@ class CloudsReader:
             extra={key: values.pop(key) for key in [key for key in values if key.startswith(KEPT)]},
             **values,
         )
+        try:
+            made.validate_values()
+        except DataError as error:
+            raise DataError(f"{self.path}: {error}") from None
+        return made
 
     def given(self, index: int) -> list:
         """Returns sequence `index` as the writer of such a file takes it again."""

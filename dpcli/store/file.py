@@ -137,29 +137,29 @@ def refuse_claim(item: h5py.Dataset, path: Path) -> None:
 
 
 def _check_types(file: h5py.File, path: Path) -> None:
-    """Raises DataError where a data set holds other values than its kind has under that name; unknown names pass."""
+    """Raises DataError where a data set has another type or shape than its kind has under that name; unknown names pass.
+
+    The lengths that a file may choose are the readers' to compare.
+    """
     known = fields_of(str(file.attrs["dpc_kind"]))
     for name, item in file.items():
         field = find_field(known, name)
-        if field is None or _holds(item, field):
-            continue
-        expected = f"data sets of {field.sort} below it" if field.group else f"a data set of {field.sort}"
-        raise DataError(
-            f"{path}: {name!r} holds something else, expected {expected}; another program changed it, make it again"
-        )
+        for one in () if field is None else item.values() if field.group and isinstance(item, h5py.Group) else (item,):
+            if not _holds(one, field):
+                found = f"{one.dtype} {one.shape}" if isinstance(one, h5py.Dataset) else "a group"
+                raise DataError(
+                    f"{path}: {one.name[1:]!r} holds something else ({found}), expected {field.in_words()}; another program"
+                    " changed it, make it again"
+                )
 
 
 def _holds(item: h5py.Group | h5py.Dataset, field: Field) -> bool:
-    """Returns whether something in a file holds the sort of values that a field has; their shape is the readers' to check."""
-    if field.group:
-        return isinstance(item, h5py.Group) and all(_is_numbers(one, "fiub") for one in item.values())
-    if field.sort == "strings":
-        return isinstance(item, h5py.Dataset) and item.ndim > 0 and h5py.check_string_dtype(item.dtype) is not None
-    return _is_numbers(item, "iu" if field.sort == "whole numbers" else "fiub")
-
-
-def _is_numbers(item: h5py.Group | h5py.Dataset, kinds: str) -> bool:
-    return isinstance(item, h5py.Dataset) and item.ndim > 0 and item.dtype.kind in kinds
+    """Returns whether something in a file has the type and the shape of a field, but for the lengths that have letters."""
+    if not isinstance(item, h5py.Dataset) or len(item.shape or ()) != len(field.shape):
+        return False
+    text = h5py.check_string_dtype(item.dtype) is not None
+    right = text if field.kind == "str" else item.dtype == field.dtype
+    return right and all(isinstance(there, str) or there == here for there, here in zip(field.shape, item.shape))
 
 
 def file_kind(path: str | Path) -> str:

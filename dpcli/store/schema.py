@@ -14,7 +14,6 @@ import numpy as np
 
 SCHEMA = 1
 KEPT = "field_"  # what the name of a column begins with that was kept on request
-_TYPES = {"f": "numbers", "i": "whole numbers", "u": "whole numbers", "s": "strings"}
 _MARKED = re.compile(r"(<!-- fields: (\w+) -->\n).*?(<!-- end of fields -->)", re.DOTALL)
 
 
@@ -44,14 +43,9 @@ class Field:
         """The shape of one entry along the first axis."""
         return self.shape[1:]
 
-    @property
-    def sort(self) -> str:
-        """The values in words, as an error names them: numbers, whole numbers or strings."""
-        return _TYPES[self.kind[0]]
-
     def in_words(self) -> str:
-        """Returns type and shape as the tables have them, such as `f32 (P,3)`."""
-        return f"{self.kind} ({','.join(map(str, self.shape))}){', optional' if self.optional else ''}"
+        """Returns type and shape as the tables and errors have them, such as `f32 (P,3)`."""
+        return f"{self.kind} ({','.join(map(str, self.shape))})"
 
 
 _WHO = (
@@ -224,7 +218,10 @@ def find_field(known: dict[str, Field], name: str) -> Field | None:
 def table(kind: str) -> str:
     """Returns the data sets of a kind as a table in markdown, one a line."""
     rows = [(f"{field.name}/STREAM" if field.group else field.name, field) for field in TABLES[kind]]
-    lines = [f"| `{name}` | {field.in_words()} | {field.meaning} |\n" for name, field in rows]
+    lines = [
+        f"| `{name}` | {field.in_words()}{', optional' if field.optional else ''} | {field.meaning} |\n"
+        for name, field in rows
+    ]
     return "".join(["| data set | type, shape | meaning |\n", "|---|---|---|\n", *lines])
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.store.joints import PARENT, TYPE, TYPES
 from dpcli.store.schema import KEPT, TABLES
 
 POINT_FIELDS = {
@@ -151,8 +152,6 @@ class CloudSequence:
                 )
         if self.shift is not None and (np.shape(self.shift) != (3,) or not np.isfinite(self.shift).all()):
             raise DataError(f"{where}: shift is {self.shift}, expected 3 finite numbers")
-        if self.scene_flow is not None and not np.isfinite(self.scene_flow).all():
-            raise DataError(f"{where}: scene_flow holds NaN or infinity; drop the points whose motion is unknown")
         if self.time is not None and self.time.shape != (self.num_frames,):
             raise DataError(f"{where}: time has shape {self.time.shape}, expected ({self.num_frames},)")
         for name, row in OF_PARTS.items():
@@ -160,3 +159,25 @@ class CloudSequence:
             if values is not None and (len(values) != self.num_frames or values.shape[2:] != row):
                 expected = ", ".join(map(str, (self.num_frames, "parts", *row)))
                 raise DataError(f"{where}: {name} has shape {values.shape}, expected ({expected})")
+        self.validate_values()
+
+    def validate_values(self) -> None:
+        """Raises DataError where a field beside the points, of the right type and shape, holds what nobody can work with."""
+        where = f"sample {self.name!r}"
+        if self.scene_flow is not None and not np.isfinite(self.scene_flow).all():
+            raise DataError(f"{where}: scene_flow holds NaN or infinity; drop the points whose motion is unknown")
+        for name in ("time", *OF_PARTS):
+            values = getattr(self, name)
+            if values is not None and not np.isfinite(values).all():
+                raise DataError(f"{where}: {name} holds NaN or infinity; make the file again")
+        if self.part is not None and self.part.min(initial=-1) < -1:
+            raise DataError(f"{where}: part holds {self.part.min()}, expected -1 (unknown) or 0, 1, ...")
+        if self.joint is not None:
+            parents, types = self.joint[..., PARENT], self.joint[..., TYPE]
+            wrong = (parents < -1) | (parents >= self.joint.shape[1]) | (types < 0) | (types >= len(TYPES))
+            if wrong.any() or (parents % 1).any() or (types % 1).any():
+                frame, part = np.argwhere(wrong | (parents % 1 != 0) | (types % 1 != 0))[0]
+                raise DataError(
+                    f"{where}: joint of part {part} in frame {frame} has parent {parents[frame, part]:g} and type"
+                    f" {types[frame, part]:g}, expected a part or -1, and 0 to {len(TYPES) - 1}"
+                )

@@ -19,7 +19,7 @@ from dpcli.runtime.progress import Progress, log
 from dpcli.standard_streams import PrintableStream, printable
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 
-EVIL = "r\x1b[31mRED\x1b]0;pwn\x07\u202egnp\x9b2J\rdpc: [bold]done[/bold]"
+EVIL = "r\x1b[31mRED\x1b]0;pwn\x07\u202egnp\x9b2J\rdpc: [bold]done[/bold]\ndpc: [bold]x"
 FORBIDDEN = ("\x1b[31mRED", "\x1b]0", "\x07", "\u202e", "\x9b", "\rdpc")
 COMMANDS = [
     "info C",
@@ -37,6 +37,7 @@ COMMANDS = [
     "prepare animation EVIL.glb --list",
     "prepare merge EVIL C -o O.h5",
     "prepare split C -o D --force",
+    "prepare split C -o N.h5 --force",
     "classify predict C --model EVIL -o O.h5",
     "classify train C --set EVIL=1 -o D",
     "segment predict EVIL --model EVIL -o O.h5",
@@ -92,7 +93,7 @@ def test_nothing_that_commands_a_terminal_comes_out(folder, line):
     done = command(folder, line)
     for told in (done.stdout.decode(), done.stderr.decode()):
         assert told == printable(told, kept="\n\t")
-        assert "\ndpc: [bold]" not in told
+        assert "\ndpc: [bold]" not in told or "--debug" in line  # a trace has lines of its own
     assert b"RED" in done.stdout + done.stderr or "-o D" in line or "report" in line, done  # the name was there
 
 

@@ -140,3 +140,60 @@ def test_a_second_signal_ends_it_at_once(folder):
         process.terminate()
     _, told = process.communicate(timeout=20)
     assert process.returncode == 75 and told == b"dpc: error: stopped by SIGTERM; run the same command again\n"
+
+
+DEAF = """
+import itertools, os, signal, sys
+from dpcli import signal_exit as s
+s._DEAF = 0.3
+s.watch_signals()
+s.stand_by()
+s.set_working(True)
+os.write(1, b"x")
+if sys.argv[1] == "loops":
+    sum(itertools.repeat(0))  # holds the interpreter, as C code may: no handler of Python's runs
+if sys.argv[1] == "crashes":
+    os.abort()
+if sys.argv[1] == "waits":
+    signal.pause()
+s.heard()
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "number", "code", "words"),
+    [
+        ("loops", signal.SIGTERM, -signal.SIGKILL, "stopped by SIGTERM; a library did not come back"),
+        ("loops", signal.SIGINT, -signal.SIGKILL, "stopped by SIGINT; a library did not come back"),
+        ("crashes", None, -signal.SIGABRT, "dpc: error: killed, or ended by a crash in a library"),
+        ("waits", signal.SIGKILL, -signal.SIGKILL, "dpc: error: killed, or ended by a crash in a library"),
+        ("waits", signal.SIGUSR1, 1, "Ended"),  # what a command answers itself
+        ("is done", None, 0, ""),
+    ],
+)
+def test_a_library_that_never_comes_back_or_crashes_ends_with_a_sentence(how, number, code, words):
+    process = subprocess.Popen(
+        [sys.executable, "-c", DEAF, how], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout.read(1) == b"x"
+    if number is not None:
+        time.sleep(0.5)  # it is in the loop by then
+        process.send_signal(number)
+    _, told = process.communicate(timeout=30)
+    assert process.returncode == code, told
+    assert words in told.decode() and told.count(b"dpc: error:") == (code < 0)
+
+
+def test_who_reads_a_pipe_does_not_wait_for_the_one_that_stands_by():
+    code = DEAF + "\nos.close(1)\nsys.stdin.read()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "is done"],
+        cwd=ROOT,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    assert process.stdout.read() == b"x"  # the end of it
+    assert process.poll() is None
+    process.communicate(timeout=30)
+    assert process.returncode == 0

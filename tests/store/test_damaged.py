@@ -4,15 +4,23 @@ import random
 import subprocess
 import sys
 import time
+from itertools import product
 
 import h5py
 import numpy as np
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader, ViewsReader
+from dpcli.store.embedding import EmbeddingReader
 from dpcli.store.file import open_store
+from dpcli.store.gaussians import read_scene
+from dpcli.store.joints import no_joints
+from dpcli.store.parts import PartsReader
+from dpcli.store.schema import KINDS
+from dpcli.store.statistics import StatisticsReader
 from dpcli.store.summary import summary
+from tests.store.test_schema import WRITERS, data_sets
 
 
 @pytest.fixture
@@ -89,3 +97,100 @@ def test_a_damaged_file_is_exit_3_of_the_command(clouds):
     clouds.write_bytes(clouds.read_bytes()[:900])
     ended = subprocess.run([sys.executable, "-m", "dpcli", "info", str(clouds)], capture_output=True, text=True)
     assert ended.returncode == 3 and "a bug" not in ended.stderr and str(clouds) in ended.stderr
+
+
+READ = {
+    "clouds": lambda path: [reader.given(k) for reader in [CloudsReader(path)] for k in range(len(reader))],
+    "parts": lambda path: [reader.given(k) for reader in [PartsReader(path)] for k in range(len(reader))],
+    "views": lambda path: [(reader.rgba(0, 0), reader.track, reader.part) for reader in [ViewsReader(path)]],
+    "scores": ScoresReader,
+    "gaussians": read_scene,
+    "embedding": EmbeddingReader,
+    "statistics": lambda path: [
+        reader.given(k) for reader in [StatisticsReader(path)] for k in range(len(reader.names))
+    ],
+}
+
+
+def _damages(values, is_text):
+    """Another type and shape, which are refused always, and odd values, which are refused or read."""
+    if is_text:
+        return [np.arange(len(values)), values[None]], [[b"\xff\xfe"] * len(values), [b"a"] * len(values)]
+    kind = values.dtype.kind
+    other = values.dtype.newbyteorder(">") if values.itemsize > 1 else "i2"
+    narrow = [values[..., :-1]] if values.ndim > 1 and values.shape[-1] in (2, 3, 4, 9) else []
+    odd = np.nan if kind == "f" else np.iinfo(values.dtype).min
+    return [values.astype(other), values[None], *narrow], [np.full_like(values, odd), values[:-1]]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_field_of_any_kind_can_be_a_bug(kind, tmp_path):
+    """Other types and shapes are refused by name; whatever values of the right ones are either refused by name or read."""
+    WRITERS[kind](tmp_path / "whole.h5")
+    whole, path = (tmp_path / "whole.h5").read_bytes(), tmp_path / "a.h5"
+    READ[kind](tmp_path / "whole.h5")
+    with h5py.File(tmp_path / "whole.h5") as file:
+        fields = {
+            name: file[name][()] for name in data_sets(tmp_path / "whole.h5") if isinstance(file[name], h5py.Dataset)
+        }
+    for name, values in fields.items():
+        wrong, odd = _damages(values, values.dtype.kind == "O")
+        for must, made in [*((True, one) for one in wrong), *((False, one) for one in odd), (False, None)]:
+            path.write_bytes(whole)
+            with h5py.File(path, "a") as file:
+                del file[name]
+                if made is not None:
+                    file.create_dataset(name, data=made, dtype=h5py.string_dtype() if isinstance(made, list) else None)
+            refused = False
+            try:
+                READ[kind](path)
+            except DataError as error:
+                assert str(path) in str(error), (name, error)
+                refused = True
+            assert refused or not must, (name, made)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_no_attribute_of_any_kind_can_be_a_bug(kind, tmp_path):
+    WRITERS[kind](tmp_path / "whole.h5")
+    whole, path = (tmp_path / "whole.h5").read_bytes(), tmp_path / "a.h5"
+    with h5py.File(tmp_path / "whole.h5") as file:
+        names = list(file.attrs)
+    for name, value in product(
+        names, ["x", 2**62, np.zeros((3, 3)), h5py.Empty("f4"), np.bytes_(b"\xff\xfe"), "[" * 5000]
+    ):
+        path.write_bytes(whole)
+        with h5py.File(path, "a") as file:
+            file.attrs[name] = value
+        try:
+            READ[kind](path)
+        except DataError as error:
+            assert str(path) in str(error), (name, error)
+
+
+@pytest.mark.parametrize(
+    "name, change, said",
+    [
+        ("name", lambda v: np.array([b"s0"] * len(v)).astype(object), "'s0' is there twice"),
+        ("label", lambda v: v - 2, "label -2 of 's0', expected -1"),
+        ("frame_offsets", lambda v: -v, "must start at 0 and never fall"),
+    ],
+)
+def test_values_that_no_index_has_are_refused(clouds, name, change, said):
+    with h5py.File(clouds, "a") as file:
+        values = change(file[name][()])
+        del file[name]
+        file.create_dataset(name, data=values, dtype=h5py.string_dtype() if values.dtype.kind == "O" else None)
+    with pytest.raises(DataError, match=said):
+        _read_all(clouds)
+
+
+@pytest.mark.parametrize(
+    "joint, said", [([7, 1], "parent 7"), ([-1, 9], "type 9"), ([0.5, 1], "parent 0.5"), ([np.nan, 1], "NaN")]
+)
+def test_joints_of_parts_that_are_not_there_are_refused(joint, said):
+    joints = no_joints(2, 2)
+    joints[1, 0, :2] = joint
+    sequence = CloudSequence.from_frames("a", [np.zeros((1, 3))] * 2, joint=joints)
+    with pytest.raises(DataError, match=said):
+        sequence.validate()

@@ -237,7 +237,7 @@ def _replace(name: str, values: np.ndarray):
         (_replace("part_probability", np.zeros((5, K), np.float32)), r"has shape \(5, 4\)"),
         (_replace("pair_offsets", np.array([0, 3, 2, 4])), "never fall"),
         (_replace("pair_offsets", np.array([0, 4])), "has 2 rows ending at 4, expected 4"),
-        (_replace("part_motion", np.zeros((1, K, 4, 4))), "part_motion has 1 rows for 4 pairs"),
+        (_replace("part_motion", np.zeros((1, K, 4, 4), np.float32)), "part_motion has 1 rows for 4 pairs"),
     ],
 )
 def test_a_damaged_layout_is_said_on_opening(tmp_path, samples, change, said):

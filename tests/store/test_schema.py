@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import h5py
@@ -111,7 +112,7 @@ def test_values_of_another_sort_are_refused(kind, name, tmp_path):
         if name in file:
             del file[name]
         file[name] = np.arange(3) if field.kind == "str" or field.group else ["no", "numbers"]
-    with pytest.raises(DataError, match=f"'{name}' holds something else, expected .*{field.sort}"):
+    with pytest.raises(DataError, match=f"'{name}' holds something else .*expected {re.escape(field.in_words())}"):
         open_store(path)
 
 

@@ -173,7 +173,7 @@ TAMPER = {
     "no rgba": (lambda f: f.__delitem__("rgba"), "'rgba' is missing"),
     "no role": (lambda f: f.__delitem__("role"), "'role' is missing"),
     "no reference": (lambda f: f.attrs.__delitem__("reference"), "'reference' is missing"),
-    "three channels": (lambda f: _reshape(f, "rgba", np.zeros((3, 4, 5, 6, 3), np.uint8)), "expected uint8"),
+    "three channels": (lambda f: _reshape(f, "rgba", np.zeros((3, 4, 5, 6, 3), np.uint8)), "expected u8"),
     "fewer frames": (lambda f: _reshape(f, "time", np.arange(3.0)), "frames = 3"),
     "text times": (lambda f: _reshape(f, "time", np.array([b"a"] * 4)), "time"),
     "NaN pose": (lambda f: f["world_to_camera"].__setitem__((0, 0, 0), np.nan), "NaN"),

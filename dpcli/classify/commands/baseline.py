@@ -56,7 +56,10 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         known = np.flatnonzero(reader.labels >= 0)
         if not len(known):
             raise DataError(f"{path}: no video has a label; prepare them with --labels TABLE or --label-from-folder")
-        values, labels = descriptors(reader, known.tolist()), reader.labels[known]
+        labels = reader.labels[known]
+        if len(set(labels.tolist())) < 2:
+            raise DataError(f"{path}: all labeled videos are of one class; expected at least two classes to tell apart")
+        values = descriptors(reader, known.tolist())
         scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
         for learned, judged in rounds:

@@ -23,11 +23,13 @@ from dpcli.classify.data.validation_split import (
     cross_folds,
     default_rule,
 )
-from dpcli.classify.data.videos import report_short
+from dpcli.classify.data.videos import report_backward, report_short
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes
 from dpcli.classify.training.confidence_fit import fitted_confidence
+from dpcli.classify.training.fine_tune import resolved, settings_from
+from dpcli.classify.training.forests import grow_forests
 from dpcli.classify.training.learning_curves import COLUMNS, draw_curves
 from dpcli.classify.training.schedule import Schedule
 from dpcli.classify.training.trainer import Trainer
@@ -90,9 +92,22 @@ def train(
         raise UsageError("several processes can't share a pipe: give a file instead of -")
     chosen = choose_device(device)
     with input_file(data) as path, process_group(chosen) as processes:
-        settings = training_settings(_with_preset(given, preset_for(CloudsReader(path), given.values)))
+        settings = _chosen_settings(given, CloudsReader(path))
         settings = replace(settings, schedule=_for_device(settings.schedule, chosen))
         return _train(path, output, settings, seed, processes.place(chosen), force, processes)
+
+
+def _chosen_settings(given: Given, reader: CloudsReader) -> TrainingSettings:
+    """Returns the settings, with what the data choose where a person left it to them."""
+    if given.preset == AUTO and given.values.get("init"):
+        values = given.values
+        _, info = load_model(find_model(values["init"], "--init"), values.get("backbone"))
+        base = settings_from(info, reader, values.get("fine_tune"))
+        sets = {name: value for name, value in given.sets.items() if name != "fine_tune"}
+        flags = {name: value for name, value in given.flags.items() if name != "fine_tune"}
+        return training_settings(Given("quick", given.config, sets, flags), base)
+    settings = training_settings(_with_preset(given, preset_for(reader, given.values)))
+    return replace(settings, schedule=resolved(settings.schedule, reader))
 
 
 def _with_preset(given: Given, preset: str) -> Given:
@@ -115,6 +130,7 @@ def _train(
     folder = RunFolder(output, _record(settings, seed, videos.digest), force, columns=COLUMNS, curves=draw_curves)
     check_shares(len(videos.training.epoch(0, schedule.clips_per_video or None)), schedule, processes.count)
     report_short(videos.training, settings.network.num_frames)
+    report_backward(videos.training.reader, videos.training.sequences)
     torch.manual_seed(seed)
     model = _new_model(settings, folder).to(device)
     info = ModelInfo(settings.network, videos.class_names, run.timing, _notes(videos, run.validation, seed))
@@ -129,6 +145,10 @@ def _train(
         processes.wait()  # the others find the folder as it is to be
         trainer = Trainer(model, info, folder, schedule, videos.training, videos.validation, device, stop, processes)
         trainer.run()
+        if settings.network.backbone == "slots":
+            info.config = grow_forests(trainer.model, videos.training, seed)
+            if processes.first:
+                save_model(folder.file("best.safetensors"), trainer.model, info)
         if processes.first and videos.validation is not None:
             _add_confidence(trainer, info, videos.validation, folder)
     accuracy = trainer.validate() if videos.validation is not None else {}
@@ -182,7 +202,7 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
     _check_labels(reader, training, validation)
-    if run.timing == "slots":
+    if run.timing == "slots" and not settings.network.scales:
         settings = replace(settings, network=measured(settings.network, reader, training))
     options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
     if rule == CROSS:
@@ -294,4 +314,5 @@ def _announce(device: torch.device, processes: Processes, videos: _Videos, setti
     log.info(
         f"training on {where}: {videos.counts[0]} videos, {videos.counts[1]} for validation ({settings.run.validation});"
         f" epochs {schedule.epochs} + {schedule.epochs_dynamic}"
+        + (f"; of {settings.run.init} learns: {schedule.fine_tune}" if settings.run.init else "")
     )

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.classify.network.descriptors import SLOTS, described
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.schema import KEPT
 
-_SLOTS = 6  # parts of a video, equally long
-_LEVELS = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LARGEST = 1e30  # a forest takes float32
 
 
@@ -29,22 +28,9 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
     columns = [sequence.extra[name] for name in fields if name in sequence.extra]
     missing = [np.zeros(len(times))] * (len(fields) - len(columns))
     values = np.column_stack([sequence.points - middle, *columns, *missing]).astype(np.float64)
-    whole = np.quantile(values, _LEVELS, axis=0)
-    slots = _slots(values, times * _SLOTS // max(sequence.num_frames, 1), whole)
-    middles = slots[:, len(_LEVELS) // 2]
-    counts = np.bincount(times * _SLOTS // max(sequence.num_frames, 1), minlength=_SLOTS) / max(len(times), 1)
     size = [sequence.num_frames, len(times) / max(sequence.num_frames, 1), *middle]
-    found = np.concatenate([size, counts, whole.ravel(), slots.ravel(), np.diff(middles, axis=0).ravel()])
+    found = np.concatenate([size, described(values, times * SLOTS // max(sequence.num_frames, 1))])
     return np.nan_to_num(found).clip(-_LARGEST, _LARGEST)
-
-
-def _slots(values: np.ndarray, slot: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Returns the quantiles of each slot, f64 (slots,levels,columns); `whole`, of all points, before the first with any."""
-    found = [whole]
-    for number in range(_SLOTS):
-        own = values[slot == number]
-        found.append(np.quantile(own, _LEVELS, axis=0) if len(own) else found[-1])
-    return np.stack(found[1:])
 
 
 def descriptors(reader: CloudsReader, sequences: list[int]) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.validation_split import CROSS, carve_validation
 from dpcli.classify.network.model_file import ModelInfo
@@ -57,6 +59,17 @@ def check_classes(reader: CloudsReader, info: ModelInfo, model_name: str) -> Non
         index, (mine, theirs) = next((i, pair) for i, pair in enumerate(pairs) if pair[0] != pair[1])
         raise DataError(
             f"{reader.path}: class {index} is {mine!r}, in {model_name} it is {theirs!r}; the model was trained for other classes"
+        )
+
+
+def report_backward(reader: CloudsReader, sequences: list[int]) -> None:
+    """Counts and names the videos whose time runs back, with a message: their frames are taken in the file's order."""
+    times = ((i, reader.times(i)) for i in sequences)
+    names = [reader.names[i] for i, time in times if time is not None and not (np.diff(time) >= 0).all()]
+    if names:
+        log.warn(
+            f"{reader.path}: time runs back in {len(names)} of {len(sequences)} videos: {', '.join(names[:5])}"
+            f"{' ...' if len(names) > 5 else ''}; frames are taken in the file's order (is a recording cut wrongly?)"
         )
 
 

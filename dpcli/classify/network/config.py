@@ -108,6 +108,10 @@ class KinetConfig:
     dropout: float = setting(0.0, "Dropout before each head's last layer.", least=0, below=1)
     members: int = setting(1, "Networks whose scores are averaged (backbone slots).", least=1, most=64)
     columns: tuple[str, ...] = ()  # what the file keeps of a point that the backbone slots reads; follows from the data
+    forest: tuple[int, int] = (
+        0,
+        0,
+    )  # trees and nodes of a tree beside each member of the backbone slots, grown from the data
     scales: tuple[float, ...] = ()  # unit of length, then middle and spread of each column; follow from the data
 
     def __post_init__(self) -> None:
@@ -147,6 +151,8 @@ class KinetConfig:
             raise UsageError(f"neighbors = {self.neighbors}: the frames within {name} = {radius} hold {near} points")
 
     def _check_columns(self) -> None:
+        if min(self.forest) < 0:
+            raise UsageError(f"forest = {self.forest}: expected the numbers of trees and of nodes")
         if self.scales and (len(self.scales) != 1 + 2 * len(self.columns) or min(self.scales[0::2]) <= 0):
             raise UsageError(
                 f"scales = {self.scales}: expected a unit, and middle and spread of each of {self.columns}"

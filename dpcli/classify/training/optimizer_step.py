@@ -76,7 +76,7 @@ class StageStep:
         if processes.count > 1:
             synchronize_norms(module)
         self.optimizer = _new_optimizer(module.branch, schedule)
-        self.parameters = list(module.branch.parameters())
+        self.parameters = [one for one in module.branch.parameters() if one.requires_grad]
         self.module: nn.Module = module
         if processes.count > 1:
             self.module = _shared(module, model, stage, device)
@@ -139,11 +139,11 @@ def _shared(module: nn.Module, model: Kinet, stage: int, device: torch.device) -
 
 def _new_optimizer(branch: nn.Module, schedule: Schedule) -> torch.optim.Optimizer:
     # The last layer sums a thousand pooled maxima, all positive: at the others' rate its first steps overshoot.
-    named = dict(branch.named_parameters())
+    named = {name: one for name, one in branch.named_parameters() if one.requires_grad}
     last = [p for name, p in named.items() if name.startswith("head.classify")]
     rest = [p for name, p in named.items() if not name.startswith("head.classify")]
     groups = [
-        {"params": last, "weight_decay": schedule.weight_decay, "share": 0.1},
+        {"params": last, "weight_decay": schedule.weight_decay, "share": 0.1 if rest else 1.0},
         {"params": [p for p in rest if p.dim() > 1], "weight_decay": schedule.weight_decay, "share": 1.0},
         {"params": [p for p in rest if p.dim() <= 1], "weight_decay": 0.0, "share": 1.0},
     ]

@@ -34,6 +34,11 @@ class Schedule:
     label_smoothing: float = setting(
         0.0, "Share of each label spread over all classes: streams become less sure of themselves.", least=0, below=1
     )
+    fine_tune: Literal["all", "head", "probe", "auto"] = setting(
+        "all",
+        "What of a model given by --init goes on learning: all of it, the head of each stream, or its last layer (probe); auto:"
+        " by the number of videos a class. The preset auto takes auto, and the model's own network, with --init.",
+    )
     clips_per_video: int = setting(1, "Random clips per video and epoch; 0 takes every start.", least=0)
     validate_every: int = setting(1, "Epochs from one validation to the next.", least=1)
     validation_clips: int = setting(4, "Clips per video in a validation.", least=1)

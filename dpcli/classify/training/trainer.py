@@ -17,6 +17,7 @@ from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
 from dpcli.classify.training.epoch_batches import Batch, EpochBatches
+from dpcli.classify.training.fine_tune import freeze, train_mode
 from dpcli.classify.training.learning_rate_schedule import learning_rate
 from dpcli.classify.training.neighbor_cache import NeighborCache
 from dpcli.classify.training.optimizer_step import LossWatch, StageStep
@@ -101,14 +102,19 @@ class Trainer:
     def _batches(self) -> EpochBatches:
         return EpochBatches(self.training, self.schedule, self.processes, self.stage)
 
+    @property
+    def _branch(self) -> torch.nn.Module:
+        return self.model.static if self.stage == 0 else self.model.dynamic
+
     def _new_step(self, data: EpochBatches) -> StageStep:
+        freeze(self._branch, self.schedule.fine_tune)
         neighbors = None
         if data.draws:
             neighbors = NeighborCache(self.model.group, self.folder.path, data.clips * data.draws)
         return StageStep(self.model, self.stage, self.schedule, self.device, self.processes, neighbors)
 
     def _run_epoch(self, data: EpochBatches, epochs: int, bar: Progress) -> None:
-        (self.model.static if self.stage == 0 else self.model.dynamic).train()
+        train_mode(self._branch, self.schedule.fine_tune)
         started, steps = time.monotonic(), epochs * data.count
         done = self.epoch * data.count
         # a run stopped after an epoch's last step has none left to do, and logs that one's rate

@@ -11,8 +11,9 @@ from dpcli.classify.settings import TRAINING
 from dpcli.cli.options import Device, Force, Seed
 from dpcli.cli.settings_options import options_of
 from dpcli.runtime.settings.catalog import Given
+from dpcli.standard_streams import printable
 
-_EVERYDAY = ("init", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
+_EVERYDAY = ("init", "fine_tune", "frames", "points", "timing", "epochs", "batch", "lr", "validation")
 
 
 @options_of(TRAINING, _EVERYDAY, presets={**PRESETS, "auto": PRESETS["quick"]}, preset="auto")
@@ -44,4 +45,4 @@ def train(
         if result.forest is not None:
             typer.echo(f"a random forest on hand-made descriptors: {100 * result.forest:.1f} % (dpc classify baseline)")
         if result.caveat:
-            typer.echo(f"note: {result.caveat}")
+            typer.echo(printable(f"note: {result.caveat}"))

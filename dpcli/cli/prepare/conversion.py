@@ -13,6 +13,7 @@ from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, ItemSeconds, PointsAtMost, Sampling
 from dpcli.cli.spread_options import Dask, Shard
 from dpcli.errors import UsageError
+from dpcli.standard_streams import printable
 
 
 @dataclass(frozen=True)
@@ -94,4 +95,4 @@ def print_check(name: str, raw: Path | None, make_index: Callable[[], Any], *, f
     from dpcli.prepare.recipe_check import check_folder
 
     for line in check_folder(name, raw, make_index, file=file):
-        typer.echo(line)
+        typer.echo(printable(line))

@@ -57,7 +57,7 @@ def predict(
     settings = PredictSettings(
         **CATALOG.resolve(PredictSettings()._asdict(), _choose_method(given, model, fast, scene))
     )
-    from dpcli.segment.commands.predict import Drawings, predict_file
+    from dpcli.segment.commands.predict import Drawings, predict_file, told_of_scenes
 
     drawings = Drawings(picture, turntable, ply)
     sequences = predict_file(
@@ -73,6 +73,8 @@ def predict(
     )
     if output != "-":
         typer.echo(f"{output}: parts of {sequences} sequences")
+        for line in told_of_scenes(output) if settings.classical.method == "scene" else ():
+            typer.echo(line)
 
 
 def _choose_method(given: Given, model: str | None, fast: bool, scene: bool) -> Given:

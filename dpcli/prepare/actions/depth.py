@@ -237,10 +237,7 @@ class DepthVideos:
                 f"no times are written: {', '.join(silent[:3])} {'say' if silent[1:] else 'says'} none (--fps)"
             )
         lines += about_series([(item.name, item.extra["series"]) for item in items if item.extra["series"]])
-        unlabeled = [item.name for item in items if item.label < 0]
-        if self._table and unlabeled:
-            lines.append(f"{len(unlabeled)} without a label in {self.labels}: {', '.join(unlabeled[:5])}")
-        return lines
+        return lines + (self._table.unnamed(items) if self._table else [])
 
 
 def _tells_time(item: Item) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.prepare.median import median
 
 _MARKS_16 = 65533  # this and more in 16 bits say that nothing was measured
 _MARKS_FLOAT = (65504.0, 65535.0)  # the largest half, and a mark of 16 bits that became a float
@@ -57,7 +58,7 @@ def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: boo
     """
     if not len(depths):
         return
-    typical = float(np.median(depths[:: max(1, len(depths) // _SAMPLED)]))
+    typical = float(median(depths[:: max(1, len(depths) // _SAMPLED)]))
     least, most = _PLAUSIBLE_IF_ASKED if asked else _PLAUSIBLE
     if least <= typical <= most:
         return

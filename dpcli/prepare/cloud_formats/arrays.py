@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy
+from dpcli.npy_files import map_npy, require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, unnamed_columns, without
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
@@ -16,7 +16,6 @@ _COLOR_KEYS = ("color", "colors", "rgb")
 _COLUMNS = (4, 3, 5, 6, 7, 8, 9, 10)  # of a .bin, the likeliest first
 _BY_CHANCE = 0.12  # nats a value that one number of columns must explain better than another
 _TELLING, _FLOATS = 400, 1 << 16  # values that are needed to tell columns apart; that are looked at in a file
-_ROOM, _PACKED_AT_MOST = 100 << 20, 50  # bytes that any archive may unpack to; and times its size beyond them
 _LARGEST, _SMALLEST = 1e10, 1e-20  # beyond these the bytes are no float32 coordinates
 
 
@@ -29,7 +28,7 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
     try:
         with np.load(path, allow_pickle=False) as archive:
-            _refuse_bomb(path, archive)
+            require_room(path, sum(info.file_size for info in archive.zip.infolist()))
             arrays = {key: archive[key] for key in archive.files}
             arrays = {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # or bare bytes
     except DataError:
@@ -63,13 +62,6 @@ def _only_points(arrays: dict[str, np.ndarray]) -> str | None:
     numbers = {k: a for k, a in arrays.items() if a.dtype.kind in "uif" and k not in others}
     found = [k for k, a in numbers.items() if a.ndim == 2 and a.shape[1] >= 3]
     return found[0] if len(found) == 1 else None
-
-
-def _refuse_bomb(path: Path, archive: np.lib.npyio.NpzFile) -> None:
-    """Raises DataError for an archive that unpacks to far more than clouds do; coordinates pack a few times smaller."""
-    claimed, held = sum(info.file_size for info in archive.zip.infolist()), path.stat().st_size
-    if claimed > _ROOM + _PACKED_AT_MOST * held:
-        raise DataError(f"{path}: claims {claimed} bytes of arrays; a file of {held} bytes can't hold such clouds")
 
 
 def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud:

@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, DpcError
+from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
+
+_CELL = 8  # bytes of a number
 
 
 class ParquetTable:
@@ -22,7 +25,11 @@ class ParquetTable:
             raise DpcError('Parquet needs pyarrow: pip install "dpc-toolkit[parquet]"') from None
         self.path = path
         try:
+            about = parquet.read_metadata(path)
+            require_room(path, _CELL * about.num_rows * about.num_columns)
             self._table: Any = parquet.read_table(path)
+        except DataError:
+            raise
         except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
             raise DataError(f"{path}: not a readable Parquet table, perhaps truncated ({error})") from None
         self.names = tuple(self._table.column_names)

@@ -16,17 +16,22 @@ from dpcli.prepare.cloud_formats.text_numbers import TextTable
 _DATA = ("ascii", "binary", "binary_compressed")
 _TYPES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 _MOST_BYTES = 1 << 32  # of a compressed cloud, unpacked
+POSED = "frames with a sensor pose (VIEWPOINT of PCD), which is not applied: points stay in the axes they are stored in"
 
 
 @dataclass(frozen=True)
 class Header:
-    """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data."""
+    """Holds field names (columns of several counts have numbers behind theirs), the row's type, points and data.
+
+    posed: whether it tells where the sensor stood, other than at the origin of the points.
+    """
 
     kind: np.dtype
     points: int
     data: str
     length: int
     lines: int
+    posed: bool = False
 
 
 def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
@@ -44,7 +49,8 @@ def read_pcd(path: Path, keep: Sequence[str] = ()) -> Cloud:
     else:
         columns = _read_compressed(path, body, header)
     shown = {name: column for name, column in columns.items() if not name.startswith("_")}  # padding
-    return replace(cloud_of_columns(path, shown, keep), dropped=beyond)
+    posed = {POSED: 1} if header.posed else {}
+    return replace(cloud_of_columns(path, shown, keep), dropped=beyond | posed)
 
 
 def _read_header(path: Path, data: bytes) -> Header:
@@ -63,7 +69,7 @@ def _read_header(path: Path, data: bytes) -> Header:
     form = said["DATA"][0].lower() if said["DATA"] else ""
     if form not in _DATA:
         raise DataError(f"{path}: DATA {form}; expected {', '.join(_DATA)}")
-    return Header(_row_type(path, said), points, form, start, lines)
+    return Header(_row_type(path, said), points, form, start, lines, _posed(said.get("VIEWPOINT", [])))
 
 
 def _points(path: Path, said: dict[str, list[str]]) -> int:
@@ -78,6 +84,15 @@ def _points(path: Path, said: dict[str, list[str]]) -> int:
             f"{path}: its header says {points} points and WIDTH x HEIGHT of {size}; damaged, write it again"
         )
     return points
+
+
+def _posed(words: list[str]) -> bool:
+    """Returns whether a VIEWPOINT (x y z, quaternion w x y z) is more than the identity; PCL's loaders don't apply it either."""
+    try:
+        x, y, z, _, i, j, k = (float(word) for word in words)
+    except ValueError:
+        return False
+    return any((x, y, z, i, j, k))
 
 
 def _row_type(path: Path, said: dict[str, list[str]]) -> np.dtype:

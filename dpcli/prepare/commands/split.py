@@ -18,6 +18,7 @@ from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
+from dpcli.standard_streams import printable
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.pipes import check_output
 from dpcli.store.writing.already_made import already_made
@@ -165,8 +166,8 @@ def split(
 
 
 def _file_name(split_name: str) -> str:
-    if "/" in split_name or split_name.startswith("."):
-        raise DataError(f"split {split_name!r} can't be a file name; -o FILE.h5 writes all into one file")
+    if "/" in split_name or split_name.startswith(".") or printable(split_name) != split_name or len(split_name) > 60:
+        raise DataError(f"split {split_name[:80]!r} can't be a file name; -o FILE.h5 writes all into one file")
     return split_name
 
 

@@ -14,7 +14,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES, look_at_video, video_frames
 from dpcli.runtime.progress import log
 
@@ -158,7 +158,7 @@ def read_rgba(path: Path) -> np.ndarray:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             return _to_rgba(as_shown(image))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         why = "empty" if path.is_file() and path.stat().st_size == 0 else str(error).splitlines()[0]
@@ -168,7 +168,9 @@ def read_rgba(path: Path) -> np.ndarray:
 def _to_rgba(image) -> np.ndarray:  # image: PIL.Image.Image
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
-        gray = np.clip(gray / (257.0 if gray.max(initial=0) > 255 else 1.0), 0, 255).round().astype(np.uint8)
+        top = gray.max(initial=0)
+        unit = 1 / 255 if image.mode == "F" and top <= 1 else 257.0 if top > 255 else 1.0
+        gray = np.clip(gray / unit, 0, 255).round().astype(np.uint8)
         return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
     return np.array(image.convert("RGBA"))
 

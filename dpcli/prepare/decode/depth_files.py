@@ -16,7 +16,7 @@ from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.deep_video import deep_frames
 from dpcli.prepare.decode.exr import read_exr
-from dpcli.prepare.decode.png import check_png, decode_gray_png
+from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
 from dpcli.runtime.clips.container_ends import ends_early
@@ -208,7 +208,7 @@ def read_image(path: Path) -> np.ndarray:
     image = decode_gray_png(data)
     if image is not None:
         return image
-    check_png(data, path)
+    check_picture(data, path)
     cv2 = load_cv2()
     pages = cv2.imdecodemulti(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[1] if data else ()
     if not pages:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.runtime.clips.images import require_plausible
 
 
 def read_exr(path: Path) -> np.ndarray:
@@ -19,7 +20,11 @@ def read_exr(path: Path) -> np.ndarray:
     except ImportError:
         raise DataError(f"{path}: OpenEXR is needed to read it; pip install 'dpc-toolkit[exr]'") from None
     try:
+        low, high = OpenEXR.File(str(path), True, True).header()["dataWindow"]
+        require_plausible(path, *(int(b) - int(a) + 1 for a, b in zip(low, high)), path.stat().st_size)
         channels = {name: channel.pixels for name, channel in OpenEXR.File(str(path), True).channels().items()}
+    except DataError:
+        raise
     except Exception:  # RuntimeError, and of a file that lost its end ValueError
         raise DataError(f"{path}: not a readable OpenEXR image (empty, truncated, or of another kind)") from None
     named = [name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth") or "depth" in name.lower()]

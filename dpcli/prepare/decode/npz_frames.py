@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import require_room
 from dpcli.prepare.decode.safe_pickle import load_arrays
-
-_MOST_BYTES = 1 << 31  # of a member unpacked; 300 frames of 40,000 points in float64 take 0.3 GB
 
 
 def member_names(path: Path) -> list[str]:
@@ -33,8 +32,7 @@ def read_frames(path: Path, key: str) -> list[np.ndarray]:
     try:
         with zipfile.ZipFile(path) as archive:
             info = archive.getinfo(f"{key}.npy")
-            if info.file_size > _MOST_BYTES:
-                raise DataError(f"{path}: {key} takes {info.file_size} bytes; expected less than {_MOST_BYTES}")
+            require_room(path, info.file_size)
             array = _read_array(io.BytesIO(archive.read(info)))
     except pickle.UnpicklingError as error:
         raise DataError(f"{path}: {key} is a pickle that is not of plain arrays: {error}; it was not loaded") from None

@@ -4,6 +4,7 @@ named.
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Callable
@@ -15,12 +16,12 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.cv2_import import load_cv2
+from dpcli.runtime.clips.images import is_plausible, require_plausible
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _END = b"\0\0\0\0IEND\xaeB`\x82"
 _HEADER = struct.Struct(">8s 4x 4s II B B 3x I")  # signature, type, width, height, bits, color, checksum
 _COLOR = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGB with alpha"}
-_MOST_DEFLATED = 1032  # bytes that one byte of a deflate stream can stand for
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,7 @@ def decode_gray_png(data: bytes) -> np.ndarray | None:
     if header is None or not data.endswith(_END) or header.color != 0 or header.bits not in _decoders():
         return None
     # memory is taken before anything is decoded: a size that can't be true would ask for gigabytes
-    possible = header.width * header.height * header.bits // 8 <= _MOST_DEFLATED * len(data)
-    if header.checksum != zlib.crc32(data[12:29]) or not possible:
+    if header.checksum != zlib.crc32(data[12:29]) or not is_plausible(header.width, header.height, len(data)):
         return None
     try:
         image = _decoders()[header.bits](data, (header.height, header.width), "mono")
@@ -105,7 +105,7 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
         raise DataError(f"{where}: {header.bits}-bit {color} PNG; expected {allowed}-bit gray depth")
     image = decode_gray_png(data)
     if image is None:
-        check_png(data, where)
+        check_picture(data, where)
         cv2 = load_cv2()
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape != (header.height, header.width):
@@ -113,14 +113,17 @@ def decode_depth_png(data: bytes, where: str, size: tuple[int, int], bits: tuple
     return image
 
 
-def check_png(data: bytes, where: str | Path) -> None:
-    """Raises DataError where a PNG's chunks are not all there with the right checksums, the last one IEND; lets all that
-    is no PNG pass.
+def check_picture(data: bytes, where: str | Path) -> None:
+    """Raises DataError for a picture that claims more pixels than its bytes can tell, and where a PNG's chunks are not all
+    there with the right checksums, the last one IEND.
 
-    OpenCV gets nothing else: it takes as much memory as a damaged chunk claims.
+    OpenCV gets nothing else: it takes as much memory as a header or a damaged chunk claims.
     """
     if not data.startswith(_SIGNATURE):
+        _check_size(data, where)
         return
+    if header := read_header(data):
+        require_plausible(where, header.width, header.height, len(data))
     position, view = len(_SIGNATURE), memoryview(data)
     while position + 12 <= len(data):
         length = int.from_bytes(data[position : position + 4], "big")
@@ -133,3 +136,17 @@ def check_png(data: bytes, where: str | Path) -> None:
             return
         position = end
     raise DataError(f"{where}: a truncated PNG: it ends after {len(data)} bytes without its end mark; copy it again")
+
+
+def _check_size(data: bytes, where: str | Path) -> None:
+    """Raises DataError for a picture of another kind whose size isn't plausible; of kinds that Pillow doesn't know it passes."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            size = image.size
+    except Image.DecompressionBombError as error:
+        raise DataError(f"{where}: {str(error)[:80]}; {len(data)} bytes of a file can't hold such a picture") from None
+    except Exception:  # nearly anything; whoever decodes it says that it can't be read
+        return
+    require_plausible(where, *size, len(data))

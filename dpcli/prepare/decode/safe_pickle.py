@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.npy_files import require_room
 
-_MOST_BYTES = 1 << 28
 _CODE = re.compile(
     r"[biufcSUO]\d{0,9}"
 )  # of an element: a number, text, or Python object, which is checked like all else
@@ -192,8 +192,7 @@ def read_npz_member(archive: zipfile.ZipFile, path: Path, key: str, pickled: boo
     except KeyError:
         found = ", ".join(sorted(name.removesuffix(".npy") for name in archive.namelist()))
         raise DataError(f"{path}: no array {key!r} in it; found: {found}") from None
-    if info.file_size > _MOST_BYTES:
-        raise DataError(f"{path}: {key} takes {info.file_size} bytes; expected less than {_MOST_BYTES}")
+    require_room(path, info.file_size)
     try:
         data = archive.read(info)
         stream = io.BytesIO(data)

@@ -23,6 +23,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
 from dpcli.prepare.meshes.other_formats import is_folder, not_gltf, refuse_other_formats
+from dpcli.runtime.clips.images import require_plausible
 from dpcli.text_files import parse_json
 
 COMPONENTS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -228,6 +229,7 @@ class Gltf:
         )
         try:
             with Image.open(io.BytesIO(data)) as picture:
+                require_plausible(self.path, *picture.size, len(data))
                 return _rgba(picture)
         except UnidentifiedImageError:
             kind = "KTX2" if data.startswith(b"\xabKTX 20\xbb") else entry.get("mimeType", "of an unknown kind")

@@ -13,7 +13,7 @@ from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns
 from dpcli.prepare.decode.calibration import Calibration, lens_coefficients
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
-from dpcli.prepare.decode.png import check_png, decode_gray_png
+from dpcli.prepare.decode.png import check_picture, decode_gray_png
 
 CLOUD_KINDS = ("sensor_msgs/msg/PointCloud2",)
 IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -95,7 +95,7 @@ def _compressed_depth(path: Path, form: str, data: bytes) -> np.ndarray:
 def _decoded(path: Path, form: str, data: bytes) -> np.ndarray:
     image = decode_gray_png(data)
     if image is None:
-        check_png(data, path)
+        check_picture(data, path)
         cv2 = load_cv2()
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
     if image is None:

@@ -149,7 +149,8 @@ class CloudFolders:
             lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"
         if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")
-        return lines + about_series([(item.name, item.extra["series"]) for item in items])
+        lines += about_series([(item.name, item.extra["series"]) for item in items])
+        return lines + (self._table.unnamed(items) if self._table else [])
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.png import check_png, decode_gray_png
+from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.reader import require_folder
 
 OUTSIDE = "points outside the camera's view, --near and --far dropped"
@@ -105,7 +105,7 @@ def read_png(
     data = path.read_bytes()
     image = decode_gray_png(data)
     if image is None and data:
-        check_png(data, path)
+        check_picture(data, path)
         image = load_cv2().imdecode(np.frombuffer(data, np.uint8), load_cv2().IMREAD_UNCHANGED)
     if image is None:
         raise DataError(f"{path}: not a readable PNG (empty or truncated); copy it again")

@@ -125,4 +125,5 @@ class RecordedClouds:
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds."""
         unread = f"; not read: {', '.join(self._first[1][:_LISTED])} (--keep-fields)" if self._first[1] else ""
-        return [f"{len(items)} recording{'s' if len(items) != 1 else ''} found{unread}"]
+        lines = [f"{len(items)} recording{'s' if len(items) != 1 else ''} found{unread}"]
+        return lines + (self._table.unnamed(items) if self._table else [])

@@ -165,7 +165,7 @@ class TableSequences:
             lines[0] += f", frames by column {loaded.column!r}" + (
                 f"; not read: {unused} (--keep-fields)" if unused else ""
             )
-        return lines
+        return lines + (self._label_table.unnamed(items) if self._label_table else [])
 
 
 @dataclass(frozen=True)

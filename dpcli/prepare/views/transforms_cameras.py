@@ -27,6 +27,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "s1", "s2", "s3",
 _DISTORTION += (*(f"ftheta_p{place}" for place in range(5)), "latlong", "rolling_shutter", "orthographic")
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
+_LAST_TIME = 1e9  # in any unit
 _SHAPE = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 
 
@@ -107,7 +108,7 @@ def _collect(path: Path, role: str, views: dict[bytes, View]) -> None:
             raise ValueError("no frames")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: not a readable list of frames ({error!r})") from None
-    tested = {str(name) for key in ("val_filenames", "test_filenames") for name in found.get(key) or ()}
+    tested = {str(name) for key in ("val_filenames", "test_filenames") for name in _values(found.get(key))}
     for number, frame in enumerate(frames):
         own_role = "test" if str(frame.get("file_path")) in tested else role
         try:
@@ -123,6 +124,8 @@ def _add(folder: Path, frame: dict[str, Any], role: str, views: dict[bytes, View
             raise DataError(f"no {key!r}" + " (a still scene? 4D needs the time of every frame)" * (key == "time"))
     _check_lens(frame)
     pose, lens = _pose(frame["transform_matrix"]), {key: _number(frame, key) for key in _LENS if key in frame}
+    if abs(_number(frame, "time")) > _LAST_TIME:
+        raise DataError(f"time {frame['time']}; expected shares of the clip, frame numbers or seconds")
     if wrong := [key for key in _POSITIVE if lens.get(key, 1) <= 0]:
         raise DataError(f"{wrong[0]} {lens[wrong[0]]:g}; expected more than 0")
     time, image = _number(frame, "time"), _image(folder, str(frame["file_path"]))

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
-from dpcli.runtime.clips.images import as_shown
+from dpcli.runtime.clips.images import as_shown, open_image
 from dpcli.runtime.clips.video_frames import video_frames
 
+_MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
 
 
@@ -22,25 +23,29 @@ def is_image_file(path: Path) -> bool:
         return start[8:12] in (b"avif", b"avis")
     if start[:4] == b"RIFF":
         return start[8:12] == b"WEBP"
+    if path.suffix.lower() in _MANY_JPEGS:
+        return False
     return start.startswith((b"GIF8", b"\x89PNG", b"\xff\xd8\xff", b"BM", b"II*\0", b"MM\0*"))
 
 
 def animation_times(path: Path) -> tuple[float, ...]:
     """Returns the seconds at which each frame appears, from 0. Raises DataError when the file is damaged or one image."""
-    from PIL import Image
-
     times, now = [], 0.0
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             first = int(getattr(image, "default_image", False))  # what viewers show that can't play an APNG
             for index in range(first, getattr(image, "n_frames", 1)):
                 image.seek(index)
                 image.load()
                 times.append(now)
                 now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
-            moves = image.format in ("GIF", "PNG", "WEBP", "AVIF")
+            moves, form = image.format in ("GIF", "PNG", "WEBP", "AVIF"), image.format
+    except DataError:
+        raise
     except Exception as error:  # a damaged file raises nearly anything
         raise DataError(f"{path}: not a readable animation ({error}); export it again") from None
+    if len(times) > 1 and form == "TIFF":
+        raise DataError(f"{path}: {len(times)} pages, which tell no times; write each into a folder as an image")
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
     return tuple(times)
@@ -53,7 +58,7 @@ def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """
     from PIL import Image
 
-    with reading(path), Image.open(path) as image:
+    with reading(path), open_image(path) as image:
         profile = image.info.get("icc_profile")
         if image.format == "PNG":
             for frame in video_frames(path, wanted):

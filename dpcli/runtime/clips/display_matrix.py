@@ -9,14 +9,25 @@ import numpy as np
 Matrix = tuple[
     int, int, int, int
 ]  # a, b, c, d: what is stored at (x, y) from the middle is shown at (ax + cy, bx + dy)
-_NOT_TURNED = (1, 0, 0, 1)
+_TURNED = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))  # by quarters, counterclockwise
 
 
 def display_matrix(frame) -> Matrix:  # frame: av.VideoFrame
-    """Returns the display matrix of a frame; the one that changes nothing where it has none.
+    """Returns the display matrix of a frame; the one that changes nothing where it has none."""
+    import av
 
-    A filter takes color profiles away first: PyAV frees their names twice, which ends the process.
-    """
+    try:
+        stored = _without_profile(frame).side_data.get("DISPLAYMATRIX")
+    except (ValueError, av.FFmpegError):  # side data that PyAV doesn't know, or pixels that filters don't
+        return _TURNED[round(frame.rotation / 90) % 4]
+    if stored is None:
+        return _TURNED[0]
+    a, b, _, c, d = np.frombuffer(bytes(stored), "<i4")[:5].tolist()
+    return a, b, c, d
+
+
+def _without_profile(frame):  # -> av.VideoFrame
+    """Returns the frame without a color profile, whose name PyAV frees twice, which ends the process."""
     import av
 
     graph = av.filter.Graph()
@@ -26,11 +37,7 @@ def display_matrix(frame) -> Matrix:  # frame: av.VideoFrame
     bare.link_to(sink)
     graph.configure()
     source.push(frame)
-    stored = sink.pull().side_data.get("DISPLAYMATRIX")
-    if stored is None:
-        return _NOT_TURNED
-    a, b, _, c, d = np.frombuffer(bytes(stored), "<i4")[:5].tolist()
-    return a, b, c, d
+    return sink.pull()
 
 
 def as_it_plays(picture: np.ndarray, matrix: Matrix) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
@@ -12,7 +13,34 @@ from dpcli.errors import DataError
 from dpcli.runtime.progress import log
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif")
+_PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many times its bytes beyond them
 _NAMED = 6  # series at most in a message
+
+
+def is_plausible(width: int, height: int, held: int) -> bool:
+    """Returns whether `held` bytes of a file can tell a picture of so many pixels.
+
+    Flat colors pack a thousand times smaller, so a small file could fill the memory.
+    """
+    return width * height <= max(_PIXELS, _PIXELS_A_BYTE * held)
+
+
+def require_plausible(where: object, width: int, height: int, held: int) -> None:
+    """Raises DataError for a picture that claims far more pixels than its `held` bytes can tell, before any is decoded."""
+    if not is_plausible(width, height, held):
+        raise DataError(
+            f"{where}: claims {width} x {height} pixels, {held} bytes of a file can't hold such a picture; export it smaller"
+        )
+
+
+@contextmanager
+def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
+    """Opens an image whose size is plausible. Raises DataError where it isn't, and what Pillow does for one that is damaged."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        require_plausible(path, *image.size, path.stat().st_size)
+        yield image
 
 
 def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image

@@ -22,14 +22,16 @@ from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".avi", ".webm", ".mkv", ".m4v", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg"),
-    *(".wmv", ".flv", ".ogv", ".3gp", ".y4m"),
+    *(".wmv", ".flv", ".ogv", ".3gp", ".y4m", ".asf", ".mxf", ".vob", ".dv", ".mjpg", ".mjpeg"),
 )
 # Formats of playlists aren't among them: they name other files, which nobody meant to be read.
 # files of one clip; others (playlists, lists to join, session descriptions) name further files, which would be opened
 VIDEO_FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,mpegvideo,asf,flv,ogg,yuv4mpegpipe,ivf,h264,hevc,obu,av1,m4v,"
-    "dv,mxf,nut,apng"
+    "dv,mxf,nut,apng,mjpeg,swf,rm"
 )
+_BARE = ("h264", "hevc", "obu", "mjpeg", "m4v")  # streams without a container: their times are FFmpeg's invention
+_ASSUMED_RATE = 25.0  # of such a stream, where it tells none
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders of them pass over the alpha
 _STAMP_STEP = 2e-3  # s: what rounding does to time stamps
 _HDR = {wide_color.PQ: "PQ", wide_color.HLG: "HLG"}
@@ -79,16 +81,19 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
     container, stream = _open(path)
     with closing(container):
         stamps, first, failed, alpha = [], None, False, False
+        bare = container.format.name in _BARE
         try:
             for frame in _decoded(path, container, stream):
                 first, alpha = first or frame, alpha or _is_transparent(frame)
                 # Frames that the decoder held back until the end know no time base of their own.
-                stamps.append(0.0 if frame.pts is None else float(frame.pts * stream.time_base))
+                stamps.append(0.0 if bare or frame.pts is None else float(frame.pts * stream.time_base))
         except DataError:
             failed = True
         if first is None:
             raise DataError(f"{path}: no frame can be decoded; the video is empty, truncated, or of an unknown codec")
-        rate = float(stream.average_rate or 0)
+        rate = float((stream.codec_context.framerate if bare else stream.average_rate) or 0)
+        if bare and rate == _ASSUMED_RATE:
+            log.info(f"{path}: a stream without a container: {rate:g} frames per second, if it tells no other (--fps)")
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
         _require_known_colors(path, first)
@@ -184,7 +189,8 @@ def _declared_and_held(
     if stream.frames > count + (not cut):
         return stream.frames, _packets(path)
     if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
-        seconds = float(container.duration or 0) / 1e6
+        begins = float((stream.start_time or 0) * stream.time_base)  # some containers count their duration from 0
+        seconds = float(container.duration or 0) / 1e6 - max(begins, 0.0)
         estimate = round(seconds * float(stream.average_rate))
         if cut:
             return estimate, count

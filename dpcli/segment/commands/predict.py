@@ -130,7 +130,7 @@ def predict_file(
                 resume=output != "-",
             ) as writer:
                 _predict_sequences(reader, sequences, work, writer, fields, spread)
-        return _close(target, drawings)
+        return _close(target, drawings, settings.classical.method == "scene")
 
 
 def _open_segmenter(settings: PredictSettings, model: str | None, device: str, seed: int) -> Segmenter:
@@ -207,27 +207,40 @@ def _predict_sequences(
         taken.run(work, load, write, workers)
 
 
-def _close(target: Path, drawings: Drawings) -> int:
+def told_of_scenes(parts: str) -> list[str]:
+    """Returns a line for each sequence of a parts file of scenes: the sensor's motion, moving objects, their speeds."""
+    from dpcli.segment.scene.report import scene_lines
+
+    with PartsReader(Path(parts)) as reader:
+        return scene_lines(reader)
+
+
+def _close(target: Path, drawings: Drawings, scene: bool) -> int:
     """Draws what was written and tells what was passed over; returns the number of sequences."""
     with PartsReader(target) as made:
         for line in skipped_lines(made.skipped):
             log.warn(line)
         if len(made):
-            _draw(target, drawings)
+            _draw(target, drawings, scene)
         return len(made)
 
 
-def _draw(target: Path, drawings: Drawings) -> None:
-    """Draws what was just written."""
+def _draw(target: Path, drawings: Drawings, scene: bool) -> None:
+    """Draws what was just written; scenes from above."""
     if drawings == Drawings():
         return
     from dpcli.draw.ply import write_ply_frames
     from dpcli.segment.pictures import parts_picture, turntable
+    from dpcli.segment.scene.report import picture_of_scene
 
     with PartsReader(target) as reader:
         if drawings.picture is not None:
             shown = np.unique(np.linspace(0, len(reader) - 1, min(len(reader), _ROWS)).astype(int))
-            parts_picture(drawings.picture, [reader.read(int(i)) for i in shown])
+            sequences, look = [reader.read(int(i)) for i in shown], None
+            if scene:
+                sequences, looks = zip(*map(picture_of_scene, sequences))
+                look = looks[0]
+            parts_picture(drawings.picture, sequences, look=look)
         if drawings.turntable is not None:
             turntable(drawings.turntable, reader.read(0))
         if drawings.ply is not None:

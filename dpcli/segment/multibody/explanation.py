@@ -24,13 +24,17 @@ class Body:
 
 @dataclass
 class Explanation:
-    """Holds bodies, the largest first, labels i64 (N), soft shares f32 (N,K) and the energy, a cost per point."""
+    """Holds bodies, the largest first, labels i64 (N), soft shares f32 (N,K) and the energy, a cost per point.
+
+    cost, field: f32 (N,K), of the points under every body with the price of displacement, and less what others support.
+    """
 
     bodies: list[Body]
     label: np.ndarray
     share: np.ndarray
     energy: float
-    cost: np.ndarray  # (N,K) with the price of displacement
+    cost: np.ndarray
+    field: np.ndarray
 
 
 def body_of(frames: Frames, trajectory: Trajectory) -> Body:
@@ -47,11 +51,18 @@ def label_points(
     """
     cost = costs_of(frames, bodies, settings)
     nearest = np.stack([body.nearest for body in bodies])
+    alike = frames.compare([body.trajectory for body in bodies], settings.hinge)
     around = 0.5 * cost + 0.5 * cost[frames.neighbors].mean(1)
     first = around.argmin(1) if start is None else start
     share = np.eye(len(bodies), dtype=np.float32)[first] * 0.8 + np.float32(0.2 / len(bodies))
-    mean_field_kernel(cost, frames.neighbors, nearest, settings.border, settings.agreement, _TEMPERATURES, share)
-    return measure(frames, bodies, share, settings, cost)
+    weights = (settings.border, settings.agreement)
+    mean_field_kernel(cost, frames.neighbors, nearest, alike, *weights, _TEMPERATURES, share)
+    label, support = share.argmax(1), np.empty((2, *share.shape), np.float32)
+    hard = np.eye(len(bodies), dtype=np.float32)[label]
+    support_kernel(hard, frames.neighbors, nearest, alike, support)
+    field = cost - settings.border * support[0] - settings.agreement * support[1]
+    own = field[np.arange(len(label)), label].mean(dtype=np.float64) + sum(weights)
+    return Explanation(bodies, label, share, float(own) + settings.body_price * len(bodies), cost, field)
 
 
 def costs_of(frames: Frames, bodies: list[Body], settings: MultibodySettings) -> np.ndarray:
@@ -60,21 +71,6 @@ def costs_of(frames: Frames, bodies: list[Body], settings: MultibodySettings) ->
     far = [frames.displace(body.trajectory, main) for body in bodies[1:]]
     away = np.stack([np.zeros(len(frames.points), np.float32), *far], 1)
     return np.ascontiguousarray(np.stack([body.cost for body in bodies], 1) + settings.displacement * away, np.float32)
-
-
-def measure(
-    frames: Frames, bodies: list[Body], share: np.ndarray, settings: MultibodySettings, cost: np.ndarray
-) -> Explanation:
-    """Returns the explanation that soft shares (N,K) make, with the energy of their hard labels."""
-    label = share.argmax(1)
-    hard = np.eye(len(bodies), dtype=np.float32)[label]
-    support = np.empty((2, *hard.shape), np.float32)
-    support_kernel(hard, frames.neighbors, np.stack([body.nearest for body in bodies]), support)
-    rows = np.arange(len(label))
-    energy = cost[rows, label].mean(dtype=np.float64)
-    energy += settings.border * (1 - support[0, rows, label].mean(dtype=np.float64))
-    energy += settings.agreement * (1 - support[1, rows, label].mean(dtype=np.float64))
-    return Explanation(bodies, label, share, float(energy) + settings.body_price * len(bodies), cost)
 
 
 def without_empty(frames: Frames, found: Explanation, settings: MultibodySettings) -> Explanation:

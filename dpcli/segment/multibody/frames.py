@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.segment.flow.surface_icp import Surface, columns
+from dpcli.segment.multibody.label_kernels import alike_kernel
 
 _PARTNERS = 6  # other frames that a point is compared with, so that the cost stays linear in frames
 POINT_SHARE = 0.15  # of point-to-point distance in a residual, besides point to plane
 _OF_SPACING = 0.6  # residual that counts one half, in spacings of the points
+_ONE_PLACE = 0.85  # spacings: how far apart two motions may take a point for it to be at their hinge
 _FEWEST = 6  # points of a frame that can hold a motion
 
 Trajectory = np.ndarray  # (F,3,4): takes a body from its own coordinates to every frame
@@ -65,6 +67,14 @@ class Frames:
                 gap[own] += np.linalg.norm(move(apart, self.points[own]), axis=1)
             gap[own] /= len(others)
         return gap
+
+    def compare(self, trajectories: list[Trajectory], hinge: float) -> np.ndarray:
+        """Returns how nearly two of K trajectories take every point to one place, f32 (N,K,K), see `alike_kernel`."""
+        alike = np.empty((len(self.points), len(trajectories), len(trajectories)), np.float32)
+        for t, others in enumerate(self.partners):
+            motions = np.stack([[relative_motion(one, t, u) for one in trajectories] for u in others])
+            alike_kernel(self.points[self.slice(t)], motions, _ONE_PLACE * self.spacing, hinge, alike[self.slice(t)])
+        return alike
 
     def fit(self, trajectory: Trajectory, inside: np.ndarray, own: bool, tight: float) -> Trajectory:
         """Returns a body's trajectory, frame after frame brought by ICP to where its points (mask (N)) of others agree.

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.segment.flow import motion_proposals
 from dpcli.segment.flow.rigid_bodies import BodySearch, find_bodies
 from dpcli.segment.flow.surface_icp import columns
 from dpcli.segment.multibody.frames import POINT_SHARE, Frames, Trajectory, compose, move, relative_motion
@@ -17,7 +16,6 @@ _STEPS, _WIDE = 12, 0.06  # of the ICP that carries a body on
 _FEWEST = 8  # points of a body
 _ALIKE = 0.7  # spacings that two trajectories differ at most to be one
 _MOST = 64  # hypotheses that are compared on all points
-_REGIONS, _KEPT = 6, 2  # badly explained regions searched anew, motions kept of each
 _SEARCH = BodySearch(second_looks=0, polish=(0.5,))
 
 PairMotions = dict[tuple[int, int], np.ndarray]  # (t, u) -> motions (K,3,4)
@@ -32,8 +30,8 @@ class Hypothesis:
     trajectory: Trajectory
 
 
-def find_hypotheses(frames: Frames) -> tuple[list[Hypothesis], PairMotions]:
-    """Returns different bodies that pairs of frames show, the largest first, and the pairs' motions."""
+def find_hypotheses(frames: Frames) -> list[Hypothesis]:
+    """Returns different bodies that pairs of frames show, the largest first."""
     pairs = _pairs(len(frames))
     clouds = [surface.points for surface in frames.surfaces]
     with ThreadPoolExecutor(2) as pool:
@@ -47,7 +45,7 @@ def find_hypotheses(frames: Frames) -> tuple[list[Hypothesis], PairMotions]:
         seeds = sorted((seed for seed in seeds if len(seed[2]) >= _FEWEST), key=lambda seed: -len(seed[2]))
         seeds = _spread(seeds, len(frames))
         carried = pool.map(lambda seed: carry(frames, seed[0][0], clouds[seed[0][0]][seed[2]], motions), seeds)
-        return keep_different(frames, list(carried)), motions
+        return keep_different(frames, list(carried))
 
 
 def _pairs(frames: int) -> list[tuple[int, int]]:
@@ -94,12 +92,11 @@ def _best(frames: Frames, u: int, part: np.ndarray, starts: np.ndarray) -> np.nd
     return ends[score.argmin()]
 
 
-def keep_different(frames: Frames, found: list[Hypothesis], known: list[Hypothesis] | None = None) -> list[Hypothesis]:
-    """Returns the hypotheses, in their order, that take their points elsewhere than all before and all known ones."""
+def keep_different(frames: Frames, found: list[Hypothesis]) -> list[Hypothesis]:
+    """Returns the hypotheses, in their order, that take their points elsewhere than all before."""
     kept: list[Hypothesis] = []
     for one in found:
-        others = [*(known or []), *kept]
-        if all(_distance(one, other) > _ALIKE * frames.spacing for other in others):
+        if all(_distance(one, other) > _ALIKE * frames.spacing for other in kept):
             kept.append(one)
     return kept[:_MOST]
 
@@ -112,48 +109,3 @@ def _distance(one: Hypothesis, other: Hypothesis) -> float:
         for u in range(len(one.trajectory))
     ]
     return max(float(np.linalg.norm(gap, axis=1).mean()) for gap in apart)
-
-
-def search_regions(
-    frames: Frames, cost: np.ndarray, own: list[Trajectory], label: np.ndarray, motions: PairMotions
-) -> list[Hypothesis]:
-    """Returns hypotheses for connected regions of high cost (N): parts turned about their edges or shifted.
-
-    own: the trajectories of the bodies; label (N): whose each point is.
-    """
-    around = 0.5 * cost + 0.5 * cost[frames.neighbors].mean(1)
-    regions = []
-    for t in range(len(frames)):
-        inside = frames.slice(t)
-        for level in (0.4, 0.6):
-            found = motion_proposals.find_components(around[inside] > level, frames.surfaces[t].neighbors)
-            regions += [(t, region) for region in found if len(region) >= _FEWEST]
-    regions.sort(key=lambda item: -around[item[1] + frames.starts[item[0]]].sum())
-    return [one for t, region in regions[:_REGIONS] for one in _search_region(frames, t, region, own, label, motions)]
-
-
-def _search_region(
-    frames: Frames, t: int, region: np.ndarray, own: list[Trajectory], label: np.ndarray, motions: PairMotions
-) -> list[Hypothesis]:
-    """Returns the hypotheses of one region of frame t: the best motions to the next frame, carried on to all."""
-    body = own[np.bincount(label[region + frames.starts[t]]).argmax()]
-    u = t + 1 if t + 1 < len(frames) else t - 1
-    first, points = relative_motion(body, t, u), frames.surfaces[t].points[region]
-    proposed = motion_proposals.propose_motions(move(first, points), np.zeros((0, 3)))
-    starts = motion_proposals.compose_motions(proposed, first)
-    narrow = frames.spacing
-    ends, score = frames.surfaces[u].icp_many(
-        columns(points), starts, _STEPS, _WIDE, narrow, POINT_SHARE, frames.scales[u]
-    )
-    chosen = motion_proposals.choose_distinct(ends, score, points.astype(np.float64), 0.03, _KEPT)
-    more = _with_body(motions, body, len(frames))
-    return [carry(frames, t, points, {**more, (t, u): ends[h][None]}) for h in chosen]
-
-
-def _with_body(motions: PairMotions, body: Trajectory, frames: int) -> PairMotions:
-    """Returns the pairs' motions and, for adjacent frames, that of a body, which a part attached to it often nearly makes."""
-    more = dict(motions)
-    for t in range(frames - 1):
-        for pair in ((t, t + 1), (t + 1, t)):
-            more[pair] = np.concatenate([motions.get(pair, np.zeros((0, 3, 4))), relative_motion(body, *pair)[None]])
-    return more

@@ -1,4 +1,4 @@
-"""The search for the bodies of a sequence: greedy growth by what a body explains, pruning, refits, and regrowth."""
+"""The search for the bodies of a sequence: greedy growth by what a body explains, pruning, refits, and growth anew."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import numpy as np
 
 from dpcli.segment.multibody.explanation import Explanation, body_of, label_points, refit, without_empty
 from dpcli.segment.multibody.frames import Frames
-from dpcli.segment.multibody.hypotheses import Hypothesis, PairMotions, find_hypotheses, keep_different, search_regions
+from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import TrackedFrames, patch_hypotheses
 
 _TRIED = 4  # bodies tried on the whole per round
+_GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
 
@@ -32,19 +33,16 @@ class Search:
 
     def __init__(self, frames: Frames, settings: MultibodySettings, hypotheses: list[Hypothesis] | None = None) -> None:
         self.frames, self.settings = frames, settings
-        self.motions: PairMotions = {}
-        if hypotheses is None:
-            hypotheses, self.motions = find_hypotheses(frames)
-        self.hypotheses = hypotheses
-        self.pool = [body_of(frames, one.trajectory) for one in self.hypotheses]
+        hypotheses = find_hypotheses(frames) if hypotheses is None else hypotheses
+        self.pool = [body_of(frames, one.trajectory) for one in hypotheses]
 
     def run(self) -> Explanation:
-        """Returns the explanation: grown, pruned, its worst regions searched anew, and its motions tightened."""
+        """Returns the explanation: grown, pruned, grown anew without each body, and its motions tightened."""
         found = self._grow(self._first())
         found = self._prune(found)
-        for _ in range(self.settings.regrow if self.motions else 0):
+        for _ in range(self.settings.regrow):
             better = self._regrow(found)
-            if better.energy >= found.energy - 1e-4:
+            if better is found:
                 break
             found = better
         return self._tighten(found)
@@ -106,19 +104,13 @@ class Search:
         return label_points(self.frames, rest, self.settings, start)
 
     def _regrow(self, found: Explanation) -> Explanation:
-        """Returns the explanation grown and pruned again, with hypotheses for what is explained badly now."""
-        current = found.cost[np.arange(len(found.label)), found.label]
-        own = [body.trajectory for body in found.bodies]
-        more = search_regions(self.frames, current, own, found.label, self.motions)
-        more = keep_different(self.frames, more, self._known(found))
-        self.hypotheses += more
-        self.pool += [body_of(self.frames, one.trajectory) for one in more]
-        return self._prune(self._grow(found))
-
-    def _known(self, found: Explanation) -> list[Hypothesis]:
-        """Returns all that is known as hypotheses: those of the pool, and the bodies."""
-        none = np.zeros((0, 3))
-        return [*self.hypotheses, *(Hypothesis(0, none, body.trajectory) for body in found.bodies)]
+        """Returns the best of what grows when a body is taken out, each in turn; itself where nothing is better."""
+        best = found
+        for k in range(len(found.bodies) if len(found.bodies) > 1 else 0):
+            grown = self._prune(self._grow(self._clean(self._without(found, k))))
+            if grown.energy < best.energy - _GAIN:
+                best = grown
+        return best
 
     def _tighten(self, found: Explanation) -> Explanation:
         """Returns the explanation with motions fitted ever tighter, onto the bodies' own points, where it costs less."""

@@ -15,6 +15,7 @@ from dpcli.segment.multibody.search import explain_sequence
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.segmenters import Flows, Segmenter
 
+_TEMPERATURE = 0.2  # of masks, in costs of a point
 Motions = dict[tuple[int, int], tuple[Tensor, Tensor]]  # (t, u) -> motions (S,3,3), (S,3) of all parts
 
 
@@ -49,9 +50,8 @@ class MultibodySegmenter(Segmenter):
         if len(frames) == 1:
             return [torch.eye(self.slots)[:1].repeat(len(frames[0]), 1)], {}
         found = explain_sequence([frame.numpy() for frame in frames], self.settings, tracks)
-        share = np.zeros((len(found.label), self.slots), np.float32)
-        share[:, : len(found.bodies)] = found.share
-        masks = list(torch.from_numpy(share / share.sum(1, keepdims=True)).split([len(frame) for frame in frames]))
+        sizes = [len(frame) for frame in frames]
+        masks = list(torch.from_numpy(masks_of(found, sizes, self.slots)).split(sizes))
         return masks, {pair: self._motions(found, *pair) for pair in pairs}
 
     def _motions(self, found: Explanation, t: int, u: int) -> tuple[Tensor, Tensor]:
@@ -60,3 +60,20 @@ class MultibodySegmenter(Segmenter):
         for k, body in enumerate(found.bodies):
             motion[k] = relative_motion(body.trajectory, t, u)
         return torch.from_numpy(motion[:, :, :3].copy()), torch.from_numpy(motion[:, :, 3].copy())
+
+
+def masks_of(found: Explanation, sizes: list[int], slots: int) -> np.ndarray:
+    """Returns how likely each point is in each body, f32 (N,slots), of frames with these numbers of points.
+
+    A body holds about the same share of every frame: it is trusted by its least share over its largest, and what is missing
+    to 1 is spread over all slots.
+    """
+    likely = np.exp((found.field.min(1, keepdims=True) - found.field) / _TEMPERATURE)
+    likely /= likely.sum(1, keepdims=True)
+    label = likely.argmax(1)
+    frames = np.split(label, np.cumsum(sizes)[:-1])
+    shares = np.stack([np.bincount(own, minlength=len(found.bodies)) / max(len(own), 1) for own in frames])
+    trust = (shares.min(0) / np.maximum(shares.max(0), 1e-9))[label, None]
+    masks = np.repeat((1 - trust) / slots, slots, axis=1)
+    masks[:, : len(found.bodies)] += trust * likely
+    return masks.astype(np.float32)

@@ -16,9 +16,15 @@ class MultibodySettings:
 
     most_bodies: int = setting(24, "multibody: most bodies of a sequence.", least=1)
     body_price: float = setting(0.001, "multibody: cost of a further body, as a share of all points.", least=0)
-    border: float = setting(0.2, "multibody: cost of a point whose neighbors are all in other bodies.", least=0)
+    border: float = setting(0.3, "multibody: cost of a point whose neighbors are all in other bodies.", least=0)
     agreement: float = setting(
-        0.2, "multibody: cost of a point whose nearest points in other frames are all in other bodies.", least=0
+        0.3, "multibody: cost of a point whose nearest points in other frames are all in other bodies.", least=0
+    )
+    hinge: float = setting(
+        0.7,
+        "multibody: share of both that a point is spared where its body and the other one take it to one place.",
+        least=0,
+        most=1,
     )
     displacement: float = setting(
         0.05, "multibody: cost of a point per diameter that it lies from where the largest body would take it.", least=0
@@ -26,7 +32,9 @@ class MultibodySettings:
     flexible: float = setting(
         0.02, "multibody: deviation from rigid motion that counts one half where tracks are given, diameters.", above=0
     )
-    regrow: int = setting(1, "multibody: times that badly explained regions are searched anew.", least=0)
+    regrow: int = setting(
+        2, "multibody: rounds in which each body in turn is taken out and its points are explained anew.", least=0
+    )
 
     def __post_init__(self) -> None:
         check(self)

@@ -11,10 +11,13 @@ from dpcli.segment.scene.object_motion import refine
 from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _MARGIN = 0.35  # meters around an object's moved points in which a frame's points are its own
+_CLOSE = 0.15  # the same for points that may as well stand
+_STANDING = 0.15  # mean cost of standing still below which a point may as well stand
 _AROUND = 1.0  # meters around its box in which points in doubt are its own
 _FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
 _FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
 _JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one another may differ
+_UNSTEADY = 2.5  # times the evidence for something that could only be carried with a jerk
 _ALIKE = (0.3, 0.25)  # the same for two pieces of one object
 _APART = 1.5  # meters between pieces of one object
 
@@ -23,13 +26,15 @@ _APART = 1.5  # meters between pieces of one object
 class MovingObject:
     """Holds an object: its points in each frame, numbers i64, and its motion, f64 (4,4) in the world, from `start` to it.
 
-    saved: what its motion explains better than standing still, in points that a frame contradicts.
+    saved: what its motion explains better than standing still, in points that a frame contradicts. demand: times
+    the usual evidence that it needs, more than 1 for pieces of a larger cluster, and what could only be carried with a jerk.
     """
 
     start: int
     points: dict[int, np.ndarray]
     motion: dict[int, np.ndarray]
     saved: float = 0.0
+    demand: float = 1.0
 
     @property
     def size(self) -> int:
@@ -66,6 +71,7 @@ def carry(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -
         if t != one.start:
             before, step = step, refine(points, there, step)
             if not _alike(points, before, step, _JERK):
+                one.demand *= _UNSTEADY
                 return
         members = _members(moved(points, step), there)
         if len(members) == 0 or (there.cost(moved(points, step))[0] < 0.9 * UNSEEN).mean() < _FOUND:
@@ -85,12 +91,18 @@ def _alike(points: np.ndarray, first: np.ndarray, second: np.ndarray, limits: tu
 
 
 def _members(moved_points: np.ndarray, frame: Frame) -> np.ndarray:
-    """Returns the raised points i64 of a frame, in no object yet, around an object's moved points."""
-    margin = max(_MARGIN, float(np.median(frame.tolerance(moved_points))))
+    """Returns the raised points i64 of a frame, in no object yet, around an object's moved points.
+
+    Those that may as well stand must lie closer, lest an object takes along what it passes.
+    """
+    tolerance = float(np.median(frame.tolerance(moved_points)))
+    margin = max(_MARGIN, tolerance)
     near = _inside(frame, moved_points, margin)
     if len(near) == 0:
         return near
-    return near[np.isfinite(cKDTree(moved_points).query(frame.points[near], distance_upper_bound=margin)[0])]
+    distance = cKDTree(moved_points).query(frame.points[near], distance_upper_bound=margin)[0]
+    standing = frame.doubt[near] < _STANDING
+    return near[distance < np.where(standing, max(_CLOSE, 0.5 * tolerance), margin)]
 
 
 def _inside(frame: Frame, points: np.ndarray, margin: float) -> np.ndarray:

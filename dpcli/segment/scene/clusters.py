@@ -7,18 +7,23 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-_BANDS = ((0.0, 20.0, 0.4), (20.0, 40.0, 0.7), (40.0, np.inf, 1.1))  # meters: from, to, and the widest gap
+_BANDS = ((0, 10, 0.4), (10, 20, 0.4), (20, 40, 0.7), (40, 70, 1.1), (70, np.inf, 1.1))  # meters: from, to, widest gap
+_ROWS = 1.3  # distances between rows of beams that are no gap
 
 
-def cluster(points: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Returns the number i64 (N) of each point's cluster. points: f64 (N,3); reach: their distances (N) from the sensor."""
+def cluster(points: np.ndarray, reach: np.ndarray, across: float) -> np.ndarray:
+    """Returns the number i64 (N) of each point's cluster.
+
+    points: f64 (N,3), z up; reach: their distances (N) from the sensor; across: the angle between its rows, radians.
+    """
     rows, columns = [np.zeros(0, int)], [np.zeros(0, int)]
     for near, far, gap in _BANDS:
         own = np.flatnonzero((reach >= near - gap) & (reach < far + gap))
         if len(own) == 0:
             continue
-        _, first, voxel = np.unique(np.floor(points[own] / (gap / 3)), axis=0, return_index=True, return_inverse=True)
-        pairs = cKDTree(points[own[first]]).query_pairs(gap, output_type="ndarray")
+        band = points[own] * [1, 1, min(1.0, gap / (_ROWS * across * min(far, 2 * near + 10)))]
+        _, first, voxel = np.unique(np.floor(band / (gap / 3)), axis=0, return_index=True, return_inverse=True)
+        pairs = cKDTree(band[first]).query_pairs(gap, output_type="ndarray")
         rows += [own, own[first][pairs[:, 0]]]
         columns += [own[first][voxel.reshape(-1)], own[first][pairs[:, 1]]]
     row, column = np.concatenate(rows), np.concatenate(columns)

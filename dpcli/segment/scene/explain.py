@@ -14,6 +14,8 @@ from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
 from dpcli.segment.scene.world import Frame, World
 
+_SURE = 50.0  # points explained better that make an object two thirds surer
+_FEWEST = 50  # points of a frame that shows anything of a scene
 _FAR = 40.0  # meters: a sensor has some point nearer than this
 _JUMPS = 0.12  # share of neighboring beams that may end at different ranges, seen from where the sensor was
 
@@ -23,13 +25,16 @@ class SceneExplanation:
     """Holds what was found: labels i64 of each frame's points, 0 for all that stands, and the motions.
 
     pose: f64 (T,4,4), frame to world, in the input's own coordinates and unit; objects: motion f64 (4,4) in that world
-    from its first frame to each that it was met in. apart: frames that overlap with none before them.
+    from its first frame to each that it was met in; confidence: of each, 0.5 to 1. apart: frames that overlap with none
+    before them. dropped: objects beyond the most that are kept.
     """
 
     labels: list[np.ndarray]
     pose: np.ndarray
     objects: list[dict[int, np.ndarray]]
+    confidence: list[float]
     apart: list[int]
+    dropped: int
 
     def motion(self, part: int, source: int, target: int) -> np.ndarray:
         """Returns the rigid motion f64 (4,4) of a part, 0 for what stands, from one frame's coordinates to another's.
@@ -48,18 +53,22 @@ def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: 
 
     sensor: places f64 (3) in the frames' coordinates where the sensor may have been; the first one that fits is taken.
     """
-    filled = [t for t, frame in enumerate(frames) if len(frame)]
+    filled = [t for t, frame in enumerate(frames) if len(frame) >= _FEWEST]
     labels = [np.zeros(len(frame), np.int64) for frame in frames]
-    poses, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], []
+    poses, found, objects, apart = np.tile(np.eye(4), (len(frames), 1, 1)), [], [], []
+    dropped = 0
     if len(filled) > 1:
         world, own, turn, apart = _build_world([frames[t] for t in filled], sensor, settings)
-        found = find_moving_objects(world, settings)[: settings.most_objects]
+        every = find_moving_objects(world, settings)
+        found, dropped = every[: settings.most_objects], max(len(every) - settings.most_objects, 0)
         for number, one in enumerate(found, 1):
             for t, points in one.points.items():
                 labels[filled[t]][points] = number
-        poses[filled] = turn.T @ own @ turn
+        before = np.maximum(np.searchsorted(filled, np.arange(len(frames)), side="right") - 1, 0)
+        poses = (turn.T @ own @ turn)[before]  # frames that show nothing are where the one before was
         objects = [_in_input_axes(one, filled, turn) for one in found]
-    return SceneExplanation(labels, poses, objects, [filled[t] for t in apart])
+    confidence = [1 - 0.5 * float(np.exp(-one.saved / _SURE)) for one in found]
+    return SceneExplanation(labels, poses, objects, confidence, [filled[t] for t in apart], dropped)
 
 
 def _in_input_axes(one: MovingObject, filled: list[int], turn: np.ndarray) -> dict[int, np.ndarray]:

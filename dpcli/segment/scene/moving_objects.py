@@ -15,10 +15,12 @@ _FEW_FREE = 2  # of them that some other frame sees through
 _LARGEST = 14.0  # meters: a longer cluster is no object, but may hold some
 _TALLEST = 5.0
 _DOUBT = 0.12  # mean cost of standing still above which a cluster is looked at
-_GAIN = 0.1  # mean saving of the motion per point and frame, in points that a frame contradicts
+_GAIN = 0.15  # mean saving of the motion per point and frame, in points that a frame contradicts
 _THROUGH = 0.05  # share of an object's points that frames must see through, in the mean
-_SHARE = 0.4  # share of the cost of standing still that a motion must save
-_FLAT = 0.4  # meters: anything lower is a bump of the ground, or a mirror
+_SHARE = (0.4, 0.6)  # share of the cost of standing still that a motion must save, the second where more is demanded
+_PIECE = 2.0  # times the evidence for the smaller piece of a cluster
+_FLAT = 0.4  # meters, and gaps between rows of beams: what is flatter, or lower above the ground, is a bump or a mirror
+_ROWS = 0.7
 _VEHICLE = 4.0  # meters around the sensor that its own vehicle takes up
 _STAYS = 0.3  # meters, of things on board
 _WORSE = 0.3  # a point that its object's motion explains worse by so much stands
@@ -30,11 +32,11 @@ def find_moving_objects(world: World, settings: SceneSettings) -> list[MovingObj
         frame.doubt, frame.free = measure_doubt(world, t)
     found: list[MovingObject] = []
     for t, frame in enumerate(world.frames):
-        for own in _propose(frame):
+        for own, demand in _propose(frame):
             own = own[frame.label[own] == 0]
             if len(own) < _FEWEST or (frame.free[own] > 0).sum() < max(_FEW_FREE, _THROUGH * len(own) / 2):
                 continue
-            one = _explain(own, t, world, settings)
+            one = _explain(own, t, world, settings, demand)
             if one is not None:
                 found.append(one)
                 world.label(one, len(found))
@@ -61,30 +63,35 @@ def measure_doubt(world: World, t: int) -> tuple[np.ndarray, np.ndarray]:
     return cost, free
 
 
-def _propose(frame: Frame) -> list[np.ndarray]:
-    """Returns the points i64 of clusters in doubt, those that are seen through most first.
+def _propose(frame: Frame) -> list[tuple[np.ndarray, float]]:
+    """Returns the points i64 of clusters in doubt, those that are seen through most first, and the evidence demanded.
 
-    Those points of a cluster that are in doubt are proposed by themselves, too: something may pass by what stands.
+    Those points of a cluster that are in doubt are proposed by themselves, too: something may pass by what stands. But so
+    look windows and leaves; a small piece of a cluster needs more evidence.
     """
     raised, proposals = frame.raised, []
     points, doubt, free = frame.points[raised], frame.doubt[raised], frame.free[raised] > 0
     reach = frame.reach(points)
-    for own in groups(cluster(points, reach)):
+    for own in groups(cluster(points, reach, frame.across)):
         if len(own) < _FEWEST or not free[own].any():
             continue
         extent = np.ptp(points[own], axis=0)
         if max(extent[:2]) <= _LARGEST and extent[2] <= _TALLEST and doubt[own].mean() > _DOUBT:
-            proposals.append(own)
+            proposals.append((own, 1.0))
         doubtful = own[free[own] | (doubt[own] > 0.9 * UNSEEN)]
         if len(doubtful) < 0.8 * len(own):
-            inner = groups(cluster(points[doubtful], reach[doubtful]))
-            proposals += [doubtful[few] for few in inner]
-    proposals.sort(key=lambda own: -free[own].sum())
-    return [raised[own] for own in proposals]
+            inner = groups(cluster(points[doubtful], reach[doubtful], frame.across))
+            pieces = [doubtful[few] for few in inner]
+            proposals += [(piece, _PIECE if len(piece) < 0.5 * len(own) else 1.0) for piece in pieces]
+    proposals.sort(key=lambda proposal: -free[proposal[0]].sum())
+    return [(raised[own], demand) for own, demand in proposals]
 
 
-def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings) -> MovingObject | None:
-    """Returns the object of these points of frame t, carried through all frames, or None where they may as well stand."""
+def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings, demand: float) -> MovingObject | None:
+    """Returns the object of these points of frame t, carried through all frames, or None where they may as well stand.
+
+    demand: times the usual evidence that it needs.
+    """
     around, frame = world.around(t), world.frames[t]
     if not around:
         return None
@@ -96,7 +103,7 @@ def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings) -> 
         cost = np.mean([world.frames[u].cost(moved(points, motion))[0].mean() for u, motion in motions.items()])
         if cost < least:
             best, least = motions, float(cost)
-    one = MovingObject(t, {t: own}, {t: np.eye(4)})
+    one = MovingObject(t, {t: own}, {t: np.eye(4)}, demand=demand)
     for u, motion in best.items():
         carry(one, t, u - t, motion, world)
     return one if _judge(one, world, settings) else None
@@ -113,7 +120,7 @@ def _judge(one: MovingObject, world: World, settings: SceneSettings) -> bool:
 
     Points that stand are taken out before. Things on the sensor's own vehicle, which go where it goes, are no objects.
     """
-    saved, still, through, count, heights = 0.0, 0.0, 0.0, 0, [0.0]
+    saved, still, through, count, upright = 0.0, 0.0, 0.0, 0, False
     for t in [t for t in one.points if len(one.points) > 1]:
         frame = world.frames[t]
         costs, moving, free = _costs(one, t, world)
@@ -121,11 +128,12 @@ def _judge(one: MovingObject, world: World, settings: SceneSettings) -> bool:
         one.points[t] = one.points[t][kept]
         saved, still = saved + (costs - moving)[kept].sum(), still + costs[kept].sum()
         through, count = through + free[kept].sum(), count + int(kept.sum())
-        heights.append(float(np.ptp(frame.points[one.points[t], 2])) if kept.any() else 0.0)
+        upright = upright or _stands_upright(one.points[t], frame)
     one.saved = float(saved)
-    enough = saved >= max(settings.evidence, _GAIN * count, _SHARE * still)
+    share = _SHARE[0] if one.demand == 1 else _SHARE[1]
+    enough = saved >= max(one.demand * settings.evidence, one.demand * _GAIN * count, share * still)
     seen_through = through >= max(settings.evidence, _THROUGH * count)
-    return bool(enough and seen_through and max(heights) > _FLAT and not _on_board(one, world))
+    return bool(enough and seen_through and upright and not _on_board(one, world))
 
 
 def _costs(one: MovingObject, t: int, world: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,6 +149,15 @@ def _costs(one: MovingObject, t: int, world: World) -> tuple[np.ndarray, np.ndar
         moving += world.frames[u].cost(moved(points, one.between(t, u)))[0] / len(others)
         free += seen / len(others)
     return still, moving, free
+
+
+def _stands_upright(own: np.ndarray, frame: Frame) -> bool:
+    """Returns whether points i64 of a frame reach up as an object does, as far as rows of beams can show it."""
+    if not len(own):
+        return False
+    points = frame.points[own]
+    flat = min(_FLAT, _ROWS * frame.across * float(frame.reach(points).min()))
+    return bool(np.ptp(points[:, 2]) >= flat and frame.height[own].max() > _FLAT)
 
 
 def _on_board(one: MovingObject, world: World) -> bool:

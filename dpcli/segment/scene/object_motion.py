@@ -62,7 +62,7 @@ def _displaced_cost(points: np.ndarray, shifts: np.ndarray, target: np.ndarray, 
 def refine(points: np.ndarray, frame: Frame, start: np.ndarray) -> np.ndarray:
     """Returns the motion f64 (4,4) of an object's points (N,3) onto a frame, by ICP both ways from a start (4,4).
 
-    Objects turn about the upright axis only, and only where they are large enough to show it.
+    Objects stay level: they turn about the upright axis only, and only where they are large enough to show it.
     """
     points = points[np.linspace(0, len(points) - 1, min(len(points), _MOST)).astype(int)]
     motion, moved = start.copy(), points @ start[:3, :3].T + start[:3, 3]
@@ -105,7 +105,7 @@ def _step(moved: np.ndarray, target: np.ndarray, tree: cKDTree, cut: float, turn
 
 
 def _upright_fit(source: np.ndarray, aim: np.ndarray, weight: np.ndarray, turns: bool) -> np.ndarray:
-    """Returns the rigid motion f64 (4,4) about the upright axis that takes source (N,3) nearest to aim (N,3)."""
+    """Returns the level motion f64 (4,4) that takes source (N,3) nearest to aim (N,3), weights (N) that sum to 1."""
     middle, goal = weight @ source, weight @ aim
     motion = np.eye(4)
     if turns:
@@ -113,5 +113,5 @@ def _upright_fit(source: np.ndarray, aim: np.ndarray, weight: np.ndarray, turns:
         angle = np.arctan2(weight @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), weight @ (a * b).sum(1))
         c, s = np.cos(angle), np.sin(angle)
         motion[:2, :2] = [[c, -s], [s, c]]
-    motion[:3, 3] = goal - motion[:3, :3] @ middle
+    motion[:2, 3] = goal[:2] - motion[:2, :2] @ middle[:2]  # rows of beams would draw it up or down
     return motion

@@ -51,7 +51,7 @@ class SceneSegmenter(Segmenter):
         origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
         found = explain_scene([clouds[t] for t in order], list(_moved(origins, to_meters)), self.settings)
         place = np.argsort(order)
-        self._tell(sequence.name, [int(order[t]) for t in found.apart])
+        self._tell(sequence.name, [int(order[t]) for t in found.apart], found.dropped)
         label = np.concatenate([found.labels[place[t]] for t in range(count)])
         motions, flows = np.tile(np.eye(4), (len(pairs), self.slots, 1, 1)), []
         for own, (i, j) in zip(motions, pairs):
@@ -60,15 +60,22 @@ class SceneSegmenter(Segmenter):
             target = _moved_by_parts(clouds[i], found.labels[place[i]], own)
             flows.append(np.float32((target - clouds[i]) / unit))
         motions = np.linalg.inv(to_meters) @ motions @ to_meters
-        probability = np.eye(self.slots, dtype=np.float32)[label]
-        sample = PartsSample(probability, np.array(pairs, np.int32).reshape(-1, 2), np.float32(motions), flows)
+        sure = np.eye(self.slots, dtype=np.float32)
+        for part, confidence in enumerate(found.confidence, 1):
+            sure[part, [0, part]] = 1 - confidence, confidence
+        sample = PartsSample(sure[label], np.array(pairs, np.int32).reshape(-1, 2), np.float32(motions), flows)
         return label.astype(np.int16), sample
 
-    def _tell(self, name: str, apart: list[int]) -> None:
-        """Warns of frames whose place is unknown, since they overlap with none before them."""
+    def _tell(self, name: str, apart: list[int], dropped: int) -> None:
+        """Warns of frames whose place is unknown, since they overlap with none before them, and of objects left out."""
+        if dropped:
+            log.warn(
+                f"{name}: {dropped} moving objects beyond the largest {self.settings.most_objects} are taken to stand;"
+                " --set most_objects= keeps more"
+            )
         if apart:
             log.warn(
-                f"{name}: frame {', '.join(map(str, apart))} overlaps too little with the one before to tell how the"
+                f"{name}: frame {', '.join(map(str, apart))}: too little in common with the frame before to tell how the"
                 " sensor moved; it is taken to move on as before, and nothing is compared across the gap"
             )
 

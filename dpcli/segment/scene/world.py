@@ -12,6 +12,7 @@ from dpcli.segment.scene.line_of_sight import LineOfSight
 
 UNSEEN = 0.4  # cost of a place that a frame doesn't look at, in points that a frame contradicts
 _NOISE = 0.1  # meters, of ranges and of registration together
+_USUAL = np.radians(0.5)
 _SPACING = 0.6  # distances between rows of beams at which a surface still counts as met
 
 
@@ -55,6 +56,11 @@ class Frame:
         """Returns the lines of sight of this frame; None without a known origin or points."""
         return LineOfSight(self.points, self.origin) if self.origin is not None and len(self.points) else None
 
+    @property
+    def across(self) -> float:
+        """Returns the angle between rows of beams, radians; a usual one where nobody knows the sensor."""
+        return self.sight.across if self.sight is not None else _USUAL
+
     def reach(self, points: np.ndarray) -> np.ndarray:
         """Returns the distance (M) of points from the sensor, or from the frame's middle where nobody knows the sensor."""
         middle = self.points.mean(0) if self.origin is None else self.origin
@@ -62,8 +68,7 @@ class Frame:
 
     def tolerance(self, points: np.ndarray) -> np.ndarray:
         """Returns the distance (M) up to which a place (M,3) counts as met, meters; it grows with the gap between rows."""
-        across = self.sight.across if self.sight is not None else np.radians(0.5)
-        return np.minimum(_NOISE + _SPACING * across * self.reach(points), 1.0)
+        return np.minimum(_NOISE + _SPACING * self.across * self.reach(points), 1.0)
 
     def cost(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns what it costs this frame, f64 (M) 0..1, that there be surface at places (M,3), and which it sees through."""

@@ -19,7 +19,7 @@ from typing import Any
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime.machines.shards import WHOLE, Shard
 from dpcli.runtime.machines.spread import Workers
-from dpcli.runtime.pool import LostWorker, ordered_map
+from dpcli.runtime.pool import LostWorker, on_second, ordered_map
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.signals import StopRequest, stop_requested
 from dpcli.store.writing.resumable_writer import ResumableWriter
@@ -102,7 +102,7 @@ class ItemPass:
             items = ((place, load(place)) for place in todo)
             try:
                 with closing(
-                    ordered_map(partial(_work_on, work), items, slots, workers.executor, workers.apart)
+                    ordered_map(partial(on_second, work), items, slots, workers.executor, workers.apart)
                 ) as results:
                     for (place, _), result in results:
                         self._take(place, result, write, bar)
@@ -152,10 +152,6 @@ class ItemPass:
         self.writer.skipped.append((self.names[place], reason))
         self.skipped.append(place)
         log.detail(f"skipped {self.names[place]}: {reason}")
-
-
-def _work_on(work: Callable[[Any], Any], item: tuple[int, Any]) -> Any:
-    return work(item[1])
 
 
 @contextmanager

@@ -90,6 +90,8 @@ def test_people_of_both_splits_are_told(tmp_path):
 def test_too_few_videos_are_refused_by_name(tmp_path):
     with pytest.raises(DataError, match="a class of one video and no test split"):
         command.baseline(write(tmp_path / "a.h5", splits=False, people=False, lone=True))
+    with pytest.raises(DataError, match="all labeled videos are of one class"):
+        command.baseline(write(tmp_path / "one.h5", labels=("up",)))
     with CloudsWriter(tmp_path / "b.h5") as writer:
         writer.write(CloudSequence.from_frames("v", [np.zeros((1, 3), np.float32)]))
     with pytest.raises(DataError, match="no video has a label"):

@@ -49,7 +49,7 @@ def data(tmp_path_factory) -> Path:
 
 
 def fields(groups: list[Grouping]) -> list[torch.Tensor]:
-    return [tensor for group in groups for tensor in vars(group).values()]
+    return [tensor for group in groups for tensor in vars(group).values() if tensor is not None]
 
 
 @pytest.mark.parametrize("backbone", ["pointnet2", "dgcnn", "spidercnn", "tests.support.tiny_backbone:TinyBackbone"])

@@ -16,9 +16,7 @@ from dpcli.errors import UsageError
 from tests.support.commands import exit_code
 
 GROUP = typer.main.get_command(app)
-TRAIN = (
-    "output preset init frames points timing epochs batch lr validation config set help-all seed device force".split()
-)
+TRAIN = "output preset init fine-tune frames points timing epochs batch lr validation config set help-all seed device force".split()
 
 
 def shown(*path: str) -> list[str]:

@@ -17,6 +17,7 @@ from dpcli.prepare.actions.depth import DepthVideos, background_depth
 from dpcli.prepare.decode.depth_files import read_depth_video, read_image, video_frames
 from dpcli.prepare.decode.pinhole_camera import Intrinsics
 from dpcli.prepare.labels import labels_of_folders, read_labels
+from dpcli.prepare.reader import Item
 from tests.support.prepare_helpers import write_video
 
 RNG = np.random.default_rng(0)
@@ -134,6 +135,50 @@ def test_a_tiff_of_several_pages_is_refused(tmp_path):
 def test_val_in_a_table_is_validation_as_the_folder_is(tmp_path):
     (tmp_path / "labels.csv").write_text("name,label,split\na,0,val\nb,1,train\nc,1,mine\n")
     assert [row.split for row in read_labels(tmp_path / "labels.csv").rows.values()] == ["validation", "train", "mine"]
+
+
+@pytest.mark.parametrize(
+    "text, encoding",
+    [
+        ("name,label,subject,split\na/1.avi,push,3,Train\nb/2.avi,wave,,test\n", "utf-8-sig"),
+        ("name;label;subject;split\r\na/1.avi;push;3;training\r\nb/2.avi;wave;;Test\r\n", "utf-16"),
+        ("Path\tClass\tPerson\tSubset\na\\1.avi\tpush\t3\tTRAIN\nb\\2.avi\twave\t\ttesting\n", "utf-8"),
+        ("# mine\nfile,category,seconds,subject,split,\n./a/1,push,2.5,3,train,\n./b/2,wave,,,test,\n", "utf-8"),
+    ],
+)
+def test_label_tables_as_people_write_them(tmp_path, capsys, text, encoding):
+    (tmp_path / "labels.csv").write_bytes(text.encode(encoding))
+    items = [Item(name, tmp_path) for name in ("a/1.avi", "b/2.avi", "b/3.avi")]
+    table = read_labels(tmp_path / "labels.csv")
+    found = [(item.label, item.subject, item.split) for item in table.apply(items)]
+    assert found == [(0, 3, "train"), (1, -1, "test"), (-1, -1, "")] and table.class_names == ["push", "wave"]
+    assert ("columns not read: seconds" in capsys.readouterr().err) is ("seconds" in text)
+    assert table.unnamed(table.apply(items)) == [f"1 without a label in {tmp_path / 'labels.csv'}: b/3.avi"]
+
+
+def test_labels_that_a_program_wrote_as_fractions_are_whole(tmp_path):
+    (tmp_path / "labels.csv").write_text("name,label\na,10.0\nb,2.0\n")
+    table = read_labels(tmp_path / "labels.csv")
+    assert [row.label for row in table.rows.values()] == [10, 2] and len(table.class_names) == 11
+
+
+@pytest.mark.parametrize(
+    "rows, names, words",
+    [
+        ("run1.7,a", ["run1.5"], "names 'run1.7', which is not among"),
+        ("a,x", ["a.avi", "a.npy"], "names 'a', which is not among"),
+        ("a.avi,x\na,y", ["a.avi"], "names 'a.avi' twice, with and without its suffix"),
+    ],
+)
+def test_names_that_may_mean_another_sample_are_refused(tmp_path, rows, names, words):
+    (tmp_path / "labels.csv").write_text("name,label\n" + rows)
+    with pytest.raises(DataError, match=words):
+        read_labels(tmp_path / "labels.csv").apply([Item(name, tmp_path) for name in names])
+
+
+def test_folders_of_splits_in_any_spelling():
+    table = labels_of_folders(Path("own"), ["Train/a/1", "Train/b/1", "Testing/a/2"], "CLASS/VIDEO")
+    assert table.class_names == ["a", "b"] and [row.split for row in table.rows.values()] == ["train", "train", "test"]
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9))

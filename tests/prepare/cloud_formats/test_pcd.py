@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError
 from dpcli.ops.open3d_import import load_open3d
-from dpcli.prepare.cloud_formats.pcd import read_pcd
+from dpcli.prepare.cloud_formats.pcd import POSED, read_pcd
 
 quick = settings(
     max_examples=60, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -116,3 +116,14 @@ def test_damaged_compression_is_named(tmp_path):
     path.write_bytes(whole[:start] + b"\xff" * (len(whole) - start))
     with pytest.raises(DataError, match="damaged"):
         read_pcd(path)
+
+
+@pytest.mark.parametrize(
+    ("viewpoint", "posed"),
+    [("0 0 0 1 0 0 0", False), ("0 0 0 -1 0 0 0", False), ("1.5 0 0.2 1 0 0 0", True), ("0 0 0 0.7 0 0 0.7", True)],
+)
+def test_a_sensor_pose_is_told_and_not_applied(tmp_path, viewpoint, posed):
+    text = header().replace("POINTS", f"VIEWPOINT {viewpoint}\nPOINTS") + "1 2 3\n4 5 6\n"
+    (tmp_path / "a.pcd").write_text(text)
+    cloud = read_pcd(tmp_path / "a.pcd")
+    assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.dropped == ({POSED: 1} if posed else {})

@@ -628,6 +628,7 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
         (lambda d: d["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "4 x 4 numbers, nor 3 x 4"),
         (lambda d: d["frames"][0].update(time=None), "a still scene"),
         (lambda d: d["frames"][0].update(time="soon"), "time 'soon'; expected a number"),
+        (lambda d: d["frames"][0].update(time=1e300), "time 1e.300; expected shares"),
         (lambda d: d.update(fl_x=float("nan")), "fl_x nan; expected a number"),
         (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
         (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dpcli.errors import DataError
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
@@ -66,3 +67,19 @@ def test_colors_of_a_profile_are_shown_in_srgb(tmp_path, suffix, moves):
 def test_images_that_are_srgb_or_have_a_damaged_profile_stay(tmp_path, profile):
     Image.new("RGB", (8, 8), (120, 90, 60)).save(tmp_path / "a.png", icc_profile=profile)
     assert tuple(read_rgba(tmp_path / "a.png")[0, 0]) == (120, 90, 60, 255)
+
+
+@pytest.mark.parametrize("gray", [np.float32(0.4), np.float32(102), np.uint16(102 * 257), np.uint16(102)])
+def test_gray_of_any_type_has_its_own_range(tmp_path, gray):
+    values = np.zeros((8, 8), gray.dtype)
+    values[2:] = gray
+    Image.fromarray(values).save(tmp_path / "a.tif")
+    read = read_rgba(tmp_path / "a.tif")
+    assert read[0, 0].tolist() == [0, 0, 0, 255] and read[4, 4].tolist() == [102, 102, 102, 255]
+
+
+def test_pages_of_a_tiff_are_no_clip(tmp_path):
+    images = [Image.new("RGB", (8, 8), (k, 0, 0)) for k in range(3)]
+    images[0].save(tmp_path / "a.tif", save_all=True, append_images=images[1:])
+    with pytest.raises(DataError, match="3 pages, which tell no times; write each into a folder"):
+        open_frames(tmp_path / "a.tif")

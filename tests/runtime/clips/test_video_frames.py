@@ -58,6 +58,7 @@ ALPHA = {
     "animation.mov": ("-c:v", "qtrle", "-pix_fmt", "argb"),
     "png.mov": ("-c:v", "png", "-pix_fmt", "rgba"),
     "ffv1.mkv": ("-c:v", "ffv1", "-pix_fmt", "bgra"),
+    "tiff.mov": ("-c:v", "tiff", "-pix_fmt", "rgba"),  # with side data that PyAV doesn't know
 }
 
 
@@ -89,13 +90,23 @@ SUFFIXES = {
     "k.wmv": ("-c:v", "wmv2", "-q:v", 2),
     "k.y4m": ("-pix_fmt", "yuv420p"),
     "no_suffix": (*PLAIN, "-f", "mp4"),
+    "k.swf": ("-c:v", "flv", "-q:v", 2),
+    "k.rm": ("-c:v", "rv20", "-q:v", 2),
+    "k.h264": PLAIN,
+    "hevc_without_suffix": ("-pix_fmt", "yuv420p", "-c:v", "libx265", "-x265-params", "log-level=none", "-f", "hevc"),
+    "k.mjpg": ("-c:v", "mjpeg", "-q:v", 2, "-f", "mjpeg"),
 }
+RATE_UNKNOWN = ("k.mjpg",)
 
 
 @pytest.mark.parametrize("name", SUFFIXES)
 def test_the_decoder_says_what_can_be_read_not_the_suffix(pictures, tmp_path, name):
     frames = open_frames(film(pictures, tmp_path / name, *SUFFIXES[name]))
     assert len(frames) == COUNT
+    if name in RATE_UNKNOWN:
+        assert frames.times is None
+    else:
+        np.testing.assert_allclose(frames.times, np.arange(COUNT) / 10, atol=2e-3)
     first = next(iter(frames.read([0])))
     assert np.abs(first[28, 18, :3].astype(int) - (200, 30, 30)).max() < 24
 
@@ -107,6 +118,13 @@ def test_a_trimmed_clip_has_the_frames_that_play(pictures, tmp_path):
     assert len(frames) == COUNT - 3
     last = list(frames.read(range(len(frames))))[-1]
     assert np.abs(last[28, 18 + 4 * (COUNT - 1), :3].astype(int) - (200, 30, 30)).max() < 24
+
+
+@pytest.mark.parametrize("name", ["late.mkv", "late.webm", "late.nut", "late.ts"])
+def test_a_clip_that_begins_late_is_whole(pictures, tmp_path, name):
+    codec = ("-c:v", "libvpx", "-pix_fmt", "yuv420p", "-b:v", "2M") if name.endswith("webm") else PLAIN
+    path = film(pictures, tmp_path / name, *codec, "-output_ts_offset", 3)
+    np.testing.assert_allclose(look_at_video(path).times, np.arange(COUNT) / 10, atol=2e-3)
 
 
 def test_a_truncated_clip_is_no_trimmed_one(pictures, tmp_path):
@@ -244,12 +262,12 @@ def test_labels_that_were_compressed_are_told_from_soft_masks(tmp_path, image, s
     np.testing.assert_allclose(read_mask(tmp_path / f"s.{suffix}"), np.asarray(soft).astype(int), atol=12)
 
 
-def test_void_is_no_object_and_is_told(tmp_path, capfd):
+def test_every_label_but_0_is_opaque_and_255_beside_small_ones_is_told(tmp_path, capfd):
     labels = LABELS.copy()
     labels[LABELS != np.roll(LABELS, 1, 1)] = 255
     Image.fromarray(labels).save(tmp_path / "m.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where((labels > 0) & (labels < 255), 255, 0))
-    assert "255 beside labels below 64 is void" in capfd.readouterr().err
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where(labels > 0, 255, 0))
+    assert "255 beside labels below 64 is read as the object" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.segment.multibody.explanation import Explanation
 from dpcli.segment.multibody.frames import Frames, choose_partners, relative_motion
-from dpcli.segment.multibody.label_kernels import mean_field_kernel, support_kernel
+from dpcli.segment.multibody.label_kernels import alike_kernel, mean_field_kernel, support_kernel
 from dpcli.segment.multibody.search import explain_sequence
-from dpcli.segment.multibody.segmenter import MultibodySegmenter
+from dpcli.segment.multibody.segmenter import MultibodySegmenter, masks_of
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import thin_tracks
 from dpcli.segment.prediction import predict_parts
@@ -150,15 +151,21 @@ def test_kernels_agree_with_plain_numpy():
     rng = np.random.default_rng(5)
     share = np.float32(rng.dirichlet([1, 1, 1], 30))
     neighbors, nearest = rng.integers(0, 30, (30, 4)), np.int32(rng.integers(0, 30, (3, 30, 2)))
-    out = np.empty((2, 30, 3), np.float32)
-    support_kernel(share, neighbors, nearest, out)
-    across = np.stack([share[nearest[k], k].mean(1) for k in range(3)], 1)
-    assert np.allclose(out[0], share[neighbors].mean(1), atol=1e-6) and np.allclose(out[1], across, atol=1e-6)
+    points, motions = rng.random((30, 3)), rng.random((2, 3, 3, 4))
+    alike, out = np.empty((30, 3, 3), np.float32), np.empty((2, 30, 3), np.float32)
+    alike_kernel(points, motions, 0.5, 0.7, alike)
+    places = np.einsum("pkxy,ny->npkx", motions[..., :3], points) + motions[..., 3]
+    gap = np.linalg.norm(places[:, :, :, None] - places[:, :, None], axis=-1).mean(1)
+    assert np.allclose(alike, np.where(np.eye(3), 1, 0.7 * np.exp(-((gap / 0.5) ** 2))), atol=1e-6)
+    support_kernel(share, neighbors, nearest, alike, out)
+    counted = np.einsum("nl,nkl->nk", share, alike)
+    across = np.stack([counted[nearest[k], k].mean(1) for k in range(3)], 1)
+    assert np.allclose(out[0], counted[neighbors].mean(1), atol=1e-6) and np.allclose(out[1], across, atol=1e-6)
     cost = np.float32(rng.random((30, 3)))
     field = cost - 0.3 * out[0] - 0.2 * out[1]
     wanted = np.exp(-field / 0.1)
     wanted = 0.5 * share + 0.5 * wanted / wanted.sum(1, keepdims=True)
-    mean_field_kernel(cost, neighbors, nearest, 0.3, 0.2, np.array([0.1]), share)
+    mean_field_kernel(cost, neighbors, nearest, alike, 0.3, 0.2, np.array([0.1]), share)
     assert np.allclose(share, wanted, atol=1e-5)
 
 
@@ -177,3 +184,15 @@ def test_partners_are_equally_many_and_never_the_frame_itself():
         partners = [choose_partners(t, frames) for t in range(frames)]
         assert {len(set(own)) for own in partners} == {min(6, frames - 1)}
         assert all(t not in own for t, own in enumerate(partners))
+
+
+def test_masks_are_shares_and_trust_a_body_that_every_frame_holds():
+    label = np.array([0, 0, 1, 1, 0, 0, 0, 1])  # of two frames of 4 points
+    field = np.float32(np.where(np.eye(2)[label] > 0, 0.0, 0.4))
+    found = Explanation([None, None], label, field, 0.0, field, field)
+    masks = masks_of(found, [4, 4], 5)
+    assert np.allclose(masks.sum(1), 1) and (masks.argmax(1) == label).all()
+    assert masks[0, 0] == pytest.approx(
+        2 / 3 * 1 / (1 + np.exp(-2)) + 1 / 15, rel=1e-5
+    )  # two, then three of four points
+    assert masks[2, 1] < masks[0, 0]

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 
 from dpcli.classify.network.backbones.interface import Backbone, Grouping, Stage
 from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.descriptors import clip_descriptors
+from dpcli.classify.network.forest import Forest
 from dpcli.classify.network.layers import ClipLinear
 from dpcli.errors import UsageError
 
@@ -26,7 +28,8 @@ class PointSlots(Backbone):
     """Classifies by the mean of `members` equal networks.
 
     In training each learns from its own share of a batch, so that all of them cost what one network costs; their errors
-    differ, and the mean of their scores has fewer. A clip may be marked with the member that must not learn from it, and
+    differ, and the mean of their scores has fewer. Beside each stands a forest on descriptors of the videos that it learned
+    from: another kind of errors. A clip may be marked with the member that must not learn from it, and
     alone says what it shows then: so all videos train, and all are judged by a network that never saw them. Reads of the
     config: num_frames (slots), points_per_frame, widths (the layers of a point; the width of a slot), columns, members,
     dropout.
@@ -36,6 +39,7 @@ class PointSlots(Backbone):
         super().__init__()
         self.config, self.tap_widths = config, ()
         self.members = nn.ModuleList(_Member(config) for _ in range(config.members))
+        self.register_buffer("forest_share", torch.tensor(0.0))  # of the logarithm of a score
 
     def group(self, points: Tensor, times: Tensor) -> list[Grouping]:
         """Returns the points (B,N,3) as they are: one grouping without neighborhoods."""
@@ -51,7 +55,7 @@ class PointSlots(Backbone):
         for member, asked in zip(self.members, speakers.T):
             if asked.any():
                 which = asked.nonzero()[:, 0]
-                total = total.index_add(0, which, torch.softmax(member(clips[which]), -1).to(total))
+                total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
         return torch.log(total.clamp(min=_LEAST) / speakers.sum(1, keepdim=True))
 
     def _speakers(self, unseen: Tensor) -> Tensor:
@@ -85,10 +89,20 @@ class _Member(nn.Module):
         self.position = nn.Parameter(torch.zeros(config.num_frames, width))
         self.over_time = nn.ModuleList(_OverTime(width, step) for step in _STEPS)
         self.dropout, self.classify = nn.Dropout(config.dropout), ClipLinear(2 * width, config.num_classes)
+        self.forest = Forest(*config.forest, config.num_classes)
         nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
 
+    def scores(self, clips: Tensor, share: Tensor) -> Tensor:
+        """Returns the probabilities (B,C); outside of training the geometric mean of the layers' and, with its share, the
+        forest's."""
+        logits = self(clips)
+        if not self.training and share > 0:
+            described = torch.from_numpy(clip_descriptors(clips.cpu().numpy())).to(clips.device)
+            logits = (1 - share) * torch.log_softmax(logits, -1) + share * torch.log(self.forest(described))
+        return torch.softmax(logits, -1)
+
     def forward(self, clips: Tensor) -> Tensor:
-        """Returns the logits (B,C)."""
+        """Returns the logits (B,C) of the layers alone."""
         here = clips[..., 3].flatten().nonzero()[:, 0]
         known = self.points(torch.cat([clips[..., :3], clips[..., 4:]], -1).flatten(0, 2).index_select(0, here))
         values = known.new_zeros(clips[..., 3].numel(), known.shape[-1]).index_copy(0, here, known)

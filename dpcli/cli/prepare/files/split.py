@@ -11,6 +11,7 @@ import typer
 from dpcli.cli.options import Force, Seed
 from dpcli.cli.prepare.lists import three_shares, whole_numbers
 from dpcli.cli.prepare.options import Compression
+from dpcli.standard_streams import printable
 
 if TYPE_CHECKING:
     from dpcli.prepare.commands.split import SplitChoice
@@ -73,4 +74,4 @@ def split(
 
     counts = split_file(clouds, output, options.choice(), compression=compression, force=force)
     for name, count in counts.items():
-        typer.echo(f"{name or 'in no split, left out'}: {count} sequences")
+        typer.echo(printable(f"{name or 'in no split, left out'}: {count} sequences"))

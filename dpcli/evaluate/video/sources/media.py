@@ -12,7 +12,7 @@ from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.npy_files import map_npy
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series
+from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 
 
@@ -63,10 +63,8 @@ def _view_of_folder(name: str) -> View:
 
 def _read_image(path: Path) -> tuple[np.ndarray, bool]:
     """Returns rgba u8 (H,W,4), and whether the file has an alpha channel. DataError when unreadable or not 8-bit color."""
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
             has_alpha = "A" in image.getbands() or "transparency" in image.info

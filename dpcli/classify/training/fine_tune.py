@@ -1,0 +1,92 @@
+"""Fine-tuning: which part of a trained network goes on learning from a person's own videos, and for how long.
+
+A few videos can't teach a network's local features, and spoil them; many can. So the number of videos a class decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from torch import nn
+
+from dpcli.classify.data.validation_split import labeled
+from dpcli.classify.network.model_file import ModelInfo
+from dpcli.classify.presets import PRESETS
+from dpcli.classify.training.schedule import Schedule
+from dpcli.errors import UsageError
+from dpcli.store import CloudsReader
+
+_PROBE, _HEAD = 3, 12  # videos a class, at most, for which the last layers alone, or the heads alone, learn
+_CLIPS = {"probe": (3000, 3000), "head": (5000, 5000), "all": (6000, 9000)}  # that each stream sees in all
+_RATES = {"probe": 2e-3, "head": 1e-3, "all": 5e-4}
+_EPOCHS = 5, 100  # at least, at most
+
+
+def part_for(reader: CloudsReader) -> str:
+    """Returns which part of a network learns from a file's training videos: `probe`, `head` or `all`, by the median number of
+    videos a class. Raises DataError where none has a label."""
+    labels = reader.labels[labeled(reader, "train")]
+    videos = float(np.median(np.unique(labels, return_counts=True)[1]))
+    return "probe" if videos <= _PROBE else "head" if videos <= _HEAD else "all"
+
+
+def settings_from(info: ModelInfo, reader: CloudsReader, part: str | None) -> dict[str, Any]:
+    """Returns the groups of settings, as a preset has them, of a run that goes on from a model: its network and timing, the
+    part that learns (chosen by the data for `auto` and None), and as many epochs as the data need.
+
+    Raises DataError where no training video has a label.
+    """
+    base = PRESETS["sparse" if info.timing == "slots" else "quick"]
+    chosen = part_for(reader) if part in (None, "auto") else part
+    videos = len(labeled(reader, "train"))
+    least, most = _EPOCHS
+    epochs, dynamic = (min(max(round(clips / videos), least), most) for clips in _CLIPS[chosen])
+    if not base["schedule"].epochs_dynamic:
+        dynamic = 0
+    schedule = replace(
+        base["schedule"],
+        epochs=epochs,
+        epochs_dynamic=dynamic,
+        learning_rate=_RATES[chosen],
+        fine_tune=chosen,
+        validate_every=max(1, epochs // 10),
+    )
+    return {
+        **base,
+        "network": info.config.changed(forest=(0, 0)),
+        "schedule": schedule,
+        "run": replace(base["run"], timing=info.timing),
+    }
+
+
+def resolved(schedule: Schedule, reader: CloudsReader) -> Schedule:
+    """Returns the schedule with the part that the data choose in place of `auto`."""
+    return replace(schedule, fine_tune=part_for(reader)) if schedule.fine_tune == "auto" else schedule
+
+
+def freeze(branch: nn.Module, part: str) -> None:
+    """Stops the gradients of what doesn't learn. Raises UsageError for a network without such a part."""
+    if part == "all":
+        return
+    for name, parameter in branch.named_parameters():
+        parameter.requires_grad_(_learns(name.rpartition(".")[0], part))
+    if not any(parameter.requires_grad for parameter in branch.parameters()):
+        raise UsageError(
+            f"--fine-tune {part}: this backbone has no layers named head or classify; take --fine-tune all"
+        )
+
+
+def train_mode(branch: nn.Module, part: str) -> None:
+    """Sets what learns to training mode, and the rest, batch norms above all, to evaluation mode."""
+    branch.train()
+    if part != "all":
+        for name, module in branch.named_modules():
+            module.training = _learns(name, part)
+
+
+def _learns(module: str, part: str) -> bool:
+    """Returns whether a module of that name learns: the last layer with `probe`, all of the head with `head`."""
+    words = module.split(".")
+    return part == "all" or "classify" in words or (part == "head" and words[0] == "head")

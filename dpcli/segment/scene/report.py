@@ -1,0 +1,58 @@
+"""Lines that tell a person what was found in scenes, to be checked against what he knows of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dpcli.segment.pictures import Look
+from dpcli.segment.scene.ground import find_up
+from dpcli.store import CloudSequence
+from dpcli.store.parts import PartsReader, PartsSample
+
+_NAMED = 8  # objects of a sequence that are named one by one
+_SHOWN = 30.0  # meters around the middle that a picture shows
+
+
+def scene_lines(reader: PartsReader) -> list[str]:
+    """Returns a line for each sequence: how far the sensor moved, and how many objects moved, how fast."""
+    lines = []
+    for index, name in enumerate(reader.names):
+        sequence, said = reader.read(index), reader.read_parts(index)
+        objects = [int(part) for part in np.unique(sequence.part) if part > 0]
+        speeds = [_speed(sequence, said, part, reader.length_unit) for part in objects]
+        told = ", ".join(f"{part}: {text}" for part, text in list(zip(objects, speeds))[:_NAMED])
+        more = f", and {len(objects) - _NAMED} more" if len(objects) > _NAMED else ""
+        sensor = _speed(sequence, said, 0, reader.length_unit)
+        few = f"{len(objects)} moving object{'' if len(objects) == 1 else 's'}"
+        lines.append(f"{name}: the sensor moves {sensor}; {few}{f' ({told}{more})' if told else ''}")
+    return lines
+
+
+def _speed(sequence: CloudSequence, said: PartsSample, part: int, unit: str) -> str:
+    """Returns how far a part (0: the sensor) moves over the ground in a frame, in the median, and per second."""
+    steps, times = [], []
+    for (i, j), motion in zip(said.pairs.tolist(), said.motion.astype(np.float64)):
+        own = sequence.frame(i)[sequence.part[sequence.frame_offsets[i] : sequence.frame_offsets[i + 1]] == part]
+        if abs(i - j) == 1 and len(own):
+            middle = np.append(np.median(own, axis=0), 1.0).astype(np.float64)
+            moved = np.linalg.solve(motion[0], motion[part] @ middle) if part else motion[0] @ middle
+            steps.append(np.linalg.norm((moved - middle)[:3]))
+            times.append(np.nan if sequence.time is None else abs(sequence.time[j] - sequence.time[i]))
+    if not steps:
+        return "unknown"
+    step = f"{np.median(steps):.2f} {unit} a frame"
+    rate = np.median(np.array(steps) / np.where(np.array(times) > 0, times, np.nan))
+    return f"{step} ({rate:.1f} {unit}/s)" if np.isfinite(rate) else step
+
+
+def picture_of_scene(sequence: CloudSequence) -> tuple[CloudSequence, Look]:
+    """Returns what a picture shows of a scene, what stands without a color, and from where: obliquely from above."""
+    middle = np.median(sequence.points, axis=0)
+    reach = np.linalg.norm(sequence.points - middle, axis=1)
+    shown = np.flatnonzero(reach <= max(_SHOWN, float(np.percentile(reach, 20))))
+    offsets = np.searchsorted(shown, sequence.frame_offsets)
+    up = find_up(sequence.frame(0).astype(np.float64), None)[0]
+    axis = int(np.abs(up).argmax())
+    sequence.take_points(shown, offsets)
+    sequence.part = np.where(sequence.part == 0, -1, sequence.part).astype(np.int16)
+    return sequence, Look(cell=420, up=("-" if up[axis] < 0 else "") + "xyz"[axis], elevation=np.deg2rad(50.0))

@@ -1,0 +1,95 @@
+"""Sparse clouds by command: the data choose the network, and odd videos are told or refused, never classified in silence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.classify.commands import train as command
+from dpcli.classify.data.clips import ClipSource, OneVideo
+from dpcli.classify.network.model_file import load_model
+from dpcli.runtime.settings.catalog import Given
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
+from dpcli.store.schema import kept_name
+from tests.support.commands import exit_code as dpc
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SPEED = kept_name("speed")
+SHORT = {"members": 2, "widths": ((8, 8), (16,)), "batch": 16, "lr": 0.01}
+
+
+def radar(path, videos, *, classes=2, people=3, back=False, column=True, points=3):
+    """Videos of one to three points a frame that rise or fall, some points 30 m away; the speed says which."""
+    rng = np.random.default_rng(0)
+    names = ["up", "down", "still"][:classes]
+    with CloudsWriter(path, class_names=names, fields=["time", SPEED] if column else ["time"]) as writer:
+        for k in range(videos * classes):
+            label, frames = k % classes, int(rng.integers(8, 20))
+            step = (0.05, -0.05, 0.0)[label]
+            made = [rng.normal((0, t * step, 2), 0.05, (int(rng.integers(1, points + 1)), 3)) for t in range(frames)]
+            made[2][0] += 30
+            sequence = CloudSequence.from_frames(f"v{k}", [one.astype(np.float32) for one in made], label=label)
+            sequence.time = np.arange(frames)[:: -1 if back and k == 1 else 1] / 10.0
+            sequence.split, sequence.subject = "test" if k >= (videos - 1) * classes else "train", k // classes % people
+            if column:
+                sequence.extra = {SPEED: rng.normal(20 * step, 0.1, len(sequence.points)).astype(np.float32)}
+            writer.write(sequence)
+    return path
+
+
+def trained(path, folder, epochs=1):
+    return command.train(str(path), str(folder), Given("auto", sets=SHORT, flags={"epochs": epochs}))
+
+
+def test_a_radar_gets_its_own_network_which_learns_and_predicts(tmp_path, capsys):
+    data = radar(tmp_path / "r.h5", 9)
+    done = trained(data, tmp_path / "run", epochs=5)
+    model, info = load_model(done.weights)
+    assert model.config.backbone == "slots" and model.config.columns == ("speed",) and info.timing == "slots"
+    assert done.videos == 16 and done.accuracy["static"] > 0.8 and done.caveat == ""  # all train, all are judged
+    said = capsys.readouterr().err
+    assert "are left out (" in said and "(cross)" in said
+    assert info.notes["confidence"]["clips"] > 0
+    assert dpc("classify", "predict", data, "--model", tmp_path / "run", "-o", tmp_path / "s.h5") == 0
+    scores = ScoresReader(tmp_path / "s.h5")
+    assert (scores.scores.argmax(1) == scores.labels).all() and np.allclose(scores.scores.sum(1), 1, atol=1e-5)
+    again = tmp_path / "again.h5"
+    assert dpc("classify", "predict", data, "--model", tmp_path / "run", "-o", again, "--batch", 1) == 0
+    assert np.array_equal(scores.scores, ScoresReader(again).scores)
+    bare = radar(tmp_path / "bare.h5", 2, column=False)
+    capsys.readouterr()
+    for words, sentence in (
+        ((bare, "-o", tmp_path / "b.h5"), "no column speed"),
+        ((data, "--stream", "--window", 20), "reads speed of every point"),
+        ((data, "-o", tmp_path / "v.h5", "--split", "validation"), "learned from all videos"),
+    ):
+        assert dpc("classify", "predict", *words, "--model", tmp_path / "run") in (2, 3)
+        assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("videos, people", [(2, 1), (2, 3), (3, 1)])
+def test_one_or_two_videos_a_class_and_one_person_train(videos, people, tmp_path):
+    done = trained(radar(tmp_path / "r.h5", videos, people=people, points=1), tmp_path / "run")
+    assert all(torch.isfinite(value).all() for value in load_model(done.weights)[0].state_dict().values())
+    assert done.videos == 2 * (videos - 1)
+
+
+def test_one_class_is_refused_and_time_that_runs_back_is_told(tmp_path, capsys):
+    assert dpc("classify", "train", radar(tmp_path / "one.h5", 3, classes=1), "-o", tmp_path / "run") == 3
+    assert "at least two classes are needed" in capsys.readouterr().err
+    trained(radar(tmp_path / "back.h5", 3, back=True), tmp_path / "back")
+    assert "time runs back in 1 of 4 videos: v1; frames are taken in the file's order" in capsys.readouterr().err
+
+
+def test_an_hour_is_one_clip(tmp_path):
+    done = trained(radar(tmp_path / "r.h5", 2), tmp_path / "run")
+    config = load_model(done.weights)[0].config
+    with CloudsReader(tmp_path / "r.h5") as reader:
+        video = reader.read(0)
+    times = 54_000 // video.num_frames + 1
+    hour = CloudSequence.from_frames("hour", [video.frame(t) for t in range(video.num_frames)] * times)
+    hour.extra = {SPEED: np.tile(video.extra[SPEED], times)}
+    source = ClipSource(OneVideo(0, hour), [0], config, timing="slots")
+    clips = source.video_clips(0, None)
+    assert len(clips) == 4 and source.load(clips[0], 0).shape == (16, 24, 6)

@@ -1,0 +1,106 @@
+"""Going on from a trained model with a person's own videos: what learns, for how long, and what is chosen by the data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dpcli.classify.commands.train import train
+from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
+from dpcli.classify.settings import network_config, training_settings
+from dpcli.classify.training.fine_tune import freeze, part_for, settings_from, train_mode
+from dpcli.classify.training.optimizer_step import StageStep
+from dpcli.classify.training.schedule import Schedule
+from dpcli.errors import UsageError
+from dpcli.runtime.distributed import Processes
+from dpcli.runtime.settings.catalog import Given
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SMALL = {
+    "frames": 2,
+    "points": 32,
+    "centroids": (8, 4),
+    "neighbors": 6,
+    "widths": ((8, 8), (8, 8), (8, 8)),
+    "timing": "uniform",
+}
+
+
+def clouds(path, videos, names=("left", "right"), points=80, frames=3):
+    """`videos` of each class for training and one to test, apart by where their points are."""
+    rng = np.random.default_rng(0)
+    with CloudsWriter(path, class_names=list(names)) as writer:
+        for k in range(len(names) * (videos + 1)):
+            label = k % len(names)
+            made = [(rng.normal(0, 0.2, (points, 3)) + [label, 0, 0]).astype(np.float32) for _ in range(frames)]
+            split = "train" if k < len(names) * videos else "test"
+            writer.write(CloudSequence.from_frames(f"v{k}", made, label=label, split=split))
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A network of three other classes, as if it had been trained."""
+    sets = {name: value for name, value in SMALL.items() if name != "timing"}
+    config, path = network_config(Given("tiny", sets=sets), 3), tmp_path_factory.mktemp("model") / "m.safetensors"
+    torch.manual_seed(0)
+    save_model(path, Kinet(config), ModelInfo(config, ["a", "b", "c"], "uniform"))
+    return path
+
+
+@pytest.mark.parametrize("videos, part", [(1, "probe"), (3, "probe"), (5, "head"), (20, "all")])
+def test_the_number_of_videos_chooses_what_learns(videos, part, tmp_path):
+    with CloudsReader(clouds(tmp_path / "c.h5", videos, points=2)) as reader:
+        assert part_for(reader) == part
+        info = ModelInfo(network_config(Given("tiny", sets={"frames": 2}), 3), ["a", "b", "c"], "uniform")
+        base = settings_from(info, reader, None)
+    schedule = base["schedule"]
+    assert schedule.fine_tune == part and base["run"].timing == "uniform" and base["network"] == info.config
+    assert 5 <= schedule.epochs <= 100 and schedule.epochs * 2 * videos <= 12_000
+
+
+@pytest.mark.parametrize("part", ["probe", "head", "all"])
+@pytest.mark.parametrize("stage", [0, 1])
+def test_only_what_learns_changes_and_batch_norms_of_the_rest_stay(part, stage, model):
+    network, _ = load_model(model)
+    branch = network.static if stage == 0 else network.dynamic
+    if stage == 1:
+        network.freeze_static()
+    freeze(branch, part)
+    train_mode(branch, part)
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    step = StageStep(network, stage, Schedule(batch=4, fine_tune=part), torch.device("cpu"), Processes())
+    step(torch.randn(4, 2, 32, 3) * 0.2, torch.tensor([0, 1, 2, 0]), 0.01)
+    changed = {name for name, value in network.state_dict().items() if not torch.equal(value, before[name])}
+    stream = "static" if stage == 0 else "dynamic"
+    start = {"probe": f"{stream}.head.classify", "head": f"{stream}.head", "all": stream}[part]
+    assert changed and all(name.startswith(start) for name in changed)
+    assert f"{stream}.head.classify.weight" in changed
+    assert part == "probe" or any(name.startswith(f"{stream}.head.linear1") for name in changed)
+    assert part != "all" or any(not name.startswith(f"{stream}.head") for name in changed)
+
+
+@pytest.mark.parametrize("videos", [1, 5])
+def test_other_classes_go_on_from_a_model_with_its_own_network(videos, model, tmp_path, capsys):
+    """One video a class leaves none to validate; the preset auto takes frames, points and timing of the model."""
+    data = clouds(tmp_path / "c.h5", videos, names=("wave", "bow"))
+    given = Given("auto", sets={"epochs_dynamic": 1}, flags={"init": str(model), "epochs": 1})
+    done = train(str(data), str(tmp_path / "run"), given)
+    made, info = load_model(done.weights)
+    assert info.class_names == ["wave", "bow"] and info.timing == "uniform" and made.config.num_frames == 2
+    assert f"learns: {'probe' if videos == 1 else 'head'}" in capsys.readouterr().err
+    theirs, ours = load_model(model)[0].state_dict(), made.state_dict()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours if ".head" not in name)
+    assert done.videos == (0 if videos == 1 else 2)
+
+
+def test_what_can_not_be_tuned_is_refused(tmp_path, model):
+    with pytest.raises(UsageError, match="--fine-tune head: goes on from a model; name it with --init"):
+        training_settings(Given("quick", flags={"fine_tune": "head"}))
+    explicit = Given("tiny", sets=SMALL | {"epochs_dynamic": 0}, flags={"init": "x", "fine_tune": "auto"})
+    assert training_settings(explicit).schedule.fine_tune == "auto"
+    with pytest.raises(UsageError, match="no layers named head or classify"):
+        freeze(torch.nn.Linear(2, 2), "probe")

@@ -1,0 +1,63 @@
+"""The script behind `make table-4.4` to `4.6`, on folders of a few points in the published formats."""
+
+from __future__ import annotations
+
+import pytest
+
+from dpcli.reproduce import street_tables
+from dpcli.reproduce.part_tables import METRICS
+from dpcli.reproduce.street_tables import METHODS, THESIS, main
+from tests.prepare.scans.test_kitti import make_scene, write_detection, write_scenes
+from tests.prepare.scans.test_semantickitti import LABELS, sequences, visible, write_scans
+
+
+def semantickitti(raw):
+    """Drive 08 of four scans."""
+    names = [f"{scan:06}" for scan in range(4)]
+    scans = {name: visible(70, scan) for scan, name in enumerate(names)}
+    write_scans(sequences(raw) / "08", scans, {name: LABELS * 10 for name in names})
+    return raw
+
+
+RAW = {
+    "kitti-sf": (lambda raw: write_scenes(raw, {"000100": make_scene(1), "000007": make_scene(2)}), "ward,scene"),
+    "kitti-det": (lambda raw: (write_detection(raw), raw)[1], "ward"),
+    "semantickitti": (semantickitti, "ward,scene"),
+}
+
+
+def test_the_thesis_has_a_number_for_every_metric():
+    assert all(
+        len(row) == len(METRICS) for table in THESIS.values() for part in table.values() for row in part.values()
+    )
+    assert [list(table.values())[-1]["network"][0] for table in THESIS.values()] == [53.6, 41.3, 44.2]
+
+
+@pytest.mark.parametrize("command", RAW)
+def test_a_toy_table_is_made_once(command, tmp_path, monkeypatch, dpc_here, capfd):
+    monkeypatch.setattr(street_tables.runs, "dpc", lambda *words, **_: _said(dpc_here, words))
+    monkeypatch.setattr(street_tables, "JUDGING", ("--ignore-below", 2))  # toy objects have fewer than 50 points
+    groups = list(THESIS[command].items())
+    monkeypatch.setitem(THESIS, command, dict(groups[-1:]))  # one group of drives shows it
+    make, methods = RAW[command]
+    words = [str(tmp_path / "table"), f"--{command}", str(make(tmp_path / "raw")), "--methods", methods]
+    main([*words, "--points", "64"])
+    text = (tmp_path / "table" / "table.md").read_text()
+    assert all(text.count(f"\n| {method} |") == 1 for method in methods.split(","))
+    assert text.count("| *network, thesis* |") == 1 and text in capfd.readouterr().out
+    made = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "table").glob("*-ward*.h5")}
+    main([*words, "--points", "64"])
+    assert made == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "table").glob("*-ward*.h5")}
+
+
+def _said(dpc_here, words) -> str:
+    done = dpc_here(*words)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.decode()
+
+
+def test_a_method_that_needs_motion_is_refused_for_single_scans(tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main([str(tmp_path), "--kitti-det", str(tmp_path), "--methods", "scene"])
+    assert "no method 'scene' for kitti-det; there are network, ward, dbscan" in capsys.readouterr().err
+    assert set(METHODS["kitti-det"]) < set(METHODS["kitti-sf"])

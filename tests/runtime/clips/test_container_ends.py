@@ -1,0 +1,83 @@
+"""Truncated videos of every container: what is lost is told, and whole files pass."""
+
+import av
+import numpy as np
+import pytest
+
+from dpcli.errors import DataError
+from dpcli.prepare.decode.depth_files import read_depth_video
+from dpcli.runtime.clips.container_ends import ends_early
+from dpcli.runtime.clips.video_frames import look_at_video
+from dpcli.runtime.progress import log
+
+FRAMES = 20
+CONTAINERS = {
+    **{f"a.{suffix}": ("libx264", "yuv420p", {}) for suffix in ("mp4", "mov", "mkv", "avi", "ts", "m2ts", "flv")},
+    "front.mp4": ("libx264", "yuv420p", {"options": {"movflags": "faststart"}}),
+    "pieces.mp4": ("libx264", "yuv420p", {"options": {"movflags": "frag_keyframe+empty_moov"}}),
+    "a.webm": ("libvpx", "yuv420p", {}),
+    "a.ogv": ("libvpx", "yuv420p", {"format": "ogg"}),
+    "a.wmv": ("wmv2", "yuv420p", {}),
+    "a.y4m": ("wrapped_avframe", "yuv420p", {}),
+    "full.y4m": ("wrapped_avframe", "yuv444p", {}),
+    "deep.nut": ("ffv1", "gray16le", {}),
+    "deep.mkv": ("ffv1", "gray16le", {}),
+}
+
+
+def write(path, codec, pixels, options):
+    gray = (np.random.default_rng(0).random((FRAMES, 24, 32)) * 255).astype(np.uint8)
+    with av.open(str(path), "w", **options) as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = 32, 24, pixels
+        for frame in gray:
+            picture = av.VideoFrame.from_ndarray(np.repeat(frame[..., None], 3, -1), format="rgb24")
+            container.mux(stream.encode(picture.reformat(format=pixels)))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("name", CONTAINERS)
+def test_a_video_that_lost_its_end_ends_early_and_a_whole_one_does_not(name, tmp_path):
+    path = write(tmp_path / name, *CONTAINERS[name])
+    whole = path.read_bytes()
+    assert not ends_early(path)
+    for cut in np.linspace(0.4 * len(whole), len(whole) - 1, 20).astype(int):
+        path.write_bytes(whole[:cut])
+        boxes = name == "pieces.mp4" and cut > len(whole) - 60  # its last box is an index that nobody needs
+        assert ends_early(path) or boxes, cut
+
+
+@pytest.mark.parametrize("name", ["a.ts", "a.mkv", "a.flv", "a.mp4", "a.y4m"])
+def test_fewer_frames_are_an_error_or_a_warning(name, tmp_path, monkeypatch):
+    path = write(tmp_path / name, *CONTAINERS[name])
+    whole, said = path.read_bytes(), []
+    monkeypatch.setattr(log, "warn", said.append)
+    assert look_at_video(path).count == FRAMES and not said
+    for cut in np.linspace(0.3, 0.97, 5):
+        path.write_bytes(whole[: int(cut * len(whole))])
+        said.clear()
+        try:
+            look_at_video(path)
+        except DataError as error:
+            said.append(str(error))
+        assert len(said) == 1 and name in said[0], cut
+
+
+@pytest.mark.parametrize("name", ["deep.nut", "deep.mkv"])
+def test_depth_says_what_is_missing_down_to_one_frame(name, tmp_path):
+    path = write(tmp_path / name, *CONTAINERS[name])
+    whole = path.read_bytes()
+    assert not (video := read_depth_video(path)).missing and not video.ends_early and len(video.frames) == FRAMES
+    for cut in (0.5, 0.8, 0.9, 0.95):
+        path.write_bytes(whole[: int(cut * len(whole))])
+        video = read_depth_video(path)
+        assert video.ends_early and len(video.frames) < FRAMES
+        assert name == "deep.nut" or len(video.frames) + video.missing == FRAMES  # NUT counts nothing
+
+
+def test_a_live_recording_promises_no_end(tmp_path):
+    path = write(tmp_path / "a.mkv", "libx264", "yuv420p", {"options": {"live": "1"}})
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    assert not ends_early(path)

@@ -1,0 +1,215 @@
+"""Streets: moving objects, their motions and the sensor's own, found in scans of a made street; and poor input."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from dpcli.prepare.synthetic.spinning_lidar import Lidar, scan
+from dpcli.prepare.synthetic.street_world import Mover, car, person, planar_pose, standing_street
+from dpcli.segment.scene.clusters import cluster
+from dpcli.segment.scene.ego_motion import register_frames
+from dpcli.segment.scene.ground import find_up, height_above_ground, level
+from dpcli.segment.scene.line_of_sight import LineOfSight, range_jumps
+from dpcli.segment.scene.segmenter import SceneSegmenter
+from dpcli.segment.scene.settings import SceneSettings
+from dpcli.store import CloudSequence
+
+LIDAR = Lidar(tuple(np.linspace(2, -22, 32)), 700, 60.0)
+PAIRS = [(0, 1), (1, 2)]
+
+
+@lru_cache(maxsize=1)
+def street() -> CloudSequence:
+    """A street of three frames, a tenth of a second apart: the sensor drives at 8 m/s, a car comes, a person walks."""
+    rng = np.random.default_rng(3)
+    standing = standing_street(rng)
+    movers = [
+        Mover("car", car(rng), np.array([14.0, 1.75]), np.pi, 9.0),
+        Mover("person", person(rng), np.array([6.0, -4.6]), 0.0, 1.8, legs=2),
+    ]
+    clouds, parts, poses = [], [], []
+    for time in (0.0, 0.1, 0.2):
+        to_lidar = np.linalg.inv(planar_pose(np.array([0, -1.75]), 0.0, 8.0, 0.1, time))
+        to_lidar[2, 3] -= LIDAR.height
+        world = [standing, *(mover.surface(time) for mover in movers)]
+        owner = np.repeat(np.arange(3), [len(one) for one in world])
+        seen, triangle = scan(np.concatenate(world) @ to_lidar[:3, :3].T + to_lidar[:3, 3], LIDAR, 0.02, 0.05, rng)
+        clouds.append(seen)
+        parts.append(owner[triangle])
+        poses.append(np.stack([to_lidar, *(to_lidar @ mover.pose(time) for mover in movers)]))
+    time = np.array([0.0, 0.1, 0.2])
+    return CloudSequence.from_frames("street", clouds, part=parts, pose=np.stack(poses), time=time)
+
+
+def explained(sequence, pairs=PAIRS, unit="m", **settings):
+    """The labels of each frame, and what else is said."""
+    label, said = SceneSegmenter(SceneSettings(**settings)).explain(sequence, pairs, unit)
+    sequence.part, truth = label, sequence.part
+    said.validate(sequence, said.probability.shape[1])
+    sequence.part = truth
+    return np.split(label, sequence.frame_offsets[1:-1]), said
+
+
+def changed(frames, **fields) -> CloudSequence:
+    return CloudSequence.from_frames("changed", [np.float32(frame) for frame in frames], **fields)
+
+
+def frames_of(sequence):
+    return [sequence.frame(t) for t in range(sequence.num_frames)]
+
+
+@lru_cache(maxsize=1)
+def answer():
+    return explained(street())
+
+
+def test_what_moves_is_found_and_the_rest_stands():
+    labels, _ = answer()
+    truth = np.split(street().part, street().frame_offsets[1:-1])
+    label, true = np.concatenate(labels), np.concatenate(truth)
+    assert (label[true > 0] > 0).mean() > 0.9
+    assert (label[true == 0] > 0).mean() < 0.002
+    for k in (1, 2):
+        ids, counts = np.unique(label[true == k], return_counts=True)
+        assert counts.max() > 0.9 * counts.sum() and ids[counts.argmax()] > 0
+        assert all((own[part == k] == ids[counts.argmax()]).any() for own, part in zip(labels, truth))
+
+
+def test_the_flow_is_that_of_the_true_poses_and_agrees_with_the_motions():
+    sequence, (labels, said) = street(), answer()
+    for (i, j), flow, motions in zip(PAIRS, said.flow, said.motion):
+        points = sequence.frame(i).astype(np.float64)
+        part = np.split(sequence.part, sequence.frame_offsets[1:-1])[i]
+        truth = np.stack([sequence.pose[j, k] @ np.linalg.inv(sequence.pose[i, k]) for k in range(3)])[part]
+        true = np.einsum("nij,nj->ni", truth[:, :3, :3], points) + truth[:, :3, 3] - points
+        error = np.linalg.norm(flow - true, axis=1)
+        assert error[part == 0].mean() < 0.03 and error[part > 0].mean() < 0.15
+        own = motions[labels[i]]
+        again = np.einsum("nij,nj->ni", own[:, :3, :3], points) + own[:, :3, 3] - points
+        assert np.allclose(again, flow, atol=2e-3)
+
+
+def turned(frames):
+    """Axes with y up and z ahead, as of KITTI scene flow."""
+    return [frame @ np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], float) for frame in frames]
+
+
+SAME = {  # input that must be answered as the plain street is
+    "y up": (turned, {}, "m"),
+    "kilometers away": (lambda frames: frames, {"shift": np.array([4.5e5, 5.4e6, 120.0])}, "m"),
+    "millimeters": (lambda frames: [1000 * frame for frame in frames], {}, "mm"),
+    "wrong time order": (lambda f: [f[2], f[0], f[1]], {"time": np.array([0.2, 0.0, 0.1])}, "m"),
+    "duplicates": (lambda frames: [np.repeat(frame, 2, axis=0) for frame in frames], {}, "m"),
+    "sizes differ": (lambda f: [f[0], f[1][::3], f[2]], {}, "m"),
+}
+
+
+@pytest.mark.parametrize("what", SAME)
+def test_other_axes_places_units_and_orders_say_the_same(what):
+    change, fields, unit = SAME[what]
+    truth = np.split(street().part, street().frame_offsets[1:-1])
+    number = {"wrong time order": [2, 0, 1]}.get(what, [0, 1, 2])
+    every = {"sizes differ": [1, 3, 1]}.get(what, [1, 1, 1])
+    true = np.concatenate(
+        [np.repeat(truth[t][:: every[n]], 2 if what == "duplicates" else 1) for n, t in enumerate(number)]
+    )
+    labels, _ = explained(changed(change(frames_of(street())), **fields), unit=unit)
+    label = np.concatenate(labels)
+    assert (label[true > 0] > 0).mean() > 0.8
+    assert (label[true == 0] > 0).mean() < 0.005
+
+
+def wall(rng, t):
+    """A depth image of a wall with a picture frame, two meters away, seen by a camera that stands (z ahead)."""
+    x, y = rng.uniform(-1.2, 1.2, (2, 4000))
+    z = 2.0 - 0.05 * ((np.abs(x) < 0.3) & (np.abs(y) < 0.3)) + rng.normal(0, 0.003, 4000)
+    return np.stack([x, y, z], 1)
+
+
+def test_a_wall_without_ground_and_a_scene_at_rest_stand():
+    rng = np.random.default_rng(0)
+    labels, said = explained(changed([wall(rng, t) for t in range(3)]))
+    assert not np.concatenate(labels).any()
+    assert np.abs(np.concatenate(said.flow)).max() < 0.05
+    frame = street().frame(0)
+    still = [frame[rng.random(len(frame)) > 0.1] for _ in range(3)]
+    labels, said = explained(changed(still))
+    assert not np.concatenate(labels).any()
+    assert np.abs(np.concatenate(said.flow)).max() < 1e-9  # a sensor that stands stands exactly
+
+
+POOR = {
+    "one frame": (lambda f: f[:1], 0),
+    "one-point frame": (lambda f: [f[0], f[1][:1], f[2]], 2),
+    "empty frame": (lambda f: [f[0], f[1][:0], f[2]], 2),
+    "one point": (lambda f: [f[0][:1], f[1][:1], f[2][:1]], 2),
+    "all points alike": (lambda f: [np.ones((500, 3))] * 3, 2),
+    "no overlap": (lambda f: [f[0], f[0][:, [1, 0, 2]] * 0.2 + [900, 0, 0], f[1] + [0, 5000, 0]], 2),
+}
+
+
+@pytest.mark.parametrize("what", POOR)
+def test_poor_input_is_answered(what):
+    change, pairs = POOR[what]
+    frames = change(frames_of(street()))
+    labels, said = explained(changed(frames), PAIRS[:pairs])
+    assert [len(own) for own in labels] == [len(frame) for frame in frames]
+    assert all(np.isfinite(flow).all() for flow in said.flow)
+    if what not in ("one-point frame", "empty frame"):
+        assert not np.concatenate(labels).any()
+
+
+def test_frames_that_show_no_common_place_are_named(capsys):
+    frames = frames_of(street())
+    explained(changed([frames[0][::4], frames[1][:200] + 300, frames[1][:9], frames[2][::4]]))
+    assert "changed: frame 1, 3: too little in common" in capsys.readouterr().err
+
+
+def test_the_least_objects_are_left_out_beyond_the_limit(capsys):
+    labels, said = explained(street(), most_objects=1)
+    assert "street: 1 moving objects beyond the largest 1" in capsys.readouterr().err
+    assert said.probability.shape[1] == 2 and set(np.unique(np.concatenate(labels))) == {0, 1}
+    ids, counts = np.unique(street().part[np.concatenate(labels) == 1], return_counts=True)
+    assert ids[counts.argmax()] == 1  # the car, which has more points than the person
+
+
+def test_up_is_the_normal_of_the_ground_and_heights_follow_a_hill():
+    frame = street().frame(0).astype(np.float64)
+    tilt = level(np.array([0.17, 0.0, np.sqrt(1 - 0.17**2)]))
+    up, seen = find_up(frame @ tilt, np.zeros(3))
+    assert seen and up @ (tilt.T @ [0, 0, 1.0]) > 0.999
+    x, y = np.random.default_rng(1).uniform(-30, 30, (2, 20000))
+    hill = np.stack([x, y, 0.1 * x + 0.02 * np.sin(9 * y)], 1)
+    pole = np.stack([np.full(30, 5.0), np.full(30, 5.0), 0.5 + np.linspace(0.3, 3, 30)], 1)
+    height = height_above_ground(np.concatenate([hill, pole]))
+    assert np.percentile(height[:20000], 99) < 0.2 and (height[20000:] > 0.2).all()
+
+
+def test_the_sensors_motion_is_found_from_far_off_starts():
+    frames = [street().frame(t).astype(np.float64) for t in (0, 2)]
+    ground = [height_above_ground(frame) < 0.2 for frame in frames]
+    true = street().pose[0, 0] @ np.linalg.inv(street().pose[2, 0])
+    poses, overlap = register_frames(frames, ground)
+    assert np.linalg.norm(poses[1][:3, 3] - true[:3, 3]) < 0.05 and overlap[0] > 0.5
+
+
+def test_beams_end_behind_what_is_free_and_before_what_is_hidden():
+    angle = np.linspace(-0.5, 0.5, 400)
+    rows = [np.stack([10 * np.cos(angle), 10 * np.sin(angle), np.full(400, z)], 1) for z in np.linspace(-1, 1, 20)]
+    sight = LineOfSight(np.concatenate(rows), np.zeros(3))
+    places = np.array([[5.0, 0.1, 0.2], [15.0, 0.1, 0.2], [9.95, 0.1, 0.2], [-5.0, 0.1, 0.2]])
+    assert sight.look(places, np.full(4, 0.2)).tolist() == [True, False, False, False]
+    assert range_jumps(np.concatenate(rows), np.zeros(3)) < 0.01
+
+
+def test_gaps_between_clusters_grow_with_distance_and_with_the_rows_of_beams():
+    pair = np.array([[0, 0, 0], [0, 0.6, 0.0]], float)
+    near, far = pair + [5, 0, 0], pair + [50, 0, 0]
+    assert cluster(near, np.full(2, 5.0), 0.007).tolist() == [0, 1]
+    assert cluster(far, np.full(2, 50.0), 0.007).tolist() == [0, 0]
+    high = pair[:, [0, 2, 1]] + [15, 0, 0]
+    assert cluster(high, np.full(2, 15.0), 0.007).tolist() == [0, 1]
+    assert cluster(high, np.full(2, 15.0), 0.035).tolist() == [0, 0]
