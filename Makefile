@@ -208,26 +208,26 @@ MESHES ?=
 ARTEMIS ?=
 table-5.1: $(READY)
 	$(if $(MESHES)$(ARTEMIS),,$(error make table-5.1 needs MESHES=folder, a folder with the held-out models below it, or ARTEMIS=folder))
-	$(BIN)/python -m dpcli.reproduce.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
+	$(BIN)/python -m dpcli.reproduce.scenes.table_5_1 table/5.1 $(if $(ARTEMIS),--artemis "$(ARTEMIS)",--meshes "$(MESHES)") $(T51)
 
 # Table 5.2 of the thesis on animated meshes; MESHES names a folder of .glb files; T52: words for the program. Stopped, it
 # goes on where it was.
 table-5.2: $(READY)
 	$(if $(MESHES),,$(error make table-5.2 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.table_5_2 "$(MESHES)" table/5.2 $(T52)
+	$(BIN)/python -m dpcli.reproduce.scenes.table_5_2 "$(MESHES)" table/5.2 $(T52)
 
 # Figure 5.3 of the thesis on the same clips: the number of control points, and the weight of temporal preservation.
 figure-5.3: $(READY)
 	$(if $(MESHES),,$(error make figure-5.3 needs MESHES=folder, a folder with Cow.glb, Fox.glb, Trex.glb and Spider.glb below it))
-	$(BIN)/python -m dpcli.reproduce.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
+	$(BIN)/python -m dpcli.reproduce.scenes.figure_5_3 "$(MESHES)" table/figure-5.3 $(T52)
 
 # The shape network on models (.glb) anywhere below MESHES; PRIOR: words for `dpc generate4d train-prior`. Stopped, it goes on.
-HELD_OUT := dpcli/reproduce/held_out_models.txt
+HELD_OUT := dpcli/reproduce/scenes/held_out_models.txt
 PRIOR ?= --set bfloat16=true
 prior: $(READY)
 	$(if $(MESHES),,$(error make prior needs MESHES=folder, a folder with the models of $(HELD_OUT) and many others below it))
 	$(DPC) generate4d train-prior "$(MESHES)" -o prior/run --held-out $(HELD_OUT) $(PRIOR)
-	$(BIN)/python -m dpcli.reproduce.prior_sides "$(MESHES)" prior --models prior/run
+	$(BIN)/python -m dpcli.reproduce.scenes.prior_sides "$(MESHES)" prior --models prior/run
 
 fuzz: $(READY)
 	$(BIN)/python -m tests.fuzz.fuzz_files fuzz/files $(if $(SEED),--seed $(SEED)) $(if $(INPUTS),--inputs $(INPUTS)) \

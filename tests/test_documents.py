@@ -190,7 +190,10 @@ def test_the_documents_hold_many_commands():
     assert len({tuple(words[:2]) for words in found}) > 30
 
 
-GIVEN = [f"{name}=raw" for name in ("MSRACTION", "NVGESTURE", "SHREC17", "NTU60", "MODELNET", "SAPIEN", "MESHES")]
+GIVEN = [
+    f"{name}=raw"
+    for name in "MSRACTION NVGESTURE SHREC17 NTU60 MODELNET SAPIEN MESHES KITTI_SF KITTI_DET SEMANTICKITTI".split()
+]
 
 
 @pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")

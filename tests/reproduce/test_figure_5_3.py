@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dpcli.reproduce import figure_5_3, table_5_2
+from dpcli.reproduce.scenes import figure_5_3, table_5_2
 
 
 @pytest.fixture

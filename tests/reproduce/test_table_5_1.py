@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dpcli.reproduce.table_5_1 import film_artemis, table
+from dpcli.reproduce.scenes.table_5_1 import film_artemis, table
 from tests.support.gltf_files import GlbFile
 from tests.support.prepare_helpers import ROOT
 
@@ -34,7 +34,7 @@ def _box(path: Path) -> Path:
 
 def test_a_toy_table_is_made_and_running_again_fits_nothing(tmp_path) -> None:
     _box(tmp_path / "meshes" / "boxes" / "Box.glb")
-    words = [sys.executable, "-m", "dpcli.reproduce.table_5_1", tmp_path / "t", "--meshes", tmp_path / "meshes"]
+    words = [sys.executable, "-m", "dpcli.reproduce.scenes.table_5_1", tmp_path / "t", "--meshes", tmp_path / "meshes"]
     words += ["--clips", "boxes/Box.glb:0", "--size", "48", "--frames", "3", "--rows", "flat,inflated,prior"]
     words += ["--", "--preset", "tiny"]
     first = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600)

@@ -13,7 +13,7 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.prepare.scans.modelnet40 import read_file
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
-from dpcli.store.heap_check import check_heaps
+from dpcli.store.heap_check import check_heaps, trust_heaps
 
 
 def clouds(path: Path) -> Path:
@@ -124,3 +124,14 @@ def test_scores_with_many_names_pass(tmp_path):
         for n in range(3000):
             writer.write(f"video number {n}", np.eye(2)[n % 2], label=0)
     check_heaps(tmp_path / "s.h5")
+
+
+def test_what_this_process_made_is_searched_again_once_it_changed(tmp_path):
+    path = clouds(tmp_path / "a.h5")
+    zeroed(path, 0, 0)
+    trust_heaps(path)
+    check_heaps(path)
+    with path.open("ab") as file:
+        file.write(b"\0")
+    with pytest.raises(DataError, match="its heap of texts"):
+        check_heaps(path)

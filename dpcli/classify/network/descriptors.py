@@ -1,4 +1,4 @@
-"""What points are like in all and in slots of time: the hand-made numbers that forests classify by."""
+"""Points in all and in slots of time: the hand-made numbers that forests classify by."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Figure 5.3 of the thesis on animated meshes: the number of control points, and the weight of temporal preservation.
 
-    python -m dpcli.reproduce.figure_5_3 MESHES OUT [--clips Cow:Gallop,...] [--sweep control_points=32,512] [words]
+    python -m dpcli.reproduce.scenes.figure_5_3 MESHES OUT [--clips Cow:Gallop,...] [--sweep control_points=32,512] [words]
 
 Clips, views, steps and words are those of `table_5_2`. Each setting is swept with the other at the thesis's choice. Results:
 OUT/table.md and OUT/figure.png. What is done already is not done again.
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dpcli.reproduce.runs import markdown, write_text
-from dpcli.reproduce.table_5_2 import fit_all, mean_score, parser_of
+from dpcli.reproduce.scenes.table_5_2 import fit_all, mean_score, parser_of
 
 SWEEPS = {  # setting -> title, values, the thesis's choice
     "control_points": ("control points K at most", (32, 128, 512, 1024), 512),

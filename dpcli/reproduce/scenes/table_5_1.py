@@ -1,7 +1,7 @@
 """Table 5.1 of the thesis: 4D scenes of one view, on ARTEMIS or on animated meshes, each row made and scored by `dpc`.
 
-    python -m dpcli.reproduce.table_5_1 OUT --meshes FOLDER [--clips animals_pack/Fox.glb:Walk,...] [-- --preset fast]
-    python -m dpcli.reproduce.table_5_1 OUT --artemis FOLDER
+    python -m dpcli.reproduce.scenes.table_5_1 OUT --meshes FOLDER [--clips animals_pack/Fox.glb:Walk,...] [-- --preset fast]
+    python -m dpcli.reproduce.scenes.table_5_1 OUT --artemis FOLDER
 
 Meshes are filmed in profile and from the front. The rows `flat` and `inflated` are no fits: every frame's layers, drawn
 from the truth's cameras. Scores of the sides are from views that no row sees. What is done already is not done again.
@@ -23,7 +23,7 @@ from dpcli.generate4d.shape.layers import ShapePrior
 from dpcli.generate4d.shape.silhouette import Flat, Inflated
 from dpcli.generate4d.targets import load_targets
 from dpcli.reproduce import runs
-from dpcli.reproduce.prior_sides import CLIPS, find_model
+from dpcli.reproduce.scenes.prior_sides import CLIPS, find_model
 from dpcli.store.views import ViewsReader, ViewsWriter
 
 LAYERS: dict[str, ShapePrior] = {"flat": Flat(), "inflated": Inflated()}

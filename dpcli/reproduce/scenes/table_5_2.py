@@ -1,6 +1,6 @@
 """Table 5.2 of the thesis on animated meshes: rows (a) to (e), each fitted and scored by `dpc` commands.
 
-    python -m dpcli.reproduce.table_5_2 MESHES OUT [--clips Cow:Gallop,...] [--size 128] [--prior views] [--jobs 2]
+    python -m dpcli.reproduce.scenes.table_5_2 MESHES OUT [--clips Cow:Gallop,...] [--size 128] [--prior views] [--jobs 2]
 
 MESHES: a folder of .glb files (searched below it). With --prior views every fit sees the input view and four more views of
 the animation, with another prior the input view alone; scores are from four azimuths that no fit sees. What is done already

@@ -1,0 +1,1 @@
+"""This folder holds the programs behind the tables and figures of 4D scenes."""
