@@ -71,6 +71,10 @@ class CloudFolders:
         left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Returns the options alone: with the whole index, going to a worker with each item, work would grow with its square."""
+        return asdict(self)
+
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
@@ -111,10 +115,10 @@ class CloudFolders:
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        items = []
+        items, told = [], {"color": self._has_color, "timed": self._timed}
         for relative, series in zip(self._relative, self._series, strict=True):
             name = as_utf8(relative.as_posix() if relative.parts else self.raw.resolve().name)
-            items.append(Item(name, series.folder, extra={"color": self._has_color, "series": series}))
+            items.append(Item(name, series.folder, extra={**told, "series": series}))
         return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
@@ -125,7 +129,7 @@ class CloudFolders:
         clouds = [read_cloud(path, columns, self.keep) for path in paths]
         if item.extra["color"]:
             _require_colors(paths, clouds)
-        time = series.frame_times(self.fps)[:: self.stride] if self._timed else None
+        time = series.frame_times(self.fps)[:: self.stride] if item.extra["timed"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
         sample.notes |= notes
         return sample
