@@ -160,6 +160,15 @@ def test_other_counts_are_told(name, tmp_path):
             read_cloud(path)
 
 
+def test_a_record_without_bytes_is_no_panic(tmp_path):
+    path, data = tmp_path / "a.laz", CLOUDS["v14.laz"]()
+    item, none = (struct.pack("<HHH", 10, size, 3) for size in (30, 0))  # what LAZ says of its kind of records
+    assert item in data
+    path.write_bytes(data.replace(item, none))
+    with pytest.raises(DataError, match="a.laz: not a readable LAZ file"):
+        read_cloud(path)
+
+
 def test_several_arrays_in_one_file_are_not_one(tmp_path):
     path = tmp_path / "a.npy"
     with path.open("wb") as file:

@@ -35,7 +35,9 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     room = _check_sizes(path)
     try:
         las = laspy.read(path)
-    except Exception as error:  # laspy.errors.LaspyException, struct.error, ValueError, lazrs.LazrsError
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # LaspyException, struct.error, LazrsError...; a panic of lazrs is no Exception
         kind = path.suffix[1:].upper()
         raise DataError(f"{path}: not a readable {kind} file, perhaps truncated ({error})") from None
     if len(las.points) != las.header.point_count:

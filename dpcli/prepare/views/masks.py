@@ -13,7 +13,7 @@ from dpcli.runtime.progress import log
 
 _SMALL_LABEL = 64  # no mask is that dark; values below are labels
 _LABELS = 64  # values at most in an image of labels
-_VOID = 255  # beside small labels: nobody decided, such as the outlines of PASCAL VOC
+_VOID = 255  # beside small labels: in some data sets, such as PASCAL VOC, that nobody decided
 _COLORFUL = 48  # gray levels between channels: more than compression does to a gray mask
 _NOISE = 32  # gray levels: compression leaves no more where nothing is
 _RIPPLE = 24  # gray levels between neighbors within a label, after compression
@@ -24,8 +24,8 @@ _SAID: set[str] = set()
 def read_mask(path: Path) -> np.ndarray:
     """Reads u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of labels isn't 0.
 
-    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits; 255 beside labels below
-    64 is void, which is 0. Raises DataError when the file isn't readable, or when compression changed its labels.
+    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits. Raises DataError when
+    the file isn't readable, or when compression changed its labels.
     """
     try:
         with open_image(path) as stored:
@@ -78,14 +78,15 @@ def _opaque(where: np.ndarray) -> np.ndarray:
 
 
 def _opaque_labels(path: Path, labels: np.ndarray) -> np.ndarray:
-    """Returns 255 wherever the label isn't 0, nor void: 255 beside labels that are small. Of void the log tells."""
-    void = labels == _VOID
-    others = labels[(labels > 0) & ~void]
-    if not void.any() or not len(others) or others.max() >= _SMALL_LABEL:
-        return _opaque(labels > 0)
-    with log.each_once(_SAID):
-        log.info(f"{path.parent}: masks: 255 beside labels below {_SMALL_LABEL} is void, which is no object")
-    return _opaque((labels > 0) & ~void)
+    """Returns 255 wherever the label isn't 0. The log tells of 255 beside small labels, which some take for "undecided"."""
+    others = labels[(labels > 0) & (labels != _VOID)]
+    if (labels == _VOID).any() and len(others) and others.max() < _SMALL_LABEL:
+        with log.each_once(_SAID):
+            log.info(
+                f"{path.parent}: masks: 255 beside labels below {_SMALL_LABEL} is read as the object, like every label but 0; "
+                "where it means undecided, write 0"
+            )
+    return _opaque(labels > 0)
 
 
 def _are_labels(values: np.ndarray) -> bool:

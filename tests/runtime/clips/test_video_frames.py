@@ -262,12 +262,12 @@ def test_labels_that_were_compressed_are_told_from_soft_masks(tmp_path, image, s
     np.testing.assert_allclose(read_mask(tmp_path / f"s.{suffix}"), np.asarray(soft).astype(int), atol=12)
 
 
-def test_void_is_no_object_and_is_told(tmp_path, capfd):
+def test_every_label_but_0_is_opaque_and_255_beside_small_ones_is_told(tmp_path, capfd):
     labels = LABELS.copy()
     labels[LABELS != np.roll(LABELS, 1, 1)] = 255
     Image.fromarray(labels).save(tmp_path / "m.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where((labels > 0) & (labels < 255), 255, 0))
-    assert "255 beside labels below 64 is void" in capfd.readouterr().err
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where(labels > 0, 255, 0))
+    assert "255 beside labels below 64 is read as the object" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
