@@ -25,6 +25,7 @@ from dpcli.runtime.machines.spread import Workers
 from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.store import CloudsReader, CloudsWriter, ScoresReader, file_kind
+from dpcli.store.heap_check import trust_heaps
 from dpcli.store.statistics import StatisticsReader
 from dpcli.store.writing.already_made import already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
@@ -194,6 +195,7 @@ def convert(
                 slots or conversion.processes, executor, apart=conversion.item_seconds > 0 and bool(_roots(reader))
             ),
         )
+    trust_heaps(output)
     return _closed(count_samples(report, output), output)
 
 

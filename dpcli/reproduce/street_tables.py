@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dpcli.reproduce import runs
-from dpcli.reproduce.part_tables import rows, score
+from dpcli.reproduce.table_4_3 import rows, score
 from dpcli.store import CloudsReader
 
 JUDGING = ("--ignore-below", 50)  # as the thesis: smaller objects don't count

@@ -18,6 +18,8 @@ from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
+_TEXT = np.dtype([("length", "<u4"), ("heap", "<u8"), ("number", "<u4")])  # what stands for a text of variable length
+_AT_ONCE = 1 << 16
 _PACKED_AT_MOST = 1100  # times that zlib makes anything smaller: 258 bytes in 2 bits, and headers
 _TEXTS = ("dpc_version", "command", "source", "length_unit", "name", "metrics")  # attributes, by what they hold
 _NUMBERS = ("seed", "skipped", "reference", "num_parts", "num_points")
@@ -121,8 +123,34 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
                 raise DataError(f"{path}: {item.name} has type {item.dtype}, expected numbers or strings")
             else:
                 refuse_claim(item, path)
+                _refuse_lengths(item, path)
 
     visit(file)
+
+
+def _refuse_lengths(item: h5py.Dataset, path: Path) -> None:
+    """Raises DataError where a text of variable length claims more bytes than the file has: libhdf5 makes room for it first."""
+    text = h5py.check_string_dtype(item.dtype)
+    if text is None or text.length is not None or item.id.get_create_plist().get_nfilters() or not item.size:
+        return
+    if item.chunks is None:
+        places = [(item.id.get_offset(), item.size)]
+    else:
+        chunks = [item.id.get_chunk_info(number) for number in range(item.id.get_num_chunks())]
+        places = [(chunk.byte_offset, chunk.size // _TEXT.itemsize) for chunk in chunks]
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        for place, count in places:
+            if place is None:  # nothing was written
+                continue
+            file.seek(place)
+            for start in range(0, count, _AT_ONCE):
+                found = np.fromfile(file, _TEXT, min(_AT_ONCE, count - start))
+                if len(found) and found["length"].max() > size:
+                    raise DataError(
+                        f"{path}: a text of {item.name} claims {found['length'].max()} bytes, a file of {size} bytes can't"
+                        " hold it; make or copy it again"
+                    )
 
 
 def refuse_claim(item: h5py.Dataset, path: Path) -> None:

@@ -171,6 +171,9 @@ class GaussianScene:
     def _header_problems(self) -> Iterator[str]:
         if not 0 <= self.reference < len(self.camera_intrinsics):
             yield f"reference is camera {self.reference}, expected 0..{len(self.camera_intrinsics) - 1}"
+        lenses = self.camera_intrinsics
+        if (lenses[:, [0, 1], [0, 1]] <= 0).any() or (lenses[:, 2] != [0, 0, 1]).any():
+            yield "camera_intrinsics holds a camera that is not [[fx s cx] [0 fy cy] [0 0 1]], fx, fy > 0"
         if len(self.size) != 2 or min(self.size) < 1:
             yield f"size is {self.size}, expected (width, height) in pixels"
         try:

@@ -16,16 +16,30 @@ _HEAD, _STEP = 16, 8
 _USER_BLOCKS = (0, 512, 1024, 2048)  # where HDF5 may begin; MATLAB's files have a block of text before
 _LOOKED_AT = 1 << 26  # bytes at either end of a larger file: there are its attributes and its names
 
+_made_here: set[tuple[int, int, int]] = set()
+
 
 def check_heaps(path: Path) -> None:
-    """Raises DataError where a heap's free space takes no bytes, which libhdf5 would pass over without an end.
+    """Raises DataError where a heap's free space takes no bytes, which libhdf5 would pass over without an end, or a heap
+    claims more than the file has.
 
     Also where lengths are not of 8 bytes each, as all of ours and nearly all others are, since heaps would lie otherwise.
     Files that are not HDF5 pass: whoever opens them says so. Files of more than 128 MiB are searched at both ends only. A
     file that did not change is searched once.
     """
-    state = os.stat(path)
-    _check_once(path, state.st_ino, state.st_size, state.st_mtime_ns)
+    state = _state(path)
+    if state not in _made_here:
+        _check_once(path, *state)
+
+
+def trust_heaps(path: Path) -> None:
+    """Notes that this process made the file as it is now: it is searched when another process, or a change, comes by."""
+    _made_here.add(_state(path))
+
+
+def _state(path: Path) -> tuple[int, int, int]:
+    found = os.stat(path)
+    return found.st_ino, found.st_size, found.st_mtime_ns
 
 
 @lru_cache(maxsize=256)
@@ -49,8 +63,13 @@ def _check_once(path: Path, _place: int, _size: int, _changed: int) -> None:
 
 
 def _check_heap(path: Path, data: mmap.mmap, place: int) -> None:
-    """Goes from object to object as libhdf5 does; what leads out of the heap it finds by itself."""
+    """Goes from object to object as libhdf5 does; what leads out of the heap it finds by itself, but makes room for a heap first."""
     end = place + int.from_bytes(data[place + 8 : place + 16], "little")
+    if end > len(data):
+        raise DataError(
+            f"{path}: the HDF5 file is damaged (its heap of texts at byte {place} claims {end - place} bytes, a file of"
+            f" {len(data)} bytes can't hold them); make or copy it again"
+        )
     at = place + _HEAD
     while at + _OBJECT.size <= min(end, len(data)):
         number, _, _, size = _OBJECT.unpack_from(data, at)

@@ -18,13 +18,15 @@ MORE_MEMORY = 200 << 20  # than the run on the undamaged input
 _LOSS = re.compile(
     r"(?<!\b0 )skipped|(?<!\b0 )dropped|left out|warning|instead of|lost|fewer|claims|says", re.IGNORECASE
 )
+_WORKS = re.compile(r"eta \d+h\d+m\s*$")  # a bar that moves, through the hours of work that a setting asks for
 _CONTROL = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\x9b\u202e]")
 
 
 def faults(ended: Ended, seed: Ended, folder: Path) -> Iterator[str]:
     """The names of what is wrong with a run in this folder; none where all is as promised."""
     if ended.code in (-signal.SIGALRM, -signal.SIGXCPU):
-        yield "hang"
+        if not _WORKS.search(ended.said):
+            yield "hang"
     elif ended.code < 0:
         yield f"signal {signal.Signals(-ended.code).name}"
     elif ended.code == UNEXPECTED or "Traceback (most recent call last)" in ended.said:
@@ -85,7 +87,8 @@ def _claim(path: Path) -> int | None:
         found = re.match(rb"\x93NUMPY.{4}[^\n]*'shape': \((\d+), \d+, \d+\)", data, re.DOTALL)
         return int(found[1]) if found else None
     if data[8:16] == b"AVI LIST" and data[24:28] == b"avih" and len(data) > 52:
-        return struct.unpack_from("<I", data, 48)[0]
+        frames = struct.unpack_from("<I", data, 48)[0]
+        return frames if frames < len(data) else None  # a damaged number: the file never had as many
     return 1 if path.suffix in (".ply", ".pcd", ".xyz", ".las", ".laz", ".png", ".bin") else None
 
 

@@ -20,6 +20,7 @@ from dpcli.prepare.decode.folder_listing import unreadable_entries
 from dpcli.prepare.labels import read_labels
 from dpcli.prepare.reader import Item
 from dpcli.prepare.thinning import Thinning
+from dpcli.regular_files import regular_files_only
 from tests.support.prepare_helpers import ToyReader, dpc, write_video
 
 
@@ -99,6 +100,33 @@ def test_an_archive_that_unpacks_to_far_more_is_refused(tmp_path, megabytes, key
         read_npz(bomb)
 
 
+ODD = {
+    "a link to nowhere": lambda path: path.symlink_to("nowhere"),
+    "a link in a circle": lambda path: path.symlink_to(path.name),
+    "a folder": lambda path: path.mkdir(),
+    "a FIFO": os.mkfifo,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+}
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_a_frame_that_is_no_file_is_named_by_every_command_of_clips(kind, tmp_path, capsys):
+    from tests.support.commands import exit_code
+    from tests.support.video_clips import clip, write_folder
+
+    whole, odd = (write_folder(tmp_path / name, clip(views=1)[0], "{:03d}.png") for name in ("whole", "odd"))
+    (odd / "001.png").unlink()
+    ODD[kind](odd / "001.png")
+    prepare = ["prepare", "video", odd, "--size", 16, "-o"]
+    compare = ["evaluate", "video", odd, "--truth", whole, "--metrics", "psnr", "--resamples", 0]
+    for words in ([*prepare, tmp_path / "a.h5"], compare):
+        assert exit_code(*words) == 3
+        said = capsys.readouterr().err
+        assert "001.png" in said and "a bug" not in said
+    assert exit_code(*prepare, tmp_path / "b.h5", "--on-error", "skip") == 0
+    assert "001.png" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["pc_01.npy", "pose_00.npy"])
 def test_a_pipe_inside_a_sample_is_not_opened(name, tmp_path):
     """pose_00 is looked at while the folder is listed, pc_01 when the sample is read."""
@@ -109,6 +137,14 @@ def test_a_pipe_inside_a_sample_is_not_opened(name, tmp_path):
     os.mkfifo(raw / "data" / "3_000001" / name)
     done = dpc("prepare", "ogc-dr", raw, "-o", tmp_path / "x.h5", "--jobs", 1)
     assert done.returncode == 3 and f"{name}: a FIFO, expected a regular file" in done.stderr
+
+
+def test_a_link_to_a_device_is_not_opened(tmp_path):
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    with regular_files_only(), pytest.raises(DataError, match="endless: a device, expected a regular file"):
+        (tmp_path / "endless").read_bytes()
+    with regular_files_only(), open("/dev/null", "rb") as nothing:
+        assert nothing.read() == b""
 
 
 def test_a_pipe_inside_a_recording_is_not_opened(tmp_path):

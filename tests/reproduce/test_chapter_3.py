@@ -15,11 +15,14 @@ import numpy as np
 import pytest
 import torch
 
-from dpcli.classify.network.model_file import load_model
+from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
+from dpcli.classify.settings import network_config
 from dpcli.cli.app import main
-from dpcli.reproduce import accuracy_tables, figure_3_5, figure_3_8, figure_a_4, runs, table_3_1
+from dpcli.reproduce import accuracy_tables, few_videos, figure_3_5, figure_3_8, figure_a_4, runs, table_3_1
 from dpcli.reproduce.accuracy_tables import EXPERIMENTS, Plan, thesis_value
-from dpcli.store import CloudSequence, CloudsWriter, ScoresReader, ScoresWriter
+from dpcli.runtime.settings.catalog import Given
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader, ScoresWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -373,6 +376,21 @@ def test_gains_of_classes(tmp_path, real):
         )
 
 
+def test_new_classes_are_numbered_anew_and_their_neighbors_found(clouds, tmp_path):
+    made = few_videos.write_classes(clouds, tmp_path / "new.h5", [1], 1, 0)
+    with CloudsReader(made) as reader:
+        assert reader.class_names == ["right"] and set(reader.labels.tolist()) == {0}
+        assert reader.splits.count("train") == 1 and reader.splits.count("test") == 3
+    both = few_videos.write_classes(clouds, tmp_path / "both.h5", [1, 0], None, 0)
+    with CloudsReader(both) as reader, CloudsReader(clouds) as before:
+        assert reader.class_names == ["right", "left"] and len(reader) == len(before)
+        assert reader.labels.tolist() == [1 - label for label in before.labels]
+    config, model = network_config(Given("tiny", sets={"frames": 4, "points": 48}), 2), tmp_path / "m.safetensors"
+    save_model(model, Kinet(config), ModelInfo(config, ["a", "b"]))
+    found = few_videos.nearest(model, both, 0)
+    assert found["videos"] == 6 and 0 <= found["accuracy"] <= 1
+
+
 @pytest.mark.parametrize(
     "target, variable",
     [
@@ -385,6 +403,7 @@ def test_gains_of_classes(tmp_path, real):
         ("figure-3.8", "MSRACTION=folder"),
         ("table-A.1", "MSRACTION=folder"),
         ("figure-A.4", "MSRACTION=folder"),
+        ("few-videos", "MSRACTION=folder"),
     ],
 )
 def test_a_target_without_its_folder_says_which_variable_to_give(target, variable):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from dpcli.reproduce import street_tables
-from dpcli.reproduce.part_tables import METRICS
 from dpcli.reproduce.street_tables import METHODS, THESIS, main
+from dpcli.reproduce.table_4_3 import METRICS
 from tests.prepare.scans.test_kitti import make_scene, write_detection, write_scenes
 from tests.prepare.scans.test_semantickitti import LABELS, sequences, visible, write_scans
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dpcli.reproduce.part_tables import METRICS
-from dpcli.reproduce.table_4_3 import METHODS, THESIS, main
+from dpcli.reproduce.table_4_3 import METHODS, METRICS, THESIS, main
 
 
 def test_the_thesis_has_a_number_for_every_metric():

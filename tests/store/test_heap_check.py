@@ -13,7 +13,7 @@ import pytest
 from dpcli.errors import DataError
 from dpcli.prepare.scans.modelnet40 import read_file
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresWriter
-from dpcli.store.heap_check import check_heaps
+from dpcli.store.heap_check import check_heaps, trust_heaps
 
 
 def clouds(path: Path) -> Path:
@@ -58,6 +58,32 @@ def test_a_zeroed_heap_is_a_damaged_file(tmp_path, dpc, command, keep):
     done = dpc(*command.split(), cwd=tmp_path, timeout=60)
     assert done.returncode == 3 and b"F: the HDF5 file is damaged (its heap of texts" in done.stderr, done.stderr
     assert time.monotonic() - started < 30
+
+
+def test_a_heap_larger_than_the_file_is_refused_before_room_is_made_for_it(tmp_path):
+    path = clouds(tmp_path / "c.h5")
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<Q", data, heaps(data)[-1] + 8, 1 << 30)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="claims 1073741824 bytes, a file of"):
+        CloudsReader(path)
+
+
+@pytest.mark.parametrize("chunks", [None, (2,)])
+def test_a_text_longer_than_the_file_is_refused_before_room_is_made_for_it(chunks, tmp_path):
+    path = clouds(tmp_path / "c.h5")
+    with h5py.File(path, "a") as file:
+        names = file["class_names"][:]
+        del file["class_names"]
+        item = file.create_dataset("class_names", data=names, dtype=h5py.string_dtype(), chunks=chunks)
+        file.flush()
+        place = item.id.get_offset() if chunks is None else item.id.get_chunk_info(0).byte_offset
+    CloudsReader(path).close()
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, place, 1 << 30)
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="a text of /class_names claims 1073741824 bytes"):
+        CloudsReader(path)
 
 
 def test_every_heap_is_looked_at(tmp_path):
@@ -124,3 +150,14 @@ def test_scores_with_many_names_pass(tmp_path):
         for n in range(3000):
             writer.write(f"video number {n}", np.eye(2)[n % 2], label=0)
     check_heaps(tmp_path / "s.h5")
+
+
+def test_what_this_process_made_is_searched_again_once_it_changed(tmp_path):
+    path = clouds(tmp_path / "a.h5")
+    zeroed(path, 0, 0)
+    trust_heaps(path)
+    check_heaps(path)
+    with path.open("ab") as file:
+        file.write(b"\0")
+    with pytest.raises(DataError, match="its heap of texts"):
+        check_heaps(path)

@@ -76,8 +76,9 @@ def window_size(info: ModelInfo, window: int | None) -> int:
             f"this model looks at a whole video in {needed} parts, and a stream has no whole: name the frames to look back at,"
             " about as many as an action lasts (--window 40, say)"
         )
-    if window < needed:
-        raise UsageError(f"--window {window}: the model takes {needed} frames; expected at least as many")
+    least = 1 if info.timing == "slots" else needed
+    if window < least:
+        raise UsageError(f"--window {window}: the model takes {needed} frames; expected at least {least}")
     return window
 
 

@@ -11,17 +11,22 @@ from typing import Any
 import numpy as np
 from torch import nn
 
+from dpcli.classify.data.clips import DEVIATION
 from dpcli.classify.data.validation_split import labeled
+from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.classify.presets import PRESETS
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
+from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
 _PROBE, _HEAD = 3, 12  # videos a class, at most, for which the last layers alone, or the heads alone, learn
 _CLIPS = {"probe": (3000, 3000), "head": (5000, 5000), "all": (6000, 9000)}  # that each stream sees in all
 _RATES = {"probe": 2e-3, "head": 1e-3, "all": 5e-4}
 _EPOCHS = 5, 100  # at least, at most
+_UNIT = 2.0  # times as large or small as what a network learned from: another unit
+_LOOKED_AT = 50  # videos
 
 
 def part_for(reader: CloudsReader) -> str:
@@ -55,10 +60,28 @@ def settings_from(info: ModelInfo, reader: CloudsReader, part: str | None) -> di
     )
     return {
         **base,
-        "network": info.config.changed(forest=(0, 0)),
+        "network": _in_its_unit(info.config, reader).changed(forest=(0, 0)),
         "schedule": schedule,
         "run": replace(base["run"], timing=info.timing),
     }
+
+
+def _in_its_unit(config: KinetConfig, reader: CloudsReader) -> KinetConfig:
+    """Returns a network's configuration that brings bodies to the height it learned from where the data are in another unit.
+
+    A network that only centers its clips was trained on bodies about as tall as `height` makes them.
+    """
+    if config.normalize != "center":
+        return config
+    some = labeled(reader, "train")[:_LOOKED_AT]
+    deviation = float(np.median([reader.read(i, (0,), fields=()).points[:, 1].std() for i in some]))
+    if DEVIATION / _UNIT < deviation < DEVIATION * _UNIT:
+        return config
+    log.warn(
+        f"{reader.path}: y deviates by {deviation:.3g} in a frame, by about {DEVIATION} in what the model learned from; bodies are"
+        " made as tall as those (normalize = height; --set normalize=center leaves them)"
+    )
+    return config.changed(normalize="height")
 
 
 def resolved(schedule: Schedule, reader: CloudsReader) -> Schedule:

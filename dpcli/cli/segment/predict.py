@@ -82,7 +82,7 @@ def _choose_method(given: Given, model: str | None, fast: bool, scene: bool) -> 
     asked = [("--fast", "network")] * fast + [("--scene", "scene")] * scene
     named = given.values.get("method")
     for flag, method in asked:
-        other = f"--method {named}" if named not in (None, method) else "--fast" if len(asked) > 1 else ""
+        other = f"--method {named}" if named not in (None, method) else "--scene" if len(asked) > 1 else ""
         if other:
             raise UsageError(f"{flag}: it means --method {method}, but {other} was given; leave one out")
     if named is not None or (model is None and not asked):

@@ -24,7 +24,8 @@ _SAID: set[str] = set()
 def read_mask(path: Path) -> np.ndarray:
     """Reads u8 (H,W): a gray mask as it is, an RGBA cut-out's alpha, or 255 where an image of labels isn't 0.
 
-    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits. Raises DataError when the file isn't readable, or when compression changed its labels.
+    Labels are palettes, colors, values below 64, and few values that fill regions, of 8 or 16 bits. Raises DataError when
+    the file isn't readable, or when compression changed its labels.
     """
     try:
         with open_image(path) as stored:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.errors import DataError
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.provenance import file_digest, record
 from dpcli.runtime.signals import stop_requested
@@ -75,8 +76,14 @@ def convert_clip(
 
 
 def digest_of(paths: Iterable[Path]) -> str:
-    """Returns one short digest of many files' bytes, in their order."""
+    """Returns one short digest of many files' bytes, in their order; one that can't be opened counts as it is named.
+
+    Whoever reads it says what is wrong with it, or leaves it out.
+    """
     digest = hashlib.sha256()
     for path in paths:
-        digest.update(file_digest(path).encode())
+        try:
+            digest.update(file_digest(path).encode())
+        except (OSError, DataError):
+            digest.update(path.name.encode(errors="surrogateescape"))
     return digest.hexdigest()[:16]

@@ -11,6 +11,8 @@ from dpcli.errors import DataError, reading
 from dpcli.runtime.clips.images import as_shown, open_image
 from dpcli.runtime.clips.video_frames import video_frames
 
+_GIF_PACKS = 4096  # pixels that a byte of GIF's LZW can't exceed: a code of 12 bits stands for fewer
+_SMALL = 1 << 20  # pixels of a canvas that may be mostly empty
 _MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
 _SHORTEST = 20.0  # ms: players show a frame of no duration about so long
 
@@ -33,6 +35,7 @@ def animation_times(path: Path) -> tuple[float, ...]:
     times, now = [], 0.0
     try:
         with open_image(path) as image:
+            _check_canvas(path, image.format, image.width * image.height)
             first = int(getattr(image, "default_image", False))  # what viewers show that can't play an APNG
             for index in range(first, getattr(image, "n_frames", 1)):
                 image.seek(index)
@@ -49,6 +52,15 @@ def animation_times(path: Path) -> tuple[float, ...]:
     if len(times) == 1 and path.suffix.lower() not in (".gif", ".apng") or not moves:
         raise DataError(f"{path}: one image; expected its folder (a folder with a single image is a clip of one frame)")
     return tuple(times)
+
+
+def _check_canvas(path: Path, kind: str | None, pixels: int) -> None:
+    """Raises DataError for a GIF's canvas that its bytes can't fill: each frame is laid out at that size."""
+    size = path.stat().st_size
+    if kind == "GIF" and pixels > _GIF_PACKS * size + _SMALL:
+        raise DataError(
+            f"{path}: its canvas claims {pixels} pixels, a file of {size} bytes can't hold them; export it again"
+        )
 
 
 def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:

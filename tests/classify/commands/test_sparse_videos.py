@@ -8,7 +8,12 @@ import torch
 
 from dpcli.classify.commands import train as command
 from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.network.model_file import load_model
+from dpcli.classify.data.slots import measured
+from dpcli.classify.network.kinet import Kinet
+from dpcli.classify.network.model_file import ModelInfo, load_model
+from dpcli.classify.settings import network_config
+from dpcli.classify.stream.sliding_window import StreamPredictor
+from dpcli.errors import UsageError
 from dpcli.runtime.settings.catalog import Given
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from dpcli.store.schema import kept_name
@@ -16,7 +21,8 @@ from tests.support.commands import exit_code as dpc
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SPEED = kept_name("speed")
-SHORT = {"members": 2, "widths": ((8, 8), (16,)), "batch": 16, "lr": 0.01}
+SMALL = {"members": 2, "widths": ((8, 8), (16,))}
+SHORT = {**SMALL, "batch": 16, "lr": 0.01}
 
 
 def radar(path, videos, *, classes=2, people=3, back=False, column=True, points=3):
@@ -93,3 +99,17 @@ def test_an_hour_is_one_clip(tmp_path):
     source = ClipSource(OneVideo(0, hour), [0], config, timing="slots")
     clips = source.video_clips(0, None)
     assert len(clips) == 4 and source.load(clips[0], 0).shape == (16, 24, 6)
+
+
+def test_a_stream_of_places_alone_is_predicted_by_its_window(tmp_path):
+    with CloudsReader(radar(tmp_path / "r.h5", 2, column=False)) as reader:
+        video = reader.read(0)
+        config = measured(network_config(Given("sparse", sets=SMALL), 2), reader, [0, 1, 2])
+    info = ModelInfo(config, ["up", "down"], "slots", {"streams": ["static"]})
+    predictor = StreamPredictor(Kinet(config).eval(), info, window=6)
+    predictor.warm_up()
+    made = [predictor.add(video.frame(t)) for t in range(video.num_frames)]
+    assert [one is not None for one in made] == [t >= 5 for t in range(video.num_frames)]
+    assert all(np.allclose(one.scores.sum(-1), 1, atol=1e-5) for one in made if one is not None)
+    with pytest.raises(UsageError, match="a stream has no whole"):
+        StreamPredictor(Kinet(config).eval(), info)

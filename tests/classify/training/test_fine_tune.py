@@ -29,13 +29,13 @@ SMALL = {
 }
 
 
-def clouds(path, videos, names=("left", "right"), points=80, frames=3):
+def clouds(path, videos, names=("left", "right"), points=80, frames=3, unit=1.0):
     """`videos` of each class for training and one to test, apart by where their points are."""
     rng = np.random.default_rng(0)
     with CloudsWriter(path, class_names=list(names)) as writer:
         for k in range(len(names) * (videos + 1)):
             label = k % len(names)
-            made = [(rng.normal(0, 0.2, (points, 3)) + [label, 0, 0]).astype(np.float32) for _ in range(frames)]
+            made = [(rng.normal(0, 0.2, (points, 3)) + [label, 0, 0]).astype(np.float32) * unit for _ in range(frames)]
             split = "train" if k < len(names) * videos else "test"
             writer.write(CloudSequence.from_frames(f"v{k}", made, label=label, split=split))
     return path
@@ -53,13 +53,22 @@ def model(tmp_path_factory):
 
 @pytest.mark.parametrize("videos, part", [(1, "probe"), (3, "probe"), (5, "head"), (20, "all")])
 def test_the_number_of_videos_chooses_what_learns(videos, part, tmp_path):
-    with CloudsReader(clouds(tmp_path / "c.h5", videos, points=2)) as reader:
+    with CloudsReader(clouds(tmp_path / "c.h5", videos)) as reader:
         assert part_for(reader) == part
         info = ModelInfo(network_config(Given("tiny", sets={"frames": 2}), 3), ["a", "b", "c"], "uniform")
         base = settings_from(info, reader, None)
     schedule = base["schedule"]
     assert schedule.fine_tune == part and base["run"].timing == "uniform" and base["network"] == info.config
     assert 5 <= schedule.epochs <= 100 and schedule.epochs * 2 * videos <= 12_000
+
+
+def test_bodies_in_another_unit_are_made_as_tall_as_the_model_knows_them(tmp_path, capsys):
+    info = ModelInfo(network_config(Given("tiny", sets={"frames": 2}), 3), ["a", "b", "c"])
+    with CloudsReader(clouds(tmp_path / "m.h5", 2)) as reader:
+        assert settings_from(info, reader, None)["network"].normalize == "center" and not capsys.readouterr().err
+    with CloudsReader(clouds(tmp_path / "mm.h5", 2, unit=1000.0)) as reader:
+        assert settings_from(info, reader, None)["network"].normalize == "height"
+    assert "in what the model learned from" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("part", ["probe", "head", "all"])

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from dpcli.errors import DataError
 from dpcli.prepare.decode.color_frames import open_frames
 
 RATES = [Fraction(24000, 1001), Fraction(25), Fraction(30), Fraction(25, 2), Fraction(60), Fraction(30000, 1001)]
@@ -237,3 +238,14 @@ def test_frames_of_an_apng_lie_over_one_another_as_browsers_have_them(tmp_path, 
     light = [colors[..., :3] * (colors[..., 3:] / 255) for colors in (read, expected)]  # faint colors are rounded
     np.testing.assert_allclose(*light, atol=2)
     np.testing.assert_allclose(frames.times, [0, 0.1, 0.2, 0.3])
+
+
+def test_a_canvas_that_a_gif_cannot_fill_is_refused_before_it_is_laid_out(tmp_path):
+    frames = [Image.fromarray(np.full((8, 8), level, np.uint8)) for level in (0, 255)]
+    frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:], duration=100)
+    data = bytearray((tmp_path / "a.gif").read_bytes())
+    data[6:10] = b"\xff\xff\xff\x00"  # 65535 x 255
+    (tmp_path / "b.gif").write_bytes(data)
+    open_frames(tmp_path / "a.gif")
+    with pytest.raises(DataError, match=r"b.gif: its canvas claims 16711425 pixels"):
+        open_frames(tmp_path / "b.gif")

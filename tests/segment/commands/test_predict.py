@@ -96,6 +96,10 @@ def test_mistakes_end_with_a_sentence(dpc_here, data, tmp_path, words, code, mes
         (("--method", "ssc", "--set", "motion=none"), "motion = none: --method ssc sees only motion"),
         (("--set", "max_parts=3"), "max_parts belongs to --method"),
         (("--method", "ward", "--parts", "40000"), "--parts 40000: more than the 512 points"),
+        (("--scene", "--method", "ward"), "--scene: it means --method scene, but --method ward was given"),
+        (("--scene", "--fast"), "--fast: it means --method network, but --scene was given"),
+        (("--scene", "--model", "x"), "--model x: --method scene uses no network"),
+        (("--scene", "--flow", "nearest"), "--flow nearest: scene finds the motions itself"),
     ],
 )
 def test_what_cannot_be_meant_is_refused(words, said, dpc_here, data, tmp_path):
