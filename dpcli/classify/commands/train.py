@@ -196,6 +196,8 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     """Returns the settings with the file's classes and rule of validation, and its clips. Raises DataError where nothing can
     be learned."""
     reader = CloudsReader(path)
+    if not class_table(reader):
+        raise DataError(f"{path}: no video has a label; prepare it with --labels or --label-from-folder")
     settings = with_classes(settings, len(class_table(reader)))
     run = settings.run
     rule = default_rule(reader, settings.network.members) if run.validation == "auto" else run.validation

@@ -14,6 +14,7 @@ from dpcli.classify.data.descriptors import descriptor
 from dpcli.errors import DataError, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, ScoresReader
 from dpcli.store.schema import kept_name
+from tests.support.commands import exit_code
 
 UP, DOPPLER = ("up", "down", "still"), kept_name("doppler")
 
@@ -87,7 +88,7 @@ def test_people_of_both_splits_are_told(tmp_path):
     assert "people never seen come out lower" in command.baseline(str(tmp_path / "b.h5")).seen
 
 
-def test_too_few_videos_are_refused_by_name(tmp_path):
+def test_too_few_videos_are_refused_by_name(tmp_path, capsys):
     with pytest.raises(DataError, match="a class of one video and no test split"):
         command.baseline(write(tmp_path / "a.h5", splits=False, people=False, lone=True))
     with pytest.raises(DataError, match="all labeled videos are of one class"):
@@ -96,6 +97,8 @@ def test_too_few_videos_are_refused_by_name(tmp_path):
         writer.write(CloudSequence.from_frames("v", [np.zeros((1, 3), np.float32)]))
     with pytest.raises(DataError, match="no video has a label"):
         command.baseline(str(tmp_path / "b.h5"))
+    assert exit_code("classify", "train", tmp_path / "b.h5", "-o", tmp_path / "run") == 3
+    assert "no video has a label; prepare it with --labels" in capsys.readouterr().err
 
 
 def test_videos_without_points_or_with_odd_numbers_are_described():
