@@ -118,9 +118,9 @@ def test_settings_that_contradict_end_with_a_sentence(typed, sentence):
 
 
 def test_the_settings_of_weights_files_stay_as_they_were():
-    """Shipped weights hold these names; classes, columns and scales follow from the data and are no settings."""
+    """Shipped weights hold these names; classes, columns, scales and forests follow from the data and are no settings."""
     names = set(json.loads(KinetConfig().to_json()))
-    assert names - {one.field for one in TRAINING.settings.values()} == {"num_classes", "columns", "scales"}
+    assert names - {one.field for one in TRAINING.settings.values()} == {"num_classes", "columns", "scales", "forest"}
     assert {"num_frames", "points_per_frame", "radii", "weighting"} <= names
     config = KinetConfig(widths=((8, 8), (8, 16), (16, 32)), head=(8, 9), radii=(0.1, 0.3))
     assert KinetConfig.from_json(config.to_json()) == config

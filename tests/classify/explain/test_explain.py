@@ -120,7 +120,8 @@ def test_equation_a2_in_loops(model, within_frames):
 
 
 def double(stage):
-    values = {key: value.double() if value.is_floating_point() else value for key, value in vars(stage).items()}
+    given = {key: value for key, value in vars(stage).items() if value is not None}
+    values = {key: value.double() if value.is_floating_point() else value for key, value in given.items()}
     return dataclasses.replace(stage, **values)
 
 

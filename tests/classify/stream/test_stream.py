@@ -440,7 +440,7 @@ WRONG = {
     "--json goes with --stream": {"stream": False, "output": "s.h5", "json_output": True},
     "Missing option '-o'": {"stream": False},
     "--window 40": {"model": "uniform"},
-    "at least as many": {"model": "uniform", "window": 3},
+    "takes 4 frames; expected at least 4": {"model": "uniform", "window": 3},
 }
 
 

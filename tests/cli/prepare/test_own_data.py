@@ -51,7 +51,7 @@ def test_a_radars_table_becomes_a_classifier_in_the_pages_four_commands(tmp_path
         ["evaluate", "classification"],
     ]
     for words in commands:
-        more = ["--set", "epochs=1", "--set", "epochs_dynamic=1"] if words[:2] == ["classify", "train"] else []
+        more = ["--epochs", "1", "--set", "clips_per_video=1"] if words[:2] == ["classify", "train"] else []
         capfd.readouterr()
         assert exit_code(*words, *more) == 0, capfd.readouterr().err
     shown = capfd.readouterr().out

@@ -21,7 +21,7 @@ GROUP = typer.main.get_command(app)
 EVERYDAY = {
     "train": "output preset init flow supervised epochs batch lr points validation config set help-all seed device force",
     "flow": "output preset steps batch config set help-all seed device force",
-    "predict": "output model fast method parts flow pairs points split config set help-all picture turntable ply seed device "
+    "predict": "output model fast scene method parts flow pairs points split config set help-all picture turntable ply seed device "
     "jobs shard dask force",
     "estimate-flow": "output flow points as-points split seed device jobs shard dask force",
     "profile": "preset group points config set help-all json device",

@@ -527,7 +527,7 @@ def test_a_model_file_knows_its_backbone(tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("nonsense", "expected pointnet2, dgcnn, spidercnn or your own as module:Class"),
+        ("nonsense", "expected pointnet2, dgcnn, spidercnn, slots or your own as module:Class"),
         ("nonsense:Thing", "No module named 'nonsense'; is its folder on PYTHONPATH"),
         ("tests.support.tiny_backbone:Thing", "no attribute 'Thing'"),
         ("tests.support.tiny_backbone:annotations", "lacks group, taps"),
