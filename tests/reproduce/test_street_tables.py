@@ -34,8 +34,8 @@ def test_the_thesis_has_a_number_for_every_metric():
 
 
 @pytest.mark.parametrize("command", RAW)
-def test_a_toy_table_is_made_once(command, tmp_path, monkeypatch, dpc_here, capfd):
-    monkeypatch.setattr(street_tables.runs, "dpc", lambda *words, **_: _said(dpc_here, words))
+def test_a_toy_table_is_made_once(command, tmp_path, monkeypatch, dpc_told, capfd):
+    monkeypatch.setattr(street_tables.runs, "dpc", dpc_told)
     monkeypatch.setattr(street_tables, "JUDGING", ("--ignore-below", 2))  # toy objects have fewer than 50 points
     groups = list(THESIS[command].items())
     monkeypatch.setitem(THESIS, command, dict(groups[-1:]))  # one group of drives shows it
@@ -48,12 +48,6 @@ def test_a_toy_table_is_made_once(command, tmp_path, monkeypatch, dpc_here, capf
     made = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "table").glob("*-ward*.h5")}
     main([*words, "--points", "64"])
     assert made == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "table").glob("*-ward*.h5")}
-
-
-def _said(dpc_here, words) -> str:
-    done = dpc_here(*words)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.decode()
 
 
 def test_a_method_that_needs_motion_is_refused_for_single_scans(tmp_path, capsys):

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from dpcli.reproduce import table_4_1
 from dpcli.reproduce.table_4_1 import METRICS, ROWS, table
 from dpcli.store import CloudsReader
-from tests.support.prepare_helpers import ROOT
 
 
 def test_rows_have_the_thesis_numbers_and_grow_by_one_switch() -> None:
@@ -52,32 +50,15 @@ def objects(dpc, tmp_path_factory) -> Path:
     return path
 
 
-def test_a_toy_table_is_made_and_running_again_trains_nothing(objects, tmp_path) -> None:
-    words = [
-        sys.executable,
-        "-m",
-        "dpcli.reproduce.table_4_1",
-        objects,
-        objects,
-        tmp_path / "t",
-        "--rows",
-        "past",
-        "--",
-        "--epochs",
-        "1",
-        "--set",
-        "pairs_per_epoch=4",
-        "--batch",
-        "2",
-        "--points",
-        "64",
-    ]
-    first = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert first.returncode == 0, first.stderr
+def test_a_toy_table_is_made_and_running_again_trains_nothing(objects, tmp_path, monkeypatch, dpc_told, capfd) -> None:
+    monkeypatch.setattr(table_4_1, "dpc", dpc_told)
+    budget = ["--epochs", "1", "--set", "pairs_per_epoch=4", "--batch", "2", "--points", "64"]
+    words = [str(objects), str(objects), str(tmp_path / "t"), "--rows", "past", "--", *budget]
+    table_4_1.main(words)
+    first = capfd.readouterr().out
     logs = {path.parent.name: path.read_bytes() for path in (tmp_path / "t").glob("*/log.json")}
     assert sorted(logs) == ["full", "past"]  # which starts from the other
-    again = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300)
-    assert again.returncode == 0, again.stderr
-    assert again.stdout == first.stdout == (tmp_path / "t" / "table.md").read_text()
-    assert "--epochs 1" in first.stdout and "pooled per point, past flow | 55.3 / " in first.stdout
+    table_4_1.main(words)
+    assert capfd.readouterr().out == first == (tmp_path / "t" / "table.md").read_text()
+    assert "--epochs 1" in first and "pooled per point, past flow | 55.3 / " in first
     assert logs == {name: (tmp_path / "t" / name / "log.json").read_bytes() for name in logs}  # not a step more

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from dpcli.reproduce import runs
 from dpcli.reproduce.table_4_3 import METHODS, METRICS, THESIS, main
 
 
@@ -17,7 +18,8 @@ def test_the_thesis_has_a_number_for_every_metric():
     assert set(METHODS) >= set(THESIS) - {"OGC", "the thesis's network"}
 
 
-def test_a_toy_table_is_made_once(tmp_path, capsys):
+def test_a_toy_table_is_made_once(tmp_path, monkeypatch, dpc_told, capfd):
+    monkeypatch.setattr(runs, "dpc", dpc_told)
     meshes, folder = tmp_path / "meshes", tmp_path / "table"
     for kind, sides in enumerate([(1, 2, 0.6), (3, 1, 1), (0.5, 0.5, 2)]):
         (meshes / f"class{kind % 2}").mkdir(parents=True, exist_ok=True)
@@ -25,7 +27,7 @@ def test_a_toy_table_is_made_once(tmp_path, capsys):
     words = [folder, "--meshes", meshes, "--rooms", 1, "--points", 128, "--methods", "dbscan,ssc"]
     main([str(word) for word in words])
     text = (folder / "table.md").read_text()
-    assert text == capsys.readouterr().out and text.count("| dbscan |") == text.count("| ssc |") == 2
+    assert text in capfd.readouterr().out and text.count("| dbscan |") == text.count("| ssc |") == 2
     assert "## full" in text and "## single view" in text and "| *the thesis's network, thesis* | 88.1 |" in text
     made = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
     main([str(word) for word in words])

@@ -240,7 +240,9 @@ def test_a_whole_network_is_the_same_without_the_kernels(variant, monkeypatch):
     with torch.no_grad():
         plain, stages = model(points), model.group(points)
         stages = [
-            Grouping(*(part if part is None or part.dtype == torch.long else part.double() for part in vars(g).values()))
+            Grouping(
+                *(part if part is None or part.dtype == torch.long else part.double() for part in vars(g).values())
+            )
             for g in stages
         ]
         taps, static = model.double().static.taps(stages)

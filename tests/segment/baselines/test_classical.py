@@ -278,7 +278,10 @@ def test_settings_belong_to_methods() -> None:
         "residual",
     ]
     for values, message in (
-        ({"method": "kmeans"}, "method = kmeans: expected one of multibody, scene, network, dbscan, ward, ssc, trajaffn"),
+        (
+            {"method": "kmeans"},
+            "method = kmeans: expected one of multibody, scene, network, dbscan, ward, ssc, trajaffn",
+        ),
         ({"method": "ward", "eps": 1.0}, "eps belongs to --method dbscan; ward has threshold, motion_weight"),
         ({"method": "dbscan", "eps": "far"}, "eps = far: expected a number"),
         ({"method": "dbscan", "eps": -1.0}, "eps = -1.0: expected a number above 0"),

@@ -5,22 +5,22 @@ from __future__ import annotations
 from tests.support.drawers import TRAIN
 
 
-def test_a_flow_estimator_is_trained_and_used(dpc, data, tmp_path):
+def test_a_flow_estimator_is_trained_and_used(dpc, dpc_here, data, tmp_path):
     folder = tmp_path / "flow"
     done = dpc("segment", "flow", data, "-o", folder, "--steps", 3, "--batch", 2, OMP_NUM_THREADS="1")
     assert done.returncode == 0, done.stderr.decode()
     assert (folder / "curves.png").exists() and done.stdout.decode().strip().endswith("best.safetensors")
     words = ("segment", "predict", data, "--method", "ward", "--flow", folder, "-o", tmp_path / "p.h5")
-    used = dpc(*words, OMP_NUM_THREADS="1")
+    used = dpc_here(*words)
     assert used.returncode == 0, used.stderr.decode()
-    again = dpc(*words, OMP_NUM_THREADS="1")
+    again = dpc_here(*words)
     assert again.returncode == 0 and b"already complete" in again.stderr
     learn = ("segment", "train", data, "-o", tmp_path / "run", *TRAIN[2:], "--flow", folder)
-    assert dpc(*learn, OMP_NUM_THREADS="1").returncode == 0
+    assert dpc_here(*learn).returncode == 0
     weights = folder / "best.safetensors"  # the estimator is trained on: the same path, another network
     header, tensors = weights.read_bytes()[:-4], weights.read_bytes()[-4:]
     weights.write_bytes(header + bytes(byte ^ 1 for byte in tensors))
-    other = dpc(*words, OMP_NUM_THREADS="1")
+    other = dpc_here(*words)
     assert other.returncode == 2 and b"another model, data or choice" in other.stderr
-    other = dpc(*learn, OMP_NUM_THREADS="1")
+    other = dpc_here(*learn)
     assert other.returncode == 2 and b"another configuration (flow_weights" in other.stderr, other.stderr

@@ -1,0 +1,19 @@
+"""What the programs of tables are tried with: their `dpc` commands run in this process, which saves a start for each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+
+@pytest.fixture
+def dpc_told(dpc_here) -> Callable[..., str]:
+    """As `runs.dpc`: what a command, which must succeed, says on stdout."""
+
+    def run(*words: object, threads: int | None = None) -> str:
+        done = dpc_here(*words)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.decode()
+
+    return run
