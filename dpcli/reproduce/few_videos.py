@@ -93,6 +93,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     own, budget = cut(words)
     given = parser.parse_args(own)
+    if not given.clouds.is_file():
+        parser.error(f"{given.clouds}: no such file; expected clouds, such as `dpc prepare msraction3d` makes")
     given.folder.mkdir(parents=True, exist_ok=True)
     with CloudsReader(given.clouds) as reader:
         count = len(reader.class_names)

@@ -103,7 +103,10 @@ def _digest(path: Path, size: int, changed: int) -> str:
 
 
 def digest(path: Path) -> str:
-    """Returns the digest of a file's bytes; read once a program."""
+    """Returns the digest of a file's bytes; read once a program. Ends the program with a sentence when it isn't there."""
+    if not path.is_file():
+        print(f"{path}: no such file", file=sys.stderr)
+        sys.exit(3)
     told = path.stat()
     return _digest(path, told.st_size, told.st_mtime_ns)
 

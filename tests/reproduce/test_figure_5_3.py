@@ -64,3 +64,10 @@ def test_rows_switch_off_what_they_say(asked, monkeypatch, tmp_path):
     fits = [one for one in asked if one[:2] == ["generate4d", "fit"]]
     off = [{word for word in one if word.endswith("=false")} for one in fits]
     assert sorted(map(len, off)) == [0, 1, 2, 2, 3] and "| (e) + dense to sparse | 20.00 | 0.9000 |" in text
+
+
+@pytest.mark.parametrize(("words", "said"), [(("--clips", "Cow"), "MODEL:CLIP"), (("--steps", "200"), "two numbers")])
+def test_words_that_say_too_little_are_told(words, said, monkeypatch, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        run(monkeypatch, table_5_2, tmp_path, *words)
+    assert said in capsys.readouterr().err

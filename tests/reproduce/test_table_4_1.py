@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dpcli.reproduce import table_4_1
+from dpcli.reproduce import runs, table_4_1
 from dpcli.reproduce.table_4_1 import METRICS, ROWS, table
 from dpcli.store import CloudsReader
 
@@ -62,3 +62,9 @@ def test_a_toy_table_is_made_and_running_again_trains_nothing(objects, tmp_path,
     assert capfd.readouterr().out == first == (tmp_path / "t" / "table.md").read_text()
     assert "--epochs 1" in first and "pooled per point, past flow | 55.3 / " in first
     assert logs == {name: (tmp_path / "t" / name / "log.json").read_bytes() for name in logs}  # not a step more
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path, capsys) -> None:
+    with pytest.raises(SystemExit, match="3"):
+        runs.digest(tmp_path / "nosuch.h5")
+    assert "nosuch.h5: no such file" in capsys.readouterr().err

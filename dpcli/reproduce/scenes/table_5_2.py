@@ -72,7 +72,7 @@ def score(views: Path, name: str, settings: Sequence[str], out: Path, given: arg
     result = scene.with_suffix(".json")
     if not result.exists():
         if not scene.exists():
-            dense, sparse = given.steps.split(",")
+            dense, sparse = given.steps
             settings = [f"dense_steps={dense}", f"sparse_steps={sparse}", "most_gaussians=6000", *settings]
             words = [word for value in settings for word in ("--set", value)]
             common = ("--preset", "quick", "--prior", given.prior, "--seed", given.seed)
@@ -111,14 +111,29 @@ def table(scores: dict[str, list[dict]], clips: int) -> str:
     return "\n".join(lines)
 
 
+def _clips(text: str) -> list[str]:
+    clips = text.split(",")
+    if not all(all(clip.partition(":")[::2]) for clip in clips):
+        raise argparse.ArgumentTypeError(f"{text!r}: expected MODEL:CLIP,... such as Cow:Gallop,Fox:Walk")
+    return clips
+
+
+def _steps(text: str) -> list[int]:
+    try:
+        dense, sparse = map(int, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected two numbers, DENSE,SPARSE such as 300,500") from None
+    return [dense, sparse]
+
+
 def parser_of(description: str | None) -> argparse.ArgumentParser:
     """Returns the words that a program of fits to animated meshes takes."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("meshes", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--clips", default=CLIPS)
+    parser.add_argument("--clips", type=_clips, default=CLIPS, metavar="MODEL:CLIP,...")
     parser.add_argument("--size", type=int, default=128)
-    parser.add_argument("--steps", default="300,500")
+    parser.add_argument("--steps", type=_steps, default="300,500", metavar="DENSE,SPARSE")
     parser.add_argument("--prior", default="views")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count())
@@ -128,7 +143,7 @@ def parser_of(description: str | None) -> argparse.ArgumentParser:
 def fit_all(given: argparse.Namespace, fits: Mapping[str, tuple[str, Sequence[str]]]) -> dict[str, list[dict]]:
     """Returns the scores of all clips for each fit. fits: row -> name in the files, settings (see `score`)."""
     given.out.mkdir(parents=True, exist_ok=True)
-    views = [film(given.meshes, clip, given.out, given.size) for clip in given.clips.split(",")]
+    views = [film(given.meshes, clip, given.out, given.size) for clip in given.clips]
     with ThreadPoolExecutor(given.jobs) as pool:
         running = {
             row: [pool.submit(score, path, name, settings, given.out, given) for path in views]
@@ -141,7 +156,7 @@ def main() -> None:
     """Fits and scores all rows, and prints the table."""
     given = parser_of(__doc__).parse_args()
     rows = {row: (row[:3], [f"{switch}=false" for switch in off]) for row, off in OFF.items()}
-    text = table(fit_all(given, rows), len(given.clips.split(",")))
+    text = table(fit_all(given, rows), len(given.clips))
     (given.out / "table.md").write_text(text + "\n")
     print(text)
 
