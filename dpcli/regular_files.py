@@ -15,7 +15,7 @@ from dpcli.errors import DataError
 _EXPECTED = ", expected a regular file"
 
 
-def why_unreadable(path: Path) -> str:
+def why_unreadable(path: str | Path) -> str:
     """Returns why a path must not be opened, "" where it may be: it is a file, a folder, or nothing that exists.
 
     Opening a FIFO waits for ever, and a device has no end; a link to nowhere is told from a name that is missing.
@@ -57,7 +57,7 @@ def regular_files_only() -> Iterator[None]:
 def _refuse_odd(event: str, arguments: tuple) -> None:
     if _refusing and event == "open" and isinstance(arguments[0], (str, bytes)):
         path = os.fsdecode(arguments[0])
-        if not path.startswith(("/dev/", "/proc/")) and (reason := why_unreadable(Path(path))).endswith(_EXPECTED):
+        if not path.startswith(("/dev/", "/proc/")) and (reason := why_unreadable(path)).endswith(_EXPECTED):
             raise DataError(f"{path}: {reason}; it was not opened")
 
 

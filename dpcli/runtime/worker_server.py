@@ -1,4 +1,4 @@
-"""The server that worker processes are forked from. It imports no library."""
+"""The server that worker processes are forked from. It imports no library but those that it is told of."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ SINGLE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 STOPPING = [getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name)]
 
 
-def ensure_server() -> None:
+def ensure_server(preload: str = "") -> None:
     """Starts the server unless it runs. Stop signals and Ctrl-C never reach it.
+
+    preload: a module that the server imports, once for all of its workers and while its caller does other things.
 
     A signal that ended the server would leave its workers running without a parent, and while it imports libraries it
     would print a trace of them.
@@ -27,6 +29,7 @@ def ensure_server() -> None:
     let_through = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, *STOPPING])
     try:
         with loud_libraries():  # each worker decides for itself
+            forkserver.set_forkserver_preload([preload] if preload else [])
             forkserver.ensure_running()
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, let_through)

@@ -13,6 +13,7 @@ from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, ItemSeconds, PointsAtMost, Sampling
 from dpcli.cli.spread_options import Dask, Shard
 from dpcli.errors import UsageError
+from dpcli.runtime.worker_server import ensure_server
 from dpcli.standard_streams import printable
 
 
@@ -56,6 +57,8 @@ def run_conversion(
         print_check(name, raw, make_reader)
         return
     require_output(options.output)
+    if options.jobs != 1 and not options.dask:
+        ensure_server("dpcli.prepare.convert_item")  # while libraries load here and the folder is listed
     reader = make_reader()
     from dpcli.prepare.commands.convert import convert_raw_data
     from dpcli.prepare.pipeline import Conversion

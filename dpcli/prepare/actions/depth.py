@@ -280,11 +280,14 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     found: list[tuple[Path, Series | None]] = []
     suffixes = (*VIDEO_SUFFIXES, ".npy")
     found += [(recording, None) for recording in find_recordings(path)]
+    clips = {os.fspath(recording) for recording, _ in found}
     for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
         folders[:] = [name for name in folders if not is_hidden(name)]
-        clips = [(Path(folder, name), frame_series(Path(folder, name), pattern)) for name in folders]
-        found += [(clip, series) for clip, series in clips if series]
-        if any(clip == Path(folder) for clip, _ in found):
+        for name in folders:
+            if series := frame_series(Path(folder, name), pattern):
+                found.append((Path(folder, name), series))
+                clips.add(os.path.join(folder, name))
+        if folder in clips:
             files = [name for name in files if not name.lower().endswith(".npy")]  # its frames, or twins of these
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))
         found += [(file, None) for file in named if file.is_file()]

@@ -12,7 +12,7 @@ _MARKS_FLOAT = (65504.0, 65535.0)  # the largest half, and a mark of 16 bits tha
 _TOO_LARGE = 1e9  # raw floats beyond are marks, whatever the unit
 _PLAUSIBLE = (0.005, 200.0)  # meters that depth cameras see, typically
 _PLAUSIBLE_IF_ASKED = (0.005, 1000.0)  # where the user gave the units
-_SAMPLED = 20_000
+_SAMPLED = 4096
 
 
 def usual_scale(kind: np.dtype) -> float:

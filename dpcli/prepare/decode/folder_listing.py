@@ -39,17 +39,32 @@ def unreadable_entries(root: Path, taken: Collection[Path]) -> list[tuple[Path, 
     """
     found: list[tuple[Path, str]] = []
     suffixes = {path.suffix.lower() for path in taken if path.suffix and path.is_file()}
-
-    def closed(error: OSError) -> None:
-        found.append((Path(error.filename), f"cannot be listed ({error.strerror})"))
-
-    for place, folders, names in os.walk(root, onerror=closed):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        for path in (Path(place, name) for name in folders):
-            if path.is_symlink() and os.path.realpath(place).startswith(os.path.realpath(path)):
+    waiting = [root]
+    while waiting:
+        folder = waiting.pop()
+        try:
+            entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")]
+        except OSError as error:
+            found.append((folder, f"cannot be listed ({error.strerror})"))
+            continue
+        for entry in entries:
+            if entry.is_file(follow_symlinks=False):  # nearly all; the listing knows it, nothing else is asked
+                continue
+            path = Path(entry.path)
+            if not _is_folder(entry):
+                found += [(path, reason)] if (reason := why_unreadable(path)) else []
+                continue
+            if entry.is_symlink() and os.path.realpath(folder).startswith(os.path.realpath(path)):
                 found.append((path, "a link to a folder above it"))
             elif path.suffix.lower() in suffixes and not any(path == one or path in one.parents for one in taken):
                 found.append((path, "a folder, though named like a file of data"))
-        odd = ((Path(place, name), why_unreadable(Path(place, name))) for name in names if not name.startswith("."))
-        found += [(path, reason) for path, reason in odd if reason]
+            if not entry.is_symlink():
+                waiting.append(path)
     return sorted((path, reason) for path, reason in found if path not in taken)
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    try:
+        return entry.is_dir()
+    except OSError:  # a link in a circle
+        return False

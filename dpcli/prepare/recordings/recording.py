@@ -59,7 +59,8 @@ def find_recordings(path: Path) -> list[Path]:
         bags = [name for name in below if is_recording(Path(folder, name))]
         found += [Path(folder, name) for name in bags]
         below[:] = [name for name in below if name not in bags and not is_hidden(name)]
-        found += [Path(folder, name) for name in names if is_recording(Path(folder, name)) and not is_hidden(name)]
+        files = (Path(folder, name) for name in names if name.lower().endswith(SUFFIXES) and not is_hidden(name))
+        found += [file for file in files if is_recording(file)]
     return sorted(found, key=lambda one: natural_key(one.relative_to(path).as_posix()))
 
 
