@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
@@ -16,18 +15,17 @@ _LONG_UNIT = 12  # letters of a unit that is told once only, behind the lengths
 _SHIFTS_SHOWN = 20
 
 
-def closing_lines(path: Path, notes: Mapping[str, int]) -> list[str]:
-    """Returns the line about a finished clouds file, and one for each sequence that was shifted; none of an empty file.
+def closing_lines(reader: CloudsReader, notes: Mapping[str, int]) -> list[str]:
+    """Returns the line about an open clouds file, and one for each sequence that was shifted; none of an empty file.
 
     notes: how many points and frames readers dropped, by reason. Distances are those from the origin, the extent is the
     box around a sequence; both are the median of up to 16 sequences, of 3 frames each, and the same in every run.
     """
-    with CloudsReader(path) as reader:
-        if not len(reader):
-            return []
-        said = [*_lengths(reader), _frames(reader)]
-        said += [f"{count} {what}" for what, count in sorted(notes.items()) if what.endswith("dropped") and count]
-        return [", ".join(said), *_shifts(reader)]
+    if not len(reader):
+        return []
+    said = [*_lengths(reader), _frames(reader)]
+    said += [f"{count} {what}" for what, count in sorted(notes.items()) if what.endswith("dropped") and count]
+    return [", ".join(said), *_shifts(reader)]
 
 
 def _lengths(reader: CloudsReader) -> list[str]:

@@ -184,7 +184,7 @@ def convert(
     if not conversion.force and already_made(output, provenance, CloudsReader):
         log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
-        return _closed(count_samples(report, output), output)
+        return count_samples(report, output)
     with _open_writer(output, reader, conversion, provenance, resume) as writer:
         taken = _write_items(writer, items, conversion)
         taken.run(
@@ -196,7 +196,7 @@ def convert(
             ),
         )
     trust_heaps(output)
-    return _closed(count_samples(report, output), output)
+    return count_samples(report, output)
 
 
 def _write_items(writer: CloudsWriter, items: list[Item], conversion: Conversion) -> ItemPass:
@@ -218,11 +218,6 @@ def _write_sample(
     for what, count in sample.notes.items():
         log.detail(f"{items[place].name}: {what}: {count}")
     return {"frames": sample.sequence.num_frames}
-
-
-def _closed(report: Report, output: Path) -> Report:
-    report.closing = closing_lines(output, report.notes)
-    return report
 
 
 def _open_writer(
@@ -252,4 +247,5 @@ def count_samples(report: Report, output: Path) -> Report:
         report.written = len(reader)
         report.skipped = reader.skipped
         report.frames, report.points = int(reader.frame_counts.sum()), int(reader.point_counts.sum())
+        report.closing = closing_lines(reader, report.notes)
     return report

@@ -146,8 +146,8 @@ class CloudsWriter(ResumableWriter):
         missing = [name for name in self.fields if sequence.value(name) is None]
         if missing:
             raise DataError(f"sample {sequence.name!r}: no {', '.join(missing)}, though the other samples have it")
-        for name in OF_PARTS.keys() & self._file.keys():
-            own, others = getattr(sequence, name).shape[1], self._file[name].shape[1]
+        for name in OF_PARTS.keys() & self._data.keys():
+            own, others = getattr(sequence, name).shape[1], self._data[name].shape[1]
             if own != others:
                 raise DataError(
                     f"sample {sequence.name!r}: {name} has {own} parts, earlier samples have {others}; pad to the largest"

@@ -120,4 +120,5 @@ def test_the_closing_line_is_what_a_person_can_check(tmp_path):
     one = convert(CloudFolders(tmp_path / "many"), tmp_path / "b.h5", Conversion(jobs=1)).closing
     two = convert(CloudFolders(tmp_path / "many"), tmp_path / "c.h5", Conversion(jobs=2)).closing
     assert one == two and "2 sequences of 1 to 2 frames without times, 6 points at (0,0,0) dropped" in one[0]
-    assert closing_lines(tmp_path / "b.h5", {})[0] in one[0]
+    with CloudsReader(tmp_path / "b.h5") as reader:
+        assert closing_lines(reader, {})[0] in one[0]
