@@ -41,7 +41,7 @@ def _calibration_note(report: ClassificationReport) -> str:
     """Returns a sentence that defines the calibration error, and says how much of it chance would make."""
     found = report.calibration.get(list(report.streams)[-1])
     if found is None:
-        return "No calibration error: the scores are no probabilities."
+        return "No calibration error: the scores are no probabilities, which `dpc classify fuse` wants, too (softmax makes some)."
     return (
         f"Calibration error: mean |share right - probability| of the best class over {BINS} bins of equal width; "
         f"{report.main.samples} perfectly calibrated samples would show {percent(found.by_chance)} on average."
