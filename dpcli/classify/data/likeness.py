@@ -19,18 +19,21 @@ _VIDEOS, _FRAMES = 50, 8  # looked at, evenly over a file and over a video
 _OTHER_UNIT, _OTHER_SENSOR = 3.0, 10.0  # times as large, times as many points
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
 _SHIPPED = {"extent": 0.233, "frames": 76.0}  # MSR-Action3D's training videos: the shipped networks' files don't say it
+_ROUNDED = 0.05  # of the extent: coarser steps show
 _SEVERAL = 5.0  # times as long as the longest training video: hardly one action
 _EXPECT = "; expect fewer right than in its training (another sensor?)"
 
 
 def like(frames: Sequence[np.ndarray]) -> dict[str, float]:
-    """Returns the median distance of points f32 (N,3) of some frames from their median, and the median number of points of a
-    frame; {} where no frame has any."""
+    """Returns the median distance of points f32 (N,3) of some frames from their median, the median number of points of a
+    frame, and the step to which float32 rounds coordinates so far from the origin; {} where no frame has any."""
     points = np.concatenate(frames) if len(frames) else np.zeros((0, 3))
     if not len(points):
         return {}
     distance = np.linalg.norm(points - np.median(points, 0), axis=1)
-    return {"extent": float(np.median(distance)), "points": float(np.median([len(frame) for frame in frames]))}
+    sizes = [len(frame) for frame in frames]
+    step = np.spacing(np.abs(points).max().astype(np.float32))
+    return {"extent": float(np.median(distance)), "points": float(np.median(sizes)), "step": float(step)}
 
 
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
@@ -53,6 +56,16 @@ def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
     return {key: value for key, value in numbers.items() if isinstance(value, int | float)}
 
 
+def tell_rounded(what: str, found: dict[str, float]) -> None:
+    """Warns where places are rounded so much, as float32 does far from the origin, that bodies lose their shape."""
+    if found.get("step", 0) > _ROUNDED * found.get("extent", np.inf):
+        log.warn(
+            f"{what}: coordinates are so large, as on a map, that float32 rounds them to {found['step']:.2g}, while half of the"
+            f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a place nearby before the file is"
+            " written, as `dpc prepare clouds` does"
+        )
+
+
 def tell_long(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
     """Warns where videos last much longer than any that the model learned from: they get one label, and may show many actions."""
     longest = _own(info, model).get("frames")
@@ -70,6 +83,7 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
 
     what: the file or stream. theirs: `like` of it. model: its name or file.
     """
+    tell_rounded(what, theirs)
     own = _own(info, model)
     size, far = own.get("extent"), theirs.get("extent")
     in_units = info.config.normalize not in ("height", "unit")

@@ -10,6 +10,7 @@ from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
 
 MOST_CLASSES = 30  # a confusion matrix of more classes is no longer read as text
+_LONGEST_NAME = 40  # of a class, in letters: its number stays beside it
 
 
 def classification_tables(report: ClassificationReport) -> list[TextTable]:
@@ -120,4 +121,5 @@ def _confusion_matrix(report: ClassificationReport) -> TextTable:
 
 
 def _class_title(label: int, name: str) -> str:
-    return f"{label} {name}" if name else str(label)
+    short = name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 1] + "…"
+    return f"{label} {short}" if name else str(label)

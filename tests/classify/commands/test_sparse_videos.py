@@ -117,7 +117,7 @@ def streamed_and_cut(tmp_path, data, capsys):
 def test_one_or_two_videos_a_class_and_one_person_train(videos, people, tmp_path):
     done = trained(radar(tmp_path / "r.h5", videos, people=people, points=1), tmp_path / "run")
     assert all(torch.isfinite(value).all() for value in load_model(done.weights)[0].state_dict().values())
-    assert done.videos == 2 * (videos - 1)
+    assert done.videos == (0 if videos == 2 else 4)  # one training video a class: no judge could have seen its class
 
 
 def test_one_class_is_refused_and_time_that_runs_back_is_told(tmp_path, capsys):
