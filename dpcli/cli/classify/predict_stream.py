@@ -29,13 +29,17 @@ Stream = Annotated[
 Hop = Annotated[
     int | None,
     typer.Option(
-        "--hop", help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window."
+        "--hop",
+        rich_help_panel=PANEL,
+        help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window.",
     ),
 ]
 Window = Annotated[
     int | None,
     typer.Option(
-        "--window", help="With --stream or --segments: frames of a window, for models trained with --timing uniform."
+        "--window",
+        rich_help_panel=PANEL,
+        help="With --stream or --segments: frames of a window, for models trained with --timing uniform.",
     ),
 ]
 Follow = Annotated[
