@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.ops.open3d_import import load_open3d
+
 # Made by commands of the project, each from what stands above it.
 MADE = """
 prepare synthetic gestures -o gestures.h5 --videos-per-class 1 --subjects 2 --frames 18 --points 60 --size 40 --jobs 1
@@ -166,7 +168,7 @@ def _depth(base: Path, rng: np.random.Generator) -> None:
 
 
 def _clouds(base: Path, rng: np.random.Generator) -> None:
-    import open3d
+    open3d = load_open3d()
     import pyarrow
     import pyarrow.parquet
 
