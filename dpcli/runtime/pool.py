@@ -17,6 +17,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DataError
+from dpcli.regular_files import regular_files_only
 from dpcli.runtime import shared_memory as handover
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import fast_transport, keep_freed_memory
@@ -74,7 +75,8 @@ def _new_pool(jobs: int) -> ProcessPoolExecutor:
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
     try:
-        return function(item)
+        with regular_files_only():  # in whatever process: a FIFO would hold it for ever
+            return function(item)
     except Exception as error:  # an item's failure is a result, so that the caller can skip it
         return error
 

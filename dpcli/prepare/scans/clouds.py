@@ -71,10 +71,6 @@ class CloudFolders:
         left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Returns the options alone: with the whole index, going to a worker with each item, work would grow with its square."""
-        return asdict(self)
-
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
