@@ -20,7 +20,7 @@ _SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NOTHING = Decimal(0)
-_EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9))  # digits of a time since 1970 -> decimal places among them
+_EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9), (18, 9))  # digits of a time since 1970, or GPS's 1980 -> decimal places
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class NumberColumns:
         if all("." in number and len(number.partition(".")[2]) >= 6 for number in numbers):  # as %f and ROS write them
             return [_in_seconds(number, False) for number in numbers]
         for digits, places in _EPOCHS:
-            if all(len(number) == digits and number[0] in "12" for number in numbers):
+            if all(len(number) == digits and (number[0] in "12" or digits == 18) for number in numbers):
                 return [Decimal(number).scaleb(-places) for number in numbers]
         return None
 

@@ -11,6 +11,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 
+AT_ORIGIN = "points at (0,0,0) dropped"
 BEYOND = "points beyond the number that their file's header says dropped"
 
 

@@ -19,6 +19,7 @@ _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
     (".pts", 7): "x y z intensity red green blue",
     (".xyzrgb", 6): "x y z red green blue",
     (".xyzn", 6): "x y z nx ny nz",
+    (".xyzi", 4): "x y z intensity",
 }
 
 

@@ -100,9 +100,7 @@ def test_bytes_the_wrong_way_round_are_no_depth(tmp_path):
     with pytest.raises(DataError, match="two bytes of each are the wrong way round"):
         sample_of(tmp_path / "v.npy", SCENE.byteswap())
     noise = RNG.integers(1, 3000, (1, 48, 64)).astype(np.uint16)
-    assert (
-        not sample_of(tmp_path / "v.npy", noise).notes
-    )
+    assert not sample_of(tmp_path / "v.npy", noise).notes
 
 
 def test_one_channel_is_no_other_dimension(tmp_path):

@@ -11,8 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
+from dpcli.ops.open3d_import import load_open3d
+from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
+from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.decode.cloud_files import read_cloud
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
 quick = settings(
@@ -131,6 +135,7 @@ def test_a_row_of_units_below_the_header_counts(tmp_path, row):
         ("pts", "1 2 3 255 0 9\n4 5 6 0 1 2\n", [[255, 0, 9], [0, 1, 2]], ()),
         ("pts", "1 2 3 9\n4 5 6 8\n", None, ("intensity",)),
         ("xyzrgb", "1 2 3 1 0 0.5\n4 5 6 0 0.25 0\n", [[1, 0, 0.5], [0, 0.25, 0]], ()),
+        ("xyzi", "1 2 3 7\n4 5 6 8\n", None, ("intensity",)),
         ("xyzn", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("nx", "ny", "nz")),
         ("xyz", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("columns 4 to 6 (no names)",)),
         ("csv", "x,y,z,snr\n1,2,3,4\n4,5,6,7\n", None, ("snr",)),
@@ -141,6 +146,44 @@ def test_columns_that_a_format_implies_and_those_not_read(tmp_path, suffix, rows
     cloud = read(tmp_path / f"a.{suffix}", rows)
     assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.unread == unread
     assert (None if cloud.color is None else cloud.color.tolist()) == color
+
+
+@pytest.mark.parametrize("suffix", ["xyz", "xyzn", "xyzrgb", "pts"])
+def test_what_open3d_writes_as_text_is_read_back(tmp_path, suffix):
+    open3d = load_open3d()
+    rng = np.random.default_rng(0)
+    points, colors = rng.uniform(-3, 3, (20, 3)), rng.uniform(0, 1, (20, 3))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    cloud.colors = cloud.normals = open3d.utility.Vector3dVector(colors)
+    assert open3d.io.write_point_cloud(str(tmp_path / f"a.{suffix}"), cloud)
+    found = read_text(tmp_path / f"a.{suffix}")
+    np.testing.assert_allclose(found.points, points, atol=1e-9)
+    assert (found.color is not None) == (suffix in ("xyzrgb", "pts"))
+    if found.color is not None:
+        np.testing.assert_allclose(as_bytes([found.color])[0], colors * 255, atol=1)
+
+
+@pytest.mark.parametrize("color", [None, [7, 8, 9]])
+def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
+    rng, scans, expected = np.random.default_rng(0), [], []
+    for angle in (0.0, 0.5):
+        turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        matrix, own = np.eye(4), rng.uniform(-9, 9, (6, 3)).round(6)
+        matrix[:3, :3], matrix[3, :3], own[2] = turn, [10 + angle, 20, 30], 0
+        head = ["3", "2", *(" ".join(map(str, row)) for row in [[0, 0, 0], *np.eye(3).tolist(), *matrix.tolist()])]
+        scans += [*head, *(" ".join(map(str, [*point.tolist(), 0.5, *(color or [])])) for point in own)]
+        expected.append(np.delete(own, 2, 0) @ turn + matrix[3, :3])
+    (tmp_path / "a.ptx").write_text("\r\n".join(scans) + "\r\n")
+    cloud = read_cloud(tmp_path / "a.ptx", keep=["intensity"])
+    np.testing.assert_allclose(cloud.points, np.concatenate(expected), atol=1e-9)
+    assert cloud.dropped == {AT_ORIGIN: 2} and cloud.extra["intensity"].tolist() == [0.5] * 10
+    assert (None if cloud.color is None else cloud.color[-1].tolist()) == color
+    (tmp_path / "a.ptx").write_text("\n".join(scans[:-1]))
+    with pytest.raises(DataError, match="says 6 points, it has room for 5"):
+        read_cloud(tmp_path / "a.ptx")
+    (tmp_path / "a.ptx").write_text("\n".join(scans[1:]))
+    with pytest.raises(DataError, match="row 1 begins no scan"):
+        read_cloud(tmp_path / "a.ptx")
 
 
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):

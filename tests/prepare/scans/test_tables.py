@@ -204,6 +204,23 @@ def test_parquet_is_read_as_pyarrow_wrote_it(tmp_path, data):
     assert sample.sequence.num_frames == len(np.unique(number))
 
 
+@pytest.mark.parametrize("packed", ["uncompressed", "lz4", "zstd"])
+@pytest.mark.parametrize("rows", [2, 100])
+def test_feather_is_read_as_pyarrow_wrote_it(tmp_path, packed, rows):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import feather
+
+    points = np.random.default_rng(0).uniform(1, 9, (7, 3)).astype(np.float16)
+    columns = {"frame": np.repeat([0, 1], [3, 4]), **dict(zip("xyz", points.T))}
+    feather.write_feather(pyarrow.table(columns), str(tmp_path / "a.feather"), compression=packed, chunksize=rows)
+    (sample,) = sequences(tmp_path / "a.feather")
+    np.testing.assert_array_equal(sample.sequence.points, points.astype(np.float32))
+    assert np.diff(sample.sequence.frame_offsets).tolist() == [3, 4]
+    (tmp_path / "a.feather").write_bytes((tmp_path / "a.feather").read_bytes()[:-9])
+    (item,) = TableSequences(tmp_path / "a.feather").items()
+    assert "a.feather: not a readable Feather table" in item.problem
+
+
 def test_a_truncated_parquet_is_named(tmp_path):
     (tmp_path / "a.parquet").write_bytes(b"PAR1 and then nothing")
     pytest.importorskip("pyarrow")
