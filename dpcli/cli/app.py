@@ -18,7 +18,7 @@ from typing import Any
 import typer
 
 from dpcli import __version__
-from dpcli.cli.help_groups import SectionedGroup
+from dpcli.cli.help_groups import SectionedCommand, SectionedGroup, use_sections
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
@@ -75,9 +75,10 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
         if asked not in (None, name):
             dpc.command(name, help=about)(_not_loaded)
         elif name == "info":
-            dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
+            dpc.command(name, cls=SectionedCommand, help=about)(import_module("dpcli.cli.info").info)
         else:
             room = import_module(f"dpcli.cli.{name}.app").app
+            use_sections(room)
             dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about, cls=SectionedGroup)
     return dpc
 

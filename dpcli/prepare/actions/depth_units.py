@@ -13,14 +13,8 @@ _TOO_LARGE = 1e9  # raw floats beyond are marks, whatever the unit
 _PLAUSIBLE = (0.005, 200.0)  # meters that depth cameras see, typically
 _PLAUSIBLE_IF_ASKED = (0.005, 1000.0)  # where the user gave the units
 _SAMPLED = 4096
-_ROUGH, _SMOOTHER = (
-    0.01,
-    8.0,
-)  # how much neighbors differ, as a share of the mean, and how much less in another byte order
-_STEPS = {
-    8: 8000,
-    5: 5000,
-}  # what raw depths are multiples of -> raw units per meter, where the sensor counted millimeters
+_ROUGH, _SMOOTHER = 0.01, 8.0  # how much neighbors differ, as a share of the mean; how much less with bytes swapped
+_STEPS = {8: 8000, 5: 5000}  # what raw depths are multiples of -> raw units per meter, of a sensor's millimeters
 _SAME_REST, _KINDS = 0.9, 32  # share of depths with one rest, and different depths that make it no chance
 _ROWS = 16  # of a frame that are looked at
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dpcli.cli.help_groups import LABELS
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 
@@ -75,6 +76,7 @@ def clouds(
         bool,
         typer.Option(
             "--label-from-folder",
+            rich_help_panel=LABELS,
             help="Take labels from folders RAW/CLASS/SEQUENCE/frames, or RAW/train/CLASS/... and RAW/test/CLASS/...",
         ),
     ] = False,
