@@ -25,7 +25,9 @@ _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
 
 def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads one cloud from a text. Raises DataError when it holds several frames, or is no table of numbers."""
-    table = read_text_table(path)
+    table = read_text_table(path, may_be_empty=True)
+    if not table.first_rows(1):  # a count of 0, or names alone
+        return cloud_of_columns(path, {name: np.empty(0) for name in table.names or "xyz"}, keep)
     if not table.names:
         names = _IMPLIED.get((path.suffix.lower(), table.width), "")
         table = replace(table, names=tuple(names.split()))

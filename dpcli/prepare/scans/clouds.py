@@ -111,6 +111,8 @@ class CloudFolders:
                 cloud = read_cloud(one.paths[0], self.bin_columns)
             except DataError:
                 continue  # a bad sample: the next one tells
+            if not len(cloud.points):  # nothing was seen, which may have no columns either
+                continue
             return cloud.color is not None, without(cloud.unread, self.keep)
         return False, ()
 
@@ -159,7 +161,7 @@ class CloudFolders:
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:
-    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None]
+    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None and len(cloud.points)]
     if plain:
         raise DataError(
             f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"

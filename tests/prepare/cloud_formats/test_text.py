@@ -107,7 +107,6 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
         ("x,y,z\n1_000,2,3\n", "column 'x' holds '1_000'"),
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
-        ("x,y,z\n", "a header, but no rows"),
         ("\n\n", "no rows"),
         ("range,azimuth,elevation\n1,2,3\n", "columns range, azimuth, elevation; expected x, y and z"),
         ("x,y,z,pos_x,X\n1,2,3,4,5\n", "columns x, X could each be x"),
@@ -184,6 +183,20 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
     (tmp_path / "a.ptx").write_text("\n".join(scans[1:]))
     with pytest.raises(DataError, match="row 1 begins no scan"):
         read_cloud(tmp_path / "a.ptx")
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"), [("csv", "x,y,z,r,g,b,snr\n"), ("csv", "x;y;z;snr\nm;m;m;\n"), ("pts", "0\n")]
+)
+def test_a_moment_that_saw_nothing_has_no_points(tmp_path, suffix, text):
+    cloud = read(tmp_path / f"a.{suffix}", text, keep=["snr"] if "snr" in text else [])
+    assert cloud.points.shape == (0, 3) and (cloud.color is not None) == ("r,g,b" in text)
+
+
+def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
+    with pytest.raises(DataError, match="--keep-fields t: float32, .* would round its values by up to 0.1;"):
+        read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,1700000000.0\n1,2,4,1700000000.1\n", keep=["t"])
+    assert read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,5\n1,2,4,1700000001\n", keep=["t"]).extra["t"][0] == 5
 
 
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):

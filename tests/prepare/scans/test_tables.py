@@ -160,6 +160,8 @@ def test_columns_that_are_not_there(tmp_path, options, message):
 
 
 def test_tables_that_cannot_be_split(tmp_path):
+    (item,) = TableSequences(write(tmp_path / "0.csv", [], "frame,x,y,z")).items()
+    assert "a header, but no rows" in item.problem
     (item,) = TableSequences(write(tmp_path / "a.csv", [(1, 2, 3)], "x,y,z")).items()
     assert "which column numbers the frames? --frame-column NAME says it; found x, y, z" in item.problem
     (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
