@@ -108,10 +108,11 @@ class CloudFolders:
         """Returns whether the first good cloud has colors, and which of its columns are not read."""
         for one in self._series:
             try:
-                cloud = read_cloud(one.paths[0], self.bin_columns)
+                clouds = (read_cloud(path, self.bin_columns) for path in one.paths)
+                cloud = next((cloud for cloud in clouds if len(cloud.points)), None)
             except DataError:
                 continue  # a bad sample: the next one tells
-            if not len(cloud.points):  # nothing was seen, which may have no columns either
+            if cloud is None:  # nothing was seen
                 continue
             return cloud.color is not None, without(cloud.unread, self.keep)
         return False, ()
