@@ -185,6 +185,19 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
         read_cloud(tmp_path / "a.ptx")
 
 
+def test_whole_numbers_before_three_columns_of_fractions_are_asked_about(tmp_path):
+    scan = "".join(f"{k} 7 1.5 2.25 0.{k}5 128\n" for k in range(3, 6))
+    with pytest.raises(DataError, match="its first 2 columns hold whole numbers, .*which are x, y and z"):
+        read(tmp_path / "a.xyz", scan)
+    assert read(tmp_path / "a.xyz", "row column x y z i\n" + scan).points[0].tolist() == [1.5, 2.25, 0.35]
+    frames = "".join(f"{k // 4} 1.5 2.25 0.{k}5\n" for k in range(12))
+    with pytest.raises(DataError, match="its first column holds whole numbers"):
+        read(tmp_path / "a.xyz", frames)
+    plain = [f"{k} 2.5 {k}.25 0.5\n" for k in (3, 4, 9)]
+    for text in ("".join(plain), "".join(plain) * 3 + "3.5 2.5 4.25 0.5\n", "3 4 5 0.1\n" * 20, "3 4 5.5 0.1\n" * 20):
+        assert read(tmp_path / "a.xyz", text).points[0, 0] == 3
+
+
 @pytest.mark.parametrize(
     ("suffix", "text"), [("csv", "x,y,z,r,g,b,snr\n"), ("csv", "x;y;z;snr\nm;m;m;\n"), ("pts", "0\n")]
 )
