@@ -268,6 +268,13 @@ def test_a_sequence_beside_folders_of_classes_has_no_class(tmp_path):
         CloudFolders(tmp_path, label_from_folder=True).items()
 
 
+def test_a_first_frame_that_saw_nothing_decides_nothing(tmp_path):
+    (tmp_path / "0.csv").write_text("x,y,z\n")
+    (tmp_path / "1.csv").write_text("x,y,z,r,g,b\n1,2,3,4,5,6\n")
+    sequence = read(tmp_path).sequence
+    assert sequence.num_frames == 1 and sequence.color.tolist() == [[4, 5, 6]]
+
+
 def test_columns_that_are_not_read_are_named(tmp_path):
     (tmp_path / "0.csv").write_text("x,y,z,ring,snr\n1,2,3,4,5\n1,2,4,4,5\n")
     reader = CloudFolders(tmp_path, keep=("snr",))
