@@ -151,7 +151,7 @@ def _follow(
     """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     feed = ReadAhead(frames, 2 * predictor.window.size)
     problem: BaseException | None = None
-    arrived, watch = time.monotonic(), _Oddities()
+    arrived, watch = time.monotonic(), _IrregularFrames()
     try:
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived, waited in feed.frames(stop):
@@ -181,8 +181,8 @@ def _follow(
     return problem
 
 
-class _Oddities:
-    """Tells the first of the frames that are odd at once, and at the end how many there were."""
+class _IrregularFrames:
+    """Warns of the first empty, sparse or late frame at once, and counts them at the end."""
 
     def __init__(self) -> None:
         self.empty = self.sparse = self.gaps = 0
@@ -206,7 +206,7 @@ class _Oddities:
             self.sparse += 1
 
     def sum_up(self) -> None:
-        """Tells how many odd frames there were, where one was told of already."""
+        """Logs how many irregular frames there were, where there was more than one."""
         counts = {
             "without points": self.empty,
             f"of fewer than {_SPARSE} points": self.sparse,
