@@ -14,6 +14,8 @@ import torch
 from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
+from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
+from dpcli.classify.data.likeness import file_like
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
     CROSS,
@@ -76,6 +78,7 @@ class _Videos:
     class_names: list[str]
     digest: str
     caveat: str  # see `Training`
+    not_read: dict[str, str]  # columns of the file, and why the network doesn't read them
 
 
 def train(
@@ -204,8 +207,10 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
     _check_labels(reader, training, validation)
+    left_out: dict[str, str] = {}
     if run.timing == "slots" and not settings.network.scales:
-        settings = replace(settings, network=measured(settings.network, reader, training))
+        network, left_out = measured(settings.network, reader, training)
+        settings = replace(settings, network=network)
     options = {"timing": run.timing, "drop_short": run.drop_short, "seed": seed}
     if rule == CROSS:
         options["folds"] = cross_folds(reader, training, settings.network.members, seed)
@@ -213,7 +218,8 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
     caveat = about_people(reader, training, validation)
-    return settings, _Videos(source, held, counts, class_table(reader), provenance.file_digest(path), caveat)
+    digest = provenance.file_digest(path)
+    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, left_out)
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:
@@ -239,6 +245,8 @@ def _notes(videos: _Videos, rule: str, seed: int) -> dict[str, Any]:
         "seed": seed,
         "validation": rule,
         "trained_on": f"{videos.counts[0]} videos",
+        NOTE_LIKE: file_like(videos.training.reader, videos.training.sequences),
+        **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }
 
 

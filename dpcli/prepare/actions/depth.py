@@ -14,7 +14,13 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
-from dpcli.prepare.actions.depth_units import require_plausible, usual_scale, without_marks
+from dpcli.prepare.actions.depth_units import (
+    doubts_of_units,
+    require_byte_order,
+    require_plausible,
+    usual_scale,
+    without_marks,
+)
 from dpcli.prepare.decode.calibration import Calibration
 from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, DepthVideo, frame_series, read_depth_video, says_depth
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
@@ -152,7 +158,8 @@ class DepthVideos:
         camera = self._camera(video.frames.shape[2], video.frames.shape[1], recorded)
         scale = self._scale(video.frames.dtype)
         depth, notes = without_marks(video.frames)
-        notes |= video.notes
+        require_byte_order(str(item.path), depth)
+        notes |= video.notes | (doubts_of_units(depth) if self._declared_scale is None else {})
         if video.missing or video.ends_early:
             notes |= {MISSING: video.missing} if video.missing else {CUT: 1}
         depth, unit = self._inverted(depth, item.path), 1 / scale

@@ -15,6 +15,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.cloud import Cloud, kept_columns, require_points, without
 from dpcli.prepare.cloud_formats.column_names import UNITS
+from dpcli.prepare.cloud_formats.laz_chunks import check_chunks
 
 _COLORS = ("red", "green", "blue")
 WITHHELD = "points that their file marks as withheld dropped"
@@ -34,8 +35,11 @@ def read_las(path: Path, keep: Sequence[str] = ()) -> Cloud:
     laspy = _load_laspy()
     room = _check_sizes(path)
     try:
-        las = laspy.read(path)
-    except (KeyboardInterrupt, SystemExit):
+        with laspy.open(path) as reader:
+            if reader.header.are_points_compressed and reader.header.point_count:
+                check_chunks(path, reader.header)
+            las = reader.read()
+    except (KeyboardInterrupt, SystemExit, DataError):
         raise
     except BaseException as error:  # LaspyException, struct.error, LazrsError...; a panic of lazrs is no Exception
         kind = path.suffix[1:].upper()
@@ -108,25 +112,20 @@ def _check_sizes(path: Path) -> int:
 def _room(path: Path, head: bytes, start: int, end: int) -> int:
     """Returns how many points lie from byte ``start`` to ``end``; of compressed ones how many the header says, by returns or not.
 
-    head: at least 227 bytes. Raises DataError where points, or the chunks of compressed ones, have no room: the parsers set
-    memory aside for all that are counted, and the compressed one ends the process.
+    head: at least 227 bytes. Raises DataError where points have no room that aren't compressed: laspy sets memory aside for
+    all that are counted.
     """
-    size = path.stat().st_size
     form, length, count = struct.unpack_from("<BHI", head, 104)
     returns = struct.unpack_from("<5I", head, 111)
     if head[25] >= 4 and len(head) >= 375:
         count, *returns = struct.unpack_from("<16Q", head, 247)
     said = max(count, sum(returns))
-    what, room = "points", (end - start) // max(length, 1)
-    if packed := form & 0xC0:  # the first 8 bytes say where the table of chunks lies, whose second number counts them
-        with path.open("rb") as file:
-            file.seek(start)
-            file.seek(min(int.from_bytes(file.read(8), "little"), size))
-            table = file.read(8)
-        what, room, count = "chunks of points", size, int.from_bytes(table[4:], "little")
+    if form & 0xC0:
+        return said
+    room, size = (end - start) // max(length, 1), path.stat().st_size
     if count > room:
-        raise DataError(f"{path}: truncated or damaged: claims {count} {what}, which a file of {size} bytes can't hold")
-    return said if packed else room
+        raise DataError(f"{path}: truncated or damaged: claims {count} points, which a file of {size} bytes can't hold")
+    return room
 
 
 def _units(path: Path, las: Any) -> tuple[str, str]:

@@ -42,7 +42,9 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
                 f"{table.path}: array of shape {(len(table.numbered), table.width)}; expected numbers (points, 3 or more)"
             )
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
-        return Cloud(values[:, :3], unread=unnamed_columns(4, table.width))
+        first = int(_counts_rows(table, values))
+        counted = ("column 1 (no name, numbers of the rows)",) if first else ()
+        return Cloud(values[:, first : first + 3], unread=counted + unnamed_columns(first + 4, table.width))
     axes = named_axes(table.path, table.names)
     if axes is None:
         raise DataError(f"{table.path}: columns {', '.join(table.names)[:80]}; expected x, y and z among them")
@@ -51,6 +53,17 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     values = table.columns(places)
     cloud = cloud_of_columns(table.path, {table.names[p]: values[:, k] for k, p in enumerate(places)}, keep)
     return replace(cloud, unread=without([name for name in table.names if name], cloud.columns, keep))
+
+
+def _counts_rows(table: TextTable, values: np.ndarray) -> bool:
+    """Returns whether the first of four or more columns without names counts the rows: whole numbers beside fractions."""
+    start = values[0, 0]
+    if table.width < 4 or len(values) < 3 or start not in (0, 1):
+        return False
+    if not np.array_equal(values[:, 0], np.arange(start, start + len(values))):
+        return False
+    rows = [table.cells(line) for _, line in table.first_rows(30)]
+    return all(row[0].isdecimal() for row in rows) and any(not cell.isdecimal() for row in rows for cell in row[1:4])
 
 
 def refuse_frames(table: TextTable) -> None:

@@ -297,6 +297,8 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
     array = map_npy(path)
     if array.ndim == 2:
         array = array[None]
+    if array.ndim == 4 and 1 in (array.shape[1], array.shape[3]):  # one channel, as networks want it
+        array = array[..., 0] if array.shape[3] == 1 else array[:, 0]
     if array.ndim != 3 or array.dtype.kind not in "uif":
         raise DataError(
             f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"

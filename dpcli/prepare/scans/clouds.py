@@ -78,7 +78,8 @@ class CloudFolders:
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
-            return labels_of_folders(self.raw, [as_utf8(path.as_posix()) for path in self._relative], "CLASS")
+            layout = "CLASS/SEQUENCE" if len({len(path.parts) for path in self._relative}) > 1 else "CLASS"
+            return labels_of_folders(self.raw, [as_utf8(path.as_posix()) for path in self._relative], layout)
         return read_labels(self.labels) if self.labels else None
 
     @cached_property

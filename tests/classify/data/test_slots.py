@@ -37,7 +37,7 @@ def config_of(tmp_path, videos, fields=(SPEED,)):
         for one in videos:
             writer.write(one)
     reader = CloudsReader(tmp_path / "c.h5")
-    return measured(network_config(Given("sparse", sets=SMALL), 2), reader, list(range(len(reader))))
+    return measured(network_config(Given("sparse", sets=SMALL), 2), reader, list(range(len(reader))))[0]
 
 
 def test_slots_hold_the_video_in_its_order_about_its_median_without_what_is_far(tmp_path, capsys):

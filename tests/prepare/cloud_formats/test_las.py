@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import laspy
+import lazrs
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -164,15 +165,60 @@ def test_a_header_that_counts_what_is_not_there_is_refused_at_once(tmp_path, pla
         read_las(path)
 
 
-@pytest.mark.parametrize(("suffix", "what"), [("las", "points"), ("laz", "chunks of points")])
-def test_counts_of_points_that_have_no_room_are_refused(tmp_path, suffix, what):
-    """The parser of LAZ sets memory aside for the chunks that a table counts, and ends the process without it."""
-    path = tmp_path / f"a.{suffix}"
+CLAIMS = ("points", "items", "size of chunks", "chunks", "late table")
+
+
+@pytest.mark.parametrize(
+    ("form", "what"), [*((form, what) for form in (0, 3, 6, 7) for what in CLAIMS), (6, "layer"), (7, "layer")]
+)
+def test_sizes_inside_a_laz_that_it_cannot_hold_are_refused(tmp_path, form, what):
+    """Its parser sets memory aside for each, and ends the process without it."""
+    path = tmp_path / "a.laz"
+    make(form, np.random.default_rng(0).uniform(0, 1, (90, 3))).write(str(path))
+    data = bytearray(path.read_bytes())
+    start, length = int.from_bytes(data[96:100], "little"), int.from_bytes(data[105:107], "little")
+    record, table = data.index(b"\x50\xc3\0\0") - 12, int.from_bytes(data[start : start + 8], "little")
+    if what == "late table":  # of a file that was written in one go
+        data[start : start + 8] = b"\xff" * 8
+        data += table.to_bytes(8, "little")
+    places = {"points": 247 if form > 5 else 107, "items": record + 36, "size of chunks": record + 12}
+    places |= {"layer": start + 8 + length + 8}
+    place = places.get(what, table + 4)
+    data[place : place + 4] = bytes(255 - one for one in data[place : place + 4])
+    path.write_bytes(data)
+    with pytest.raises(
+        DataError, match="claims .* which a (file|chunk) of .* can't hold|but .* where they are compressed"
+    ):
+        read_las(path)
+
+
+@pytest.mark.parametrize(("count", "more"), [(90, 0), (0x70000000, 0), (90, 0x70000000)])
+def test_chunks_of_a_laz_that_each_say_their_size(tmp_path, count, more):
+    path = tmp_path / "a.laz"
+    make(6, np.random.default_rng(0).uniform(0, 1, (90, 3))).write(str(path))
+    data = bytearray(path.read_bytes())
+    start, record = int.from_bytes(data[96:100], "little"), data.index(b"\x50\xc3\0\0") - 12
+    table = int.from_bytes(data[start : start + 8], "little")
+    data[record + 12 : record + 16] = b"\xff" * 4
+    with path.open("wb+") as file:
+        file.write(data[:table])
+        lazrs.write_chunk_table(
+            file, [(count, table - start - 8 + more)], lazrs.LazVlr(bytes(data[record : record + 40]))
+        )
+    if (count, more) == (90, 0):
+        assert len(read_las(path).points) == 90
+        return
+    with pytest.raises(
+        DataError, match=f"claims (a chunk of {count} points|chunks of {more + table - start - 8} bytes)"
+    ):
+        read_las(path)
+
+
+def test_counts_of_points_that_have_no_room_are_refused(tmp_path):
+    path = tmp_path / "a.las"
     make(0, np.random.default_rng(0).uniform(0, 1, (9, 3))).write(str(path))
     data = bytearray(path.read_bytes())
-    start = int.from_bytes(data[96:100], "little")
-    place = 107 if suffix == "las" else int.from_bytes(data[start : start + 8], "little") + 4
-    data[place : place + 4] = (242_422_355).to_bytes(4, "little")
+    data[107:111] = (242_422_355).to_bytes(4, "little")
     path.write_bytes(data)
-    with pytest.raises(DataError, match=f"claims 242422355 {what}, which a file of {len(data)} bytes can't hold"):
+    with pytest.raises(DataError, match=f"claims 242422355 points, which a file of {len(data)} bytes can't hold"):
         read_las(path)

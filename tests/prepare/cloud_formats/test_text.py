@@ -64,6 +64,9 @@ def test_what_csv_writers_write_is_read_back(tmp_path, data):
         "x,y,z,v\nm,m,m,m/s\n0.126,-0.132,0.64,1\n0.105,-0.536,0.362,2\n-1.265,-0.623,0.041,3\n",
         "x;y;z\n#[m];[m];[m]\n0,126;-0,132;0,64\n0,105;-0,536;0,362\n-1,265;-0,623;0,041\n",
         "x y z\n0.126 -0.132 0.64\nx y z\n0.105 -0.536 0.362\nx y z\n-1.265 -0.623 0.041\n",
+        "0,1,2\n0.126,-0.132,0.64\n0.105,-0.536,0.362\n-1.265,-0.623,0.041\n",
+        ",0,1,2,3\n0,0.126,-0.132,0.64,9\n1,0.105,-0.536,0.362,9\n2,-1.265,-0.623,0.041,8\n",
+        "1 0.126 -0.132 0.64\n2 0.105 -0.536 0.362\n3 -1.265 -0.623 0.041\n",
         "Points:0,Points:1,Points:2,id\n0.126,-0.132,0.64,0\n0.105,-0.536,0.362,1\n-1.265,-0.623,0.041,2\n",
     ],
 )
@@ -80,6 +83,11 @@ def test_texts_of_the_same_points(tmp_path, text):
         ("x;y;z\n1 234,5;1;2\n", [1234.5, 1, 2]),
         ("x,y,z\n,2,nan\n", [np.nan, 2, np.nan]),
         ("x,y,z\nNULL,2,1e30\n", [np.nan, 2, 1e30]),
+        ("x,y,z\n#DIV/0!,2,3\n", [np.nan, 2, 3]),
+        ("x,y,z\n1,#N/A,3\n", [1, np.nan, 3]),
+        ('x,y,z\n"1,500","-2,250",500\n', [1500, -2250, 500]),
+        ("x;y;z\n1,500;2,250;1,125\n", [1.5, 2.25, 1.125]),
+        ("x;y;z\n1,500;0,250;7\n", [1.5, 0.25, 7]),
     ],
 )
 def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
@@ -92,6 +100,8 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("x,y,z\n0,126,-0,132,0,640\n", "a.csv:2: 6 values; .*decimal commas between commas"),
         ("0,126,-0,132,0,640\n0,105,-0,536,0,362\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
+        ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
+        ("x,y,z\n1_000,2,3\n", "column 'x' holds '1_000'"),
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
         ("x,y,z\n", "a header, but no rows"),
         ("\n\n", "no rows"),
@@ -124,6 +134,7 @@ def test_a_row_of_units_below_the_header_counts(tmp_path, row):
         ("xyzn", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("nx", "ny", "nz")),
         ("xyz", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("columns 4 to 6 (no names)",)),
         ("csv", "x,y,z,snr\n1,2,3,4\n4,5,6,7\n", None, ("snr",)),
+        ("xyz", "1 2 3 4\n4 5 6 4\n", None, ("column 4 (no name)",)),
     ],
 )
 def test_columns_that_a_format_implies_and_those_not_read(tmp_path, suffix, rows, color, unread):
@@ -155,6 +166,9 @@ def test_bytes_that_are_no_text(tmp_path):
         ("z_ft y_ft x_ft", [2, 1, 0], "ft"),
         ("point_x point_y point_z", [0, 1, 2], ""),
         ("x-coordinate y-coordinate z-coordinate", [0, 1, 2], ""),
+        ("Points_m_XYZ:0 Points_m_XYZ:1 Points_m_XYZ:2 intensity", [0, 1, 2], ""),
+        ("X1 (mm)|Y1 (mm)|Z1 (mm)|X2 (mm)|Y2 (mm)|Z2 (mm)", [0, 1, 2], "mm"),
+        ("x (in)|y (in)|z (in)", [0, 1, 2], "in"),
     ],
 )
 def test_styles_of_headers(names, places, unit):

@@ -9,6 +9,7 @@ from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
+from dpcli.prepare.scans.assembling import COARSE
 from dpcli.prepare.scans.cleaning import AT_ORIGIN, IMPOSSIBLE, NOT_FINITE, clean
 from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.runtime.machines.shards import Shard
@@ -37,6 +38,7 @@ def convert_folder(folder, path, **options):
         ([-3.4e38, 0, 0], IMPOSSIBLE),
         ([-9999.0] * 3, IMPOSSIBLE),
         ([65535.0] * 3, IMPOSSIBLE),
+        ([-(2.0**31)] * 3, IMPOSSIBLE),
         ([np.nan, 1, 1], NOT_FINITE),
         ([-np.inf, 1, 1], NOT_FINITE),
     ],
@@ -71,6 +73,12 @@ def test_the_shift_is_kept_told_and_undone(tmp_path):
     assert near.shift is None and far.shift.tolist() == np.floor((POINTS + base).min(0)).tolist()
     np.testing.assert_allclose(near.original_frame(0), POINTS, atol=1e-6)
     assert report.closing[1] == "map: (448000, 5411000, 300) was taken off its coordinates; the file keeps it as shift"
+
+
+@pytest.mark.parametrize(("kind", "rounded"), [("f4", True), ("f8", False)])
+def test_map_coordinates_that_float32_rounded_are_told(tmp_path, kind, rounded):
+    reader = CloudFolders(frames_of(tmp_path, (POINTS + [448_000, 5_411_000, 300]).astype(kind)))
+    assert (COARSE in reader.read(reader.items()[0], np.random.default_rng(0)).notes) is rounded
 
 
 def test_shards_and_merges_keep_shifts(tmp_path):
