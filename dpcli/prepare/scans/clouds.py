@@ -141,7 +141,7 @@ class CloudFolders:
             return self.bin_columns, {}
         columns, sure = guess_bin_columns(frames[:: max(1, len(frames) // _LOOKED_AT)][:_LOOKED_AT])
         doubt = "" if sure else ", though other numbers fit as well"
-        note = f"sequences of .bin read as {columns} float32 a point, by their look{doubt} (--bin-columns says it)"
+        note = f"sequences of .bin read as {columns} float32 a point, judged by their values{doubt} (--bin-columns says it)"
         return columns, {} if columns == 4 and sure else {note: 1}
 
     def summary(self, items: list[Item]) -> list[str]:
