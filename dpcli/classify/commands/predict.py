@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.classify.commands.model_task import ModelTask
-from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
 from dpcli.classify.data.likeness import file_like, tell_long, tell_unlike
@@ -25,6 +24,7 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
 from dpcli.store.schema import kept_name
+from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 _WORTH_WORKERS = 500  # clips; fewer are scored by one process before a second has started
@@ -88,7 +88,7 @@ def predict(
         if confidence is not None:
             config["reject_below"] = {"temperature": confidence.temperature, "threshold": confidence.threshold}
         entry = describe_shard(provenance.record(config, task.seed, {"clouds": path}), spread.shard)
-        complete = not task.force and already_scored(target, entry)
+        complete = not task.force and already_made(target, entry, ScoresReader, WORK)
         if not complete:
             keep_freed_memory()
             with _writer(task, target, info, [*reader.provenance, entry], confidence is not None) as writer:
