@@ -83,7 +83,7 @@ def video(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Reads a clip of one object: frames with alpha, masks or a plain background; optionally further views.
+    """Read a clip of one object: frames with alpha, masks or a plain background; optionally further views.
 
     For example: dpc prepare video fox.mp4 --background white -o fox.h5
     """
