@@ -18,6 +18,7 @@ from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, ope
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
+_SAID: set[str] = set()
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
@@ -147,17 +148,23 @@ def read_rgba(path: Path) -> np.ndarray:
 
     try:
         with open_image(path) as image:
-            return _to_rgba(as_shown(image))
+            return _to_rgba(as_shown(image), path)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         why = "empty" if path.is_file() and path.stat().st_size == 0 else str(error).splitlines()[0]
         raise DataError(f"{path}: not a readable image ({why}); export this frame again") from None
 
 
-def _to_rgba(image) -> np.ndarray:  # image: PIL.Image.Image
+def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
         top = gray.max(initial=0)
         unit = 1 / 255 if image.mode == "F" and top <= 1 else 257.0 if top > 255 else 1.0
+        if unit == 1 and top and image.mode != "F":
+            with log.each_once(_SAID):
+                log.warn(
+                    f"{path.parent}: 16-bit gray of which a picture nowhere exceeds 255 is taken for 0 to 255 there; store "
+                    "8 bits where it is nearly black instead"
+                )
         gray = np.clip(gray / unit, 0, 255).round().astype(np.uint8)
         return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
     return np.array(image.convert("RGBA"))
