@@ -259,6 +259,7 @@ bench: $(READY)
 	$(BIN)/python -m tests.bench.bench_part_metrics
 	$(BIN)/python -m tests.bench.bench_segment
 	$(BIN)/python -m tests.bench.bench_spread
+	$(BIN)/python -m tests.bench.bench_clouds
 	$(DPC) classify profile --preset thesis --steps
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_store $(BENCH_DATA))
 	$(if $(BENCH_DATA),$(BIN)/python -m tests.bench.bench_prepare $(BENCH_DATA),@echo "bench_prepare needs MSRACTION=folder")

@@ -18,7 +18,7 @@ from typing import Any
 import typer
 
 from dpcli import __version__
-from dpcli.cli.help_groups import SectionedGroup
+from dpcli.cli.help_groups import SectionedCommand, SectionedGroup, use_sections
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
@@ -32,9 +32,9 @@ ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
     "classify": "Recognize actions and gestures (Kinet).",
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
-    "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
+    "generate4d": "Fit, draw and export a 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.",
+    "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; as a contact sheet or a page, too.",
 }
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
@@ -75,9 +75,10 @@ def application(words: Sequence[str] | None = None) -> typer.Typer:
         if asked not in (None, name):
             dpc.command(name, help=about)(_not_loaded)
         elif name == "info":
-            dpc.command(name, help=about)(import_module("dpcli.cli.info").info)
+            dpc.command(name, cls=SectionedCommand, help=about)(import_module("dpcli.cli.info").info)
         else:
             room = import_module(f"dpcli.cli.{name}.app").app
+            use_sections(room)
             dpc.add_typer(_narrowed(room, path[1:]) if path else room, name=name, help=about, cls=SectionedGroup)
     return dpc
 

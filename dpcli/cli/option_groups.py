@@ -1,7 +1,8 @@
-"""Options that several commands share, written once as the fields of a frozen dataclass.
+"""Options that belong together or that commands share, written once as the fields of a frozen dataclass.
 
 @dataclass(frozen=True)
 class Camera:
+    HEADING: ClassVar = "Camera"  # over these options in the help; without one they stand among the command's own
     size: Annotated[int, typer.Option("--size", help="Side of the pictures, pixels.")] = 512
 
 @app.command()
@@ -11,11 +12,12 @@ def film(model: Model, camera: Camera, frames: Frames = 32) -> None: ...
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_args, get_type_hints
 
 
 def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -48,7 +50,21 @@ def with_option_groups(command: Callable[..., Any]) -> Callable[..., Any]:
 def _options_of(group: type) -> list[inspect.Parameter]:
     """Returns a keyword parameter for each field of a dataclass, with the field's annotation and default."""
     hints = get_type_hints(group, include_extras=True)
+    heading = getattr(group, "HEADING", None)
     return [
-        inspect.Parameter(one.name, inspect.Parameter.KEYWORD_ONLY, annotation=hints[one.name], default=one.default)
+        inspect.Parameter(
+            one.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            annotation=_under(heading, hints[one.name]) if heading else hints[one.name],
+            default=one.default,
+        )
         for one in fields(group)
     ]
+
+
+def _under(heading: str, annotation: Any) -> Any:
+    """Returns an option's annotation with the heading that the option stands under in the help."""
+    kind, option = get_args(annotation)
+    option = copy.copy(option)
+    option.rich_help_panel = heading
+    return Annotated[kind, option]

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from dpcli.cli.help_groups import RUNNING
 from dpcli.errors import UsageError
 
 _LARGEST_SEED = 2**63 - 1  # what torch and an attribute of an HDF5 file hold
@@ -26,19 +27,33 @@ def _read_seed(text: str) -> int:
     return seed
 
 
-Seed = Annotated[int, typer.Option("--seed", parser=_read_seed, metavar="INTEGER", help="Seed of all randomness.")]
-Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes. Default: the CPUs this process may use.")]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu, cuda or cuda:N.")]
+Seed = Annotated[
+    int,
+    typer.Option(
+        "--seed", parser=_read_seed, metavar="INTEGER", rich_help_panel=RUNNING, help="Seed of all randomness."
+    ),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option("--jobs", min=1, rich_help_panel=RUNNING, help="Processes. Default: the CPUs this process may use."),
+]
+Device = Annotated[str, typer.Option("--device", rich_help_panel=RUNNING, help="auto, cpu, cuda or cuda:N.")]
 OnError = Annotated[
     Literal["skip", "stop"],
-    typer.Option("--on-error", help="After a bad sample: skip it and list it at the end, or stop."),
+    typer.Option(
+        "--on-error", rich_help_panel=RUNNING, help="After a bad sample: skip it and list it at the end, or stop."
+    ),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Start over, even if the output or a part of it exists.")]
+Force = Annotated[
+    bool,
+    typer.Option("--force", rich_help_panel=RUNNING, help="Start over, even if the output or a part of it exists."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 Picture = Annotated[Path | None, typer.Option("--picture", help="Write a picture (.png) to this file.")]
 TrustedBackbone = Annotated[
     str | None,
     typer.Option(
-        "--backbone", help="module:Class of a model made on a backbone of your own: your leave to run that code."
+        "--backbone",
+        help="Your own backbone as module:Class, where the model was trained on one; its code is run only if it is named here.",
     ),
 ]

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from dpcli.cli.help_groups import SETTINGS
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import Setting, settings_of
 from dpcli.runtime.settings.value_types import metavar, without_none, words_of, write_text
@@ -105,11 +106,17 @@ def _flag(one: Setting, default: str) -> inspect.Parameter:
 
 
 def _general_options(catalog: Catalog, presets: Presets) -> list[inspect.Parameter]:
-    config = typer.Option("--config", metavar="FILE", help="A TOML file of settings; --set and flags stand over it.")
+    config = typer.Option(
+        "--config",
+        metavar="FILE",
+        rich_help_panel=SETTINGS,
+        help="A TOML file of settings; --set and flags override it.",
+    )
     words = tuple(f"{name}={word}" for name, one in catalog.settings.items() for word in words_of(one.hint) or ("",))
     sets = typer.Option(
         "--set",
         metavar="NAME=VALUE",
+        rich_help_panel=SETTINGS,
         autocompletion=_completion(words),
         help="Change any setting; may be repeated. --help-all lists them.",
     )
@@ -119,7 +126,9 @@ def _general_options(catalog: Catalog, presets: Presets) -> list[inspect.Paramet
             typer.echo(_help_all(context, catalog, presets))
             raise typer.Exit()
 
-    everything = typer.Option("--help-all", is_eager=True, callback=show, help="List all settings and exit.")
+    everything = typer.Option(
+        "--help-all", is_eager=True, callback=show, rich_help_panel=SETTINGS, help="List all settings and exit."
+    )
     return [
         _parameter("config_file", Annotated[Path | None, config], None),
         _parameter("set_values", Annotated[list[str] | None, sets], None),

@@ -7,17 +7,25 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dpcli.cli.help_groups import RUNNING
+
 if TYPE_CHECKING:
     from dpcli.runtime.machines.spread import Spread
 
 Shard = Annotated[
     str,
     typer.Option(
-        "--shard", metavar="I/N", help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them."
+        "--shard",
+        metavar="I/N",
+        rich_help_panel=RUNNING,
+        help="Only every N-th sample from I = 0 ... N-1; dpc prepare merge joins them.",
     ),
 ]
 Dask = Annotated[
-    str, typer.Option("--dask", metavar="ADDRESS", help="Work on a Dask cluster: tcp://HOST:PORT, or local.")
+    str,
+    typer.Option(
+        "--dask", metavar="ADDRESS", rich_help_panel=RUNNING, help="Work on a Dask cluster: tcp://HOST:PORT, or local."
+    ),
 ]
 
 
@@ -27,7 +35,12 @@ class SpreadOptions:
 
     jobs: Annotated[
         int | None,
-        typer.Option("--jobs", min=1, help="Processes. Default: as many CPUs as pay, one on an accelerator."),
+        typer.Option(
+            "--jobs",
+            min=1,
+            rich_help_panel=RUNNING,
+            help="Processes. Default: as many CPUs as make it faster; one on a GPU.",
+        ),
     ] = None
     shard: Shard = ""
     dask: Dask = ""

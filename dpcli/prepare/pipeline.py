@@ -190,7 +190,6 @@ def convert(
     provenance = describe_shard(record(config, conversion.seed), conversion.shard)
     report = Report()
     if not conversion.force and already_made(output, provenance, CloudsReader):
-        log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         report.was_complete = True
         return count_samples(report, output)
     with _open_writer(output, reader, conversion, provenance, resume) as writer:

@@ -24,6 +24,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from dpcli.runtime.machines.shards import Shard, describe_shard
+from dpcli.runtime.provenance import record
+from dpcli.store import CloudSequence, CloudsWriter
+
 FPS, POINTS = 30, 256
 MODEL = "train gestures.h5 -o model --preset tiny --epochs 1 --set epochs_dynamic=1 --force"
 
@@ -77,6 +81,7 @@ def rate(looks: list[Look]) -> float:
 def told(name: str, looks: list[Look]) -> bool:
     """Prints a line about a run; says whether it was flat."""
     looks = [one for one in looks if one.done > 0]
+    looks = looks[: 1 + max(range(len(looks)), key=lambda place: looks[place].done)]  # then it closes its files
     tenth = max(len(looks) // 10, 2)
     early, late = looks[tenth : 2 * tenth + 1], looks[-tenth - 1 :]
     speed = rate(late) / rate(early)
@@ -135,12 +140,12 @@ def samples(folder: Path, asked: argparse.Namespace) -> bool:
     (folder / "many.h5").unlink(missing_ok=True)
     words = dpc("prepare", "clouds", raw, "-o", "many.h5", "--jobs", os.cpu_count() or 1, "--force")
     process = subprocess.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    looks = watch(process, lambda: _journaled(folder), 0.5)
-    return told(f"prepare, {asked.samples} samples, bytes", looks)
+    looks = watch(process, lambda: _journaled(folder / ".many.h5.part"), 0.5)
+    return told(f"prepare, {asked.samples} samples, bytes of the journal", looks)
 
 
-def _journaled(folder: Path) -> int:
-    return sum(one.stat().st_size for one in folder.glob("*many.h5*"))
+def _journaled(journal: Path) -> int:
+    return journal.stat().st_size if journal.exists() else 0
 
 
 def _write_samples(raw: Path, count: int) -> None:
@@ -152,23 +157,25 @@ def _write_samples(raw: Path, count: int) -> None:
 
 
 def shards(folder: Path, asked: argparse.Namespace) -> bool:
-    """Merges many shards of many samples."""
-    from dpcli.store import CloudSequence, CloudsWriter
-
+    """Merges many shards of one conversion."""
     rng, paths = np.random.default_rng(0), []
-    for shard in range(asked.shards):
-        paths.append(folder / f"shard{shard:03d}.h5")
-        with CloudsWriter(paths[-1], class_names=["a"], force=True) as writer:
-            for sample in range(asked.samples // asked.shards):
+    entry = record({"items": asked.samples}, 0)
+    for index in range(asked.shards):
+        shard = Shard(index, asked.shards)
+        paths.append(folder / f"shard{index:03d}.h5")
+        provenance = [describe_shard(entry, shard)]
+        with CloudsWriter(paths[-1], class_names=["a"], provenance=provenance, force=True) as writer:
+            places = shard.places(asked.samples)
+            for sample in places:
                 frames = [rng.random((8, 3), np.float32) for _ in range(3)]
-                writer.write(CloudSequence.from_frames(f"{shard}-{sample}", frames, label=0))
+                writer.write(CloudSequence.from_frames(f"s{sample:06d}", frames, label=0))
+            writer.positions = (list(places), [])
     words = dpc("prepare", "merge", *paths, "-o", "merged.h5", "--force")
     process = subprocess.Popen(words, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    return told(f"merge, {asked.shards} shards, bytes", watch(process, lambda: _size(folder), 0.2))
-
-
-def _size(folder: Path) -> int:
-    return sum(one.stat().st_size for one in folder.glob("*merged.h5*"))
+    return told(
+        f"merge, {asked.shards} shards, bytes of the journal",
+        watch(process, lambda: _journaled(folder / ".merged.h5.part"), 0.2),
+    )
 
 
 def main() -> int:

@@ -76,5 +76,24 @@ def test_prepare_names_every_command_once_under_a_heading_of_its_own():
     assert "Commands:" not in text  # each has a heading
 
 
+def commands_of(group, path=()):
+    for name, command in group.commands.items():
+        yield from commands_of(command, (*path, name)) if hasattr(command, "commands") else [((*path, name), command)]
+
+
+def test_every_command_shows_at_most_fifteen_options_of_its_own_and_each_option_once():
+    """Rarer ones stand under headings of their own, those of the run last."""
+    many = {}
+    for path, command in commands_of(typer.main.get_command(cli.application())):
+        context = typer.Context(command, info_name=path[-1])
+        lines = command.get_help(context).split("\nOptions:\n")[1].splitlines()
+        headings = [line for line in lines if line.strip() and not line.startswith(" ")]
+        assert not headings or headings[-1] == "Running:" or "Running:" not in headings, path
+        shown = [line for line in lines if line.startswith("  -")]
+        assert len(shown) == sum(one.param_type_name == "option" for one in command.get_params(context)), path
+        many[" ".join(path)] = sum(line in shown for line in lines[: (lines + [""]).index("")]) - 1  # without --help
+    assert len(many) > 50 and max(many.values()) <= 15, {name: count for name, count in many.items() if count > 15}
+
+
 def test_a_text_without_an_empty_line_is_its_own_first_paragraph():
     assert first_paragraph("") == "" and first_paragraph(" a\n b ") == "a b"

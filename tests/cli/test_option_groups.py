@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from dpcli.cli.help_groups import SectionedCommand
 from dpcli.cli.option_groups import with_option_groups
 
 
@@ -20,6 +21,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class SmallCamera(Camera):
+    HEADING: ClassVar = "Small camera"
     size: Annotated[int, typer.Option("--size", min=1, help="Side of the small one.")] = 8
 
 
@@ -30,7 +32,7 @@ def called():
     def run(*words: str) -> tuple[int, str]:
         app = typer.Typer(rich_markup_mode=None)
 
-        @app.command()
+        @app.command(cls=SectionedCommand)
         @with_option_groups
         def film(
             name: Annotated[str, typer.Argument(help="Its name.")],
@@ -58,6 +60,7 @@ def test_help_and_errors_are_those_of_ordinary_options(called):
     run, found = called
     code, text = run("--help")
     assert code == 0 and "Film something." in text and "Side of the small one." in text
+    assert text.index("--frames") < text.index("Small camera:") < min(text.index("--size"), text.index("--color"))
     assert text.index("--frames") < text.index("--size") < text.index("--color")
     for words, message in ((("--size", "0"), "greater than or equal to 1"), (("--color", "blue"), "'gray', 'red'")):
         code, text = run("fox", *words)

@@ -164,7 +164,7 @@ import itertools, os, signal, sys
 from dpcli import signal_exit as s
 s._DEAF = 0.3
 s.watch_signals()
-s.stand_by()
+s.start_watchdog()
 s.set_working(True)
 os.write(1, b"x")
 if sys.argv[1] == "loops":
@@ -173,7 +173,7 @@ if sys.argv[1] == "crashes":
     os.abort()
 if sys.argv[1] == "waits":
     signal.pause()
-s.heard()
+s.acknowledge_signal()
 """
 
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.ops.open3d_import import load_open3d
-
 # Made by commands of the project, each from what stands above it.
 MADE = """
 prepare synthetic gestures -o gestures.h5 --videos-per-class 1 --subjects 2 --frames 18 --points 60 --size 40 --jobs 1
@@ -168,10 +166,12 @@ def _depth(base: Path, rng: np.random.Generator) -> None:
 
 
 def _clouds(base: Path, rng: np.random.Generator) -> None:
-    open3d = load_open3d()
     import pyarrow
     import pyarrow.parquet
 
+    from dpcli.ops.open3d_import import load_open3d
+
+    open3d = load_open3d()
     for frame in range(3):
         points = rng.random((20, 3))
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

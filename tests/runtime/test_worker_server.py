@@ -14,7 +14,7 @@ import pytest
 # A module that takes long to import says so first; the pool must work all the same, whatever came meanwhile.
 SLOW = "import pathlib, time\npathlib.Path('importing').touch()\ntime.sleep(1.5)\n"
 PROGRAM = """
-import multiprocessing, signal, sys, time
+import signal, sys, time
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.worker_server import ensure_server
 
@@ -22,8 +22,7 @@ if __name__ == "__main__":
     seen = []
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, frame: seen.append(number))
-    multiprocessing.get_context("forkserver").set_forkserver_preload(["slow_import"])
-    ensure_server()
+    ensure_server("slow_import")
     while not seen:
         time.sleep(0.01)
     print([result for _, result in ordered_map(abs, [-1, 2], 2)], *map(int, seen))
@@ -47,6 +46,7 @@ def test_a_signal_to_all_while_it_imports_reaches_the_command_only(tmp_path: Pat
     waited = time.monotonic() + 60
     while not (tmp_path / "importing").exists() and time.monotonic() < waited:
         time.sleep(0.01)
+    assert (tmp_path / "importing").exists()
     os.killpg(process.pid, number)
     said, problems = process.communicate(timeout=60)
     assert said.split("\n")[0] == f"[1, 2] {int(number)}"

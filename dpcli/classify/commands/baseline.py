@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.descriptors import descriptors
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
@@ -59,7 +60,10 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
         labels = reader.labels[known]
         if len(set(labels.tolist())) < 2:
             raise DataError(f"{path}: all labeled videos are of one class; expected at least two classes to tell apart")
-        values = descriptors(reader, known.tolist())
+        columns, left_out = telling_columns(reader, known.tolist(), by_class=False)
+        if left_out:
+            log.info(f"{path}: columns read: {', '.join(columns) or 'none'}{not_read(left_out)}")
+        values = descriptors(reader, known.tolist(), columns)
         scores = np.full((len(known), len(reader.class_names) or int(labels.max()) + 1), np.nan, np.float32)
         rounds = list(_rounds(reader, known, labels))
         for learned, judged in rounds:
@@ -74,7 +78,8 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
 
 def forest_accuracy(reader: CloudsReader, learned: list[int], judged: list[int], seed: int) -> float:
     """Returns the share of the labeled sequences `judged` that a forest which saw the sequences `learned` gets right."""
-    known, asked = descriptors(reader, learned), descriptors(reader, judged)
+    columns, _ = telling_columns(reader, learned, by_class=False)
+    known, asked = (descriptors(reader, some, columns) for some in (learned, judged))
     scores = _forest_scores(known, reader.labels[learned], asked, int(reader.labels.max()) + 1, seed)
     return float((scores.argmax(1) == reader.labels[judged]).mean())
 

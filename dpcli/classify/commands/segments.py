@@ -10,6 +10,8 @@ import numpy as np
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import choose_confidence
+from dpcli.classify.data.clips import check_columns
+from dpcli.classify.data.likeness import file_like, tell_unlike
 from dpcli.classify.data.videos import check_classes, select_videos
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
@@ -50,7 +52,9 @@ def predict_segments(task: ModelTask, options: SegmentOptions) -> tuple[Segments
     with input_file(task.data) as path:
         reader = CloudsReader(path)
         check_classes(reader, info, task.model)
+        check_columns(reader, info.config)
         chosen = select_videos(reader, task.split, info, task.model)
+        tell_unlike(str(path), file_like(reader, chosen), info, task.model)
         keep_freed_memory()
         recordings = {}
         with Progress("classify predict --segments", int(reader.frame_counts[chosen].sum()), "frame") as bar:

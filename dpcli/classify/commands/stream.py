@@ -15,6 +15,7 @@ import numpy as np
 
 from dpcli.classify.commands.model_task import ModelTask
 from dpcli.classify.confidence import Confidence, choose_confidence
+from dpcli.classify.data.likeness import like, tell_unlike
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
 from dpcli.classify.stream.frame_source import CloudFiles, open_frames
 from dpcli.classify.stream.read_ahead import ReadAhead
@@ -83,11 +84,16 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     predictor = StreamPredictor(model, info, window=options.window, hop=options.hop, seed=task.seed, device=device)
     confidence = choose_confidence(info.notes, options.reject_below, task.model)
     speaker = Speaker(info.class_names, predictor.streams, confidence, predictor.window.size, options.hop)
-    frames = open_frames(task.data, options.follow, options.files)
+    frames = open_frames(task.data, options.follow, options.files, info.config.columns)
     keep_freed_memory()
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
-        problem = _follow(predictor, frames, new_listener(speaker), stop)
+        watch = _IrregularFrames(
+            info.timing == "slots",
+            predictor.window.size,
+            lambda theirs: tell_unlike(task.source, theirs, info, task.model),
+        )
+        problem = _follow(predictor, frames, new_listener(speaker), stop, watch)
         if not predictor.clips:
             raise problem or DataError(f"{task.source}: not one frame came; the program before the pipe wrote nothing")
         if target is not None:
@@ -146,18 +152,22 @@ def _interrupt_asks(stop: StopRequest) -> Iterator[None]:
 
 
 def _follow(
-    predictor: StreamPredictor, frames: Iterator[np.ndarray], lines: Listener, stop: StopRequest
+    predictor: StreamPredictor,
+    frames: Iterator[np.ndarray],
+    lines: Listener,
+    stop: StopRequest,
+    watch: _IrregularFrames,
 ) -> BaseException | None:
     """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     feed = ReadAhead(frames, 2 * predictor.window.size)
     problem: BaseException | None = None
-    arrived, watch = time.monotonic(), _Oddities()
+    arrived = time.monotonic()
     try:
         predictor.warm_up()  # the first frames come in meanwhile
         for points, arrived, waited in feed.frames(stop):
             silent = waited if predictor.window.count else 0.0
             watch.see(predictor.window.count, points, silent)
-            lines.see(points, silent)
+            lines.see(points[:, :3], silent)
             made = predictor.add(points)
             if made is not None:
                 lines.write(made, time.monotonic() - arrived, feed.waiting)
@@ -181,14 +191,27 @@ def _follow(
     return problem
 
 
-class _Oddities:
-    """Tells the first of the frames that are odd at once, and at the end how many there were."""
+class _IrregularFrames:
+    """Warns of the first empty, sparse or late frame at once, and counts them at the end.
 
-    def __init__(self) -> None:
+    few: whether frames of few points, or none, are what the model takes. window, compare: so many frames are first compared
+    with what the model learned from.
+    """
+
+    def __init__(
+        self, few: bool = False, window: int = 0, compare: Callable[[dict[str, float]], None] = lambda theirs: None
+    ) -> None:
         self.empty = self.sparse = self.gaps = 0
+        self._few, self._window, self._compare = few, window, compare
+        self._first: list[np.ndarray] = []
 
     def see(self, number: int, points: np.ndarray, silent: float) -> None:
         """Looks at a frame, and at the seconds since the one before."""
+        if number < self._window:
+            self._first.append(points[:, :3])
+            if number + 1 == self._window:
+                self._compare(like(self._first))
+                self._first = []
         if silent > _SILENT:
             if not self.gaps:
                 log.warn(
@@ -196,6 +219,8 @@ class _Oddities:
                     " neighbors; told once"
                 )
             self.gaps += 1
+        if self._few:
+            return
         if len(points) == 0:
             if not self.empty:
                 log.warn(f"frame {number} has no points: they are taken to be at the origin; told once")
@@ -206,7 +231,9 @@ class _Oddities:
             self.sparse += 1
 
     def sum_up(self) -> None:
-        """Tells how many odd frames there were, where one was told of already."""
+        """Logs how many irregular frames there were, where there was more than one."""
+        if self._first:  # fewer than a window
+            self._compare(like(self._first))
         counts = {
             "without points": self.empty,
             f"of fewer than {_SPARSE} points": self.sparse,

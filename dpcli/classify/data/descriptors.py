@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.classify.network.descriptors import SLOTS, described
 from dpcli.store import CloudSequence, CloudsReader
-from dpcli.store.schema import KEPT
+from dpcli.store.schema import kept_name
 
 _LARGEST = 1e30  # a forest takes float32
 
@@ -33,7 +33,7 @@ def descriptor(sequence: CloudSequence, fields: tuple[str, ...]) -> np.ndarray:
     return np.nan_to_num(found).clip(-_LARGEST, _LARGEST)
 
 
-def descriptors(reader: CloudsReader, sequences: list[int]) -> np.ndarray:
-    """Returns the descriptors f64 (N,D) of some videos of a file, with all columns that it keeps."""
-    fields = tuple(name for name in reader.fields if name.startswith(KEPT))
+def descriptors(reader: CloudsReader, sequences: list[int], columns: tuple[str, ...]) -> np.ndarray:
+    """Returns the descriptors f64 (N,D) of some videos of a file, with some of the columns that it keeps."""
+    fields = tuple(map(kept_name, columns))
     return np.stack([descriptor(reader.read(i, fields=fields), fields) for i in sequences])

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from dpcli.classify.data.augment import NONE, Augmentation
+from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.network.config import KinetConfig
 from dpcli.runtime.progress import log
 from dpcli.store import CloudSequence, CloudsReader
-from dpcli.store.schema import KEPT, kept_name
+from dpcli.store.schema import kept_name
 
 FARTHEST = 3.0  # units from the median: beyond it lies nobody who makes a gesture
 _EXTREME = 3.0  # spreads: a column's value beyond counts as being there
@@ -39,17 +40,18 @@ def preset_for(reader: CloudsReader, given: Mapping[str, Any]) -> str:
     return "sparse" if sparse and not any(given.get(name) for name in _OWN_CHOICE) else "quick"
 
 
-def measured(config: KinetConfig, reader: CloudsReader, sequences: list[int]) -> KinetConfig:
-    """Returns the configuration of a network for sparse clouds with the columns and scales of these videos."""
-    columns = file_columns(reader)
+def measured(config: KinetConfig, reader: CloudsReader, sequences: list[int]) -> tuple[KinetConfig, dict[str, str]]:
+    """Returns the configuration of a network for sparse clouds with the columns and scales of these videos, and why other
+    columns are not read."""
+    columns, left_out = telling_columns(reader, sequences)
     config = config.changed(columns=columns, scales=measured_scales(reader, sequences, columns))
     counts = [(len(one.points), len(slot_rows(one, config))) for one in (_read(reader, i, config) for i in sequences)]
     points, near = np.sum(counts, 0)
     log.info(
         f"sparse clouds: points farther than {FARTHEST * config.scales[0]:.3g} from their video's median are left out"
-        f" ({points - near} of {points}); read beside places: {', '.join(columns) or 'nothing'}"
+        f" ({points - near} of {points}); read beside places: {', '.join(columns) or 'nothing'}{not_read(left_out)}"
     )
-    return config
+    return config, left_out
 
 
 def _read(reader: CloudsReader, sequence: int, config: KinetConfig) -> CloudSequence:
@@ -74,11 +76,6 @@ def measured_scales(reader: CloudsReader, sequences: list[int], columns: tuple[s
         found += [0.0 if signed else float(middle), float(high - low) / 2]
     units = [value if place % 2 or value > 1e-9 else 1.0 for place, value in enumerate(found)]
     return tuple(float(value) for value in units)
-
-
-def file_columns(reader: CloudsReader) -> tuple[str, ...]:
-    """Returns the names of the columns that a file keeps of its points."""
-    return tuple(name.removeprefix(KEPT) for name in reader.fields if name.startswith(KEPT))
 
 
 def slot_rows(sequence: CloudSequence, config: KinetConfig) -> np.ndarray:

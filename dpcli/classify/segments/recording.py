@@ -12,6 +12,7 @@ from dpcli.classify.segments.decoding import best_path, runs
 from dpcli.classify.stream.sliding_window import Prediction, StreamPredictor
 from dpcli.runtime.progress import Progress
 from dpcli.store import CloudSequence, CloudsReader
+from dpcli.store.schema import kept_name
 from dpcli.store.tables.segments import Segment
 
 CHANGE = 0.3  # cost of a change of class, in nats of one whole window's evidence
@@ -45,8 +46,10 @@ def score_windows(predictor: StreamPredictor, reader: CloudsReader, sequence: in
     """Returns what the windows of a recording say; some hundred frames are in memory at a time."""
     made: list[Prediction | None] = []
     times = []
-    for block in _blocks(reader, sequence):
-        made += [predictor.add(block.frame(t)) for t in range(block.num_frames)]
+    columns = tuple(map(kept_name, predictor.info.config.columns))
+    for block in _blocks(reader, sequence, columns):
+        points = np.column_stack([block.points, *(block.extra[name] for name in columns)])
+        made += [predictor.add(frame) for frame in np.split(points, block.frame_offsets[1:-1])]
         times.append(block.time)
         bar.advance(block.num_frames)
     made.append(predictor.finish())
@@ -56,8 +59,9 @@ def score_windows(predictor: StreamPredictor, reader: CloudsReader, sequence: in
     return WindowScores(last, scores, predictor.window.count, time)
 
 
-def _blocks(reader: CloudsReader, sequence: int) -> Iterator[CloudSequence]:
-    count, fields = int(reader.frame_counts[sequence]), [name for name in ("time",) if name in reader.fields]
+def _blocks(reader: CloudsReader, sequence: int, columns: tuple[str, ...]) -> Iterator[CloudSequence]:
+    count = int(reader.frame_counts[sequence])
+    fields = [name for name in ("time", *columns) if name in reader.fields]
     for start in range(0, count, _BLOCK):
         yield reader.read(sequence, slice(start, min(start + _BLOCK, count)), fields=fields)
 

@@ -25,18 +25,20 @@ _RECIPE = "expected frames written one after another by numpy.save(pipe, points)
 
 @dataclass(frozen=True)
 class CloudFiles:
-    """Says how to read the files of a folder: which suffixes, in which order, and the points (N,3) of one."""
+    """Says how to read the files of a folder: which suffixes, in which order, and the points (N,3+F) of one, with F columns of
+    these names beside their places."""
 
     suffixes: tuple[str, ...]
     order: Callable[[Path], list]
-    read: Callable[[Path], np.ndarray]
+    read: Callable[[Path, tuple[str, ...]], np.ndarray]
 
 
-def open_frames(argument: str, follow: float, files: CloudFiles) -> Iterator[np.ndarray]:
-    """Yields frames f32 (P,3) of `-` (stdin), a file or a folder, each as soon as it is whole.
+def open_frames(argument: str, follow: float, files: CloudFiles, columns: tuple[str, ...] = ()) -> Iterator[np.ndarray]:
+    """Yields frames f32 (P,3+F) of `-` (stdin), a file or a folder, each as soon as it is whole.
 
-    `follow`: seconds to wait for more at the end of a file or folder; a pipe ends when its writer closes it. Raises
-    UsageError or DataError at once for what can't be read, DataError from the iterator for a bad frame.
+    `columns`: what is read of a point beside its place, F names in order. `follow`: seconds to wait for more at the end of
+    a file or folder; a pipe ends when its writer closes it. Raises UsageError or DataError at once for what can't be read,
+    DataError from the iterator for a bad frame.
     """
     if argument == "-":
         stream = standard_input()
@@ -44,17 +46,17 @@ def open_frames(argument: str, follow: float, files: CloudFiles) -> Iterator[np.
             raise UsageError("- reads frames from a pipe, but stdin is a terminal; pipe a program into this one")
         if follow:
             raise UsageError("--follow is for files and folders; a pipe ends when its writer closes it")
-        return read_arrays(stream.fileno(), "stdin")
+        return read_arrays(stream.fileno(), "stdin", columns=columns)
     path = Path(argument)
     if not path.exists():
         raise DataError(f"{path}: no such file or folder")
-    return _folder_frames(path, follow, files) if path.is_dir() else _file_frames(path, follow)
+    return _folder_frames(path, follow, files, columns) if path.is_dir() else _file_frames(path, follow, columns)
 
 
-def _file_frames(path: Path, follow: float) -> Iterator[np.ndarray]:
+def _file_frames(path: Path, follow: float, columns: tuple[str, ...]) -> Iterator[np.ndarray]:
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
     try:
-        yield from read_arrays(descriptor, str(path), follow)
+        yield from read_arrays(descriptor, str(path), follow, columns)
     finally:
         os.close(descriptor)
 
@@ -91,8 +93,11 @@ class _Bytes:
         self.ended = False
 
 
-def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.ndarray]:
-    """Yields the arrays of a concatenation of `.npy` files as frames f32 (P,3); raises DataError names the frame and what is wrong."""
+def read_arrays(descriptor: int, name: str, follow: float = 0.0, columns: tuple[str, ...] = ()) -> Iterator[np.ndarray]:
+    """Yields the arrays of a concatenation of `.npy` files as frames f32 (P,3+F), x, y, z and the F columns.
+
+    Raises DataError, which names the frame and what is wrong.
+    """
     source, number = _Bytes(descriptor, follow), 0
     while True:
         where, start = f"{name}: frame {number}", source.position
@@ -104,6 +109,11 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.
         if magic[:6] != _MAGIC[: len(magic)]:
             raise DataError(f"{where}, byte {start}: not a .npy array but {magic!r}; {_RECIPE}")
         shape, fortran, dtype = _header(source, magic, where)
+        if columns and shape[1] != 3 + len(columns):
+            raise DataError(
+                f"{where}: {shape[1]} numbers a point; the model reads {3 + len(columns)}: x, y, z, {', '.join(columns)}, in this"
+                " order"
+            )
         body = source.read(int(np.prod(shape)) * dtype.itemsize)
         if (cut := body.find(_MAGIC + b"\x01\x00")) >= 0:  # no coordinates look like this: the next frame begins here
             log.warn(
@@ -114,7 +124,7 @@ def read_arrays(descriptor: int, name: str, follow: float = 0.0) -> Iterator[np.
             continue
         _check_whole(source, where)
         array = np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
-        yield as_frame(array[:, :3], where)
+        yield as_frame(array[:, : 3 + len(columns)], where)
         number += 1
 
 
@@ -143,16 +153,16 @@ def _check_whole(source: _Bytes, where: str) -> None:
 
 
 def as_frame(points: np.ndarray, where: str) -> np.ndarray:
-    """Returns points as f32 (P,3) of their own. Raises DataError unless they are finite."""
+    """Returns points as f32 (P,3+F) of their own. Raises DataError unless their places are finite; a column may lack a value."""
     with np.errstate(over="ignore"):
         frame = np.array(points, np.float32, order="C")
-    bad = int((~np.isfinite(frame)).any(1).sum())
+    bad = int((~np.isfinite(frame[:, :3])).any(1).sum())
     if bad:
         raise DataError(f"{where}: {bad} of {len(frame)} points are NaN or infinite; drop them before sending")
     return frame
 
 
-def _folder_frames(folder: Path, follow: float, files: CloudFiles) -> Iterator[np.ndarray]:
+def _folder_frames(folder: Path, follow: float, files: CloudFiles, columns: tuple[str, ...]) -> Iterator[np.ndarray]:
     """Yields files in name order, the newest once it has settled; ends when none came for `follow` seconds."""
     taken, last, since, told = 0, None, time.monotonic(), False
     while True:
@@ -165,7 +175,7 @@ def _folder_frames(folder: Path, follow: float, files: CloudFiles) -> Iterator[n
         for position, (key, path) in enumerate(fresh):
             if position == len(fresh) - 1 and not _settled(path, since + follow):
                 break
-            yield as_frame(files.read(path), str(path))
+            yield as_frame(files.read(path, columns), str(path))
             taken, last, since = taken + 1, key, time.monotonic()
         if not fresh and time.monotonic() - since >= follow:
             return

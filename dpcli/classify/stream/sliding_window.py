@@ -17,20 +17,21 @@ from dpcli.classify.video_scores import clip_scores
 from dpcli.errors import UsageError
 from dpcli.runtime.seeds import generator
 from dpcli.store import CloudSequence
+from dpcli.store.schema import kept_name
 
 
 class Window:
     """Holds the last `size` frames of one video without end, read by number as from a `clouds` file: what ClipSource asks for."""
 
-    names, path, fields = ("stream",), Path("stream"), ()
+    names, path = ("stream",), Path("stream")
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    def __init__(self, size: int, columns: tuple[str, ...] = ()) -> None:
+        self.size, self.fields = size, tuple(map(kept_name, columns))
         self._frames: deque[np.ndarray] = deque(maxlen=size)
         self.count = 0  # frames so far
 
     def append(self, points: np.ndarray) -> None:
-        """Takes the next frame, f32 (P,3); the oldest one leaves."""
+        """Takes the next frame, f32 (P,3+F) with the window's columns; the oldest one leaves."""
         self._frames.append(points)
         self.count += 1
 
@@ -45,7 +46,11 @@ class Window:
     def read(self, sequence: int, frames: Sequence[int], fields: Sequence[str] = ()) -> CloudSequence:
         """Returns frames by their number in the stream; they must still be in the window."""
         first = self.count - len(self._frames)
-        return CloudSequence.from_frames(self.names[sequence], [self._frames[t - first] for t in frames])
+        shown = [self._frames[t - first] for t in frames]
+        found = CloudSequence.from_frames(self.names[sequence], [frame[:, :3] for frame in shown])
+        for place, name in enumerate(self.fields, 3):
+            found.extra[name] = np.concatenate([frame[:, place] for frame in shown])
+        return found
 
 
 @dataclass(frozen=True)
@@ -101,13 +106,8 @@ class StreamPredictor:
     ) -> None:
         if hop < 1:
             raise UsageError(f"--hop {hop}: expected at least 1 frame")
-        if info.config.columns:
-            raise UsageError(
-                f"this model reads {', '.join(info.config.columns)} of every point, which a stream of places doesn't carry;"
-                " predict videos (without --stream and --segments)"
-            )
         self.model, self.info, self.hop, self.device = model.to(device), info, hop, device
-        self.window = Window(window_size(info, window))
+        self.window = Window(window_size(info, window), info.config.columns)
         self._source = ClipSource(self.window, [0], info.config, timing=info.timing, seed=seed)
         self.streams = tuple(info.notes.get("streams", STREAMS))
         self.clips = 0
@@ -121,7 +121,7 @@ class StreamPredictor:
         self._scores(torch.from_numpy(generator(0).random(shape, np.float32)))
 
     def add(self, points: np.ndarray) -> Prediction | None:
-        """Takes a frame f32 (P,3); returns the prediction when one is due."""
+        """Takes a frame f32 (P,3+F), F columns as the model reads them; returns the prediction when one is due."""
         self.window.append(points)
         since_full = self.window.count - self.window.size
         return self._predict() if since_full >= 0 and since_full % self.hop == 0 else None

@@ -29,13 +29,17 @@ Stream = Annotated[
 Hop = Annotated[
     int | None,
     typer.Option(
-        "--hop", help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window."
+        "--hop",
+        rich_help_panel=PANEL,
+        help="With --stream or --segments: frames between predictions. Default: 1, or a quarter of the window.",
     ),
 ]
 Window = Annotated[
     int | None,
     typer.Option(
-        "--window", help="With --stream or --segments: frames of a window, for models trained with --timing uniform."
+        "--window",
+        rich_help_panel=PANEL,
+        help="With --stream or --segments: frames of a window, for models trained with --timing uniform.",
     ),
 ]
 Follow = Annotated[
@@ -122,11 +126,14 @@ def cloud_files() -> CloudFiles:
     return CloudFiles(SUFFIXES, natural_key, _read_points)
 
 
-def _read_points(path: Path) -> np.ndarray:
-    """Returns the points of a file, without those that are no measurement, as `dpc prepare clouds` does."""
+def _read_points(path: Path, columns: tuple[str, ...]) -> np.ndarray:
+    """Returns the points of a file with these columns beside their places, without those that are no measurement, as `dpc
+    prepare clouds` does."""
+    import numpy as np
+
     from dpcli.prepare.decode.cloud_files import read_cloud
     from dpcli.prepare.scans.cleaning import clean
 
-    cloud = read_cloud(path)
+    cloud = read_cloud(path, keep=columns)
     clean([cloud])
-    return cloud.points
+    return np.column_stack([cloud.points, *(cloud.extra[name] for name in columns)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
@@ -30,6 +30,7 @@ class ArticulatedConversion(ConversionOptions):
 class ArticulationOptions:
     """Holds the options that say how an articulated object moves and how it is seen."""
 
+    HEADING: ClassVar = "Motion and view"
     frames: Annotated[int, typer.Option("--frames", min=1, help="Frames per sequence.")] = 4
     view: Annotated[
         Literal["full", "single"],

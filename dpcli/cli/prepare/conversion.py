@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from dpcli.cli.help_groups import RUNNING
 from dpcli.cli.options import Force, Jobs, OnError, Seed
 from dpcli.cli.prepare.options import Check, Compression, FileOrPipe, ItemSeconds, PointsAtMost, Sampling
 from dpcli.cli.spread_options import Dask, Shard
@@ -25,7 +26,8 @@ class ConversionOptions:
     points: PointsAtMost = 0
     sampling: Sampling = "random"
     limit: Annotated[
-        int | None, typer.Option("--limit", min=1, help="Convert only the first N samples, for a trial.")
+        int | None,
+        typer.Option("--limit", min=1, rich_help_panel=RUNNING, help="Convert only the first N samples, for a trial."),
     ] = None
     compression: Compression = "none"
     on_error: OnError = "skip"

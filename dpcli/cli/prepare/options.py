@@ -7,10 +7,13 @@ from typing import Annotated, Literal
 
 import typer
 
+from dpcli.cli.help_groups import LABELS, RUNNING
+
 FileOrPipe = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
 Check = Annotated[bool, typer.Option("--check", help="Only compare the folder with its recipe; list what is missing.")]
 Compression = Annotated[
-    Literal["none", "lzf", "gzip"], typer.Option("--compression", help="How the coordinates are compressed.")
+    Literal["none", "lzf", "gzip"],
+    typer.Option("--compression", rich_help_panel=RUNNING, help="How the coordinates are compressed."),
 ]
 PointsAtMost = Annotated[
     int, typer.Option("--points", min=0, help="Keep at most this many points per frame; 0 keeps all.")
@@ -24,6 +27,7 @@ ItemSeconds = Annotated[
     typer.Option(
         "--item-seconds",
         min=0,
+        rich_help_panel=RUNNING,
         help="Processor time that one sample may take, and 10 seconds more for each MB of its files; then it is passed over."
         " 0: no limit.",
     ),
@@ -32,26 +36,32 @@ Stride = Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th fr
 Pattern = Annotated[
     str,
     typer.Option(
-        "--pattern",
-        help="Which files of a folder are its frames, such as '*.depth.png'. Default: found by their names.",
+        "--pattern", help="Which files of a folder are its frames, such as 'frame_*'. Default: found by their names."
     ),
 ]
 Topic = Annotated[
     str, typer.Option("--topic", help="Topic of a recording (.bag, .mcap, .db3). Default: the only one that fits.")
 ]
 LabelTable = Annotated[
-    Path | None, typer.Option("--labels", help="CSV file of labels; its columns: name,label[,subject][,split].")
+    Path | None,
+    typer.Option(
+        "--labels", rich_help_panel=LABELS, help="CSV file of labels; its columns: name,label[,subject][,split]."
+    ),
 ]
 TestCategories = Annotated[
-    str, typer.Option("--test-categories", help="Categories that are split test, such as Laptop,Scissors.")
+    str,
+    typer.Option(
+        "--test-categories", rich_help_panel=LABELS, help="Categories that are split test, such as Laptop,Scissors."
+    ),
 ]
 ValidationCategories = Annotated[
-    str, typer.Option("--validation-categories", help="Categories that are split validation.")
+    str, typer.Option("--validation-categories", rich_help_panel=LABELS, help="Categories that are split validation.")
 ]
 CategoryFractions = Annotated[
     str,
     typer.Option(
         "--fractions",
+        rich_help_panel=LABELS,
         help="Shares train,validation,test of the objects in no named category. Default: 0.8,0.1,0.1, or all of them"
         " train when categories are named.",
     ),
@@ -88,5 +98,6 @@ Border = Annotated[
     float, typer.Option("--border", help="Share of the picture left empty along the object's longer side.")
 ]
 BadFrame = Annotated[
-    Literal["skip", "stop"], typer.Option("--on-error", help="After a bad frame: stop, or skip it (leave it out).")
+    Literal["skip", "stop"],
+    typer.Option("--on-error", rich_help_panel=RUNNING, help="After a bad frame: stop, or skip it (leave it out)."),
 ]

@@ -13,6 +13,10 @@ _TOO_LARGE = 1e9  # raw floats beyond are marks, whatever the unit
 _PLAUSIBLE = (0.005, 200.0)  # meters that depth cameras see, typically
 _PLAUSIBLE_IF_ASKED = (0.005, 1000.0)  # where the user gave the units
 _SAMPLED = 4096
+_ROUGH, _SMOOTHER = 0.01, 8.0  # how much neighbors differ, as a share of the mean; how much less with bytes swapped
+_STEPS = {8: 8000, 5: 5000}  # what raw depths are multiples of -> raw units per meter, of a sensor's millimeters
+_SAME_REST, _KINDS = 0.9, 32  # share of depths with one rest, and different depths that make it no chance
+_ROWS = 16  # of a frame that are looked at
 
 
 def usual_scale(kind: np.dtype) -> float:
@@ -51,6 +55,46 @@ def _marks(frames: np.ndarray) -> np.ndarray | None:
     return (frames == 65535) | (frames >= np.iinfo(np.int32).max) if largest >= 65535 else None
 
 
+def require_byte_order(name: str, frames: np.ndarray) -> None:
+    """Raises DataError when depths (T,H,W) of 16 bits have their two bytes the other way round: then neighbors differ wildly."""
+    if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
+        return
+    frame = frames[len(frames) // 2]
+    some = frame[:: max(1, len(frame) // _ROWS)]
+    rough = _roughness(some)
+    if rough > _ROUGH and rough > _SMOOTHER * _roughness(some.byteswap()) and len(np.unique(some)) > _KINDS:
+        raise DataError(
+            f"{name}: its depths leap from pixel to pixel, as where the two bytes of each are the wrong way round; write"
+            " them again in the byte order that the format prescribes, such as by NumPy's byteswap"
+        )
+
+
+def _roughness(rows: np.ndarray) -> float:
+    """Returns how much neighbors in rows (R,W) differ where both saw something, as a share of their mean."""
+    values = rows.astype(np.float32)
+    both = (values[:, 1:] > 0) & (values[:, :-1] > 0)
+    return float(np.abs(np.diff(values))[both].mean() / values[:, 1:][both].mean()) if both.any() else 0.0
+
+
+def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
+    """Returns a note when raw depths (T,H,W) of 16 bits go in steps of 8 or 5, as data sets store what a sensor measured
+    in millimeters; the low bits of 8 may hold flags.
+    """
+    if frames.dtype.itemsize != 2 or frames.dtype.kind == "f":
+        return {}
+    flat = frames[len(frames) // 2].reshape(-1)
+    some = flat[:: max(1, len(flat) // _SAMPLED)].astype(np.int64)
+    some = some[some > 0]
+    if len(np.unique(some)) <= _KINDS:
+        return {}
+    for step, scale in _STEPS.items():
+        alike, coarser = (np.bincount(some % own).max() > _SAME_REST * len(some) for own in (step, 2 * step))
+        if alike and not coarser:
+            what = f"videos whose raw depths go in steps of {step}"
+            return {f"{what}; if their sensor counted millimeters, give --depth-scale {scale}": 1}
+    return {}
+
+
 def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: bool) -> None:
     """Raises DataError when depths in meters, f32 (P), can't be those of a depth camera.
 
@@ -67,7 +111,7 @@ def require_plausible(name: str, depths: np.ndarray, scale: float, *, asked: boo
     hint = (
         f"did you mean --depth-scale {better:.6g}, which makes it {raw / better:.3g} m?"
         if better
-        else "see --depth-scale"
+        else "see --depth-scale."
     )
     keep = "" if asked or typical < least else f" If it is true, say so: --depth-scale {scale:g}."
     raise DataError(

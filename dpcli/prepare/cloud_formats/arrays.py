@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, require_room
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, unnamed_columns, without
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, kept_columns, unnamed_columns, without
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
@@ -51,7 +51,7 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     missing = [name for name in keep if name not in columns]
     if missing:
         raise DataError(f"{path}: --keep-fields {missing[0]}: no such array of one number a point")
-    cloud.extra = {name: columns[name].astype(np.float32) for name in keep}
+    cloud.extra = kept_columns(path, columns, keep)
     cloud.unread += without(list(arrays), [key, color_key], keep)
     return cloud
 
@@ -71,7 +71,11 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
     if keep:
         raise DataError(f"{path}: --keep-fields {keep[0]}: its columns have no names")
     if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "uif":
-        raise DataError(f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (points, 3 or more)")
+        several = "; of several frames save a file for each, of a cloud in rows and columns its reshape(-1, 3)"
+        hint = several if array.ndim == 3 else ""
+        raise DataError(
+            f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (points, 3 or more){hint}"
+        )
     if len(array) in (3, 4) and array.shape[1] > 16:
         raise DataError(f"{path}: array of shape {array.shape}; expected a row for each point: save its transpose (.T)")
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
@@ -89,6 +93,11 @@ def read_bin(path: Path, columns: int) -> Cloud:
     size_of = np.abs(values[np.isfinite(values)])
     if np.mean((size_of > _LARGEST) | ((size_of > 0) & (size_of < _SMALLEST))) > 0.01:
         raise DataError(f"{path}: its bytes are no coordinates in float32 (another type, or a header before them)")
+    if len(values) and 0 < abs(values[0, 0]) < _SMALLEST:
+        raise DataError(
+            f"{path}: its first four bytes are no coordinate, but the whole number {values.view(np.uint32)[0, 0]}; a header"
+            " before the points? Save them without it"
+        )
     return Cloud(np.ascontiguousarray(values))
 
 
@@ -102,7 +111,8 @@ def guess_bin_columns(paths: Sequence[Path]) -> tuple[int, bool]:
     possible = [c for c in _COLUMNS if all(size % (4 * c) == 0 for size in sizes)]
     if not possible:
         return 4, True  # reading says what is wrong
-    values = [np.fromfile(path, "<f4", _FLOATS).astype(np.float64) for path in paths]
+    with np.errstate(invalid="ignore"):  # bytes of another type may be no numbers; reading says so
+        values = [np.fromfile(path, "<f4", _FLOATS).astype(np.float64) for path in paths]
     near = _likely(values, possible)
     if 4 in near and all(_is_reflectance(one[: len(one) // 4 * 4].reshape(-1, 4)[:, 3]) for one in values):
         return 4, True

@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 
 _BYTE, _WORD = 255, 65535
+_ABOUT_ONE, _SURELY_BYTES = 1.001, 2.0  # fractions may be rounded; from the second on fractions of bytes are bytes
 _SURELY_WORDS = 1023  # numbers without a type that are less above 255 are an error in the file
 
 
@@ -27,10 +28,12 @@ def as_bytes(frames: Sequence[np.ndarray]) -> list[np.ndarray]:
     if not all(np.isfinite(frame).all() for frame in filled) or low < 0 or high > _WORD:
         raise _unknown(low, high)
     floats = any(kind.kind == "f" for kind in kinds)
-    if high <= _BYTE and not (floats and high <= 1):
+    if floats and high <= _ABOUT_ONE:
+        return [np.rint(np.minimum(frame.astype(np.float64), 1) * _BYTE).astype(np.uint8) for frame in frames]
+    if floats and high < _SURELY_BYTES and any((frame != np.floor(frame)).any() for frame in filled):
+        raise _unknown(low, high)  # brighter than white, or bytes of a scene that is nearly black
+    if high <= _BYTE:
         return [np.rint(frame).astype(np.uint8) for frame in frames]
-    if high <= 1:
-        return [np.rint(frame.astype(np.float64) * _BYTE).astype(np.uint8) for frame in frames]
     if kinds <= {np.dtype(np.uint16)} or high > _SURELY_WORDS:
         return [(frame.astype(np.int64) >> 8).astype(np.uint8) for frame in frames]
     raise _unknown(low, high)

@@ -68,6 +68,8 @@ def find_axes(names: Sequence[str]) -> tuple[list[int], str] | None:
 def unit_of(name: str) -> str:
     """Returns the unit that a name ends with, as in UNITS, "" where it says none."""
     words = words_of(name)
+    if re.search(r"[\[(]in[\])]$", name.strip()):  # without brackets a word like others
+        return "in"
     return _SPELLED.get(words[-1], "") if len(words) > 1 else ""
 
 
@@ -80,13 +82,15 @@ def _one_unit(units: set[str]) -> str:
 def _axis(name: str) -> tuple[int, int, str] | None:
     """Returns axis (0 to 2), how plainly the name says it (0: best), and the unit."""
     words = words_of(name)
-    unit = _SPELLED.get(words[-1], "") if len(words) > 1 else ""
+    unit = unit_of(name)
     rest = words[:-1] if unit else words
+    first_return = rest[-1:] == ["1"]  # as lidars call it that report two
+    rest = rest[:-1] if first_return else rest
     letters = [word for word in rest if word in ("x", "y", "z")]
     others = [word for word in rest if word not in ("x", "y", "z")]
     if len(letters) != 1 or not set(others) <= _ABOUT_POINTS:
         return None
-    return "xyz".index(letters[0]), 2 if others else 1 if unit else 0, unit
+    return "xyz".index(letters[0]), 2 if others or first_return else 1 if unit else 0, unit
 
 
 def _map_axes(names: Sequence[str]) -> list[int | None]:
@@ -102,7 +106,8 @@ def _numbered_axes(names: Sequence[str]) -> list[int | None]:
 
     def axis(name: str) -> int | None:
         *rest, last = words_of(name) or [""]
-        return int(last) if last in ("0", "1", "2") and rest and set(rest) <= _ABOUT_POINTS else None
+        known = set(rest) <= {*_ABOUT_POINTS, "m"}
+        return int(last) if last in ("0", "1", "2") and rest and known else None
 
     return [axis(name) for name in names]
 

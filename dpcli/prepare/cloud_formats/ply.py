@@ -147,7 +147,7 @@ def _row_size(data: memoryview, start: int, order: str, element: Element) -> int
         if at + length.itemsize > len(data):
             return len(data) + 1
         count = int(np.frombuffer(data, length, 1, at)[0])
-        if count < name.startswith("vertex_ind"):
+        if count < (element.name == "face" and name.startswith("vertex_ind")):  # range grids have empty lists
             return len(data) + 1
         at += length.itemsize + count * numbers.itemsize
     return at - start

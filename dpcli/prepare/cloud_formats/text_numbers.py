@@ -26,10 +26,14 @@ _MARKS = (
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 _COMMENT = ("#", "//", "%")
-_MISSING = frozenset(("", "nan", "-nan", "+nan", "na", "n/a", "null", "none", "nil", "-", "nan(ind)", "-nan(ind)"))
+_SHEET_ERRORS = ("#n/a", "#na", "#value!", "#div/0!", "#num!", "#ref!", "#null!", "#name?")  # of spreadsheets
+_MISSING = frozenset(
+    ("", "nan", "-nan", "+nan", "na", "n/a", "null", "none", "nil", "-", "nan(ind)", "-nan(ind)", *_SHEET_ERRORS)
+)
 _NOT_A_NUMBER = re.compile(r"[-+]?1[.,]#(qnan|snan|ind|inf)\w*", re.IGNORECASE)  # as Windows writes it
 _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
 _EDGES = " \r\n\x00"  # no tabs: they may stand for empty cells
 _HEAD = 200  # lines among which the header is looked for
 _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns hold
@@ -55,7 +59,7 @@ class TextTable:
     def numbered(self) -> list[tuple[int, str]]:
         """Returns the rows with the number of their line; no empty ones, no comments, no header that comes again."""
         lines = enumerate(self.body.split("\n"), self.first_line)
-        rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip() and not line.lstrip().startswith(_COMMENT))
+        rows = ((k, line.strip(_EDGES)) for k, line in lines if line.strip() and not _is_comment(line))
         return list(islice((row for row in rows if row[1] != self.header or not self.header), self.limit))
 
     @property
@@ -85,10 +89,12 @@ class TextTable:
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty. Raises DataError that names the line."""
-        plain = parse_plain(self.body, self.width, self.delimiter, self.limit) if self.width else None
+        doubtful = self.delimiter != "," and _may_be_thousands(self.body)
+        sure = self.width and not doubtful
+        plain = parse_plain(self.body, self.width, self.delimiter, self.limit) if sure else None
         if plain is not None:
             return plain[:, list(places)]
-        fast = self._read_fast(list(places))
+        fast = None if doubtful else self._read_fast(list(places))
         return self._read_any(list(places)) if fast is None else fast
 
     def words(self, place: int) -> list[str]:
@@ -147,12 +153,32 @@ class TextTable:
         both = [cell for cell in commas if "." in cell]
         signs = {max(".,", key=cell.rfind) for cell in both}
         if not both:
-            points = any("." in row[place] for row in rows for place in places)
-            grouped = all(_GROUPED.fullmatch(cell) for cell in commas)
-            signs = {"."} if points and grouped else {","} if not points else set()
+            others = [row[place] for row in rows for place in places if "," not in row[place]]
+            points = any("." in cell for cell in others)
+            grouped = all(_THOUSANDS.fullmatch(cell) for cell in commas)
+            whole = [cell for cell in others if re.fullmatch(r"[-+]?[1-9]\d{0,2}", cell)]  # as groups leave below 1,000
+            if grouped and whole and not points and self.delimiter != ",":
+                raise DataError(
+                    f"{self.path}: {commas[0]} beside {whole[0]} may be {commas[0].replace(',', '')} or"
+                    f" {commas[0].replace(',', '.')}; expected numbers without groups of thousands"
+                )
+            signs = {"."} if grouped and (points or whole) else {","} if not points else set()
         if len(signs) != 1:
             raise DataError(f"{self.path}: numbers such as {commas[0]} beside others with a point; expected one style")
         return signs.pop()
+
+
+def _may_be_thousands(body: str) -> bool:
+    """Returns whether every comma of a text may divide thousands, such as 1,500: no other number tells decimal commas."""
+    if "," not in body or "." in body:
+        return False
+    return re.search(r",(?!\d{3}(?![\d,]))|(?<!\d)0,|\d{4},|(?<!\d),", body) is None
+
+
+def _is_comment(line: str) -> bool:
+    """Returns whether a line says something about the rows; one that begins with a spreadsheet's error is a row."""
+    start = line.lstrip()
+    return start.startswith(_COMMENT) and not start.lower().startswith(_SHEET_ERRORS)
 
 
 def _trimmed(cells: list[str], width: int = 0) -> list[str]:
@@ -172,14 +198,19 @@ def _number(cell: str, decimal: str) -> float | None:
         cell = cell.replace(grouped[1], "")
     if decimal == ",":
         cell = cell.replace(",", ".")
+    if "_" in cell:  # which Python would pass over
+        return None
     try:
         return float(cell)
     except ValueError:
         return None
 
 
-def read_text_table(path: Path) -> TextTable:
-    """Reads the rows of a text and what its header says. Raises DataError when it is no table of numbers."""
+def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
+    """Reads the rows of a text and what its header says. Raises DataError when it is no table of numbers, or has no rows.
+
+    may_be_empty: names without rows are a table, too, such as of a moment in which a radar saw nothing.
+    """
     text = decode_text(path)
     head = list(enumerate(text.split("\n", _HEAD)[:_HEAD], 1))
     head = [(k, line.strip(_EDGES)) for k, line in head if line.strip()]
@@ -193,13 +224,15 @@ def read_text_table(path: Path) -> TextTable:
     header = next((line for k, line in head if k == first - 1), "") if names else ""
     table = _with_units(TextTable(path, tuple(names), body, first, delimiter, header=header))
     rows = table.first_rows(2)
+    if not rows and names and may_be_empty:
+        return table
     if not rows:
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
     if re.fullmatch(r"\d+", rows[0][1]) and (len(rows) == 1 or len(_rough_cells(rows[1][1])) > 2):
         table = _without_count(table, *rows)
         rows = rows[1:] or rows
     table = replace(table, delimiter=delimiter or _delimiter(rows[0][1]))
-    return table if names else _checked_unnamed(table)
+    return table if names else _checked_unnamed(_with_counted_header(table))
 
 
 def _with_units(table: TextTable) -> TextTable:
@@ -215,6 +248,21 @@ def _with_units(table: TextTable) -> TextTable:
     names = tuple(f"{name} [{unit}]" if place in axes[0] else name for place, name in enumerate(table.names))
     number = table.first_line + row[0].count("\n")
     return replace(table, names=names, body=table.body[row.end() :], first_line=number)
+
+
+def _with_counted_header(table: TextTable) -> TextTable:
+    """Returns the table, its first row taken for names where that only counts the columns, as pandas writes ``0,1,2`` above
+    columns without names, perhaps behind an empty cell above the index.
+    """
+    (number, first), *rows = table.first_rows(_LOOKED_AT) or [(0, "")]
+    cells = table.cells(first)
+    index = cells[:1] == [""]
+    counted = cells[index:] == [str(k) for k in range(len(cells) - index)] and len(cells) - index >= len("xyz")
+    if not counted or not any(re.search(r"[.,]\d|\de", cell) for _, row in rows for cell in table.cells(row)[index:]):
+        return table
+    names = ("", "x", "y", "z")[not index :] + tuple(cells[3 + index :])
+    body = table.body.split("\n", number - table.first_line + 1)[-1]
+    return replace(table, names=names, body=body, first_line=number + 1)
 
 
 def decode_text(path: Path) -> str:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+SHRUNK = 0.01  # of the largest reach in the clip: what is smaller shows nothing
+
 
 @dataclass(frozen=True)
 class Texture:
@@ -34,6 +36,12 @@ class Material:
     unlit: bool = False
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emission_texture: Texture | None = None
+
+    @property
+    def is_clear(self) -> bool:
+        """Returns whether its alpha leaves nothing to be seen, whatever texture it has."""
+        alpha = self.color[3]
+        return (self.blend == "blend" and alpha == 0) or (self.blend == "mask" and alpha < self.cutoff)
 
 
 @dataclass(frozen=True)
@@ -69,6 +77,25 @@ class AnimatedMesh:
         """Returns the number of frames."""
         return len(self.time)
 
+    def areas(self, frame: int) -> np.ndarray:
+        """Returns the areas f64 (F) of the triangles in a frame, 0 where their material leaves nothing to be seen."""
+        a, b, c = (self.positions[frame][self.triangles[:, k]].astype(np.float64) for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        clear = np.array([material.is_clear for material in self.materials], bool)
+        return np.where(clear[self.material], 0.0, area) if clear.any() else area
+
+    def seen_corners(self) -> np.ndarray:
+        """Returns bool (T,V): whether a vertex is a corner of a triangle that shows something in a frame.
+
+        What is shrunk to nothing then, is never seen or has no area doesn't count, nor do vertices without triangles.
+        """
+        areas = np.stack([self.areas(frame) for frame in range(self.num_frames)])
+        shown = areas > SHRUNK**2 * areas.max(0)
+        seen = np.zeros(self.positions.shape[:2], bool)
+        for frame, triangles in enumerate(shown):
+            seen[frame, self.triangles[triangles]] = True
+        return seen
+
     def frames(self, start: int, stop: int) -> AnimatedMesh:
         """Returns frames start to stop - 1 alone; small enough to send to another process."""
         cut = slice(start, stop)
@@ -102,19 +129,27 @@ def bounding_sphere(points: np.ndarray, steps: int = 300) -> tuple[np.ndarray, f
 
 
 def normalized(mesh: AnimatedMesh, radius: float, yaw: float = 0.0, travel: bool = True) -> AnimatedMesh:
-    """Returns the mesh in a ball of this radius around the origin, over all frames together.
+    """Returns the mesh in a ball of this radius around the origin, over all frames together; what is hidden doesn't count.
 
     yaw: radians about the upright, y. travel=False: takes out the level (x, z) motion of the middle, as on a treadmill.
     """
+    seen = mesh.seen_corners()
+    seen[:, np.unique(mesh.triangles)] |= not seen.any()  # nothing has an area: whoever draws points refuses it
     if not travel:
-        middle = mesh.positions.mean(axis=1, dtype=np.float64) * [1, 0, 1]
+        middle = _middles(mesh.positions, seen) * [1, 0, 1]
         mesh = mesh.moved(np.eye(3), middle[0] - middle, 1.0)
-    corners = np.unique(mesh.triangles)
-    center, size = bounding_sphere(mesh.positions[:, corners].reshape(-1, 3))
+    center, size = bounding_sphere(mesh.positions[seen])
     cosine, sine = np.cos(yaw), np.sin(yaw)
     rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     scale = radius / max(size, 1e-12)
     return mesh.moved(rotation, -scale * rotation @ center, scale)
+
+
+def _middles(positions: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Returns the mean f64 (T,3) of the vertices seen (T,V) in each frame; where none is, that of the frame before or after."""
+    filled = np.flatnonzero(seen.any(1))
+    means = np.stack([positions[frame, seen[frame]].mean(0, dtype=np.float64) for frame in filled])
+    return means[np.clip(np.searchsorted(filled, np.arange(len(seen)), side="right") - 1, 0, None)]
 
 
 def _extreme(points: np.ndarray, directions: int = 512) -> np.ndarray:

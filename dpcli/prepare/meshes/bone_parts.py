@@ -5,34 +5,28 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.meshes.animated_mesh import AnimatedMesh
+from dpcli.prepare.meshes.animated_mesh import SHRUNK, AnimatedMesh
 from dpcli.prepare.meshes.gltf_nodes import parents_first
 from dpcli.prepare.meshes.surface_points import SurfacePoints, choose_on_surface
-
-_SHRUNK = 0.01  # of the largest reach or area in the clip: what is smaller shows nothing
 
 
 def choose_points(mesh: AnimatedMesh, count: int, rng: np.random.Generator) -> SurfacePoints:
     """Draws ``count`` points, uniform over the surface of the first frame and of what is hidden there.
 
-    A triangle that is shrunk then, below a hundredth of what it becomes, counts with its largest area in the clip.
+    A triangle that is never seen gets none; one that is shrunk then, below a hundredth of what it becomes, counts with
+    its largest area in the clip.
     """
-    areas = [_areas(mesh, frame) for frame in range(mesh.num_frames)]
+    areas = [mesh.areas(frame) for frame in range(mesh.num_frames)]
     largest = np.max(areas, axis=0)
     if not largest.any():
         raise DataError(f"{mesh.name}: no triangle has an area in any frame; expected a surface")
-    return choose_on_surface(np.where(areas[0] < _SHRUNK * largest, largest, areas[0]), count, rng)
+    return choose_on_surface(np.where(areas[0] < SHRUNK * largest, largest, areas[0]), count, rng)
 
 
-def ever_hidden(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
-    """Returns bool (M): whose triangles are shrunk to nothing in some frame, below 1/10,000 of their largest area."""
-    areas = np.stack([_areas(mesh, frame)[points.triangle] for frame in range(mesh.num_frames)])
-    return (areas < _SHRUNK**2 * areas.max(0)).any(0)
-
-
-def _areas(mesh: AnimatedMesh, frame: int) -> np.ndarray:
-    a, b, c = (mesh.positions[frame][mesh.triangles[:, k]].astype(np.float64) for k in range(3))
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+def hidden_points(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
+    """Returns bool (T,M): in which frames a point's triangle is shrunk to nothing, below 1/10,000 of its largest area."""
+    areas = np.stack([mesh.areas(frame)[points.triangle] for frame in range(mesh.num_frames)])
+    return areas < SHRUNK**2 * areas.max(0)
 
 
 def track_points(mesh: AnimatedMesh, points: SurfacePoints) -> np.ndarray:
@@ -98,7 +92,7 @@ def _starts(track: np.ndarray, bone: np.ndarray, bones: int) -> np.ndarray:
     starts = np.zeros(bones, np.int64)
     for index in np.unique(bone):
         reach = np.linalg.norm(np.ptp(track[:, bone == index], axis=1), axis=1)
-        starts[index] = reach.argmax() if reach[0] < _SHRUNK * reach.max() else 0
+        starts[index] = reach.argmax() if reach[0] < SHRUNK * reach.max() else 0
     return starts
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.prepare.meshes.animated_mesh import AnimatedMesh, normalized
-from dpcli.prepare.meshes.bone_parts import choose_points, ever_hidden, heaviest_bones, rigid_parts, track_points
+from dpcli.prepare.meshes.bone_parts import choose_points, heaviest_bones, hidden_points, rigid_parts, track_points
 from dpcli.prepare.meshes.raycast import FrameCaster
 from dpcli.prepare.views.views_pipeline import Clip
 from dpcli.runtime.pool import ordered_map
@@ -98,19 +98,24 @@ def film(mesh: AnimatedMesh, filming: Filming, jobs: int = 1) -> Clip:
 
 
 def ground_truth(mesh: AnimatedMesh, filming: Filming) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Returns track f32 (T,M,3) and part i16 (M) of `tracks` points; None, None when 0 are asked for."""
+    """Returns track f32 (T,M,3) and part i16 (M) of `tracks` points; None, None when 0 are asked for.
+
+    Where a point is hidden, it rests on a point within the object's ball.
+    """
     if not filming.tracks:
         return None, None
     points = choose_points(mesh, filming.tracks, generator(filming.seed))
     track, bone = track_points(mesh, points), heaviest_bones(mesh, points)
-    hidden = int(ever_hidden(mesh, points).sum())
-    if hidden:
+    hidden = hidden_points(mesh, points)
+    if hidden.any():
         log.warn(
-            f"{mesh.name}: {hidden} of {filming.tracks} tracks are hidden in some frames, a point of no extent there"
+            f"{mesh.name}: {hidden.any(0).sum()} of {filming.tracks} tracks are hidden in some frames, a point of no extent there"
         )
     smallest = int(np.ceil(filming.min_part * filming.tracks))
     tolerance = filming.part_tolerance * OBJECT_RADIUS
     part = rigid_parts(mesh.bone_pose, mesh.bone_parent, bone, track, tolerance, smallest)
+    far = np.linalg.norm(track[hidden], axis=1, keepdims=True)
+    track[hidden] *= OBJECT_RADIUS / np.maximum(far, OBJECT_RADIUS)  # whatever waits outside the picture
     log.info(f"{mesh.name}: {int(part.max()) + 1} rigid parts of {len(np.unique(bone))} bones")
     return track, part
 

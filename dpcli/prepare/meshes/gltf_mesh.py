@@ -86,13 +86,25 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         uv=joined("uv"),
         bones=joined("bones", joints),
         weights=joined("weights", joints),
-        bone_pose=poses,
+        bone_pose=_hidden_apart(pieces, poses, shown),
         bone_parent=parent,
         bone_name=tuple(node_name(file, index) for index in range(len(parent))),
         emission_uv=joined("emission_uv"),
     )
     culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]
     return replace(mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None)
+
+
+def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """Returns the poses (T,N,4,4) with nodes that carry pieces put into one point while they are hidden, bool shown (T,N).
+
+    So what is seen at other times moves apart, as it does where clips hide it by a scale of 0.
+    """
+    joints = {bone for piece in pieces if piece.node not in piece.inverse_bind for bone in piece.inverse_bind}
+    poses = poses.copy()
+    for node in {piece.node for piece in pieces} - joints:
+        poses[~shown[:, node], node] = np.diag([0.0, 0.0, 0.0, 1.0])
+    return poses
 
 
 def _turned_out(piece: _Piece, poses: np.ndarray) -> _Piece:

@@ -8,6 +8,8 @@ import numpy as np
 
 from dpcli.ops.rotations import motion_matrix, quaternion_to_matrix
 
+_ROUNDING = 2e-6  # of the latest time: what 32 bits make of keys at k / 24
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -23,22 +25,26 @@ class Curve:
     rotation: bool = False
 
     def at(self, time: np.ndarray) -> np.ndarray:
-        """Returns values f64 (T,D) at `time` (T); before the first and after the last key they stay."""
+        """Returns values f64 (T,D) at `time` (T); before the first and after the last key they stay.
+
+        A time that misses a key by rounding alone is at it: a step would show what was before.
+        """
         cubic = self.interpolation == "CUBICSPLINE"
         time = np.clip(np.asarray(time, np.float64), self.times[0], self.times[-1])
         if len(self.times) == 1:
             found = np.repeat(self.values[:, 1] if cubic else self.values, len(time), axis=0)
             return normalize(found) if self.rotation else found
-        k = np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2)
+        at_key = np.searchsorted(self.times, time + _ROUNDING * np.abs(self.times).max(), side="right") - 1
+        if self.interpolation == "STEP":
+            found = self.values[at_key]
+            return normalize(found) if self.rotation else found
+        k = np.clip(at_key, 0, len(self.times) - 2)
         step = self.times[k + 1] - self.times[k]
-        s = np.where(step > 0, (time - self.times[k]) / np.where(step > 0, step, 1), 1)[:, None]
+        s = np.where(step > 0, (time - self.times[k]) / np.where(step > 0, step, 1), 1).clip(0)[:, None]
         if cubic:
             found = _hermite(self.values[k], self.values[k + 1], step[:, None], s)
             return normalize(found) if self.rotation else found
         first, last = self.values[k], self.values[k + 1]
-        if self.interpolation == "STEP":
-            found = np.where(s < 1, first, last)
-            return normalize(found) if self.rotation else found
         return slerp(first, last, s) if self.rotation else first + s * (last - first)
 
 

@@ -20,6 +20,10 @@ from dpcli.store.schema import kept_name
 _FAR_AWAY = 1e4  # beyond this a float32 step exceeds half a millimeter: map coordinates must be shifted first
 _WIDE, _ABSURD = 1e3, 1e5  # meters around a sensor, and in any case
 _COUNTED, _LOOKED_AT = 20.0, 1000  # meters from which on whole numbers alone are odd, and points that tell
+_COARSE = 0.01  # meters between neighboring float32 numbers, from which on a shape is lost
+COARSE = (
+    "sequences whose files hold map coordinates in float32, which rounds them to 1 cm or more; write them in double"
+)
 SHIFTED = "sequences shifted to their first frame's corner for precision"
 
 
@@ -39,13 +43,14 @@ class Lengths:
     def divisor(self, clouds: Sequence[Cloud]) -> tuple[float, dict[str, int]]:
         """Returns what the coordinates are divided by, and a note where the files themselves decided that."""
         declared = {cloud.unit for cloud in clouds} - {""}
-        if self.scale is not None or self.unit != "m" or not declared - {"m"}:
+        if self.scale is not None or self.unit not in UNITS or not declared - {self.unit}:
             return self.scale or 1.0, {}
         if len({cloud.unit for cloud in clouds}) > 1:
             names = ", ".join(sorted(cloud.unit or "none" for cloud in clouds))
             raise DataError(f"its frames declare different units ({names[:80]}); --scale says what they are in")
         (name,) = declared
-        return 1 / UNITS[name], {f"sequences converted from {name} to m, as their files declare": 1}
+        note = f"sequences converted from {name} to {self.unit}, as their files declare"
+        return UNITS[self.unit] / UNITS[name], {note: 1}
 
 
 def assemble(
@@ -67,6 +72,7 @@ def assemble(
     if shift is not None:
         notes[SHIFTED] = 1
     if lengths.unit == "m":
+        notes |= _rounded(frames, each, divisor)
         notes |= _doubts(*ends, frames[0][:_LOOKED_AT] if lengths.scale is None and divisor == 1 else None)
     extra = {kept_name(name): np.concatenate([clouds[t].extra[name] for t in kept]) for name in clouds[0].extra}
     sequence = CloudSequence(
@@ -97,6 +103,13 @@ def _joined(
     points = np.concatenate(frames, dtype=np.float64) / divisor
     corner = np.floor(points[: len(frames[0])].min(0)) if far else np.zeros(3)
     return (points - corner).astype(np.float32), corner if far else None
+
+
+def _rounded(frames: Sequence[np.ndarray], ends: np.ndarray, divisor: float) -> dict[str, int]:
+    """Returns a note where coordinates lie so far away that the float32 they were stored in rounded them. ends: f64 (T,2,3)."""
+    single = [k for k, frame in enumerate(frames) if frame.dtype == np.float32]
+    farthest = np.float32(np.abs(ends[single]).max(initial=0))
+    return {COARSE: 1} if np.spacing(farthest) / divisor > _COARSE else {}
 
 
 def _doubts(low: np.ndarray, high: np.ndarray, some: np.ndarray | None) -> dict[str, int]:

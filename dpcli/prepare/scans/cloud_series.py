@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -17,8 +18,12 @@ from dpcli.prepare.series import TEXTS, Series, choose_series, is_hidden
 
 _PREFERRED = (".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".xyz")  # of two files of one frame
 
+_ABOUT_SENSORS = re.compile(  # folders whose texts tell of the vehicle, the camera or the objects
+    r"oxts|imu|gps|gnss|poses?|odom\w*|calib\w*|labels?|label_\d|time_?stamps?|traj\w*|(in|ex)trinsics?", re.IGNORECASE
+)
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
-    ".e57 .ptx .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx".split()
+    ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
+    " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord".split()
 )
 
 
@@ -40,7 +45,24 @@ def find_sequences(
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: save their points as .ply" if others else ""
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
-    return sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix()))
+    return _without_logs(root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())))
+
+
+def _without_logs(root: Path, found: list[Series]) -> list[Series]:
+    """Returns the sequences without the texts of folders such as KITTI's ``oxts``, which the first one names as left out;
+    all of them where there is nothing else.
+    """
+
+    def is_log(one: Series) -> bool:
+        parts = one.folder.relative_to(root).parts
+        return one.suffix in TEXTS and any(_ABOUT_SENSORS.fullmatch(part) for part in parts)
+
+    logs = [one for one in found if is_log(one)]
+    if len(logs) in (0, len(found)):
+        return found
+    first, *others = [one for one in found if one not in logs]
+    named = [f"{one.folder.relative_to(root).as_posix()}/{one.described()}" for one in logs]
+    return [replace(first, left_out=(*first.left_out, *named)), *others]
 
 
 def _counted(foreign: Counter[str]) -> tuple[str, ...]:

@@ -74,7 +74,8 @@ class CloudFolders:
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
-            return labels_of_folders(self.raw, [as_utf8(path.as_posix()) for path in self._relative], "CLASS")
+            layout = "CLASS/SEQUENCE" if len({len(path.parts) for path in self._relative}) > 1 else "CLASS"
+            return labels_of_folders(self.raw, [as_utf8(path.as_posix()) for path in self._relative], layout)
         return read_labels(self.labels) if self.labels else None
 
     @cached_property
@@ -103,9 +104,12 @@ class CloudFolders:
         """Returns whether the first good cloud has colors, and which of its columns are not read."""
         for one in self._series:
             try:
-                cloud = read_cloud(one.paths[0], self.bin_columns)
+                clouds = (read_cloud(path, self.bin_columns) for path in one.paths)
+                cloud = next((cloud for cloud in clouds if len(cloud.points)), None)
             except DataError:
                 continue  # a bad sample: the next one tells
+            if cloud is None:  # nothing was seen
+                continue
             return cloud.color is not None, without(cloud.unread, self.keep)
         return False, ()
 
@@ -137,7 +141,7 @@ class CloudFolders:
             return self.bin_columns, {}
         columns, sure = guess_bin_columns(frames[:: max(1, len(frames) // _LOOKED_AT)][:_LOOKED_AT])
         doubt = "" if sure else ", though other numbers fit as well"
-        note = f"sequences of .bin read as {columns} float32 a point, by their look{doubt} (--bin-columns says it)"
+        note = f"sequences of .bin read as {columns} float32 a point, judged by their values{doubt} (--bin-columns says it)"
         return columns, {} if columns == 4 and sure else {note: 1}
 
     def summary(self, items: list[Item]) -> list[str]:
@@ -154,7 +158,7 @@ class CloudFolders:
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:
-    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None]
+    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None and len(cloud.points)]
     if plain:
         raise DataError(
             f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Protocol
 
@@ -12,11 +15,19 @@ from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_frame_column, words_of
 
 _SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}  # digits of a time since 1970 -> seconds
+_EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
 _TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
 SINGLE = (
     "sequences whose frames hold one point each; does the frame column tell the time of each point? (--frame-column)"
 )
+FELL = "sequences whose frame numbers fall on the way, put in the order of the numbers (--gap N begins a new sequence there)"
+WRAPPED = "sequences whose frame numbers begin anew at 0 when their counter is full; their frames stay in their order"
+_FULL = (2**8, 2**16, 2**32)  # what a counter of 8, 16 or 32 bits never reaches
+_CLOCK = re.compile(
+    r"(?:(\d{4})[-/](\d\d?)[-/](\d\d?)[T _]\s*)?(\d\d?):(\d\d):(\d\d)([.,]\d{1,9})?\s*(Z|UTC|[-+]\d\d:?\d\d)?",
+    re.IGNORECASE,
+)
+_DAY = 86_400.0
 JOINED = "frames whose rows were joined, as their numbers come again later (--gap N begins a new sequence there)"
 
 
@@ -38,22 +49,24 @@ class Table(Protocol):
 @dataclass(frozen=True)
 class Rows:
     """Holds one sequence of a table. name: what is added to the table's, "" where it has one only; rows: i64 (N), frame
-    after frame; offsets: i64 (T+1); frames: what the frame column holds, f64 (T), None for words; joined: how many frames
-    lay in several places.
+    after frame; offsets: i64 (T+1); frames: what the frame column holds, f64 (T), None for words; clock: it holds times of
+    day, here in seconds; joined: how many frames lay in several places; notes: what is odd about their numbers.
     """
 
     name: str
     rows: np.ndarray
     offsets: np.ndarray
     frames: np.ndarray | None
+    clock: bool = False
     joined: int = 0
+    notes: tuple[str, ...] = ()
 
     def times(self, column: str, fps: float | None) -> np.ndarray | None:
         """Returns seconds since the first frame, f64 (T): what the column tells, or its numbers by ``fps``; else None."""
         if self.frames is None:
             return np.arange(len(self.offsets) - 1) / fps if fps else None
         since = self.frames - self.frames[0]
-        unit = seconds_of(column, self.frames)
+        unit = 1.0 if self.clock else seconds_of(column, self.frames)
         if unit:
             return since * unit
         step = np.gcd.reduce(np.diff(self.frames).astype(np.int64)) if len(since) > 1 else 1
@@ -96,7 +109,7 @@ def split_rows(table: Table, column: str, sequence_column: str = "", gap: float 
     ``gap``: a jump of more than this in the frame column, or a fall, begins a new one. Raises DataError on a column that
     is not there, or that holds nothing in some row.
     """
-    frames, numbers = _frame_values(table, column)
+    frames, numbers, clock = _frame_values(table, column)
     if gap is not None and numbers is None:
         raise DataError(f"{table.path}: --gap needs numbers in {column!r}; it holds words such as {frames[0]!r}")
     groups = _groups(table, sequence_column, len(frames))
@@ -105,23 +118,66 @@ def split_rows(table: Table, column: str, sequence_column: str = "", gap: float 
         parts = [rows] if gap is None else _cut(frames, rows, gap)
         for k, part in enumerate(parts):
             names = [*([name] if sequence_column else []), *([f"{k:03d}"] if gap is not None else [])]
-            found.append(_in_frames("/".join(names), frames, numbers, part))
+            found.append(replace(_in_frames("/".join(names), frames, numbers, part), clock=clock))
     return found
 
 
-def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns what orders the rows (numbers, or places of words in the order they first occur), and the numbers."""
+def _frame_values(table: Table, column: str) -> tuple[np.ndarray, np.ndarray | None, bool]:
+    """Returns what orders the rows (numbers, or places of words in the order they first occur), the numbers, and whether
+    these are seconds that the words told as dates or times of day.
+    """
     place = table.names.index(column)
     try:
         values = table.columns([place])[:, 0]
     except DataError:
         words = table.words(place)
         order = {word: k for k, word in enumerate(dict.fromkeys(words))}
-        return np.array([order[word] for word in words]), None
+        if seconds := clock_seconds(list(order)):
+            told = np.array([seconds[order[word]] for word in words])
+            return told, told, True
+        return np.array([order[word] for word in words]), None, False
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise DataError(f"{table.path}: {len(bad)} rows, the first is {bad[0] + 1}, have no number in {column!r}")
-    return values, values
+    return values, values, False
+
+
+def clock_seconds(words: Sequence[str]) -> list[float]:
+    """Returns the seconds of dates with times of day, or of times of day alone, which may pass midnight; [] of other words.
+
+    >>> clock_seconds(["23:59:59.5", "00:00:00"]), clock_seconds(["a"])
+    ([86399.5, 86400.0], [])
+    """
+    found: list[float] = []
+    days = 0
+    for word in words:
+        match = _CLOCK.fullmatch(word.strip())
+        try:
+            seconds = _seconds_told(match) if match else None
+        except ValueError:  # such as a month 13
+            seconds = None
+        if match is None or seconds is None:
+            return []
+        if match[1] is None:
+            days += bool(found) and seconds + days * _DAY < found[-1] - _DAY / 2
+        found.append(seconds + days * _DAY)
+    return found
+
+
+def _seconds_told(match: re.Match[str]) -> float:
+    year, month, day, hour, minute, second, fraction, _ = match.groups()
+    own = int(hour) * 3600 + int(minute) * 60 + int(second) + float((fraction or ".0").replace(",", "."))
+    if year is None:
+        return own
+    return datetime(int(year), int(month), int(day), tzinfo=timezone.utc).timestamp() + own - _offset(match[8])
+
+
+def _offset(zone: str | None) -> float:
+    """Returns the seconds by which a zone such as ``+02:00`` is ahead."""
+    if not zone or zone[0] not in "+-":
+        return 0.0
+    ahead = int(zone[1:3]) * 3600 + int(zone[-2:]) * 60
+    return float(-ahead if zone[0] == "-" else ahead)
 
 
 def _groups(table: Table, column: str, count: int) -> list[tuple[str, np.ndarray]]:
@@ -144,8 +200,25 @@ def _cut(frames: np.ndarray, rows: np.ndarray, gap: float) -> list[np.ndarray]:
 
 def _in_frames(name: str, frames: np.ndarray, numbers: np.ndarray | None, rows: np.ndarray) -> Rows:
     own = frames[rows]
+    notes = []
+    if numbers is not None and (full := _fills_counter(own)):
+        own = own + full * np.cumsum(np.append(0, np.diff(own)) == 1 - full)
+        notes.append(WRAPPED)
+    falls = bool((np.diff(own) < 0).any())
     runs = 1 + int(np.count_nonzero(np.diff(own)))
     order = np.argsort(own, kind="stable")
     values, starts = np.unique(own[order], return_index=True)
     offsets = np.append(starts, len(rows)).astype(np.int64)
-    return Rows(name, rows[order], offsets, None if numbers is None else values, runs - len(values))
+    joined = runs - len(values)
+    notes += [FELL] if falls and not joined and numbers is not None else []
+    return Rows(name, rows[order], offsets, None if numbers is None else values, joined=joined, notes=tuple(notes))
+
+
+def _fills_counter(numbers: np.ndarray) -> int:
+    """Returns how many values the counter has whose numbers f64 (N) go on at 0 after its last, and fall nowhere else; 0
+    where they don't.
+    """
+    steps = np.diff(numbers)
+    falls = steps[steps < 0]
+    full = int(numbers.max(initial=0)) + 1
+    return full if full in _FULL and len(falls) and (falls == 1 - full).all() else 0

@@ -40,7 +40,7 @@ def write(path, *, videos=8, splits=True, people=True, labels=UP, field=False, l
             sequence.subject = number % 4 if people else -1
             sequence.split = ("test" if number % 4 == 3 else "train") if splits else ""
             if field:
-                sequence.extra = {DOPPLER: np.full(len(sequence.points), label, np.float32)}
+                sequence.extra = {DOPPLER: rng.normal(label, 0.3, len(sequence.points)).astype(np.float32)}
             if not (lone and label == 2 and number > 2):
                 writer.write(sequence)
     return str(path)

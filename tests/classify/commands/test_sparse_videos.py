@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
+
 import numpy as np
 import pytest
 import torch
@@ -67,18 +69,55 @@ def test_a_radar_gets_its_own_network_which_learns_and_predicts(tmp_path, capsys
     capsys.readouterr()
     for words, sentence in (
         ((bare, "-o", tmp_path / "b.h5"), "no column speed"),
-        ((data, "--stream", "--window", 20), "reads speed of every point"),
+        ((bare, "-o", tmp_path / "b.csv", "--segments", "--window", 20), "no column speed"),
         ((data, "-o", tmp_path / "v.h5", "--split", "validation"), "learned from all videos"),
     ):
         assert dpc("classify", "predict", *words, "--model", tmp_path / "run") in (2, 3)
         assert sentence in capsys.readouterr().err
+    streamed_and_cut(tmp_path, data, capsys)
+
+
+def streamed_and_cut(tmp_path, data, capsys):
+    """A stream and a recording carry the columns that a model reads; windows of the whole video say what `predict` says."""
+    model = ("--model", tmp_path / "run")
+    assert dpc("classify", "predict", data, *model, "-o", tmp_path / "one.h5", "--clips-per-video", 1) == 0
+    expected = ScoresReader(tmp_path / "one.h5")
+    with CloudsReader(data) as reader:
+        video = reader.read(reader.names.index(expected.names[0]))
+    rows = np.column_stack([video.points, video.extra[SPEED]])
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    names = ("frames", "bare", "millimeters")
+    with ExitStack() as stack:
+        pipe, bare, other = (stack.enter_context(open(tmp_path / f"{name}.npy", "wb")) for name in names)
+        for t, frame in enumerate(np.split(rows, video.frame_offsets[1:-1])):
+            np.save(pipe, frame)
+            np.save(bare, frame[:, :3])
+            np.save(other, frame * np.float32([1000, 1000, 1000, 1]))
+            table = np.column_stack([frame[:, 3], frame[:, :3]])
+            np.savetxt(folder / f"{t:03}.csv", table, delimiter=",", header="speed,x,y,z", comments="", fmt="%.9g")
+    window = ("--stream", "--window", video.num_frames)
+    for source in (tmp_path / "frames.npy", folder):
+        assert dpc("classify", "predict", source, *window, *model, "-o", tmp_path / f"{source.stem}.h5", "--force") == 0
+        assert np.allclose(ScoresReader(tmp_path / "frames.h5").scores, expected.scores[:1], atol=1e-3)
+    assert "another" not in capsys.readouterr().err
+    assert dpc("classify", "predict", tmp_path / "millimeters.npy", *window, *model) == 0
+    said = capsys.readouterr().err
+    assert "millimeters.npy: half of the points lie within" in said and "another unit of length?" in said
+    assert dpc("classify", "predict", tmp_path / "bare.npy", *window, *model) == 3
+    assert "frame 0: 3 numbers a point; the model reads 4: x, y, z, speed, in this order" in capsys.readouterr().err
+    cut = tmp_path / "cut.csv"
+    assert dpc("classify", "predict", data, "--segments", "--window", 8, *model, "-o", cut, "--reject-below", 0) == 0
+    assert [line.split(",")[3] for line in cut.read_text().split()[1:]] == [
+        expected.class_names[label] for label in expected.labels
+    ]
 
 
 @pytest.mark.parametrize("videos, people", [(2, 1), (2, 3), (3, 1)])
 def test_one_or_two_videos_a_class_and_one_person_train(videos, people, tmp_path):
     done = trained(radar(tmp_path / "r.h5", videos, people=people, points=1), tmp_path / "run")
     assert all(torch.isfinite(value).all() for value in load_model(done.weights)[0].state_dict().values())
-    assert done.videos == 2 * (videos - 1)
+    assert done.videos == (0 if videos == 2 else 4)  # one training video a class: no judge could have seen its class
 
 
 def test_one_class_is_refused_and_time_that_runs_back_is_told(tmp_path, capsys):
@@ -88,7 +127,7 @@ def test_one_class_is_refused_and_time_that_runs_back_is_told(tmp_path, capsys):
     assert "time runs back in 1 of 4 videos: v1; frames are taken in the file's order" in capsys.readouterr().err
 
 
-def test_an_hour_is_one_clip(tmp_path):
+def test_an_hour_is_one_clip_with_a_warning(tmp_path, capsys):
     done = trained(radar(tmp_path / "r.h5", 2), tmp_path / "run")
     config = load_model(done.weights)[0].config
     with CloudsReader(tmp_path / "r.h5") as reader:
@@ -99,16 +138,24 @@ def test_an_hour_is_one_clip(tmp_path):
     source = ClipSource(OneVideo(0, hour), [0], config, timing="slots")
     clips = source.video_clips(0, None)
     assert len(clips) == 4 and source.load(clips[0], 0).shape == (16, 24, 6)
+    with CloudsWriter(tmp_path / "hour.h5", class_names=["up", "down"], fields=[SPEED]) as writer:
+        writer.write(hour)
+    capsys.readouterr()
+    words = ("--model", tmp_path / "run", "-o", tmp_path / "s.h5", "--clips-per-video", 1)
+    assert dpc("classify", "predict", tmp_path / "hour.h5", *words) == 0
+    assert "1 of 1 videos are over 5 times as long as any" in capsys.readouterr().err
 
 
 def test_a_stream_of_places_alone_is_predicted_by_its_window(tmp_path):
     with CloudsReader(radar(tmp_path / "r.h5", 2, column=False)) as reader:
         video = reader.read(0)
-        config = measured(network_config(Given("sparse", sets=SMALL), 2), reader, [0, 1, 2])
+        config, _ = measured(network_config(Given("sparse", sets=SMALL), 2), reader, [0, 1, 2])
     info = ModelInfo(config, ["up", "down"], "slots", {"streams": ["static"]})
     predictor = StreamPredictor(Kinet(config).eval(), info, window=6)
     predictor.warm_up()
     made = [predictor.add(video.frame(t)) for t in range(video.num_frames)]
+    nothing = [predictor.add(video.points[:0]) for _ in range(6)]
+    assert np.allclose(nothing[-1].scores, 0.5)  # no point tells no class
     assert [one is not None for one in made] == [t >= 5 for t in range(video.num_frames)]
     assert all(np.allclose(one.scores.sum(-1), 1, atol=1e-5) for one in made if one is not None)
     with pytest.raises(UsageError, match="a stream has no whole"):

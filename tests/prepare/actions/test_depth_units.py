@@ -84,6 +84,30 @@ def test_units_the_other_way_round_stop_with_the_right_ones(tmp_path, frames, op
         sample_of(tmp_path / "v.npy", frames, **options)
 
 
+SCENE = np.add.outer(np.arange(48) * 5, 1000 + np.arange(64) * 2).astype(np.uint16)[None]
+
+
+@pytest.mark.parametrize(
+    ("frames", "scale"), [(SCENE * 8, 8000), (SCENE * 8 + 2, 8000), (SCENE * 5, 5000), (SCENE, 0), (SCENE * 16, 0)]
+)
+def test_steps_of_raw_depths_tell_how_data_sets_store_millimeters(tmp_path, frames, scale):
+    notes = sample_of(tmp_path / "v.npy", frames).notes
+    assert [scale] == [int(note.split()[-1]) for note in notes] if scale else not notes
+    assert not sample_of(tmp_path / "v.npy", frames, depth_scale=5000).notes
+
+
+def test_bytes_the_wrong_way_round_are_no_depth(tmp_path):
+    with pytest.raises(DataError, match="two bytes of each are the wrong way round"):
+        sample_of(tmp_path / "v.npy", SCENE.byteswap())
+    noise = RNG.integers(1, 3000, (1, 48, 64)).astype(np.uint16)
+    assert not sample_of(tmp_path / "v.npy", noise).notes
+
+
+def test_one_channel_is_no_other_dimension(tmp_path):
+    for frames in (SCENE[..., None], SCENE[:, None]):
+        np.testing.assert_allclose(sample_of(tmp_path / "v.npy", frames).sequence.points[0, 2], 1.0)
+
+
 def test_far_scenes_pass_when_the_user_says_so():
     require_plausible("v", np.full(9, 500, np.float32), 1.0, asked=True)
     with pytest.raises(DataError, match="500 m"):

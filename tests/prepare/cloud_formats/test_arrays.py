@@ -75,6 +75,8 @@ def test_an_array_that_lies_on_its_side_is_refused(tmp_path):
     [
         (np.float32([[0, 0.5, 1]]), [0, 128, 255]),
         (np.float32([[0, 100, 255]]), [0, 100, 255]),
+        (np.float32([[1.0000001, 0.5, 0]]), [255, 128, 0]),
+        (np.float32([[2, 0.5, 127.5]]), [2, 0, 128]),
         (np.float64([[121, 131, 193]]), [121, 131, 193]),
         (np.uint16([[39, 57, 249]]), [39, 57, 249]),
         (np.uint16([[0, 32768, 65535]]), [0, 128, 255]),
@@ -88,7 +90,7 @@ def test_ranges_of_color(values, expected):
     assert found.dtype == np.uint8 and found.tolist() == [expected]
 
 
-@pytest.mark.parametrize("values", [[[-1.0, 0, 0]], [[np.nan, 0, 0]], [[256.0, 3, 4]], [[1e6, 0, 0]]])
+@pytest.mark.parametrize("values", [[[-1.0, 0, 0]], [[np.nan, 0, 0]], [[256.0, 3, 4]], [[1e6, 0, 0]], [[1.4, 0.5, 0]]])
 def test_colors_of_no_range_are_refused(values):
     with pytest.raises(DataError, match="expected 0 to 255, fractions from 0 to 1, or 16 bits"):
         as_bytes([np.float64(values)])
@@ -130,6 +132,12 @@ def test_a_bin_of_another_type_is_refused(tmp_path):
     np.random.default_rng(0).normal(size=(60, 4)).astype("<f8").tofile(tmp_path / "0.bin")
     with pytest.raises(DataError, match="no coordinates in float32"):
         read_bin(tmp_path / "0.bin", 4)
+
+
+def test_a_count_before_the_points_is_no_coordinate(tmp_path):
+    (tmp_path / "0.bin").write_bytes(np.uint32(500).tobytes() + scan(4, 500, 0).tobytes())
+    with pytest.raises(DataError, match="no coordinate, but the whole number 500; a header before the points"):
+        CloudFolders(tmp_path).read(CloudFolders(tmp_path).items()[0], np.random.default_rng(0))
 
 
 def test_damaged_arrays_are_named(tmp_path):

@@ -29,6 +29,14 @@ def read_text(path, *arguments, **options):
     return read_ply(path)
 
 
+def test_a_range_grid_of_empty_lists_is_no_damage(tmp_path):
+    grid = np.array([([0],), ([],), ([1],)], dtype=[("vertex_indices", object)])
+    points = np.array(POINTS, dtype=[(name, "f4") for name in "xyz"])
+    elements = [plyfile.PlyElement.describe(points, "vertex"), plyfile.PlyElement.describe(grid, "range_grid")]
+    plyfile.PlyData(elements, byte_order=">").write(str(tmp_path / "a.ply"))
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply").points, POINTS, rtol=1e-6)
+
+
 @quick
 @given(data=st.data())
 def test_what_plyfile_writes_is_read_back(tmp_path, data):

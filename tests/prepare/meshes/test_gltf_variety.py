@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
+from dpcli.prepare.meshes.animated_mesh import normalized
 from dpcli.prepare.meshes.animation import clip_outputs, list_clips, load_animation
 from dpcli.prepare.meshes.filming import Filming, film, ground_truth
 from dpcli.prepare.meshes.gltf import read_gltf
@@ -208,6 +209,79 @@ def test_what_is_hidden_at_first_and_what_never_has_an_area(tmp_path):
     flat.tree["meshes"][0]["primitives"][0]["indices"] = flat.add([0, 0, 1, 1, 2, 2], "u4")
     with pytest.raises(DataError, match="no triangle has an area in any frame"):
         film(load(flat, tmp_path, frames=2), SMALL)
+
+
+def empty() -> GlbFile:
+    """A scene without nodes and clips, whose materials 0 and 1 are white and blue."""
+    file = quad()
+    file.tree["nodes"], file.tree["scenes"][0]["nodes"] = [], []
+    file.tree["materials"].append(BLUE)
+    del file.tree["animations"]
+    return file
+
+
+@pytest.mark.parametrize("rate, count", [(24, 6), (30, 10), (10, 10), (29.97, 11), (60, 13)])
+def test_each_frame_of_stop_motion_shows_its_own_object_at_any_rate(tmp_path, rate, count):
+    """Keys at k / rate are rounded to 32 bits: a frame that misses its key by that must not show what was before."""
+    file, times = empty(), np.arange(count + 1) / rate
+    for k in range(count):
+        index = node(file, mesh=square(file, 3.0 * k))
+        file.animate(index, "scale", times, (np.arange(count + 1)[:, None] == k) * np.ones(3), "STEP")
+    reach = np.ptp(load(file, tmp_path, frames=count).positions.reshape(count, count, 4, 3), axis=2).max(-1)
+    np.testing.assert_array_equal(reach > 0, np.eye(count, dtype=bool))
+
+
+def hidden_by_scale(file: GlbFile, index: int) -> None:
+    file.animate(index, "scale", [0, 1], np.zeros((2, 3)))
+
+
+def hidden_until_it_comes(file: GlbFile, index: int) -> None:
+    file.animate(index, "scale", [0, 0.5, 1], np.repeat([[0.0], [1.0], [1.0]], 3, axis=1), "STEP")
+    file.animate(index, "translation", [0, 0.5, 1], [[100, 0, 0], [0, 0, 0], [0, 0, 0]], "STEP")
+
+
+def without_area(file: GlbFile, index: int) -> None:
+    primitive = file.tree["meshes"][file.tree["nodes"][index]["mesh"]]["primitives"][0]
+    primitive["indices"] = file.add([0, 0, 1, 2, 2, 2], "u4")
+
+
+def clear(file: GlbFile, index: int) -> None:
+    file.tree["materials"][1] = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0]}, "alphaMode": "BLEND"}
+
+
+def cut_off(file: GlbFile, index: int) -> None:
+    file.tree["materials"][1] = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.3]}, "alphaMode": "MASK"}
+
+
+@pytest.mark.parametrize("hide_it", [hidden_by_scale, hidden_until_it_comes, without_area, clear, cut_off])
+@pytest.mark.parametrize("travel", [True, False])
+def test_what_shows_nothing_has_no_tracks_and_makes_nothing_small(tmp_path, hide_it, travel):
+    """A square turns, and another one waits 100 units away: the first fills the picture as if it were alone."""
+    file = empty()
+    file.tree["nodes"].append({"mesh": 0})
+    file.tree["scenes"][0]["nodes"].append(0)
+    file.animate(0, "rotation", [0, 1], [[0, 0, 0, 1], [0, 0, 1, 0]])
+    hide_it(file, node(file, mesh=square(file, 0.0), translation=[100, 0, 0]))
+    mesh = normalized(load(file, tmp_path, frames=4), 0.75, travel=travel)
+    np.testing.assert_allclose(
+        np.linalg.norm(mesh.positions[:, :4], axis=2), 0.75, atol=0.6 if hide_it is hidden_until_it_comes else 1e-3
+    )
+    track, part = ground_truth(mesh, SMALL)
+    assert np.linalg.norm(track, axis=2).max() < (0.751 if travel else 1.4)
+    assert np.bincount(part).tolist() == ([150, 150] if hide_it is hidden_until_it_comes else [300])
+
+
+def test_stop_motion_by_visibility_has_the_parts_of_stop_motion_by_scale(tmp_path):
+    file = empty()
+    for k in range(3):
+        index = node(file, mesh=square(file, 3.0 * k))
+        file.animate(index, "pointer", [0, 1, 2, 3], np.arange(4) == k, "STEP")
+        extension = {"KHR_animation_pointer": {"pointer": f"/nodes/{index}/extensions/KHR_node_visibility/visible"}}
+        file.tree["animations"][0]["channels"][-1]["target"] = {"path": "pointer", "extensions": extension}
+    track, part = ground_truth(load(file, tmp_path, frames=3), SMALL)
+    assert np.bincount(part).tolist() == [100] * 3
+    extents = [np.ptp(track[:, part == k], axis=1).max(1) for k in range(3)]
+    np.testing.assert_array_equal(np.array(extents) > 0.1, np.eye(3, dtype=bool))
 
 
 # extensions

@@ -251,6 +251,30 @@ def test_what_else_lies_there_is_named(tmp_path):
         CloudFolders(tmp_path).items()
 
 
+def test_texts_of_a_vehicles_sensors_are_no_clouds(tmp_path):
+    for folder in ("velodyne/data", "oxts/data", "label_2"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "0.txt").write_text("49.0 8.4 116.4 0.2\n" * 2)
+    reader = CloudFolders(tmp_path)
+    assert [item.name for item in reader.items()] == ["velodyne/data"]
+    assert "left out: label_2/0.txt, oxts/data/0.txt" in reader.summary(reader.items())[1]
+    assert len(CloudFolders(tmp_path / "oxts").items()) == 1  # who names it, gets it
+
+
+def test_a_sequence_beside_folders_of_classes_has_no_class(tmp_path):
+    for folder in ("a", "wave/b"):
+        save(tmp_path / folder / "0.npy")
+    with pytest.raises(DataError, match="'a' lies in no folder of its class"):
+        CloudFolders(tmp_path, label_from_folder=True).items()
+
+
+def test_a_first_frame_that_saw_nothing_decides_nothing(tmp_path):
+    (tmp_path / "0.csv").write_text("x,y,z\n")
+    (tmp_path / "1.csv").write_text("x,y,z,r,g,b\n1,2,3,4,5,6\n")
+    sequence = read(tmp_path).sequence
+    assert sequence.num_frames == 1 and sequence.color.tolist() == [[4, 5, 6]]
+
+
 def test_columns_that_are_not_read_are_named(tmp_path):
     (tmp_path / "0.csv").write_text("x,y,z,ring,snr\n1,2,3,4,5\n1,2,4,4,5\n")
     reader = CloudFolders(tmp_path, keep=("snr",))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, UsageError
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE
+from dpcli.prepare.scans.frames_of_tables import FELL, JOINED, SINGLE, WRAPPED
 from dpcli.prepare.scans.tables import TableSequences
 from dpcli.store import CloudsReader
 
@@ -71,6 +71,9 @@ def test_sequences_by_a_column(tmp_path):
         ("timestamp", [1600000000000, 1600000000100, 1600000000300], [0, 0.1, 0.3]),
         ("stamp_ns", [10**18, 10**18 + 10**8, 10**18 + 3 * 10**8], [0, 0.1, 0.3]),
         ("frame", [0, 5, 10], None),
+        ("frame", [254, 255, 0], None),
+        ("stamp", ["2024-03-05T23:59:59.95Z", "2024-03-06T00:00:00Z", "2024-03-06T02:00:00.1+02:00"], [0, 0.05, 0.15]),
+        ("stamp", ["23:59:59.950", "00:00:00.000", "00:00:00.050"], [0, 0.05, 0.1]),
         ("frame", ["a.png", "b.png", "c.png"], None),
     ],
 )
@@ -83,6 +86,14 @@ def test_times_are_what_the_column_tells_or_absent(tmp_path, name, values, expec
         (sample,) = sequences(path, frame_column=name, fps=10)
         expected = [0, 0.1, 0.2]
     np.testing.assert_allclose(sample.sequence.time, expected, atol=1e-6)
+
+
+def test_numbers_that_fall_are_told_and_counters_that_are_full_go_on(tmp_path):
+    (sample,) = sequences(write(tmp_path / "a.csv", frames(2, 0, 1)))
+    assert sample.notes == {FELL: 1} and sample.sequence.points[:, 0].tolist()[::2] == [0, 1, 2]
+    (sample,) = sequences(write(tmp_path / "b.csv", frames(254, 255, 0, 1, 2)), fps=10)
+    assert sample.notes == {WRAPPED: 1} and sample.sequence.points[::2, 0].tolist() == [254, 255, 0, 1, 2]
+    np.testing.assert_allclose(sample.sequence.time, [0, 0.1, 0.2, 0.3, 0.4])
 
 
 def test_kept_columns_and_colors_are_in_the_file(tmp_path):
@@ -149,6 +160,8 @@ def test_columns_that_are_not_there(tmp_path, options, message):
 
 
 def test_tables_that_cannot_be_split(tmp_path):
+    (item,) = TableSequences(write(tmp_path / "0.csv", [], "frame,x,y,z")).items()
+    assert "a header, but no rows" in item.problem
     (item,) = TableSequences(write(tmp_path / "a.csv", [(1, 2, 3)], "x,y,z")).items()
     assert "which column numbers the frames? --frame-column NAME says it; found x, y, z" in item.problem
     (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
@@ -191,6 +204,23 @@ def test_parquet_is_read_as_pyarrow_wrote_it(tmp_path, data):
     (sample,) = sequences(path, sequence_column="run")
     np.testing.assert_allclose(sample.sequence.points, points.astype(np.float32))
     assert sample.sequence.num_frames == len(np.unique(number))
+
+
+@pytest.mark.parametrize("packed", ["uncompressed", "lz4", "zstd"])
+@pytest.mark.parametrize("rows", [2, 100])
+def test_feather_is_read_as_pyarrow_wrote_it(tmp_path, packed, rows):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import feather
+
+    points = np.random.default_rng(0).uniform(1, 9, (7, 3)).astype(np.float16)
+    columns = {"frame": np.repeat([0, 1], [3, 4]), **dict(zip("xyz", points.T))}
+    feather.write_feather(pyarrow.table(columns), str(tmp_path / "a.feather"), compression=packed, chunksize=rows)
+    (sample,) = sequences(tmp_path / "a.feather")
+    np.testing.assert_array_equal(sample.sequence.points, points.astype(np.float32))
+    assert np.diff(sample.sequence.frame_offsets).tolist() == [3, 4]
+    (tmp_path / "a.feather").write_bytes((tmp_path / "a.feather").read_bytes()[:-9])
+    (item,) = TableSequences(tmp_path / "a.feather").items()
+    assert "a.feather: not a readable Feather table" in item.problem
 
 
 def test_a_truncated_parquet_is_named(tmp_path):

@@ -47,7 +47,8 @@ class PointSlots(Backbone):
         return [Grouping(points, times, points[:, :0], times[:, :0], nothing)]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Class logits (B,C): the logarithm of the mean scores of the members that `_speakers` names."""
+        """Class logits (B,C): the logarithm of the mean scores of the members that `_speakers` names; of a clip without any
+        point, which tells nothing, all classes alike."""
         clips = torch.cat([groups[0].points, groups[0].columns], -1)
         clips = clips.unflatten(1, (self.config.num_frames, self.config.points_per_frame))
         speakers = self._speakers(clips[..., 3].amax((1, 2)).long() - 2)
@@ -56,7 +57,9 @@ class PointSlots(Backbone):
             if asked.any():
                 which = asked.nonzero()[:, 0]
                 total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
-        return torch.log(total.clamp(min=_LEAST) / speakers.sum(1, keepdim=True))
+        logits = torch.log(total.clamp(min=_LEAST) / speakers.sum(1, keepdim=True))
+        empty = (clips[..., 3] == 0).flatten(1).all(1, keepdim=True)
+        return torch.where(empty & (not self.training), torch.zeros_like(logits), logits)
 
     def _speakers(self, unseen: Tensor) -> Tensor:
         """Returns who says something about which clip, bool (B,K): in training one member, not the one that must not see it;

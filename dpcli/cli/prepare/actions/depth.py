@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import typer
 
+from dpcli.cli.help_groups import LABELS
 from dpcli.cli.prepare.conversion import ConversionOptions, run_conversion
 from dpcli.cli.prepare.options import LabelTable, Pattern, Stride, Topic
 from dpcli.errors import UsageError
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 class DepthCamera:
     """Holds the options that say which camera filmed."""
 
+    HEADING: ClassVar = "Camera"
     intrinsics: Annotated[
         Path | None, typer.Option("--intrinsics", help="File of RealSense, Open3D, ROS, COLMAP, or with fx fy cx cy.")
     ] = None
@@ -84,13 +86,14 @@ def depth(
         bool,
         typer.Option(
             "--label-from-folder",
+            rich_help_panel=LABELS,
             help="Take labels from folders FOLDER/CLASS/VIDEO, or FOLDER/train/CLASS/VIDEO and FOLDER/test/CLASS/VIDEO.",
         ),
     ] = False,
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Turns any depth video, 8 or 16 bits, into points in meters.
+    """Turn any depth video, 8 or 16 bits, into points in meters.
 
     For example: dpc prepare depth my_videos --label-from-folder --fov 70 -o own.h5
     """

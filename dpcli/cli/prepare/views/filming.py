@@ -15,6 +15,8 @@ from dpcli.cli.prepare.options import FileOrPipe, PictureSize
 if TYPE_CHECKING:
     from dpcli.prepare.meshes.filming import Filming
 
+TRUTH = "Ground truth"  # heading in the help
+
 
 @dataclass(frozen=True)
 class FilmingOptions:
@@ -38,16 +40,20 @@ class FilmingOptions:
     ] = True
     samples: Annotated[int, typer.Option("--samples", min=1, max=8, help="N x N rays per pixel.")] = 2
     shading: Annotated[float, typer.Option("--shading", help="0 plain colors .. 1 full light and shade.")] = 0.5
-    tracks: Annotated[int, typer.Option("--tracks", min=0, help="Surface points of ground truth; 0: none.")] = 4096
+    tracks: Annotated[
+        int, typer.Option("--tracks", min=0, rich_help_panel=TRUTH, help="Surface points of ground truth; 0: none.")
+    ] = 4096
     part_tolerance: Annotated[
         float,
         typer.Option(
             "--part-tolerance",
+            rich_help_panel=TRUTH,
             help="Bones that differ from their parent by less than this are one part with it, in object radii.",
         ),
     ] = 0.01
     min_part: Annotated[
-        float, typer.Option("--min-part", help="Parts of a smaller share of the points join another.")
+        float,
+        typer.Option("--min-part", rich_help_panel=TRUTH, help="Parts of a smaller share of the points join another."),
     ] = 0.01
     seed: Seed = 0
 

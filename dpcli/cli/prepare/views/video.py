@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import typer
 
@@ -34,6 +34,7 @@ class PictureOptions:
 class CutOutOptions:
     """Holds the options that tell the object from its background."""
 
+    HEADING: ClassVar = "Cutting the object out"
     background: Annotated[
         str,
         typer.Option(
@@ -49,7 +50,8 @@ class CutOutOptions:
         typer.Option("--holes", help="Enclosed regions of the background's color: keep (filled) or cut (gaps)."),
     ] = "auto"
     mask: Annotated[
-        Path | None, typer.Option("--mask", help="Folder with a mask for each frame, the object white.")
+        Path | None,
+        typer.Option("--mask", help="Folder with a mask for each frame, or a video of them, the object white."),
     ] = None
 
 
@@ -57,6 +59,7 @@ class CutOutOptions:
 class OrbitOptions:
     """Holds the options of the filming camera and of further views."""
 
+    HEADING: ClassVar = "Cameras and further views"
     elevation: Annotated[float, typer.Option("--elevation", help="Elevation of the camera, degrees, up = +.")] = 0.0
     radius: Annotated[float, typer.Option("--radius", help="Distance of the cameras from the object's middle.")] = 2.0
     fovy: Annotated[float, typer.Option("--fovy", help="Vertical field of view of the cameras, degrees.")] = 49.1
@@ -80,7 +83,7 @@ def video(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Reads a clip of one object: frames with alpha, masks or a plain background; optionally further views.
+    """Read a clip of one object: frames with alpha, masks or a plain background; optionally further views.
 
     For example: dpc prepare video fox.mp4 --background white -o fox.h5
     """
