@@ -9,9 +9,10 @@ from pathlib import Path
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.whole_file import make_folder
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
-from dpcli.segment.kinematics.urdf_writer import make_folder, tree_json, write_trees, write_urdf
+from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
 from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
 
