@@ -5,7 +5,7 @@ from __future__ import annotations
 
 def main() -> None:
     """Run `dpc` with the words of the command line."""
-    from dpcli.signal_exit import heard, stand_by, watch_signals
+    from dpcli.signal_exit import acknowledge_signal, start_watchdog, watch_signals
 
     watch_signals()
     import sys
@@ -14,7 +14,7 @@ def main() -> None:
         from dpcli.standard_streams import hush_warnings, quiet_libraries, ready_streams
 
         ready_streams()
-        stand_by()
+        start_watchdog()
         if "--debug" not in sys.argv:
             hush_warnings()
             quiet_libraries()
@@ -26,7 +26,7 @@ def main() -> None:
         sys.stderr.write("dpc: error: interrupted\n")
         sys.exit(130)
     finally:
-        heard()
+        acknowledge_signal()
 
 
 if __name__ == "__main__":

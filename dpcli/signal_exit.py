@@ -2,7 +2,7 @@
 
 Commands that can keep what is done take the stop signals over while they work (`runtime.signals`). This imports nothing
 but what Python has loaded anyway, so that it stands before anything else does. Python's handlers run between two lines of
-Python: for a library that doesn't come back to them, or crashes, a second process stands by, which does nothing else.
+Python: for a library that doesn't come back to them, or crashes, a watchdog process ends this one.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ if TYPE_CHECKING:  # as in typing, whose import would take longer than all of th
     from types import FrameType, SimpleNamespace
 
 STOPPED, INTERRUPTED = 75, 130  # as EX_TEMPFAIL, and as a shell reports SIGINT
-_PATIENCE = 0.05  # seconds after which one looks again whether libraries still load
-_DEAF, _DEAF_TWICE = 15, 2  # seconds after which a signal, a second signal, that nobody heard ends the process
-_HEARD = b"\0"  # no signal's number
+_RETRY = 0.05  # seconds until it is looked again whether an import still runs
+_GRACE, _SECOND_GRACE = (
+    15,
+    2,
+)  # seconds after which a first, a second signal that Python didn't acknowledge ends the process
+_ACKNOWLEDGED = b"\0"  # no signal's number
 _OVERTAKEN = 0.1  # seconds in which the number of a signal that another thread got may come after the answer to it
 _CODES = {"SIGINT": INTERRUPTED, "SIGTERM": STOPPED, "SIGUSR1": STOPPED, "SIGUSR2": STOPPED}
 
@@ -27,35 +30,35 @@ class Ended(KeyboardInterrupt):
     """Unwinds a command, raised in it by a signal. Not the plain one, for which Python kills itself by SIGINT as it ends."""
 
 
-class _Watch:
+class _State:
     """Holds the name of the signal that came, whether there is work to be ended in order, and whose process this is."""
 
     name = ""
     working = False
     process = 0
-    writing = -1  # to the process that stands by
+    writing = -1  # end of the pipe to the watchdog
 
 
-_watch = _Watch()
+_state = _State()
 
 
 def watch_signals() -> None:
     """Makes Ctrl-C and stop signals end this process with a sentence; those that are ignored (nohup) stay so."""
-    _watch.process, sys.unraisablehook = os.getpid(), _lost
+    _state.process, sys.unraisablehook = os.getpid(), _reraise_dropped
     for name in _CODES:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _handle)
 
 
-def stand_by() -> None:
-    """Starts a process that ends this one when it hears no signal, and says so when it ends without a word; not on Windows."""
+def start_watchdog() -> None:
+    """Starts a process that kills this one when it doesn't acknowledge a signal, and reports when it crashed; not on Windows."""
     if not hasattr(os, "fork"):
         return
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
-    _watch.writing = writing
+    _state.writing = writing
     signal.set_wakeup_fd(writing, warn_on_full_buffer=False)  # what C gets at once, also where Python's handlers wait
     try:
         child = os.fork()
@@ -64,45 +67,45 @@ def stand_by() -> None:
     if child == 0:
         try:
             os.close(writing)
-            _stand_by(reading, _watch.process)
+            _run_watchdog(reading, _state.process)
         finally:
             os._exit(0)
     os.close(reading)
 
 
-def heard() -> None:
-    """Tells the process that stands by that a signal was heard, or that the work is done."""
-    if _watch.writing >= 0 and _watch.process == os.getpid():
+def acknowledge_signal() -> None:
+    """Tells the watchdog that a signal was received, or that the work is done."""
+    if _state.writing >= 0 and _state.process == os.getpid():
         try:
-            os.write(_watch.writing, _HEARD)
+            os.write(_state.writing, _ACKNOWLEDGED)
         except OSError:  # it was killed
             pass
 
 
-def _stand_by(reading: int, process: int) -> None:
+def _run_watchdog(reading: int, process: int) -> None:
     import select
     import time
 
     for name in ("SIGHUP", *_CODES):  # they reach the whole group, and are the other one's to answer
         signal.signal(getattr(signal, name), signal.SIG_IGN)
-    for number in (0, 1):  # whoever waits for the end of a pipe waits for the command alone
+    for number in (0, 1):  # else a reader of our pipes would wait for the watchdog, too
         os.close(number)
     numbers = {getattr(signal, name): name for name in _CODES}
-    unheard, patience, heard_at, ended_well = "", None, -1.0, False
+    pending, grace, acknowledged_at, ended_well = "", None, -1.0, False
     while True:
-        ready, _, _ = select.select([reading], [], [], patience)
+        ready, _, _ = select.select([reading], [], [], grace)
         if not ready:
-            _say(f"stopped by {unheard}; a library did not come back from its work; run the same command again")
+            _say(f"stopped by {pending}; a library did not come back from its work; run the same command again")
             os.kill(process, signal.SIGKILL)
             return
-        told = os.read(reading, 1)
-        if not told:
+        message = os.read(reading, 1)
+        if not message:
             break
-        if told == _HEARD:
-            unheard, patience, heard_at, ended_well = "", None, time.monotonic(), True
-        elif told[0] in numbers and time.monotonic() > heard_at + _OVERTAKEN:
-            patience = _DEAF_TWICE if unheard else _DEAF
-            unheard, ended_well = numbers[told[0]], False
+        if message == _ACKNOWLEDGED:
+            pending, grace, acknowledged_at, ended_well = "", None, time.monotonic(), True
+        elif message[0] in numbers and time.monotonic() > acknowledged_at + _OVERTAKEN:
+            grace = _SECOND_GRACE if pending else _GRACE
+            pending, ended_well = numbers[message[0]], False
     if not ended_well:
         _say("killed, or ended by a crash in a library: too little memory, perhaps, or a damaged input")
 
@@ -119,21 +122,21 @@ def _say(sentence: str) -> None:
 
 def set_working(working: bool) -> None:
     """Says whether a signal has to unwind a command, which tidies up, or ends the process at once. The second one always does."""
-    _watch.working = working
+    _state.working = working
 
 
 def signal_outcome() -> tuple[int, str] | None:
     """Returns the exit code and what to say when a signal has ended the command, else None."""
-    if not _watch.name:
+    if not _state.name:
         return None
-    code = _CODES[_watch.name]
-    stopped = f"stopped by {_watch.name}; run the same command again"
+    code = _CODES[_state.name]
+    stopped = f"stopped by {_state.name}; run the same command again"
     return code, "interrupted" if code == INTERRUPTED else stopped
 
 
 def let_end() -> None:
     """Ignores further signals: the work is done, and what it is worth is decided."""
-    if _watch.process == os.getpid():
+    if _state.process == os.getpid():
         signal.setitimer(signal.ITIMER_REAL, 0)
         for name in (*_CODES, "SIGALRM"):
             if hasattr(signal, name):
@@ -141,13 +144,13 @@ def let_end() -> None:
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    if os.getpid() != _watch.process:  # a fork of it, which its parent ends
+    if os.getpid() != _state.process:  # a fork of it, which its parent ends
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
         return
-    heard()
-    first, _watch.name = not _watch.name, signal.Signals(number).name
-    if _watch.working and first:
+    acknowledge_signal()
+    first, _state.name = not _state.name, signal.Signals(number).name
+    if _state.working and first:
         _unwind(number, frame)
         return
     code, said = signal_outcome() or (STOPPED, "stopped")
@@ -157,25 +160,25 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 def _unwind(number: int, frame: FrameType | None) -> None:
     """Raises Ended, but not within an import: a library that is half there turns it into anything, an abort even."""
-    if not _imports(frame):
+    if not _is_importing(frame):
         raise Ended
-    _again()
+    _retry_unwinding()
 
 
-def _again() -> None:
+def _retry_unwinding() -> None:
     signal.signal(signal.SIGALRM, _unwind)
-    signal.setitimer(signal.ITIMER_REAL, _PATIENCE)
+    signal.setitimer(signal.ITIMER_REAL, _RETRY)
 
 
-def _lost(told: SimpleNamespace) -> None:
+def _reraise_dropped(dropped: SimpleNamespace) -> None:
     """Raises Ended again where Python drops errors, such as in what runs as an object goes; others only --debug shows."""
-    if told.exc_type is Ended:
-        _again()
+    if dropped.exc_type is Ended:
+        _retry_unwinding()
     elif "--debug" in sys.argv:
-        sys.__unraisablehook__(told)
+        sys.__unraisablehook__(dropped)
 
 
-def _imports(frame: FrameType | None) -> bool:
+def _is_importing(frame: FrameType | None) -> bool:
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True

@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from dpcli.classify.data.augment import AUGMENTATIONS, Augmentation
+from dpcli.classify.data.validation_split import CROSS
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES, backbone_changes
 from dpcli.classify.training.run_settings import RunSettings
@@ -44,7 +45,7 @@ class TrainingSettings:
                 " uniform or clips_per_video = 0"
             )
 
-        if self.run.validation == "cross" and self.network.members < 2:
+        if self.run.validation == CROSS and self.network.members < 2:
             raise UsageError(
                 "--validation cross: needs a network of several members, as preset sparse has; give another rule"
             )

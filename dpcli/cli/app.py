@@ -32,9 +32,9 @@ ROOMS = {
     "prepare": "Turn raw data into a file of point cloud sequences, or of views.",
     "classify": "Recognize actions and gestures (Kinet).",
     "segment": "Find rigid parts and their motions in a few frames, without labels.",
-    "generate4d": "A 4D Gaussian scene with rigid parts, from one video.",
+    "generate4d": "Fit, draw and export a 4D Gaussian scene with rigid parts, from one video.",
     "evaluate": "Compare what a model says with the truth.",
-    "info": "Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.",
+    "info": "Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; as a contact sheet or a page, too.",
 }
 
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
@@ -270,7 +270,7 @@ def _run(command: Any, arguments: list[str]) -> Any:
 
     try:
         set_working(True)
-        with regular_files_only() if arguments[:1] != ["classify"] else nullcontext():  # a stream may come by a FIFO
+        with nullcontext() if "--stream" in arguments else regular_files_only():  # a stream may come by a FIFO
             code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
         sys.stdout.flush()
         return code

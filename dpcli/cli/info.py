@@ -47,7 +47,7 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Kind, counts, lengths, classes, splits, ranges and provenance of a file; a contact sheet of its frames; a page to look at it.
+    """Show what is in a file: kind, counts, lengths, classes, splits, ranges, provenance; as a contact sheet or a page, too.
 
     Of a model: its classes, configuration and training.
     """

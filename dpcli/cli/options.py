@@ -53,6 +53,7 @@ Picture = Annotated[Path | None, typer.Option("--picture", help="Write a picture
 TrustedBackbone = Annotated[
     str | None,
     typer.Option(
-        "--backbone", help="module:Class of a model made on a backbone of your own: your leave to run that code."
+        "--backbone",
+        help="Your own backbone as module:Class, where the model was trained on one; its code is run only if it is named here.",
     ),
 ]

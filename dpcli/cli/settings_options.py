@@ -110,7 +110,7 @@ def _general_options(catalog: Catalog, presets: Presets) -> list[inspect.Paramet
         "--config",
         metavar="FILE",
         rich_help_panel=SETTINGS,
-        help="A TOML file of settings; --set and flags stand over it.",
+        help="A TOML file of settings; --set and flags override it.",
     )
     words = tuple(f"{name}={word}" for name, one in catalog.settings.items() for word in words_of(one.hint) or ("",))
     sets = typer.Option(

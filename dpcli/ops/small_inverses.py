@@ -74,7 +74,7 @@ def small_solve(matrices: Tensor, right: Tensor) -> Tensor:
     return found
 
 
-def mend_guarded_gradients(
+def correct_guarded_gradients(
     moments: np.ndarray,
     places: np.ndarray,
     planes: np.ndarray,

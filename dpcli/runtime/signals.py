@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from dpcli.errors import Stopped
-from dpcli.signal_exit import heard
+from dpcli.signal_exit import acknowledge_signal
 
 _NAMES = ("SIGTERM", "SIGUSR1", "SIGUSR2")  # batch systems send one of these before they kill
 
@@ -37,7 +37,7 @@ def stop_requested() -> Iterator[StopRequest]:
         return
 
     def handle(number: int, frame: object) -> None:
-        heard()
+        acknowledge_signal()
         if request.requested:
             os._exit(Stopped.exit_code)
         request.requested, request.name = True, signal.Signals(number).name

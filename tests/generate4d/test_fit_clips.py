@@ -44,7 +44,7 @@ def test_processes_and_shards_fit_the_same_scenes(clips, tmp_path, dpc, dpc_here
             for key in alone.keys() - {"provenance"}:
                 np.testing.assert_array_equal(alone[key], other[key], err_msg=f"{folder} {name} {key}")
     again = dpc_here("generate4d", "fit", *good, "-o", tmp_path / "jobs", *OPTIONS)
-    assert again.returncode == 0 and again.stderr.count(b"this fit is finished") == 2
+    assert again.returncode == 0 and again.stderr.count(b"already complete") == 2
 
 
 def test_a_bad_clip_is_named_and_the_others_are_fitted(clips, tmp_path, dpc_here):

@@ -72,7 +72,7 @@ class Embedding:
 
     def lines(self) -> list[str]:
         """Returns the same for a person, one line a stream below a heading."""
-        heading = f"{len(self.labels)} videos, perplexity {self.perplexity:g}; of the features, not of the map:"
+        heading = f"{len(self.labels)} videos, perplexity {self.perplexity:.3g}; of the features, not of the map:"
         return [heading] + [
             f"{stream:<8} {embedding.features.shape[1]:>5} numbers, {_caption(embedding)}"
             for stream, embedding in self.streams.items()

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.fusion import MEANS, geometric_weights, likelihood_weights, mean_scores, parse_weights
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import short_names
@@ -19,6 +18,7 @@ from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.store import ScoresReader, ScoresWriter, input_file, output_file
 from dpcli.store.pipes import refuse_repeats
+from dpcli.store.writing.already_made import WORK, already_made
 
 _TAKEN = "fused"  # what evaluations call the main scores: no stream may
 _OFF = 1e-2  # how far from 1 the sum of a sample's probabilities may be: 16-bit numbers of another program
@@ -66,7 +66,7 @@ def fuse(
         config = _record(streams, mean, shares, readers, judges)
         entry = provenance.record(config, 0, dict(zip(stream_names(short_names(called)), paths)))
         fusion = Fusion(len(sources[0].names), dict(zip(streams, shares.tolist())))
-        if not force and already_scored(target, entry):
+        if not force and already_made(target, entry, ScoresReader, WORK):
             return Fusion(fusion.videos, fusion.weights, complete=True)
         with ScoresWriter(
             target,

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from dpcli.classify.commands.model_task import ModelTask
-from dpcli.classify.commands.scores_made import already_scored
 from dpcli.classify.confidence import Confidence, choose_confidence
 from dpcli.classify.data.clips import ClipSource, OneVideo
-from dpcli.classify.data.likeness import file_like, tell_unlike
+from dpcli.classify.data.likeness import file_like, tell_long, tell_unlike
 from dpcli.classify.data.videos import check_classes, report_backward, report_short, select_videos
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model
@@ -25,6 +24,7 @@ from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import keep_freed_memory
 from dpcli.store import CloudSequence, CloudsReader, ScoresReader, ScoresWriter, input_file, output_file
 from dpcli.store.schema import kept_name
+from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 _WORTH_WORKERS = 500  # clips; fewer are scored by one process before a second has started
@@ -82,12 +82,13 @@ def predict(
         report_short(source, info.config.num_frames)
         report_backward(reader, source.sequences)
         tell_unlike(str(path), file_like(reader, source.sequences), info, task.model)
+        tell_long(reader, source.sequences, info, task.model)
         config = _record(task, weights, info, source, clips_per_video)
         confidence = None if reject_below is None else choose_confidence(info.notes, reject_below, task.model)
         if confidence is not None:
             config["reject_below"] = {"temperature": confidence.temperature, "threshold": confidence.threshold}
         entry = describe_shard(provenance.record(config, task.seed, {"clouds": path}), spread.shard)
-        complete = not task.force and already_scored(target, entry)
+        complete = not task.force and already_made(target, entry, ScoresReader, WORK)
         if not complete:
             keep_freed_memory()
             with _writer(task, target, info, [*reader.provenance, entry], confidence is not None) as writer:

@@ -88,7 +88,7 @@ def predict_stream(task: ModelTask, options: StreamOptions, new_listener: Callab
     keep_freed_memory()
     target = _writer(task, info, predictor) if task.output else None
     with target if target is not None else nullcontext(), stop_requested() as stop, _interrupt_asks(stop):
-        watch = _Oddities(
+        watch = _IrregularFrames(
             info.timing == "slots",
             predictor.window.size,
             lambda theirs: tell_unlike(task.source, theirs, info, task.model),
@@ -152,7 +152,11 @@ def _interrupt_asks(stop: StopRequest) -> Iterator[None]:
 
 
 def _follow(
-    predictor: StreamPredictor, frames: Iterator[np.ndarray], lines: Listener, stop: StopRequest, watch: _Oddities
+    predictor: StreamPredictor,
+    frames: Iterator[np.ndarray],
+    lines: Listener,
+    stop: StopRequest,
+    watch: _IrregularFrames,
 ) -> BaseException | None:
     """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     feed = ReadAhead(frames, 2 * predictor.window.size)
@@ -187,8 +191,8 @@ def _follow(
     return problem
 
 
-class _Oddities:
-    """Tells the first of the frames that are odd at once, and at the end how many there were.
+class _IrregularFrames:
+    """Warns of the first empty, sparse or late frame at once, and counts them at the end.
 
     few: whether frames of few points, or none, are what the model takes. window, compare: so many frames are first compared
     with what the model learned from.
@@ -227,7 +231,7 @@ class _Oddities:
             self.sparse += 1
 
     def sum_up(self) -> None:
-        """Tells how many odd frames there were, where one was told of already."""
+        """Logs how many irregular frames there were, where there was more than one."""
         if self._first:  # fewer than a window
             self._compare(like(self._first))
         counts = {

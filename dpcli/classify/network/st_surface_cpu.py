@@ -17,7 +17,7 @@ from torch import Tensor
 from dpcli.classify.network.st_surface import deviations, fit_surface, solve_rule
 from dpcli.ops.backend import chosen_backend
 from dpcli.ops.cpu.cache_blocks import TASKS, ranges, share_tasks, steps
-from dpcli.ops.small_inverses import GUARDS, KERNEL_SIZE, mend_guarded_gradients
+from dpcli.ops.small_inverses import GUARDS, KERNEL_SIZE, correct_guarded_gradients
 from dpcli.runtime.mixed_precision import is_reduced
 
 _PIECE = 1 << 20  # bytes of reduced features
@@ -197,12 +197,12 @@ class _Case:
             *self.sizes,
         )
 
-    def mend(
+    def correct(
         self, moment: np.ndarray, plane: np.ndarray, to_plane: np.ndarray, to_matrix: np.ndarray, moved: np.ndarray
     ) -> None:
         """Sets the gradients of the fits of a piece whose determinant the guard moved."""
         groups, size = self.layout.groups, self.layout.size + 1
-        mend_guarded_gradients(
+        correct_guarded_gradients(
             moment.reshape(-1, self.layout.entries, groups),
             self.layout.places,
             plane.reshape(-1, size, groups),
@@ -279,7 +279,7 @@ class _SurfaceFit(torch.autograd.Function):
                 if len(away):
                     case.row_kernels.deviation_back(some, away, to_plane, *case.sizes)
                 case.solve_kernels.solve_planes_back(moment, *case.rule, to_plane, to_matrix, to_right, moved)
-                case.mend(moment, _flat(planes)[plane], to_plane, to_matrix, moved)
+                case.correct(moment, _flat(planes)[plane], to_plane, to_matrix, moved)
                 to_features = room.features[: rows.stop - rows.start]
                 case.row_kernels.fit_back(
                     some,

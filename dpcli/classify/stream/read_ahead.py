@@ -1,4 +1,4 @@
-"""Frames read ahead in a thread of their own, so that arrival is timed and a signal is heard while the pipe is silent."""
+"""Frames read ahead in a thread of their own, so that arrival is timed and a signal is noticed while the pipe is silent."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def baseline(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Tell in seconds what a network must beat: a random forest on quantiles of position, motion and kept columns."""
+    """Train and score a random forest in seconds, for a network to beat; it sees quantiles of position, motion, kept columns."""
     from dpcli.classify.commands.baseline import baseline as run
 
     result = run(data, output=output, seed=seed, force=force)

@@ -49,6 +49,6 @@ for command in MADE:
 app.add_typer(
     synthetic,
     name="synthetic",
-    help="Makes data out of nothing, with ground truth: gestures, articulated objects, streets, an animal.",
+    help="Make data from nothing but a seed, with ground truth: gestures, articulated objects, streets, an animal.",
     rich_help_panel="Synthetic data",
 )

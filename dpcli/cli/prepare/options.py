@@ -36,8 +36,7 @@ Stride = Annotated[int, typer.Option("--stride", min=1, help="Keep every n-th fr
 Pattern = Annotated[
     str,
     typer.Option(
-        "--pattern",
-        help="Which files of a folder are its frames, such as '*.depth.png'. Default: found by their names.",
+        "--pattern", help="Which files of a folder are its frames, such as 'frame_*'. Default: found by their names."
     ),
 ]
 Topic = Annotated[

@@ -18,7 +18,7 @@ PRESETS = {name: {"network": network} for name, network in NETWORK_PRESETS.items
 
 @options_of(CATALOG, ("group", "points"), presets=PRESETS, preset="compact")
 def profile(given: Given, as_object: Json = False, device: Device = "auto") -> None:
-    """True parameters and multiply-adds of a part network, the paper's way of counting beside, latency and memory."""
+    """Show a part network's true parameters and multiply-adds, the paper's count beside them, latency and memory."""
     network = CATALOG.resolve(PRESETS[str(given.preset)], given)["network"]
     from dpcli.segment.commands.profile import profile_network
 

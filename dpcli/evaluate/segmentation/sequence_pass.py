@@ -22,7 +22,6 @@ from dpcli.store.writing.already_made import WORK, already_made
 from dpcli.store.writing.item_pass import ItemPass, Wording, skipped_lines
 
 Measure = Callable[[SequencePair], dict[str, Any]]
-_REFUSAL = "holds something else than these statistics ({differences}); write to another file, or --force to replace it"
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def count_sequences(paired: PairedSequences, measure: Measure, about: dict[str, 
         about = {**about, "split": paired.split, "truth": str(paired.truth.path), "left_out": left_out}
         inputs = {"parts": paired.predicted.path, "truth": paired.truth.path} if kept else None
         entry = describe_shard(provenance.record(about, 0, inputs), keeping.spread.shard)
-        if not kept or keeping.force or not already_made(target, entry, StatisticsReader, _REFUSAL, WORK):
+        if not kept or keeping.force or not already_made(target, entry, StatisticsReader, WORK):
             with StatisticsWriter(
                 target,
                 class_names=paired.truth.class_names,

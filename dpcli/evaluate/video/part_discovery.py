@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.proportions import divide
 from dpcli.evaluate.segmentation.rand_index import adjusted_rand_index
+from dpcli.ops.rotations import quaternion_to_matrix
 from dpcli.runtime.seeds import scikit_learn_state
 from dpcli.store.gaussians import GaussianScene
 
@@ -125,31 +126,14 @@ def carry_points(scene: GaussianScene, points: np.ndarray, times: np.ndarray) ->
     """
     means, turns = scene.at(float(times[0]))
     index, weight = nearest_gaussians(points, means, scene.opacity, TRACK_NEIGHBORS)
-    back = np.swapaxes(_rotations(turns), 1, 2)
+    back = np.swapaxes(quaternion_to_matrix(turns.astype(np.float64)), 1, 2)
     local = np.einsum("mkij,mkj->mki", back[index], points[:, None].astype(np.float64) - means[index])
     carried = np.empty((len(times), *points.shape))
     for frame, time in enumerate(times):
         means, turns = scene.at(float(time))
-        moved = np.einsum("mkij,mkj->mki", _rotations(turns)[index], local) + means[index]
+        moved = np.einsum("mkij,mkj->mki", quaternion_to_matrix(turns.astype(np.float64))[index], local) + means[index]
         carried[frame] = (weight[..., None] * moved).sum(1)
     return carried
-
-
-def _rotations(quaternions: np.ndarray) -> np.ndarray:
-    """Returns rotations f64 (N,3,3) of unit quaternions w x y z (N,4)."""
-    w, x, y, z = quaternions.astype(np.float64).T
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return np.stack(rows, -1).reshape(-1, 3, 3)
 
 
 def track_score(scene: GaussianScene, track: np.ndarray, times: np.ndarray) -> TrackScore:

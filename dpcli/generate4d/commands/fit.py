@@ -50,17 +50,15 @@ def fit_scene(
     """Fits a scene to a views file, or continues a stopped fit, and writes it; does nothing where this fit is finished.
 
     run: folder of checkpoints, log, settings and previews, by default beside the output. picture: where the last preview
-    is written. Raises UsageError, DataError for what a user can mend, Stopped after a signal.
+    is written. Raises UsageError, DataError for what a user can correct, Stopped after a signal.
     """
     if picture is not None:
         check_target(picture, "--picture", PICTURES)
     chosen, folder_path = choose_device(device), _run_folder(output, run)
     with input_file(views) as path:
         record = _record(path, config, supervision, seed)
-        refusal = "exists already and is no scene of this fit; --force replaces it"
         made = output != "-" and not force
-        if made and already_made(Path(output), {"config": record}, scene_origin, refusal, ["config"]):
-            log.info(f"{output}: this fit is finished; --force fits again")
+        if made and already_made(Path(output), {"config": record}, scene_origin, ["config"]):
             if picture is not None:
                 write_preview(read_scene(Path(output)), _load(path, config, supervision), picture)
             return

@@ -296,7 +296,7 @@ def solve_planes(moments, places, groups, ridge, min_det, guard, planes):
 def solve_planes_back(moments, places, groups, ridge, min_det, guard, grad, grad_matrix, grad_right, moved):
     """The gradient of `solve_planes`: grad (centroids*n*groups) at the planes -> grad_matrix (centroids*n*n*groups), G + G',
     and grad_right (centroids*n*groups). moved (centroids*groups): the fits whose determinant the guard moved, and on whose
-    plane something depends; their grad_matrix is the caller's to mend (`ops.small_inverses.mend_guarded_gradients`)."""
+    plane something depends; their grad_matrix is the caller's to correct (`ops.small_inverses.correct_guarded_gradients`)."""
     n = places.shape[0]
     half = n if n <= 4 else (n + 1) // 2
     tile, out = np.empty((n, n, TILE), np.float32), np.empty((n, n, TILE), np.float32)

@@ -6,7 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from os.path import splitext
 from pathlib import Path
@@ -163,7 +163,9 @@ class DepthVideos:
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        return self._table.apply(self._found) if self._table else self._found
+        told = {"timed": self._timed}
+        items = [replace(item, extra={**item.extra, **told}) for item in self._found]
+        return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -199,7 +201,7 @@ class DepthVideos:
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
-        if not self._timed:
+        if not item.extra["timed"]:
             return None
         series: Series | None = item.extra["series"]
         if self.fps and series:

@@ -61,8 +61,6 @@ def _no_clouds(inputs: Sequence[Path]) -> bool:
 def _merge_shards(inputs: Sequence[Path], output: Path, force: bool, resume: bool) -> Report:
     there = output.exists() and not force
     join_shards(inputs, output, force=force, resume=resume)
-    if there:
-        log.info(f"{output}: already complete, made of the same files (--force makes it again)")
     return count_samples(Report(was_complete=there), output)
 
 
@@ -129,7 +127,6 @@ def _write_samples(copy: Copy, samples: list[tuple[Source, int, int | None]]) ->
     """Copies (file, index, new label or None for its own), or leaves a file as it is that was made of the same."""
     report = Report(skipped=copy.skipped)
     if not copy.force and already_made(copy.output, copy.provenance, CloudsReader):
-        log.info(f"{copy.output}: already complete, made of the same files (--force makes it again)")
         report.was_complete = True
         return count_samples(report, copy.output)
     files = OpenFiles()

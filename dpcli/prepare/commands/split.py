@@ -15,7 +15,6 @@ from dpcli.errors import DataError, UsageError
 from dpcli.prepare.commands.copy_samples import Copy, copy_samples
 from dpcli.prepare.commands.sources import Source, read_source
 from dpcli.prepare.reader import SPLITS
-from dpcli.runtime.progress import log
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
 from dpcli.standard_streams import printable
@@ -189,7 +188,6 @@ def _write_split(reader: CloudsReader, splits: list[str], wanted: list[str], cop
     """Copies the samples of the wanted splits, or leaves a file as it is that was made the same way."""
     check_output(copy.output, "-o", [copy.pattern.path])
     if not copy.force and already_made(copy.output, copy.provenance[-1], CloudsReader):
-        log.info(f"{copy.output}: already complete (--force makes it again)")
         return
     chosen = [index for index, name in enumerate(splits) if name in wanted]
 

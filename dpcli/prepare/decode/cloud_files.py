@@ -41,7 +41,7 @@ SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] = ()) -> Cloud:
     """Reads one cloud. Raises DataError, which says what is wrong.
 
-    ``bin_columns``: float32 values per point of a ``.bin``, None to tell by their look. ``keep``: names of further
+    ``bin_columns``: float32 values per point of a ``.bin``, None to judge by the values. ``keep``: names of further
     columns.
     """
     if path.stat().st_size == 0:

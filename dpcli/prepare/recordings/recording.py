@@ -20,7 +20,7 @@ SUFFIXES = (".bag", ".mcap", ".db3")
 _IN_FOLDERS = (*SUFFIXES, *(f"{suffix}.zstd" for suffix in SUFFIXES))
 _METADATA = "metadata.yaml"  # beside the files of a ROS 2 bag
 _LISTED = 12
-_MENDERS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
+_REPAIR_TOOLS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}  # for recordings that were cut off
 
 
 @dataclass(frozen=True)
@@ -168,8 +168,8 @@ def _damage_named(path: Path) -> Iterator[None]:
         yield
     except Exception as error:
         said = " ".join(str(error).split())[:200] or type(error).__name__
-        mender = _MENDERS.get(path.suffix.lower())
-        hint = f"; if it was cut off, {mender} mends it" if mender else ""
+        tool = _REPAIR_TOOLS.get(path.suffix.lower())
+        hint = f"; if it was cut off, {tool} repairs it" if tool else ""
         raise DataError(
             f"{path}: not a readable recording ({said}); expected a ROS 1 bag, a ROS 2 bag, or an MCAP file of ROS 2"
             f" messages{hint}"

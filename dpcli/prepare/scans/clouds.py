@@ -71,10 +71,6 @@ class CloudFolders:
         left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Returns the options alone: with the whole index, going to a worker with each item, work would grow with its square."""
-        return asdict(self)
-
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
@@ -145,7 +141,7 @@ class CloudFolders:
             return self.bin_columns, {}
         columns, sure = guess_bin_columns(frames[:: max(1, len(frames) // _LOOKED_AT)][:_LOOKED_AT])
         doubt = "" if sure else ", though other numbers fit as well"
-        note = f"sequences of .bin read as {columns} float32 a point, by their look{doubt} (--bin-columns says it)"
+        note = f"sequences of .bin read as {columns} float32 a point, judged by their values{doubt} (--bin-columns says it)"
         return columns, {} if columns == 4 and sure else {note: 1}
 
     def summary(self, items: list[Item]) -> list[str]:

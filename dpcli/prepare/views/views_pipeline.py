@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.progress import Progress
 from dpcli.runtime.provenance import file_digest, record
 from dpcli.runtime.signals import stop_requested
 from dpcli.store.views import ViewsHeader, ViewsReader, ViewsWriter
@@ -49,7 +49,6 @@ def convert_clip(
     """
     provenance = record(json.loads(json.dumps({"reader": source, **config})), seed)
     if not force and already_made(output, provenance, ViewsReader):
-        log.info(f"{output}: already complete, made by the same configuration (--force makes it again)")
         with ViewsReader(output) as reader:
             return reader.header
     clip = make_clip()

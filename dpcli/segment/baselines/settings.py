@@ -31,7 +31,7 @@ class ClassicalSettings:
 
     method: Literal["multibody", "scene", "network", "dbscan", "ward", "ssc", "trajaffn"] = setting(
         "multibody",
-        "Who says the parts: multibody (one set of rigid bodies explains all frames together), scene (streets: what moves"
+        "What finds the parts: multibody (one set of rigid bodies explains all frames together), scene (streets: what moves"
         " on its own in lidar scans or depth images; --scene chooses it too), network (a trained part network, frame by"
         " frame; --model or --fast choose it too), or a classical method.",
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -150,7 +149,7 @@ def estimate_flow_of_file(
         entry = describe_shard(provenance.record(config, seed, inputs), spread.shard)
         device = str(choose_device(device)) if weights else "cpu"
         work = FlowOfSequence(str(weights.resolve()) if weights else flow, points, as_points, seed, device)
-        if force or not _already_there(target, entry):
+        if force or not already_made(target, entry, CloudsReader, WORK):
             keep_freed_memory()
             with CloudsWriter(
                 target,
@@ -173,15 +172,6 @@ def estimate_flow_of_file(
 def _worthwhile_processes(work: FlowOfSequence, frames: int) -> int:
     """Returns how many processes pay: one for each core where rigid bodies are found, which takes one core, else one."""
     return cpu_count() if work.flow == "icp" and frames > _WORTH_WORKERS else 1
-
-
-def _already_there(target: Path, entry: dict) -> bool:
-    """Returns whether `target` holds the flow of this very work, and says so; UsageError when it holds something else."""
-    refusal = "holds the flow of other data or choices; use another -o, or --force to replace it"
-    made = already_made(target, entry, CloudsReader, refusal, WORK)
-    if made:
-        log.info(f"{target}: already complete, made from the same data (--force makes it again)")
-    return made
 
 
 def _estimate_sequences(

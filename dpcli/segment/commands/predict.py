@@ -116,7 +116,7 @@ def predict_file(
         flow = str(estimator.resolve() if estimator else flow)
         work = PartsOfSequence(once, flow, refinement, seed, reader.length_unit)
         fields = [name for name in reader.fields if name not in ("part", *OF_PARTS)]
-        if force or not _already_there(target, entry):
+        if force or not already_made(target, entry, PartsReader, WORK):
             with PartsWriter(
                 target,
                 num_parts=segmenter.slots,
@@ -172,15 +172,6 @@ def _choose_flow(settings: PredictSettings, reader: CloudsReader) -> str:
             f"--flow {flow}: {method} finds the motions itself; add --method network or a classical one, or leave it out"
         )
     return "icp" if flow in ("auto", "tracks") else flow
-
-
-def _already_there(target: Path, entry: dict) -> bool:
-    """Returns whether `target` holds the parts of this very work, and says so; UsageError when it holds something else."""
-    refusal = "holds parts of another model, data or choice; use another -o, or --force to replace it"
-    made = already_made(target, entry, PartsReader, refusal, WORK)
-    if made:
-        log.info(f"{target}: already complete, made from the same model and data (--force makes it again)")
-    return made
 
 
 def _predict_sequences(

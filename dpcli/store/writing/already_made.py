@@ -6,11 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+from dpcli.config_diff import differences
 from dpcli.errors import DataError, UsageError
+from dpcli.runtime.progress import log
 from dpcli.store.writing.journal import sweep
 
 WORK = ("config", "seed", "inputs", "version")  # what makes two commands the same work, data and program included
-_NAMED = 4  # settings that a refusal names
+_PLAIN = ("seed", "version")
+_NAMED = 4  # differences that a refusal names
 
 
 class HasProvenance(Protocol):
@@ -25,14 +28,13 @@ def already_made(
     target: Path,
     entry: dict[str, Any],
     reader: Callable[[Path], HasProvenance],
-    refusal: str = "exists, made with {differences}; write to another file, or --force to replace it",
     keys: Sequence[str] = ("config", "seed"),
 ) -> bool:
-    """Returns whether `target` holds the result of the work that `entry`, a provenance entry, describes; False if it is absent.
+    """Returns whether `target` holds the result of the work that `entry`, a provenance entry, describes, and logs it.
 
-    `reader` opens the file and checks it. Compared is the last command that made it, by `keys` of its entry. Raises
-    UsageError when the file is another one's: of no kind that `reader` takes, or made otherwise, which `refusal` says
-    behind its name. Leftovers of a run that was killed just after it had finished the file are removed.
+    `reader` opens the file and checks it. Compared is the last command that made it, by `keys` of its entry. False if
+    there is no such file. Raises UsageError when the file is another one's: of no kind that `reader` takes, or made
+    otherwise; the error names what differs. Leftovers of a run that was killed just after it had finished the file are removed.
     """
     if not target.exists():
         return False
@@ -42,13 +44,16 @@ def already_made(
         raise UsageError(f"{error}\nIt stands where the output should go: write to another file, or --force") from None
     before = history[-1] if history else {}
     if not history or any(before.get(key) != entry.get(key) for key in keys):
-        raise UsageError(f"{target}: {refusal.format(differences=_differences(before, entry))}")
+        made = _describe_differences(before, entry) if history else "by another program"
+        raise UsageError(f"{target}: exists, made {made}; write to another file, or --force to replace it")
     sweep(target)
+    log.info(f"{target}: already complete, made by the same command from the same data (--force makes it again)")
     return True
 
 
-def _differences(before: dict[str, Any], now: dict[str, Any]) -> str:
-    """Returns the first settings that differ, in words."""
-    old, new = ({**entry.get("config", {}), "seed": entry.get("seed")} for entry in (before, now))
-    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    return ", ".join(f"{name} {old.get(name)} (now {new.get(name)})" for name in names[:_NAMED])
+def _describe_differences(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """Returns the first settings that differ, and the inputs that are other files, in words."""
+    old, new = ({**entry.get("config", {}), **{key: entry.get(key) for key in _PLAIN}} for entry in (before, now))
+    inputs, own = before.get("inputs") or {}, now.get("inputs") or {}
+    others = [f"another {role} file" for role in sorted({*inputs, *own}) if inputs.get(role) != own.get(role)]
+    return "with " + ("; ".join([*differences(old, new), *others][:_NAMED]) or "other settings")

@@ -14,7 +14,7 @@ from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.st_surface import surface_normal
 from dpcli.classify.network.st_surface_cpu import Fit, _Layout, fit_reduced, fit_reduced_reference
 from dpcli.ops.cpu.small_inverses import solve_planes, solve_planes_back
-from dpcli.ops.small_inverses import GUARDS, mend_guarded_gradients, small_inverse, small_inverse_reference
+from dpcli.ops.small_inverses import GUARDS, correct_guarded_gradients, small_inverse, small_inverse_reference
 
 
 def unit(size, learned, coordinates, weighted, dtype, neighbors=24, dead=False):
@@ -197,7 +197,7 @@ def test_guarded_solutions_and_gradients_against_autograd(size, least, guard):
     given = grad.transpose(1, 2).contiguous().numpy().reshape(-1)
     moved = np.empty((count, groups), np.bool_)
     solve_planes_back(flat, *rule, given, to_matrix.reshape(-1), to_right.reshape(-1), moved.reshape(-1))
-    mend_guarded_gradients(
+    correct_guarded_gradients(
         moments, layout.places, planes, (least, guard), given.reshape(count, n, groups), to_matrix, moved
     )
     wanted = torch.autograd.grad((expected * grad).sum(), leaves)

@@ -21,7 +21,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dpcli.classify.commands.stream import _Oddities
+from dpcli.classify.commands.stream import _IrregularFrames
 from dpcli.classify.data.clips import Clip, ClipSource, uniform_frames
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.kinet import Kinet
@@ -554,7 +554,7 @@ def test_nothing_happens_below_the_threshold_and_scores_stay(model_file, tmp_pat
 
 
 def test_a_silence_is_told_once_and_counted(capsys):
-    watch, points = _Oddities(), np.ones((9, 3), np.float32)
+    watch, points = _IrregularFrames(), np.ones((9, 3), np.float32)
     for number, silent in enumerate((0.0, 0.1, 7.3, 0.1, 2.5)):
         watch.see(number, points, silent)
     watch.sum_up()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from dpcli.evaluate.compare.paired_picture import draw_comparison
 from dpcli.evaluate.compare.paired_tables import compare_notes, compare_tables
 from dpcli.evaluate.compare.result_json import compare_json
 from dpcli.evaluate.compare.significance_tests import mcnemar
+from dpcli.evaluate.results import LeftOut
 from dpcli.store import ScoresWriter
 from tests.support.parts_helpers import CHAIN, perfect, truth_sequence, write_parts
 from tests.support.scores_helpers import CLASSES, write_scores
@@ -139,6 +141,9 @@ def test_a_table_of_values_becomes_a_whole_report(tmp_path):
     (table, changed), notes = compare_tables(report), compare_notes(report)
     assert table.rows[0][:4] == ["PSNR (dB)", "21.5", "22.5", "-1"] and len(changed.rows) == 4
     assert any("4 views" in line for line in notes) and found["units"] == {"psnr": "dB", "lpips": "1"}
+    part = replace(report.parts[0], left_out=[LeftOut("not of split 'test'", ["view 9"])])
+    twice = compare_notes(replace(report, parts=[part, part]))  # as of a parts file: segmentation and motion
+    assert sum("Left out" in line for line in twice) == 1
     draw_comparison(report, tmp_path / "v.png")
     assert (tmp_path / "v.png").stat().st_size > 5000
 

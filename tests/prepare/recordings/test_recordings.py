@@ -350,6 +350,6 @@ def test_damaged_recordings_are_refused_by_name(tmp_path, kind, kept):
     file = path if kind == "bag" else next(path.glob("*.mcap"))
     whole = file.read_bytes()
     file.write_bytes(whole[: kept if isinstance(kept, int) else int(kept * len(whole))])
-    mender = {"bag": "rosbag reindex", "mcap": "mcap recover"}[kind]
-    with pytest.raises(DataError, match=f"not a readable recording .*if it was cut off, {mender} mends it"):
+    tool = {"bag": "rosbag reindex", "mcap": "mcap recover"}[kind]
+    with pytest.raises(DataError, match=f"not a readable recording .*if it was cut off, {tool} repairs it"):
         read(RecordedClouds(file))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 
 import laspy
@@ -124,21 +123,6 @@ def test_folders_of_splits_above_those_of_classes(tmp_path):
     reader = CloudFolders(tmp_path, label_from_folder=True)
     assert reader.class_names == ["run", "walk"]
     assert [(i.label, i.split) for i in reader.items()] == [(1, "test"), (0, "train"), (1, "train")]
-
-
-def test_a_reader_goes_to_a_worker_without_its_index(tmp_path):
-    """It goes with each item: work on many would grow with the square of their number."""
-    for number in range(20):
-        (tmp_path / f"s{number}").mkdir()
-        for frame in range(2):
-            np.save(tmp_path / f"s{number}" / f"{frame}.npy", np.full((4, 3), frame + 1, np.float32))
-    reader = CloudFolders(tmp_path, fps=10)
-    before = len(pickle.dumps(reader))
-    items = reader.items()
-    assert len(items) == 20 and len(pickle.dumps(reader)) == before
-    far, rng = pickle.loads(pickle.dumps(reader)), np.random.default_rng(0)
-    sequence = far.read(items[3], rng).sequence
-    assert np.allclose(sequence.time, [0, 0.1]) and "_series" not in vars(far)
 
 
 def test_a_label_table_beside_the_data_is_no_cloud(tmp_path):

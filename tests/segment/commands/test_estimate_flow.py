@@ -193,7 +193,7 @@ def test_a_stopped_run_is_continued_to_the_same_bytes(data, tmp_path, monkeypatc
     assert (tmp_path / "flow.h5").read_bytes() == (tmp_path / "whole.h5").read_bytes()
     estimate(data, tmp_path / "flow.h5")  # already complete
     assert len(calls) == 5 and sorted(p.name for p in tmp_path.iterdir()) == ["flow.h5", "whole.h5"]
-    with pytest.raises(UsageError, match="holds the flow of other data or choices"):
+    with pytest.raises(UsageError, match="exists, made with seed 0, now 1; write"):
         estimate(data, tmp_path / "flow.h5", seed=1)
     estimate(data, tmp_path / "flow.h5", seed=1, force=True)
     assert (tmp_path / "flow.h5").read_bytes() != (tmp_path / "whole.h5").read_bytes()

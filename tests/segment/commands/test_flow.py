@@ -21,6 +21,6 @@ def test_a_flow_estimator_is_trained_and_used(dpc, dpc_here, data, tmp_path):
     header, tensors = weights.read_bytes()[:-4], weights.read_bytes()[-4:]
     weights.write_bytes(header + bytes(byte ^ 1 for byte in tensors))
     other = dpc_here(*words)
-    assert other.returncode == 2 and b"another model, data or choice" in other.stderr
+    assert other.returncode == 2 and b"exists, made with another flow file" in other.stderr
     other = dpc_here(*learn)
     assert other.returncode == 2 and b"another configuration (flow_weights" in other.stderr, other.stderr

@@ -93,7 +93,7 @@ def depth(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Turns any depth video, 8 or 16 bits, into points in meters.
+    """Turn any depth video, 8 or 16 bits, into points in meters.
 
     For example: dpc prepare depth my_videos --label-from-folder --fov 70 -o own.h5
     """

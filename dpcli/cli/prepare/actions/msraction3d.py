@@ -23,7 +23,7 @@ def msraction3d(
     ] = "1,2,3,4,5",
     conversion: ConversionOptions,
 ) -> None:
-    """Reads MSR-Action3D: 20 actions in Kinect depth, 567 videos of 10 subjects."""
+    """Read MSR-Action3D: 20 actions in Kinect depth, 567 videos of 10 subjects."""
     from dpcli.prepare.actions.msraction3d import MSRAction3D
 
     subjects = whole_numbers(train_subjects, "--train-subjects")

@@ -25,7 +25,7 @@ def ntu60(
     ] = 655.35,
     conversion: ConversionOptions,
 ) -> None:
-    """Reads NTU RGB+D 60: 60 actions in masked Kinect v2 depth, 56,880 videos of 40 subjects."""
+    """Read NTU RGB+D 60: 60 actions in masked Kinect v2 depth, 56,880 videos of 40 subjects."""
     from dpcli.prepare.actions.ntu60 import NTU60, named_intrinsics
 
     run_conversion(

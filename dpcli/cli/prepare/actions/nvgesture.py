@@ -22,7 +22,7 @@ def nvgesture(
     coordinates: PixelCoordinates = "image",
     conversion: ConversionOptions,
 ) -> None:
-    """Reads NvGesture: 25 hand gestures in 8-bit depth, 1,532 clips of 20 subjects."""
+    """Read NvGesture: 25 hand gestures in 8-bit depth, 1,532 clips of 20 subjects."""
     from dpcli.prepare.actions.nvgesture import NvGesture
 
     run_conversion(

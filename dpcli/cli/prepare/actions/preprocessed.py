@@ -36,7 +36,7 @@ def preprocessed(
     ] = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Reads clouds others have made: pts_label.npy (PointLSTM, Kinet), .npz (MeteorNet, PSTNet and its followers)."""
+    """Read clouds others have made: pts_label.npy (PointLSTM, Kinet), .npz (MeteorNet, PSTNet and its followers)."""
     from dpcli.prepare.actions.preprocessed import open_preprocessed
 
     run_conversion(

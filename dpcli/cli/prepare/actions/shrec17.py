@@ -34,7 +34,7 @@ def shrec17(
     coordinates: PixelCoordinates = "image",
     conversion: ConversionOptions,
 ) -> None:
-    """Reads SHREC'17 Track: 14 hand gestures, by one finger or the whole hand, 2,800 sequences of 28 subjects."""
+    """Read SHREC'17 Track: 14 hand gestures, by one finger or the whole hand, 2,800 sequences of 28 subjects."""
     from dpcli.prepare.actions.shrec17 import Shrec17
 
     run_conversion(

@@ -14,7 +14,7 @@ def mbs(
     raw: Annotated[Path, typer.Argument(help="Folder of meta.json and data/000000.npz ..., as distributed.")],
     conversion: ConversionOptions,
 ) -> None:
-    """Reads mbs-shapepart and mbs-sapien (MultiBodySync): four views of articulated objects, parts and poses."""
+    """Read mbs-shapepart and mbs-sapien (MultiBodySync): four views of articulated objects, parts and poses."""
     from dpcli.prepare.articulated.mbs import MultiBodySync
 
     run_conversion("mbs", lambda: MultiBodySync(raw), conversion, raw)

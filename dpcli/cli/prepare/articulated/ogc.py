@@ -52,12 +52,12 @@ class NewRoomOptions:
 
 
 def ogc_dr(raw: _Raw = None, generate: _Meshes = None, *, rooms: NewRoomOptions, conversion: RoomConversion) -> None:
-    """Reads OGC-DR: rooms of 4 to 8 objects, each moving rigidly over 4 frames; as released, or new from any meshes."""
+    """Read OGC-DR: rooms of 4 to 8 objects, each moving rigidly over 4 frames; as released, or new from any meshes."""
     _convert_rooms("ogc-dr", raw, generate, rooms, conversion, "full")
 
 
 def ogc_drsv(raw: _Raw = None, generate: _Meshes = None, *, rooms: NewRoomOptions, conversion: RoomConversion) -> None:
-    """Reads OGC-DRSV: OGC-DR's rooms as one depth camera sees them; as released, or new from any meshes."""
+    """Read OGC-DRSV: OGC-DR's rooms as one depth camera sees them; as released, or new from any meshes."""
     _convert_rooms("ogc-drsv", raw, generate, rooms, conversion, "single")
 
 

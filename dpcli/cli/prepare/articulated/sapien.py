@@ -25,7 +25,7 @@ def sapien(
     ] = False,
     conversion: ArticulatedConversion,
 ) -> None:
-    """Reads articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
+    """Read articulated objects, PartNet-Mobility (SAPIEN) or any URDF: moving parts with exact poses.
 
     Lengths are diameters of the object in frame 0.
     """

@@ -66,7 +66,7 @@ def split(
     compression: Compression = "none",
     force: Force = False,
 ) -> None:
-    """Divides a file of clouds: by the splits it tells, a list, subjects or fractions.
+    """Divide a file of clouds: by the splits in it, a list, subjects or fractions.
 
     For example: dpc prepare split own.h5 --fractions 0.8,0.1,0.1 -o own_split.h5
     """

@@ -23,7 +23,10 @@ class CloudUnits:
     """Holds the options that say what the numbers in the files mean."""
 
     bin_columns: Annotated[
-        int | None, typer.Option("--bin-columns", help="float32 values per point of a .bin. Default: by their look.")
+        int | None,
+        typer.Option(
+            "--bin-columns", help="float32 values per point of a .bin. Default: judged by the values, else 4."
+        ),
     ] = None
     scale: Annotated[
         float | None,
@@ -83,7 +86,7 @@ def clouds(
     labels: LabelTable = None,
     conversion: ConversionOptions,
 ) -> None:
-    """Reads point cloud files: a folder is a sequence, its files are the frames; or tables with a column of frames,
+    """Read point cloud files: a folder is a sequence, its files are the frames; or tables with a column of frames,
     or a topic of a robot's recording.
 
     For example: dpc prepare clouds scans --fps 10 -o own.h5

@@ -27,7 +27,7 @@ def kitti_sf(
     coordinates: SceneCoordinates = "published",
     conversion: PublishedConversion,
 ) -> None:
-    """Reads KITTI scene flow 2015: 200 street scenes, pairs of clouds with true flow and objects."""
+    """Read KITTI scene flow 2015: 200 street scenes, pairs of clouds with true flow and objects."""
     from dpcli.prepare.scans.kitti_sf import KittiSceneFlow
 
     run_conversion(

@@ -31,7 +31,7 @@ def semantickitti(
     coordinates: SceneCoordinates = "published",
     conversion: PublishedConversion,
 ) -> None:
-    """Reads SemanticKITTI: Velodyne scans of 11 drives, objects are the labeled instances."""
+    """Read SemanticKITTI: Velodyne scans of 11 drives, objects are the labeled instances."""
     from dpcli.prepare.scans.kitti_files import View
     from dpcli.prepare.scans.semantickitti import SemanticKitti
 

@@ -25,7 +25,7 @@ def animal(
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
-    """Makes and films a made-up animal that moves: shape, coat and gait by --seed, exact tracks and rigid parts.
+    """Make and film a made-up animal that moves: shape, coat and gait by --seed, exact tracks and rigid parts.
 
     Needs no data.
     """

@@ -25,7 +25,7 @@ def articulated(
     fractions: CategoryFractions = "",
     conversion: ArticulatedConversion,
 ) -> None:
-    """Makes procedural articulated objects: furniture, appliances, tools, lamps, ... with exact parts and poses.
+    """Make procedural articulated objects: furniture, appliances, tools, lamps, ... with exact parts and poses.
 
     Lengths are diameters of the object in frame 0. Categories are kinds.
     """

@@ -24,7 +24,7 @@ def gestures(
     ] = "depth",
     conversion: ConversionOptions,
 ) -> None:
-    """Makes arm gestures whose pairs differ only in the direction of time, seen by a virtual depth camera or radar."""
+    """Make arm gestures whose pairs differ only in the direction of time, seen by a virtual depth camera or radar."""
     from dpcli.prepare.synthetic.gestures import SyntheticGestures
     from dpcli.prepare.synthetic.radar_gestures import RadarGestures
 

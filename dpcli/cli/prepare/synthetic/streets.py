@@ -21,7 +21,7 @@ def streets(
     dropout: Annotated[float, typer.Option("--dropout", help="Share of rays that are lost anywhere.")] = 0.05,
     conversion: ConversionOptions,
 ) -> None:
-    """Makes streets with cars, buses, cyclists and people, scanned by a spinning lidar that drives along.
+    """Make streets with cars, buses, cyclists and people, scanned by a spinning lidar that drives along.
 
     Part 0 is all that stands. Poses give the true motion of every point.
     """

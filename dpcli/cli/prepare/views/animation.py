@@ -33,7 +33,7 @@ def animation(
     jobs: Jobs = None,
     force: Force = False,
 ) -> None:
-    """Films an animated 3D model: pictures with alpha, true tracks of surface points and rigid parts (bones).
+    """Film an animated 3D model: pictures with alpha, true tracks of surface points and rigid parts (bones).
 
     The object is scaled to radius 0.75 around the origin over the whole clip; the cameras stand at distance 2.
     """

@@ -46,7 +46,7 @@ def artemis(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Reads ARTEMIS (DFA): animals filmed by 36 cameras, with bones and skinned voxels as ground truth."""
+    """Read ARTEMIS (DFA): animals filmed by 36 cameras, with bones and skinned voxels as ground truth."""
     if check:
         from dpcli.prepare.views.views_check import ArtemisIndex
 

@@ -50,7 +50,8 @@ class CutOutOptions:
         typer.Option("--holes", help="Enclosed regions of the background's color: keep (filled) or cut (gaps)."),
     ] = "auto"
     mask: Annotated[
-        Path | None, typer.Option("--mask", help="Folder with a mask for each frame, the object white.")
+        Path | None,
+        typer.Option("--mask", help="Folder with a mask for each frame, or a video of them, the object white."),
     ] = None
 
 
@@ -82,7 +83,7 @@ def video(
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
-    """Reads a clip of one object: frames with alpha, masks or a plain background; optionally further views.
+    """Read a clip of one object: frames with alpha, masks or a plain background; optionally further views.
 
     For example: dpc prepare video fox.mp4 --background white -o fox.h5
     """
