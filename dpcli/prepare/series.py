@@ -28,6 +28,12 @@ _BESIDE = re.compile(
     re.IGNORECASE,
 )
 
+_ARRAYS_BESIDE = re.compile(
+    r"((cam(era)?|depth|color|rgb)[-_]?)?(poses|trajectory|odometry|times|time_?stamps?|calib(ration)?|(in|ex)trinsics?|labels|"
+    r"imu|gps|k)",
+    re.IGNORECASE,
+)
+
 
 @dataclass(frozen=True)
 class Series:
@@ -121,8 +127,10 @@ def is_hidden(name: str) -> bool:
 
 
 def is_beside(name: str) -> bool:
-    """Returns whether a text's name says that it is about the frames (README, poses, times, labels, ...), not one."""
+    """Returns whether a text's or an array's name says that it is about the frames (README, poses, times, ...), not one."""
     stem, suffix = splitext(name)
+    if suffix.lower() in (".npy", ".npz"):
+        return _ARRAYS_BESIDE.fullmatch(stem) is not None
     return suffix.lower() in TEXTS and _BESIDE.fullmatch(stem) is not None
 
 
