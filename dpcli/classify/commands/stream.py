@@ -152,7 +152,11 @@ def _interrupt_asks(stop: StopRequest) -> Iterator[None]:
 
 
 def _follow(
-    predictor: StreamPredictor, frames: Iterator[np.ndarray], lines: Listener, stop: StopRequest, watch: _IrregularFrames
+    predictor: StreamPredictor,
+    frames: Iterator[np.ndarray],
+    lines: Listener,
+    stop: StopRequest,
+    watch: _IrregularFrames,
 ) -> BaseException | None:
     """Predicts as frames come and sums up; returns what ended the stream before its end, if anything did."""
     feed = ReadAhead(frames, 2 * predictor.window.size)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
@@ -145,9 +146,8 @@ def _refuse_videos(folder: Path) -> None:
         return
     kinds = sorted({Path(name).suffix for name in names})
     patterns = " ".join(f"{shlex.quote(str(folder))}/*{kind}" for kind in kinds)
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     raise DataError(
-        f"{folder}: {len(names)} videos, one clip is wanted: {', '.join(names[:_LISTED])}{more}\n"
+        f"{folder}: {len(names)} videos, one clip is wanted: {first_names(names, _LISTED)}\n"
         f"Name one of them: {folder / names[0]}; or take all, each into a file of its own: "
         f'for clip in {patterns}; do dpc prepare video "$clip" -o "$clip.h5"; done'
     )
