@@ -270,7 +270,7 @@ def _run(command: Any, arguments: list[str]) -> Any:
 
     try:
         set_working(True)
-        with regular_files_only() if arguments[:1] != ["classify"] else nullcontext():  # a stream may come by a FIFO
+        with nullcontext() if "--stream" in arguments else regular_files_only():  # a stream may come by a FIFO
             code = command.main(args=arguments, prog_name="dpc", standalone_mode=False)
         sys.stdout.flush()
         return code

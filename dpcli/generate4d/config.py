@@ -66,6 +66,12 @@ class FitConfig:
         "Weight of a shape prior's pictures from the sides, first and last, log-linear, as a share of the reconstruction's.",
         above=0,
     )
+    shape_until: float = setting(
+        0.8,
+        "Share of the steps until which those pictures count; the last ones follow the given views alone.",
+        least=0,
+        most=1,
+    )
     shape_size: int = setting(96, "Side of a shape prior's pictures, pixels.", least=16)
     views: float = setting(1.0, "Weight of given novel views, as a share of the reconstruction's.", least=0)
     augmentation: float = setting(1.0, "Weight of score distillation, eq. C.11.", least=0)
@@ -79,7 +85,9 @@ class FitConfig:
     )
     arap: float = setting(10.0, "Weight of the as-rigid-as-possible energy.", least=0)
     thickness: float = setting(
-        1000.0, "Weight that keeps one view's depth where the start put it, unless a shape prior tells it.", least=0
+        1000.0,
+        "Weight that keeps one view's depth where the start put it, or, where a shape prior tells it, alike in all frames.",
+        least=0,
     )
     aspect: float = setting(2.0, "Longest axis of a Gaussian over its mean axis, at most.", least=1)
 

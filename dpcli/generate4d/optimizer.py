@@ -99,7 +99,7 @@ class SceneOptimizer:
         loss, squared, notes = self._picture_terms(instant, views, frames, rng)
         if self.prior is not None:
             loss = loss + config.augmentation * self._prior_term(instant, frames, rng)
-        if self.shape is not None:
+        if self.shape is not None and self.step < config.shape_until * config.steps:
             loss = loss + self._shape_term(instant, frames, rng)
         loss = loss + self._motion_terms(instant, frames)
         value = float(loss.detach())
@@ -208,9 +208,12 @@ class SceneOptimizer:
             total = total + config.control * drift.square().sum(-1).mean()
         if config.arap:
             total = total + config.arap * arap_loss(points, points + moved, self._neighbors)
-        if self.regularize and self.targets.num_views == 1 and self.shape is None:
+        if self.regularize and self.targets.num_views == 1:
             axis = torch.from_numpy(self.targets.world_to_camera[self.targets.reference][2, :3]).float().to(self.device)
-            total = total + config.thickness * thickness_loss(instant.mean, self.model.gaussians.anchor, axis)
+            own = self.model.gaussians
+            # a shape prior says where they are, but differs from frame to frame by more than what moves
+            rest = own.anchor if self.shape is None else own.mean
+            total = total + config.thickness * thickness_loss(instant.mean, rest, axis)
         return total
 
     def _begin_sparse(self) -> None:

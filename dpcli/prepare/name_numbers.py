@@ -16,11 +16,14 @@ import numpy as np
 _DATE = re.compile(
     r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
 )
+_YEAR_LAST = re.compile(
+    r"([0-3]\d)[-_.]([0-3]\d)[-_.]((?:19|20)\d\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
+)
 _SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NOTHING = Decimal(0)
-_EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9))  # digits of a time since 1970 -> decimal places among them
+_EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9), (18, 9))  # digits of a time since 1970, or GPS's 1980 -> decimal places
 
 
 @dataclass(frozen=True)
@@ -68,15 +71,29 @@ def _next_number(stem: str, start: int) -> tuple[re.Match[str] | None, str, bool
     if plain is None:
         return None, "", False
     digits = len(plain[0])
-    if digits >= 4 and (date := _DATE.match(stem, plain.start())) and (seconds := _since_1970(date)):
+    if digits >= 4 and (date := _DATE.match(stem, plain.start())) and (seconds := _since_1970(*date.groups())):
+        return date, seconds, True
+    if (
+        digits in (2, 5)
+        and (date := _YEAR_LAST.match(stem, plain.start()))
+        and (seconds := _since_1970_told_last(date))
+    ):
         return date, seconds, True
     if digits >= 10 and (parts := _SECONDS.match(stem, plain.start())):
         return parts, f"{parts[1]}.{parts[2] or parts[3]}", True
     return plain, plain[0], False
 
 
-def _since_1970(match: re.Match[str]) -> str:
-    year, month, day, hour, minute, second, fraction = match.groups()
+def _since_1970_told_last(match: re.Match[str]) -> str:
+    """Returns the seconds of a date whose year stands last, "" where day and month may be either way round."""
+    first, other, year, *clock = match.groups()
+    if (first > "12") == (other > "12"):
+        return ""
+    day, month = (first, other) if first > "12" else (other, first)
+    return _since_1970(year, month, day, *clock)
+
+
+def _since_1970(year: str, month: str, day: str, hour: str, minute: str, second: str, fraction: str | None) -> str:
     try:
         moment = datetime(int(year), int(month), int(day), int(hour), int(minute), 0, tzinfo=timezone.utc)
     except ValueError:  # such as month 13: it is no date
@@ -140,7 +157,7 @@ class NumberColumns:
         if all("." in number and len(number.partition(".")[2]) >= 6 for number in numbers):  # as %f and ROS write them
             return [_in_seconds(number, False) for number in numbers]
         for digits, places in _EPOCHS:
-            if all(len(number) == digits and number[0] in "12" for number in numbers):
+            if all(len(number) == digits and (number[0] in "12" or digits == 18) for number in numbers):
                 return [Decimal(number).scaleb(-places) for number in numbers]
         return None
 

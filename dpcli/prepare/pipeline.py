@@ -7,7 +7,7 @@ import json
 import os
 from collections import Counter
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -138,6 +138,14 @@ def _roots(reader: Reader) -> list[Path]:
     return [root for root in given if isinstance(root, Path)]
 
 
+def without_index(reader: Reader) -> Reader:
+    """Returns a reader of the same options that holds no index: with one, sent to a worker with every item, the work would
+    grow with the square of their number.
+    """
+    listed = {"inputs": ()} if hasattr(reader, "inputs") else {}
+    return replace(reader, **listed) if is_dataclass(reader) else reader
+
+
 def all_items(reader: Reader) -> tuple[list[Item], list[Item]]:
     """Returns a reader's index, and an item with a problem for each entry below its folder that can't be opened.
 
@@ -187,7 +195,13 @@ def convert(
     with _open_writer(output, reader, conversion, provenance, resume) as writer:
         taken = _write_items(writer, items, conversion)
         taken.run(
-            partial(convert_item, reader, conversion.thinning, conversion.seed, item_seconds=conversion.item_seconds),
+            partial(
+                convert_item,
+                without_index(reader),
+                conversion.thinning,
+                conversion.seed,
+                item_seconds=conversion.item_seconds,
+            ),
             lambda place: (place, items[place]),
             partial(_write_sample, writer, report, items),
             Workers(

@@ -60,7 +60,8 @@ def split_called(word: str) -> str:
 
 class Reader(Protocol):
     """Reads a raw format. Implementations are frozen dataclasses of their options, so they pickle into worker
-    processes.
+    processes, without what `items` found: what `read` needs of that is in the item's ``extra``. What they list may be called
+    ``inputs``; workers have none.
 
     What an option decides is a property, what is always the same a ClassVar.
     """

@@ -9,6 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import TimeoutError as NotYet  # its own class before Python 3.11
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
@@ -16,12 +17,14 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from dpcli.errors import DataError
+from dpcli.regular_files import regular_files_only
 from dpcli.runtime import shared_memory as handover
 from dpcli.runtime.progress import log
 from dpcli.runtime.tuning import fast_transport, keep_freed_memory
 from dpcli.runtime.worker_server import SINGLE_THREAD, STOPPING, ensure_server
 from dpcli.standard_streams import quiet_libraries
 
+_LOOK = 1.0  # seconds between looks whether a process died while it wrote a result
 _MOST = 1024  # processes; with far more, the counters of a pool's queue overflow
 
 
@@ -72,7 +75,8 @@ def _new_pool(jobs: int) -> ProcessPoolExecutor:
 
 def _guarded(function: Callable[[Any], Any], item: Any) -> Any:
     try:
-        return function(item)
+        with regular_files_only():  # in whatever process: a FIFO would hold it for ever
+            return function(item)
     except Exception as error:  # an item's failure is a result, so that the caller can skip it
         return error
 
@@ -99,21 +103,26 @@ class _Pool:
     def _open(self) -> None:
         self._strangers = set(multiprocessing.active_children())
         self._executor = self._given or _new_pool(self._jobs)
+        self._children: set = set()
 
     def submit(self, item: Any) -> Future:
         """Has an item worked on, by new processes where the old ones broke."""
         try:
-            return self._executor.submit(self._work, item)
+            future = self._executor.submit(self._work, item)
         except BrokenProcessPool:
             self._end_broken()
             self._open()
-            return self._executor.submit(self._work, item)
+            future = self._executor.submit(self._work, item)
+        self._children |= (
+            set(multiprocessing.active_children()) - self._strangers
+        )  # now: later it forgets those that ended
+        return future
 
     def result(self, item: Any, future: Future) -> Any:
         """Returns an item's result, or LostWorker as one. What was on its way as a process died is tried again, alone, as
         nobody can say which item took it down."""
         try:
-            return self._unpacked(item, future.result())
+            return self._unpacked(item, _awaited(future, self._given or self._executor, self._children))
         except Exception as error:
             if not _was_lost(error):
                 raise
@@ -131,9 +140,9 @@ class _Pool:
         strangers = set(multiprocessing.active_children())
         with _new_pool(1) as alone:
             tried = alone.submit(self._guarded, item)
-            children = set(multiprocessing.active_children()) - strangers  # now: later it forgets those that ended
+            children = set(multiprocessing.active_children()) - strangers
             try:
-                return tried.result()
+                return _awaited(tried, alone, children)
             except BrokenProcessPool:
                 return _lost(_end(children))
 
@@ -149,6 +158,24 @@ class _Pool:
             except BrokenProcessPool:
                 _end(set(multiprocessing.active_children()) - self._strangers)
             self._executor.shutdown(wait=True, cancel_futures=True)
+
+
+def _awaited(future: Future, executor: Executor, children: set) -> Any:
+    """Returns a future's result; ends a pool whose process died while it wrote a result, so that the future breaks.
+
+    The thread of such a pool reads on, and would wait for the rest for ever: `executor` itself has the pipe open, too.
+    """
+    dead_before = False
+    while True:
+        try:
+            return future.result(_LOOK if children else None)
+        except NotYet:
+            dead = any(not child.is_alive() for child in children)
+            if dead and dead_before and not future.done():
+                _end(children)
+                executor._result_queue._writer.close()  # type: ignore[attr-defined]  # nothing public ends that thread
+                children = set()
+            dead_before = dead
 
 
 def _end(children: set) -> str:

@@ -21,6 +21,8 @@ _MAGIC = b"\x89HDF\r\n\x1a\n"
 _TEXT = np.dtype([("length", "<u4"), ("heap", "<u8"), ("number", "<u4")])  # what stands for a text of variable length
 _AT_ONCE = 1 << 16
 _PACKED_AT_MOST = 1100  # times that zlib makes anything smaller: 258 bytes in 2 bits, and headers
+_OBJECTS = 4096  # groups and data sets of a file at most
+_CHUNK = 1 << 26  # bytes that a chunk of any data set may have
 _TEXTS = ("dpc_version", "command", "source", "length_unit", "name", "metrics")  # attributes, by what they hold
 _NUMBERS = ("seed", "skipped", "reference", "num_parts", "num_points")
 STRING = h5py.string_dtype("utf-8")
@@ -103,9 +105,15 @@ def _is_utf8(text: str) -> bool:
 
 
 def _refuse_outside(file: h5py.File, path: Path) -> None:
-    """Raises DataError for what lies outside the file, or is no number and no text: hostile files could name others, or pickles."""
+    """Raises DataError for what lies outside the file, or is no number and no text: hostile files could name others, or pickles.
+
+    Also for many objects, and for one under several names: groups that hold each other twice would be looked at for ever.
+    """
+    seen = {h5py.h5o.get_info(file.id).addr}
 
     def visit(group: h5py.Group) -> None:
+        if len(group) > _OBJECTS or len(seen) > _OBJECTS:
+            raise DataError(f"{path}: holds more than {_OBJECTS} groups and data sets; another program made it")
         for name in group:
             link = group.get(name, getlink=True)
             if not isinstance(link, h5py.HardLink):
@@ -113,6 +121,10 @@ def _refuse_outside(file: h5py.File, path: Path) -> None:
                     f"{path}: {group.name}/{name} is a link to elsewhere; a dpc file must be self-contained"
                 )
             item = group[name]
+            place = h5py.h5o.get_info(item.id).addr
+            if place in seen:
+                raise DataError(f"{path}: {item.name} is there under another name, too; another program changed it")
+            seen.add(place)
             if isinstance(item, h5py.Group):
                 visit(item)
             elif item.is_virtual or item.external:
@@ -161,6 +173,12 @@ def refuse_claim(item: h5py.Dataset, path: Path) -> None:
         raise DataError(
             f"{path}: {item.name} claims {math.prod(item.shape)} values, {stored} bytes of a file of"
             f" {path.stat().st_size} bytes can't hold them; make or copy it again"
+        )
+    chunk = math.prod(item.chunks or ()) * item.dtype.itemsize  # unpacked whole, for a single value even
+    if packed and chunk > max(_CHUNK, math.prod(item.shape or ()) * item.dtype.itemsize):
+        raise DataError(
+            f"{path}: {item.name} has {math.prod(item.shape)} values, and claims {chunk} bytes for a chunk of them; make or"
+            " copy it again"
         )
 
 

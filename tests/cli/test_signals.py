@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.errors import DataError
+from dpcli.runtime.pool import ordered_map
 from dpcli.store import ScoresWriter
 from tests.support.prepare_helpers import ROOT
 
@@ -127,6 +129,21 @@ def test_one_signal_ends_a_wait_for_a_pipe(folder):
     _, told = process.communicate(timeout=20)
     os.close(reading), os.close(writing)
     assert process.returncode == 75 and b"stopped by SIGTERM" in told
+
+
+@pytest.mark.parametrize("words", ["classify train s.h5 -o m --config pipe", "evaluate classification pipe"])
+def test_no_command_waits_for_a_pipe_given_as_a_file(words, folder, monkeypatch, dpc_here):
+    """Nobody writes into it; only streams come by one."""
+    monkeypatch.chdir(folder)
+    os.mkfifo("pipe")
+    done = dpc_here(*words.split())
+    assert done.returncode in (2, 3) and b"pipe" in done.stderr and b"expected a" in done.stderr
+
+
+def test_a_worker_does_not_wait_for_a_pipe(folder):
+    os.mkfifo(folder / "pipe")
+    ((_, error),) = ordered_map(Path.read_bytes, [folder / "pipe"], 1, apart=True)
+    assert isinstance(error, DataError) and "pipe: a FIFO, expected a regular file" in str(error)
 
 
 def test_a_second_signal_ends_it_at_once(folder):

@@ -166,10 +166,12 @@ def _depth(base: Path, rng: np.random.Generator) -> None:
 
 
 def _clouds(base: Path, rng: np.random.Generator) -> None:
-    import open3d
     import pyarrow
     import pyarrow.parquet
 
+    from dpcli.ops.open3d_import import load_open3d
+
+    open3d = load_open3d()
     for frame in range(3):
         points = rng.random((20, 3))
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))

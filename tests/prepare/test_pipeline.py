@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import pickle
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,13 @@ from scipy.spatial.distance import cdist
 
 from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.prepare import pipeline
+from dpcli.prepare.actions.depth import DepthVideos
 from dpcli.prepare.actions.msraction3d import MSRAction3D
 from dpcli.prepare.pipeline import Conversion, convert, convert_item
 from dpcli.prepare.reader import drop_empty_frames, natural_key
+from dpcli.prepare.scans.clouds import CloudFolders
+from dpcli.prepare.scans.recorded_clouds import RecordedClouds
+from dpcli.prepare.scans.tables import TableSequences
 from dpcli.prepare.thinning import Thinning, voxel_representatives
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from tests.support.prepare_helpers import ToyReader, write_msr
@@ -91,6 +96,45 @@ def test_bytes_do_not_depend_on_the_number_of_jobs(tmp_path):
     assert digest(tmp_path / "1.h5") == digest(tmp_path / "2.h5")
     convert(MSRAction3D(raw), tmp_path / "other.h5", Conversion(points=10, seed=6))
     assert digest(tmp_path / "other.h5") != digest(tmp_path / "1.h5")
+
+
+def _write_inputs(folder: Path, suffix: str, count: int) -> Path:
+    for number in range(count):
+        path = folder / f"c{number % 2}" / f"video{number:03}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if suffix == "frames":
+            path.mkdir()
+            np.save(path / "0.npy", np.ones((4, 3), np.float32))
+        elif suffix == ".npy":
+            np.save(path.with_suffix(suffix), np.ones((2, 4, 5), np.uint16))
+        else:  # recordings that can't be opened are items, too
+            path.with_suffix(suffix).write_text("frame,x,y,z\n0,0,0,0\n0,1,1,1\n1,1,1,1\n1,2,2,2\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("suffix", "make"),
+    [
+        ("frames", lambda raw: CloudFolders(raw, label_from_folder=True)),
+        (".csv", lambda raw: TableSequences(raw, label_from_folder=True)),
+        (".mcap", lambda raw: RecordedClouds(raw, label_from_folder=True)),
+        (".npy", lambda raw: DepthVideos(inputs=(raw,), label_from_folder=True)),
+        (".npy", lambda raw: DepthVideos(inputs=tuple(sorted(raw.rglob("*.npy"))))),
+    ],
+)
+def test_what_goes_to_a_worker_with_an_item_does_not_grow_with_their_number(suffix, make, tmp_path, monkeypatch):
+    sent = []
+
+    def keep(taken, work, load, *_):
+        sent.append(len(pickle.dumps((work, load(1)))))
+        raise Stopped("seen")
+
+    monkeypatch.setattr(pipeline.ItemPass, "run", keep)
+    for count in (3, 40):
+        reader = make(_write_inputs(tmp_path / f"{count:02}", suffix, count))
+        with pytest.raises(Stopped):
+            convert(reader, tmp_path / f"{count}.h5")
+    assert sent[0] == sent[1]
 
 
 def test_the_file_holds_the_items_in_order(tmp_path):

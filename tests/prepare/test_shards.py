@@ -62,7 +62,7 @@ def test_a_shard_tells_its_places_and_takes_every_nth(tmp_path):
         assert list(reader.names) == ["toy001"] and reader.provenance[-1]["config"]["shard"] == "1/3"
         assert read_positions(reader.file) == ([1], [4])
     assert convert(ToyReader(count=7, bad=(4,)), path, Conversion(shard=Shard(1, 3), points=20)).was_complete
-    with pytest.raises(UsageError, match="shard \"1/3\", now \"2/3\""):
+    with pytest.raises(UsageError, match='shard "1/3", now "2/3"'):
         convert(ToyReader(count=7, bad=(4,)), path, Conversion(shard=Shard(2, 3), points=20))
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -35,6 +36,21 @@ def die_at_three(x: int) -> int:
     if x == 3:
         os.kill(os.getpid(), signal.SIGKILL)
     return x
+
+
+def die_writing_at_three(item):
+    """Writes the first bytes of a result's length as `multiprocessing` does, and dies; the second time it returns."""
+    number, folder = item
+    if number == 3 and not any(Path(folder).iterdir()):
+        (Path(folder) / "died").touch()
+        frame = sys._getframe()
+        while "result_queue" not in frame.f_locals:
+            frame = frame.f_back
+        queue = frame.f_locals["result_queue"]
+        queue._wlock.acquire()
+        os.write(queue._writer.fileno(), struct.pack("!i", 99_999) + b"half of it")
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
 
 
 def die_once_at_three(item: tuple[int, str]) -> int:
@@ -79,6 +95,13 @@ def test_an_item_that_kills_whoever_works_on_it_costs_itself_alone():
 def test_a_worker_that_is_killed_once_costs_nothing(tmp_path):
     items = [(x, str(tmp_path)) for x in range(9)]
     assert [done for _, done in ordered_map(die_once_at_three, items, 2)] == list(range(9))
+    assert list(tmp_path.iterdir())
+
+
+def test_a_worker_that_is_killed_while_it_writes_a_result_costs_nothing(tmp_path):
+    """Its pool waits for the rest of the result, and other workers for their turn to write."""
+    items = [(x, str(tmp_path)) for x in range(5)]
+    assert [done for _, done in ordered_map(die_writing_at_three, items, 2)] == list(range(5))
     assert list(tmp_path.iterdir())
 
 

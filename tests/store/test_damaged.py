@@ -93,6 +93,41 @@ def test_a_shape_that_the_file_cannot_hold_is_refused_at_once(clouds, shape):
     assert time.monotonic() - begun < 1
 
 
+def _twice_each(file):
+    for _ in range(40):  # 2 to the power of 40 ways down
+        below = file.create_group("a")
+        file["b"] = below
+        file = below
+
+
+def _in_itself(file):
+    file["again"] = file["/"]
+
+
+def _many(file):
+    for number in range(4200):
+        file.create_group(f"g{number}")
+
+
+@pytest.mark.parametrize("change", [_twice_each, _in_itself, _many])
+def test_groups_without_an_end_are_refused_at_once(clouds, change):
+    with h5py.File(clouds, "a") as file:
+        change(file)
+    with pytest.raises(DataError, match="under another name, too|more than 4096 groups"):
+        open_store(clouds)
+
+
+def test_a_chunk_that_is_far_larger_than_its_data_set_is_refused(clouds):
+    """HDF5 unpacks it whole for one value; from 200 KB to gigabytes."""
+    with h5py.File(clouds, "a") as file:
+        del file["name"]
+        text, one = h5py.string_dtype(), (1 << 24,)
+        made = file.create_dataset("name", (2,), text, maxshape=(None,), chunks=one, compression="gzip")
+        made.id.write_direct_chunk((0,), b"packed" * 9)
+    with pytest.raises(DataError, match="/name has . values, and claims 134217728 bytes for a chunk of them"):
+        open_store(clouds)
+
+
 def test_a_damaged_file_is_exit_3_of_the_command(clouds):
     clouds.write_bytes(clouds.read_bytes()[:900])
     ended = subprocess.run([sys.executable, "-m", "dpcli", "info", str(clouds)], capture_output=True, text=True)

@@ -15,10 +15,11 @@ from dpcli.classify.commands.baseline import forest_accuracy
 from dpcli.classify.confidence import NOTE
 from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
-from dpcli.classify.data.likeness import file_like
+from dpcli.classify.data.likeness import file_like, tell_rounded
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
     CROSS,
+    about_classes,
     about_people,
     carve_validation,
     class_table,
@@ -78,6 +79,7 @@ class _Videos:
     class_names: list[str]
     digest: str
     caveat: str  # see `Training`
+    looks: dict[str, float]  # `file_like` of the training videos
     not_read: dict[str, str]  # columns of the file, and why the network doesn't read them
 
 
@@ -207,6 +209,9 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     settings = replace(settings, run=replace(run, validation=rule))
     training, validation = carve_validation(reader, rule, seed)
     _check_labels(reader, training, validation)
+    _tell_unlabeled(reader)
+    looks = file_like(reader, training)
+    tell_rounded(str(path), looks)
     left_out: dict[str, str] = {}
     if run.timing == "slots" and not settings.network.scales:
         network, left_out = measured(settings.network, reader, training)
@@ -217,9 +222,10 @@ def _videos(path: Path, settings: TrainingSettings, seed: int) -> tuple[Training
     source = ClipSource(reader, training, settings.network, augmentation=settings.augmentation, **options)
     held = ClipSource(reader, validation, settings.network, **options) if validation else None
     counts = len(training), len(validation)
-    caveat = about_people(reader, training, validation)
+    remarks = about_classes(reader, options.get("folds", {})), about_people(reader, training, validation)
+    caveat = "; ".join(filter(None, remarks))
     digest = provenance.file_digest(path)
-    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, left_out)
+    return settings, _Videos(source, held, counts, class_table(reader), digest, caveat, looks, left_out)
 
 
 def _record(settings: TrainingSettings, seed: int, digest: str) -> dict[str, Any]:
@@ -245,7 +251,7 @@ def _notes(videos: _Videos, rule: str, seed: int) -> dict[str, Any]:
         "seed": seed,
         "validation": rule,
         "trained_on": f"{videos.counts[0]} videos",
-        NOTE_LIKE: file_like(videos.training.reader, videos.training.sequences),
+        NOTE_LIKE: videos.looks,
         **({"columns_not_read": videos.not_read} if videos.not_read else {}),
     }
 
@@ -264,6 +270,16 @@ def _check_labels(reader: CloudsReader, training: list[int], validation: list[in
         log.warn(
             f"{len(missing)} of {len(names)} classes have no training video and can't be recognized: {', '.join(missing[:8])}"
         )
+
+
+def _tell_unlabeled(reader: CloudsReader) -> None:
+    """Counts the training videos that nothing can be learned from, with a message."""
+    names = [
+        name for name, split, label in zip(reader.names, reader.splits, reader.labels) if split == "train" and label < 0
+    ]
+    if names:
+        shown = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
+        log.warn(f"{reader.path}: {len(names)} videos of the split 'train' have no label and are left out: {shown}")
 
 
 def check_shares(clips: int, schedule: Schedule, processes: int) -> None:

@@ -94,7 +94,11 @@ def _why_not(videos: list[_Video], labels: np.ndarray | None) -> str:
 
 
 def _numbers_rows(videos: list[_Video]) -> bool:
-    """Returns whether the value grows by 1 from row to row in nearly all frames that have several."""
+    """Returns whether the value grows by 1 from row to row in nearly all frames that have several, but for frames that all have
+    as many points: there a number is a name, such as a joint's."""
+    sizes = np.unique(np.concatenate([np.unique(one.frames, return_counts=True)[1] for one in videos]))
+    if len(sizes) == 1:
+        return False
     right = several = 0
     for one in videos:
         same = np.diff(one.frames) == 0

@@ -18,22 +18,26 @@ NOTE = "learned_from"  # in a model's notes: `like`
 _VIDEOS, _FRAMES = 50, 8  # looked at, evenly over a file and over a video
 _OTHER_UNIT, _OTHER_SENSOR = 3.0, 10.0  # times as large, times as many points
 _REPEATED = 8  # times that a point is drawn, at which nothing is left of a shape
-_SHIPPED = 0.233  # extent of MSR-Action3D's training videos: the shipped networks' files don't say it
+_SHIPPED = {"extent": 0.233, "frames": 76.0}  # MSR-Action3D's training videos: the shipped networks' files don't say it
+_ROUNDED = 0.05  # of the extent: coarser steps show
+_SEVERAL = 5.0  # times as long as the longest training video: hardly one action
 _EXPECT = "; expect fewer right than in its training (another sensor?)"
 
 
 def like(frames: Sequence[np.ndarray]) -> dict[str, float]:
-    """Returns the median distance of points f32 (N,3) of some frames from their median, and the median number of points of a
-    frame; {} where no frame has any."""
+    """Returns the median distance of points f32 (N,3) of some frames from their median, the median number of points of a
+    frame, and the step to which float32 rounds coordinates so far from the origin; {} where no frame has any."""
     points = np.concatenate(frames) if len(frames) else np.zeros((0, 3))
     if not len(points):
         return {}
     distance = np.linalg.norm(points - np.median(points, 0), axis=1)
-    return {"extent": float(np.median(distance)), "points": float(np.median([len(frame) for frame in frames]))}
+    sizes = [len(frame) for frame in frames]
+    step = np.spacing(np.abs(points).max().astype(np.float32))
+    return {"extent": float(np.median(distance)), "points": float(np.median(sizes)), "step": float(step)}
 
 
 def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float]:
-    """Returns `like` in the median of some videos of a file."""
+    """Returns `like` in the median of some videos of a file, and the frames of the longest of all."""
     found = []
     for number in list(sequences)[:: -(-len(sequences) // _VIDEOS) or 1]:
         count = int(reader.frame_counts[number])
@@ -41,7 +45,37 @@ def file_like(reader: CloudsReader, sequences: Sequence[int]) -> dict[str, float
         video = reader.read(number, shown, fields=())
         found.append(like([video.frame(t) for t in range(video.num_frames)]))
     found = [one for one in found if one]
-    return {key: float(np.median([one[key] for one in found])) for key in (found[0] if found else ())}
+    middle = {key: float(np.median([one[key] for one in found])) for key in (found[0] if found else ())}
+    return {**middle, "frames": float(reader.frame_counts[list(sequences)].max(initial=0))}
+
+
+def _own(info: ModelInfo, model: str | Path) -> dict[str, float]:
+    """Returns `file_like` of the videos that a model learned from, as far as it is known."""
+    own = info.notes.get(NOTE) or (_SHIPPED if find_model(model).parent == SHIPPED else {})
+    numbers = own if isinstance(own, dict) else {}
+    return {key: value for key, value in numbers.items() if isinstance(value, int | float)}
+
+
+def tell_rounded(what: str, found: dict[str, float]) -> None:
+    """Warns where places are rounded so much, as float32 does far from the origin, that bodies lose their shape."""
+    if found.get("step", 0) > _ROUNDED * found.get("extent", np.inf):
+        log.warn(
+            f"{what}: coordinates are so large, as on a map, that float32 rounds them to {found['step']:.2g}, while half of the"
+            f" points lie within {found['extent']:.2g} of the middle: shapes are lost; subtract a place nearby before the file is"
+            " written, as `dpc prepare clouds` does"
+        )
+
+
+def tell_long(reader: CloudsReader, sequences: Sequence[int], info: ModelInfo, model: str | Path) -> None:
+    """Warns where videos last much longer than any that the model learned from: they get one label, and may show many actions."""
+    longest = _own(info, model).get("frames")
+    long = [i for i in sequences if longest and reader.frame_counts[i] > _SEVERAL * longest]
+    if long:
+        log.warn(
+            f"{reader.path}: {len(long)} of {len(sequences)} videos are over {_SEVERAL:g} times as long as any that {model} learned"
+            f" from ({reader.names[long[0]]}: {reader.frame_counts[long[0]]} frames after {longest:g}), and each gets one label:"
+            " --segments cuts recordings of several actions"
+        )
 
 
 def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str | Path) -> None:
@@ -49,22 +83,24 @@ def tell_unlike(what: str, theirs: dict[str, float], info: ModelInfo, model: str
 
     what: the file or stream. theirs: `like` of it. model: its name or file.
     """
-    own = info.notes.get(NOTE) or ({"extent": _SHIPPED} if find_model(model).parent == SHIPPED else {})
-    size = own.get("extent") if isinstance(own, dict) else None
-    far = theirs.get("extent")
+    tell_rounded(what, theirs)
+    own = _own(info, model)
+    size, far = own.get("extent"), theirs.get("extent")
     in_units = info.config.normalize not in ("height", "unit")
     if size and far is not None and in_units and not size / _OTHER_UNIT < far < size * _OTHER_UNIT:
         log.warn(
             f"{what}: half of the points lie within {far:.3g} of the middle, within {size:.3g} in what {model} learned from:"
             " another unit of length? The scores mean nothing then; `dpc prepare clouds --scale` brings both to the same"
         )
-    if info.timing == "slots" and size and theirs:
+    if far is None:
+        return
+    if info.timing == "slots" and "points" in own:
         many, count = theirs["points"], own["points"]
         if not count / _OTHER_SENSOR < many < count * _OTHER_SENSOR:
             log.warn(
                 f"{what}: a frame has {many:g} points in the median, {count:g} in what {model} learned from{_EXPECT}"
             )
-    elif theirs and theirs["points"] * _REPEATED < info.config.points_per_frame:
+    elif info.timing != "slots" and theirs["points"] * _REPEATED < info.config.points_per_frame:
         drawn = info.config.points_per_frame
         log.warn(
             f"{what}: a frame has {theirs['points']:g} points in the median, {model} takes {drawn}: repeated{_EXPECT}"

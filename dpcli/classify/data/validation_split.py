@@ -133,14 +133,32 @@ def _one_fold(reader: CloudsReader, chosen: list[int], rule: str, seed: int) -> 
 
 
 def default_rule(reader: CloudsReader, members: int = 1) -> str:
-    """Returns `split` when the file has labeled validation videos, `cross` for a network of several members, `subject`
-    when the training videos have several known subjects, else 15 % of each class."""
+    """Returns `split` when the file has labeled validation videos, `cross` for a network of several members, or `none` where
+    each class has one video, `subject` when the training videos have several known subjects, else 15 % of each class."""
     if any(name == "validation" and label >= 0 for name, label in zip(reader.splits, reader.labels)):
         return "split"
     if members > 1:
-        return CROSS
+        labels = reader.labels[labeled(reader, "train")]
+        return CROSS if len(labels) > len(np.unique(labels)) else "none"
     subjects = {int(reader.subjects[i]) for i in labeled(reader, "train")}
     return "subject" if len(subjects) > 1 and min(subjects) >= 0 else "0.15"
+
+
+def about_classes(reader: CloudsReader, judges: dict[int, int]) -> str:
+    """Returns how many videos can't be judged right, since their judge saw no other of their class, "" where all can.
+
+    judges: by video, the fold whose networks never saw it, as from `cross_folds`.
+    """
+    folds_of: dict[int, set[int]] = {}
+    for i, fold in judges.items():
+        folds_of.setdefault(int(reader.labels[i]), set()).add(fold)
+    lone = sum(len(folds_of[int(reader.labels[i])]) == 1 for i in judges)
+    if not lone:
+        return ""
+    return (
+        f"{lone} of these videos count as wrong, since all of their class, such as one video or one person's, were held out"
+        " together; new videos may come out better"
+    )
 
 
 def about_people(reader: CloudsReader, training: list[int], validation: list[int]) -> str:

@@ -75,7 +75,23 @@ def report_backward(reader: CloudsReader, sequences: list[int]) -> None:
 
 
 def report_short(source: ClipSource, frames: int) -> None:
-    """Names the videos that are dropped or padded, with a message each."""
+    """Names the videos that are dropped or padded, and those with frames without points, with a message each."""
     for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
         if names:
             log.info(f"{len(names)} videos shorter than {frames} frames are {what}: {first_names(names)}")
+    if source.timing != "slots":
+        _report_empty(source)
+
+
+def _report_empty(source: ClipSource) -> None:
+    """Counts the frames without points, which clips show as points at the origin, and names their videos, with a message."""
+    reader = source.reader
+    ends = np.cumsum(reader.frame_counts)
+    of = np.searchsorted(ends, np.flatnonzero(reader.frame_sizes == 0), side="right")
+    counts = np.bincount(of, minlength=len(ends))
+    found = {i: int(counts[i]) for i in source.sequences if counts[i]}
+    if found:
+        log.warn(
+            f"{reader.path}: {sum(found.values())} frames without points in {len(found)} videos are taken as points at the origin:"
+            f" {first_names([reader.names[i] for i in found])}"
+        )

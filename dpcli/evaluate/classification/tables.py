@@ -10,6 +10,7 @@ from dpcli.evaluate.results import left_out_note
 from dpcli.evaluate.text_tables import TextTable, percent, percent_ends, resampling_note
 
 MOST_CLASSES = 30  # a confusion matrix of more classes is no longer read as text
+_LONGEST_NAME = 40  # of a class, in letters: its number stays beside it
 
 
 def classification_tables(report: ClassificationReport) -> list[TextTable]:
@@ -41,7 +42,7 @@ def _calibration_note(report: ClassificationReport) -> str:
     """Returns a sentence that defines the calibration error, and says how much of it chance would make."""
     found = report.calibration.get(list(report.streams)[-1])
     if found is None:
-        return "No calibration error: the scores are no probabilities."
+        return "No calibration error: the scores are no probabilities, which `dpc classify fuse` wants, too (softmax makes some)."
     return (
         f"Calibration error: mean |share right - probability| of the best class over {BINS} bins of equal width; "
         f"{report.main.samples} perfectly calibrated samples would show {percent(found.by_chance)} on average."
@@ -120,4 +121,5 @@ def _confusion_matrix(report: ClassificationReport) -> TextTable:
 
 
 def _class_title(label: int, name: str) -> str:
-    return f"{label} {name}" if name else str(label)
+    short = name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 1] + "…"
+    return f"{label} {short}" if name else str(label)

@@ -20,6 +20,7 @@ from dpcli.evaluate.video.sources.source import Picture, Source, View
 from dpcli.evaluate.video.sources.stored import SceneSource
 from dpcli.runtime.progress import Progress
 
+_RATE = 0.01  # how far apart two rates are the same
 Watch = Callable[[View, int, int, Picture, Picture], None]
 
 
@@ -195,6 +196,11 @@ class FramePass:
             lines.append(f"The prediction ({self.predicted.kind}) has no alpha: its colors are compared as they are.")
         if not self.truth.has_alpha:
             lines.append(f"The truth ({self.truth.kind}) has no alpha: background and object are compared alike.")
+        rates = self.predicted.rate, self.truth.rate
+        if all(rates) and abs(rates[0] / rates[1] - 1) > _RATE:
+            lines.append(
+                f"The prediction plays {rates[0]:.4g} frames a second, the truth {rates[1]:.4g}: compared by their number."
+            )
         if self.swapped:
             lines.append(
                 f"Red and blue look swapped in the prediction ({self.swapped}): with them exchanged it is much "

@@ -51,15 +51,18 @@ def train_shape_prior(
     model = _start(settings, folder)
     notes = {"command": provenance.command_line(), "seed": seed, "trained_on": models}
     keep_freed_memory()
-    with folder, stop_requested() as stop:
+    with folder:
         with whole_file(folder.file("settings.toml")) as part:
             part.write_text(CATALOG.to_toml(settings._asdict(), "generate4d train-prior"))
         kept = make_round(held, settings.data.validation, HELD_OUT_ROUND)
         weights = sum(value.numel() for value in model.parameters())
         log.info(f"{weights:,} weights; {len(kept.rgba)} pictures for validation; {settings.schedule.steps} steps")
         batch = kept.take(range(len(kept.rgba)))
-        trainer = ShapeTrainer(model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop)
-        return trainer.run()
+        with stop_requested() as stop:  # until here there is nothing to be kept, and a signal ends it at once
+            trainer = ShapeTrainer(
+                model, folder, settings.schedule, learned, batch, notes, seed=seed, jobs=jobs, stop=stop
+            )
+            return trainer.run()
 
 
 def check_sizes(settings: ShapeTraining) -> None:

@@ -38,7 +38,7 @@ def arap_loss(
 
 
 def thickness_loss(moved: Tensor, anchor: Tensor, view_axis: Tensor) -> Tensor:  # [B, N, 3], [N, 3], [3]
-    """Returns the mean squared drift along the line of sight (unit vector) from where the start put each Gaussian.
+    """Returns the mean squared drift along the line of sight (unit vector) from where each Gaussian should stay.
 
     Moved positions count, not canonical ones: a motion of all frames hides there as well, and away from the camera
     everything looks smaller.

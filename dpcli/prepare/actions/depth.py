@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from os.path import splitext
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -22,7 +24,14 @@ from dpcli.prepare.actions.depth_units import (
     without_marks,
 )
 from dpcli.prepare.decode.calibration import Calibration
-from dpcli.prepare.decode.depth_files import VIDEO_SUFFIXES, DepthVideo, frame_series, read_depth_video, says_depth
+from dpcli.prepare.decode.depth_files import (
+    ARRAY_SUFFIXES,
+    VIDEO_SUFFIXES,
+    DepthVideo,
+    frame_series,
+    read_depth_video,
+    says_depth,
+)
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
@@ -39,6 +48,9 @@ _OTHER_PICTURES = re.compile(
     r"vis|colou?r|preview|rgb|jet|mask|conf|normal|amplitude|intensity|label|semantic|instance|segm|albedo|flow|image|photo"
     r"|infra|(?<![a-z])(ir|gray|grey)(?![a-z])",
     re.IGNORECASE,
+)
+_FOREIGN = tuple(  # that may hold depth, and are not read
+    ".mat .h5 .hdf5 .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo .svo2 .r3d .sens .xef .klg .dat .pkl".split()
 )
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
 
@@ -150,7 +162,9 @@ class DepthVideos:
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
-        return self._table.apply(self._found) if self._table else self._found
+        told = {"timed": self._timed}
+        items = [replace(item, extra={**item.extra, **told}) for item in self._found]
+        return self._table.apply(items) if self._table else items
 
     def read(self, item: Item, rng: np.random.Generator) -> Sample:
         """Returns the sample of one item. Raises DataError when its data are bad."""
@@ -186,7 +200,7 @@ class DepthVideos:
 
     def _times(self, item: Item, video: DepthVideo, kept: np.ndarray) -> np.ndarray | None:
         """Returns seconds since the first frame, f64, of the frames that are kept; None when they are not known for all."""
-        if not self._timed:
+        if not item.extra["timed"]:
             return None
         series: Series | None = item.extra["series"]
         if self.fps and series:
@@ -285,7 +299,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     if own := frame_series(path, pattern):
         return [(path, own)]
     found: list[tuple[Path, Series | None]] = []
-    suffixes = (*VIDEO_SUFFIXES, ".npy")
+    suffixes = (*VIDEO_SUFFIXES, *ARRAY_SUFFIXES)
     found += [(recording, None) for recording in find_recordings(path)]
     clips = {os.fspath(recording) for recording, _ in found}
     for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
@@ -295,14 +309,18 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
                 found.append((Path(folder, name), series))
                 clips.add(os.path.join(folder, name))
         if folder in clips:
-            files = [name for name in files if not name.lower().endswith(".npy")]  # its frames, or twins of these
+            files = [name for name in files if not name.lower().endswith(ARRAY_SUFFIXES)]  # its frames, or their twins
         named = (Path(folder, name) for name in files if name.lower().endswith(suffixes) and not is_hidden(name))
         found += [(file, None) for file in named if file.is_file()]
     found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
+        below = (name.lower() for _, _, files in os.walk(path) for name in files if not is_hidden(name))
+        others = Counter(splitext(name)[1] for name in below if name.endswith(_FOREIGN))
+        seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
         raise DataError(
-            f"{path}: no depth video in it{asked}; expected folders of 16-bit images, .npy, {', '.join(VIDEO_SUFFIXES)},"
-            " or recordings (.bag, .mcap, .db3)"
+            f"{path}: no depth video in it{asked}; expected folders of 16-bit images, .npy, .npz,"
+            f" {', '.join(VIDEO_SUFFIXES)}, or recordings (.bag, .mcap, .db3)"
+            + (f"; found {seen}: save their depth as 16-bit PNG, or as .npy (frames, height, width)" if seen else "")
         )
     return found

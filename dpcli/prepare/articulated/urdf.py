@@ -19,6 +19,7 @@ from dpcli.prepare.articulated.urdf_meshes import geometry_triangles, resolve
 MOVABLE = ("revolute", "continuous", "prismatic")
 _UNSUPPORTED = ("floating", "planar")
 _TURNS = "hinges with limits more than two turns apart (one turn taken; are they degrees? a URDF has radians)"
+_EQUAL = "joints whose two limits are equal taken as fixed (as SolidWorks exports joints without limits)"
 
 _SHAPES = ("box", "capsule", "cylinder", "sphere", "mesh")
 _XACRO = "it is written in xacro; make a plain URDF of it first: xacro FILE > robot.urdf"
@@ -130,9 +131,22 @@ def _make_plain(path: Path, tree: Any) -> None:
     etree.cleanup_namespaces(tree)
     if root.tag != "robot":
         raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
+    for origin in root.iter("origin"):
+        if origin.get("quat_xyzw"):
+            origin.set("rpy", " ".join(map(repr, _roll_pitch_yaw(path, origin.attrib.pop("quat_xyzw")))))
     for shape in root.findall("link/collision"):
         if any(isinstance(part.tag, str) and part.tag not in _SHAPES for part in shape.findall("geometry/*")):
             shape.getparent().remove(shape)
+
+
+def _roll_pitch_yaw(path: Path, text: str) -> list[float]:
+    """Returns the three angles of a quaternion, which newer URDFs may give instead of them."""
+    from scipy.spatial.transform import Rotation
+
+    try:
+        return Rotation.from_quat([float(word) for word in text.split()]).as_euler("xyz").tolist()
+    except ValueError:
+        raise DataError(f"{path}: quat_xyzw {text!r} is no rotation; expected four numbers, not all zero") from None
 
 
 def _capsules(root: Any) -> list[tuple[int, str, int]]:
@@ -259,6 +273,8 @@ def _movable(
         elif joint.type not in (*MOVABLE, "fixed"):
             raise DataError(f"{path}: joint {joint.name!r} has the type {joint.type!r}; expected {', '.join(MOVABLE)}")
         if not _moves(joint):
+            if joint.type in MOVABLE:
+                notes[_EQUAL] += 1
             continue
         low, high, odd = _limits(joint)
         if odd:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, require_room
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, unnamed_columns, without
+from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, kept_columns, unnamed_columns, without
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
@@ -51,7 +51,7 @@ def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     missing = [name for name in keep if name not in columns]
     if missing:
         raise DataError(f"{path}: --keep-fields {missing[0]}: no such array of one number a point")
-    cloud.extra = {name: columns[name].astype(np.float32) for name in keep}
+    cloud.extra = kept_columns(path, columns, keep)
     cloud.unread += without(list(arrays), [key, color_key], keep)
     return cloud
 

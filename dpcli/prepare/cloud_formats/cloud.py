@@ -11,6 +11,8 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 
+AT_ORIGIN = "points at (0,0,0) dropped"
+_WHOLE_FLOAT32, _LOST = 1 << 24, 1e-3  # below the first it holds whole numbers; a share of a column's range
 BEYOND = "points beyond the number that their file's header says dropped"
 
 
@@ -107,7 +109,21 @@ def kept_columns(path: Path, columns: Mapping[str, np.ndarray], keep: Sequence[s
             raise DataError(f"{path}: --keep-fields {name}: no such column; found {', '.join(columns) or 'no names'}")
         if columns[name].dtype.kind not in "fiub" or columns[name].ndim != 1:
             raise DataError(f"{path}: --keep-fields {name}: holds no numbers, one a point; leave it out")
+        _require_float32(path, name, columns[name])
     return {name: columns[name].astype(np.float32) for name in keep}
+
+
+def _require_float32(path: Path, name: str, values: np.ndarray) -> None:
+    """Raises DataError where float32, which files keep columns in, can't tell the values of a column apart."""
+    known = values[np.isfinite(values)].astype(np.float64)
+    if not len(known) or np.abs(known).max() < _WHOLE_FLOAT32:
+        return
+    lost = float(np.abs(known - known.astype(np.float32)).max())
+    if lost > _LOST * float(np.ptp(known)):
+        raise DataError(
+            f"{path}: --keep-fields {name}: float32, in which columns are kept, would round its values by up to {lost:.3g};"
+            " keep smaller numbers, such as times since the beginning"
+        )
 
 
 def unpack_rgb(packed: np.ndarray) -> np.ndarray | None:

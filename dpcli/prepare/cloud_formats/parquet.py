@@ -1,4 +1,4 @@
-"""Parquet tables, by pyarrow, which is an extra: it is large, and few have such tables."""
+"""Parquet and Feather tables, by pyarrow, which is an extra: it is large, and few have such tables."""
 
 from __future__ import annotations
 
@@ -12,26 +12,32 @@ from dpcli.errors import DataError, DpcError
 from dpcli.npy_files import require_room
 from dpcli.prepare.cloud_formats.cloud import Cloud
 
+COLUMNAR = (".parquet", ".feather")
 _CELL = 8  # bytes of a number
 
 
 class ParquetTable:
-    """Offers a Parquet file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words."""
+    """Offers a Parquet or Feather file as `text_numbers.TextTable` offers a text: names, columns as numbers, columns as words."""
 
     def __init__(self, path: Path) -> None:
         try:
             import pyarrow.parquet as parquet
         except ImportError:
-            raise DpcError('Parquet needs pyarrow: pip install "dpc-toolkit[parquet]"') from None
+            raise DpcError('Parquet and Feather need pyarrow: pip install "dpc-toolkit[parquet]"') from None
         self.path = path
         try:
-            about = parquet.read_metadata(path)
-            require_room(path, _CELL * about.num_rows * about.num_columns)
-            self._table: Any = parquet.read_table(path)
+            if path.suffix.lower() == ".feather":
+                self._table: Any = _read_feather(path)
+            else:
+                about = parquet.read_metadata(path)
+                require_room(path, _CELL * about.num_rows * about.num_columns)
+                self._table = parquet.read_table(path)
         except DataError:
             raise
         except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
-            raise DataError(f"{path}: not a readable Parquet table, perhaps truncated ({error})") from None
+            raise DataError(
+                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({error})"
+            ) from None
         self.names = tuple(self._table.column_names)
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
@@ -50,6 +56,19 @@ class ParquetTable:
     def words(self, place: int) -> list[str]:
         """Returns the cells of a column as text."""
         return [str(value) for value in self._table.column(place).to_pylist()]
+
+
+def _read_feather(path: Path) -> Any:
+    """Returns the table of a Feather file (Arrow's), batch after batch, so that one that claims too much ends early."""
+    import pyarrow
+
+    with pyarrow.memory_map(str(path)) as file, pyarrow.ipc.open_file(file) as reader:
+        batches, taken = [], 0
+        for place in range(reader.num_record_batches):
+            batches.append(reader.get_batch(place))
+            taken += batches[-1].nbytes
+            require_room(path, taken)
+        return pyarrow.Table.from_batches(batches, reader.schema)
 
 
 def read_parquet(path: Path, keep: Sequence[str] = ()) -> Cloud:

@@ -13,18 +13,22 @@ from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, named_axe
 from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
 
+_TELLING = 10  # rows that tell what columns without names hold
 _IMPLIED = {  # (suffix, columns) -> what they hold, in formats without a header
     (".pts", 4): "x y z intensity",
     (".pts", 6): "x y z red green blue",
     (".pts", 7): "x y z intensity red green blue",
     (".xyzrgb", 6): "x y z red green blue",
     (".xyzn", 6): "x y z nx ny nz",
+    (".xyzi", 4): "x y z intensity",
 }
 
 
 def read_text(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads one cloud from a text. Raises DataError when it holds several frames, or is no table of numbers."""
-    table = read_text_table(path)
+    table = read_text_table(path, may_be_empty=True)
+    if not table.first_rows(1):  # a count of 0, or names alone
+        return cloud_of_columns(path, {name: np.empty(0) for name in table.names or "xyz"}, keep)
     if not table.names:
         names = _IMPLIED.get((path.suffix.lower(), table.width), "")
         table = replace(table, names=tuple(names.split()))
@@ -42,7 +46,7 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
                 f"{table.path}: array of shape {(len(table.numbered), table.width)}; expected numbers (points, 3 or more)"
             )
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
-        first = int(_counts_rows(table, values))
+        first = _first_axis(table, values)
         counted = ("column 1 (no name, numbers of the rows)",) if first else ()
         return Cloud(values[:, first : first + 3], unread=counted + unnamed_columns(first + 4, table.width))
     axes = named_axes(table.path, table.names)
@@ -55,15 +59,29 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     return replace(cloud, unread=without([name for name in table.names if name], cloud.columns, keep))
 
 
-def _counts_rows(table: TextTable, values: np.ndarray) -> bool:
-    """Returns whether the first of four or more columns without names counts the rows: whole numbers beside fractions."""
-    start = values[0, 0]
-    if table.width < 4 or len(values) < 3 or start not in (0, 1):
-        return False
-    if not np.array_equal(values[:, 0], np.arange(start, start + len(values))):
-        return False
-    rows = [table.cells(line) for _, line in table.first_rows(30)]
-    return all(row[0].isdecimal() for row in rows) and any(not cell.isdecimal() for row in rows for cell in row[1:4])
+def _first_axis(table: TextTable, values: np.ndarray) -> int:
+    """Returns which column without a name is x: 0, or 1 behind one that counts the rows.
+
+    Raises DataError where whole numbers lie before three columns of fractions, such as the row and column of a scanner's
+    ray: which three are x, y and z?
+    """
+    rows = [table.cells(line) for _, line in table.first_rows(_TELLING)]
+    fractions = [any(not cell.lstrip("-+").isdecimal() for cell in column) for column in zip(*rows)]
+    whole = fractions.index(True) if True in fractions else len(fractions)
+    if not 0 < whole <= table.width - 3 or not all(fractions[whole : whole + 3]):
+        return 0
+    ids = values[:, :whole]
+    if (ids < 0).any() or (ids != np.floor(ids)).any():
+        return 0
+    start = ids[0, 0]
+    if whole == 1 and len(ids) > 2 and start in (0, 1) and np.array_equal(ids[:, 0], np.arange(len(ids)) + start):
+        return 1
+    if len(ids) < (_TELLING if whole == 1 else 3):
+        return 0
+    raise DataError(
+        f"{table.path}: its first {f'{whole} columns hold' if whole > 1 else 'column holds'} whole numbers, the three behind"
+        " fractions; which are x, y and z? Write a line of names above, such as: row column x y z intensity"
+    )
 
 
 def refuse_frames(table: TextTable) -> None:

@@ -206,8 +206,11 @@ def _number(cell: str, decimal: str) -> float | None:
         return None
 
 
-def read_text_table(path: Path) -> TextTable:
-    """Reads the rows of a text and what its header says. Raises DataError when it is no table of numbers."""
+def read_text_table(path: Path, *, may_be_empty: bool = False) -> TextTable:
+    """Reads the rows of a text and what its header says. Raises DataError when it is no table of numbers, or has no rows.
+
+    may_be_empty: names without rows are a table, too, such as of a moment in which a radar saw nothing.
+    """
     text = decode_text(path)
     head = list(enumerate(text.split("\n", _HEAD)[:_HEAD], 1))
     head = [(k, line.strip(_EDGES)) for k, line in head if line.strip()]
@@ -221,6 +224,8 @@ def read_text_table(path: Path) -> TextTable:
     header = next((line for k, line in head if k == first - 1), "") if names else ""
     table = _with_units(TextTable(path, tuple(names), body, first, delimiter, header=header))
     rows = table.first_rows(2)
+    if not rows and names and may_be_empty:
+        return table
     if not rows:
         raise DataError(f"{path}: a header, but no rows; expected numbers in columns")
     if re.fullmatch(r"\d+", rows[0][1]) and (len(rows) == 1 or len(_rough_cells(rows[1][1])) > 2):
@@ -249,7 +254,7 @@ def _with_counted_header(table: TextTable) -> TextTable:
     """Returns the table, its first row taken for names where that only counts the columns, as pandas writes ``0,1,2`` above
     columns without names, perhaps behind an empty cell above the index.
     """
-    (number, first), *rows = table.first_rows(_LOOKED_AT)
+    (number, first), *rows = table.first_rows(_LOOKED_AT) or [(0, "")]
     cells = table.cells(first)
     index = cells[:1] == [""]
     counted = cells[index:] == [str(k) for k in range(len(cells) - index)] and len(cells) - index >= len("xyz")

@@ -16,14 +16,16 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
+from dpcli.prepare.cloud_formats.column_names import UNITS, unit_of
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
 _CX = ("cx", "ppx", "c_x", "mx_depth")
 _CY = ("cy", "ppy", "c_y", "my_depth")
 _MATRIX = ("intrinsic_matrix", "camera_matrix", "k", "intrinsic", "intrinsics", "intrinsicmatrix", "cameramatrix")
-_WIDTH = ("width", "w", "image_width", "depthwidth")
-_HEIGHT = ("height", "h", "image_height", "depthheight")
+_MATRIX += ("m_calibrationdepthintrinsic",)  # of ScanNet's recordings
+_WIDTH = ("width", "w", "image_width", "depthwidth", "m_depthwidth")
+_HEIGHT = ("height", "h", "image_height", "depthheight", "m_depthheight")
 _SCALE = (
     "depth_scale",
     "depthmapfactor",
@@ -35,6 +37,7 @@ _SCALE = (
     "depth_shift",
     "integer_depth_scale",
     "depth_unit_scale_factor",
+    "m_depthshift",
 )
 _LENS = (
     "coeffs",
@@ -46,6 +49,7 @@ _LENS = (
     "distortion",
     "disto",
 )
+_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # of a lens, in OpenCV's order
 _MODEL = ("model", "distortion_model", "camera_model", "cameramodel", "lens_model", "type")
 _BROWN = ("", "brown_conrady", "plumb_bob", "rational_polynomial", "opencv", "full_opencv", "radtan", "pinhole", "none")
 _OF_SLAM = re.compile(r"^(Camera1?|RGBD)\.(?!.*bf)")  # before the names that ORB-SLAM and its kind write
@@ -164,10 +168,21 @@ def _yaml(path: Path, text: str) -> Any:
 
 
 def _number_or_text(text: str) -> Any:
+    """Returns the number that a text holds, the list of its numbers where it holds four or more, else the text itself."""
     try:
-        return float(text)
+        numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
         return text
+    return numbers[0] if len(numbers) == 1 else numbers if len(numbers) >= len(_TERMS[:4]) else text
+
+
+def _with_numbers(data: Any) -> Any:
+    """Returns what a file holds with the numbers that stand in quotes as numbers."""
+    if isinstance(data, dict):
+        return {key: _with_numbers(value) for key, value in data.items()}
+    if isinstance(data, list):
+        return [_with_numbers(value) for value in data]
+    return _number_or_text(data) if isinstance(data, str) else data
 
 
 def _load_npy(path: Path) -> list[float]:
@@ -253,7 +268,10 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
             f"{path}: is the raw calibration of an Azure Kinect, whose lens model is not read; {_EXPECTED}, as the"
             " camera's SDK reports them for the depth mode"
         )
+    data = _with_numbers(data)
     own = _camera_of(path, data)
+    if _are_numbers([own.get("skew", 0)]) and own.get("skew"):
+        raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")
     numbers = _pixels(path, own)
     lens = _lens(path, own)
     size = _resolution(own)
@@ -322,11 +340,23 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
     """Returns the coefficients k1 k2 p1 p2 k3 k4 k5 k6 of a lens, none where all are 0."""
     values = _first(own, _LENS)
     if isinstance(values, dict):
-        values = values.get("data")
-    if values is None and any(f"k{k}" in own for k in (1, 2)):
-        values = [own.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+        values = values["data"] if "data" in values else _named_terms(path, values)
+    if values is None and any(key in own for key in _TERMS):
+        values = _named_terms(path, {key: own[key] for key in _TERMS if key in own})
+    if values is None and (radial := own.get("radial_distortion", own.get("radialdistortion"))) is not None:
+        bent = own.get("tangential_distortion", own.get("tangentialdistortion")) or [0.0, 0.0]
+        values = [*radial[:2], *bent, *radial[2:]] if isinstance(radial, list) and isinstance(bent, list) else None
     flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
     return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat) if _are_numbers(flat) else ()
+
+
+def _named_terms(path: Path, terms: dict[str, Any]) -> list[Any]:
+    """Returns the coefficients of a lens that a mapping names. Raises DataError at one that isn't known."""
+    small = {str(key).lower(): value or 0.0 for key, value in terms.items()}
+    strange = [key for key in small if key not in _TERMS and _are_numbers([small[key]]) and small[key]]
+    if strange:
+        raise DataError(f"{path}: its lens has a coefficient {strange[0]}; expected {', '.join(_TERMS)} alone")
+    return [small.get(key, 0.0) for key in (_TERMS if any(small.get(key) for key in _TERMS[5:]) else _TERMS[:5])]
 
 
 def lens_coefficients(path: Path, name: str, flat: list[float]) -> tuple[float, ...]:
@@ -353,6 +383,8 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
         value = own["scale"]
     if value is None:
         return None
+    if isinstance(value, str) and (unit := unit_of(f"in {value}")):
+        return 1 / UNITS[unit]
     if not _are_numbers([value]) or not value > 0 or not np.isfinite(value):
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
     return float(value) if value >= 1 else float(f"{1 / value:.12g}")

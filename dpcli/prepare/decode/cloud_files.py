@@ -12,6 +12,7 @@ from dpcli.prepare.cloud_formats.las import read_las
 from dpcli.prepare.cloud_formats.parquet import read_parquet
 from dpcli.prepare.cloud_formats.pcd import read_pcd
 from dpcli.prepare.cloud_formats.ply import read_ply
+from dpcli.prepare.cloud_formats.ptx import read_ptx
 from dpcli.prepare.cloud_formats.text_cloud import read_text
 
 _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
@@ -22,6 +23,8 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".npy": read_npy,
     ".npz": read_npz,
     ".parquet": read_parquet,
+    ".feather": read_parquet,
+    ".ptx": read_ptx,
     ".csv": read_text,
     ".tsv": read_text,
     ".xyz": read_text,
@@ -30,8 +33,9 @@ _READERS: dict[str, Callable[[Path, Sequence[str]], Cloud]] = {
     ".txt": read_text,
     ".xyzn": read_text,
     ".xyzrgb": read_text,
+    ".xyzi": read_text,
 }
-SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", ".npy", ".npz", ".parquet", *list(_READERS)[7:])
+SUFFIXES = (".ply", ".pcd", ".las", ".laz", ".bin", *list(_READERS)[4:])
 
 
 def read_cloud(path: Path, bin_columns: int | None = None, keep: Sequence[str] = ()) -> Cloud:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,11 +14,12 @@ from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
+from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
-from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES, look_at_video, video_frames
+from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
-_LISTED = 6  # files at most in a message
+_ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
 
@@ -126,31 +126,20 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
                 log.info(line)
         paths = [path for path in paths if path.name in chosen.names]
     elif not paths:
-        _refuse_videos(folder)
+        refuse_clips(folder, _ALL, 'dpc prepare video "$clip" -o "$clip.h5"')
         inside = sorted(p.name for p in folder.iterdir() if p.is_dir())[:3]
         hint = f"; it has folders ({', '.join(inside)}): name one of them" if inside else ""
         raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){hint}")
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
+    if not quiet and (clips := clips_in(folder)):
+        log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:
-        raise DataError(f"{folder}: {twins[0]!r} is there with two suffixes; leave one image per frame")
+        raise DataError(
+            f"{folder}: {twins[0]!r} is there with two suffixes; choose with --pattern '*{paths[0].suffix}'"
+        )
     return Frames(folder, tuple(p.name for p in paths), tuple(frame_numbers(stems)), tuple(paths))
-
-
-def _refuse_videos(folder: Path) -> None:
-    """Raises DataError that lists the videos in a folder, and says how to take them all; none: nothing happens."""
-    suffixes = (*VIDEO_SUFFIXES, ".gif", ".apng")
-    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in suffixes and path.name[0] != ".")
-    if not names:
-        return
-    kinds = sorted({Path(name).suffix for name in names})
-    patterns = " ".join(f"{shlex.quote(str(folder))}/*{kind}" for kind in kinds)
-    raise DataError(
-        f"{folder}: {len(names)} videos, one clip is wanted: {first_names(names, _LISTED)}\n"
-        f"Name one of them: {folder / names[0]}; or take all, each into a file of its own: "
-        f'for clip in {patterns}; do dpc prepare video "$clip" -o "$clip.h5"; done'
-    )
 
 
 def read_rgba(path: Path) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy
+from dpcli.npy_files import map_npy, require_room
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.deep_video import deep_frames
@@ -24,7 +24,8 @@ from dpcli.runtime.clips.video_frames import missing_frames
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".jp2", ".pfm", ".exr")
-FRAME_SUFFIXES = (*IMAGE_SUFFIXES, ".npy")  # of two files of one frame the earlier is preferred
+ARRAY_SUFFIXES = (".npy", ".npz")
+FRAME_SUFFIXES = (*IMAGE_SUFFIXES, *ARRAY_SUFFIXES)  # of two files of one frame the earlier is preferred
 # names that say depth, and not a picture of it or what lies beside it
 _DEPTH_NAME = r"^(?!.*(vis|colou?r|preview|rgb|jet|mask|conf|normal)).*(depth|(^|[-_. ])[dz]([-_. *]|$))"
 _GRAY_NOISE, _COLORED_SHARE = (
@@ -226,8 +227,8 @@ def read_image(path: Path) -> np.ndarray:
 
 
 def read_frame(path: Path) -> np.ndarray:
-    """Reads one frame (H,W) of a folder: an image, or an array in ``.npy``."""
-    if path.suffix.lower() != ".npy":
+    """Reads one frame (H,W) of a folder: an image, or an array in ``.npy`` or ``.npz``."""
+    if path.suffix.lower() not in ARRAY_SUFFIXES:
         return read_image(path)
     array = read_array(path)
     if len(array) != 1:
@@ -277,9 +278,9 @@ def says_depth(name: str) -> bool:
 
 
 def _is_frame(path: Path) -> bool:
-    """Returns whether an array file holds one frame (H,W), by its header."""
+    """Returns whether an array file holds one frame (H,W), by its header where it has one."""
     try:
-        return map_npy(path).ndim == 2
+        return map_npy(path).ndim == 2 if path.suffix.lower() == ".npy" else len(read_array(path)) == 1
     except (DataError, OSError):  # reading the file says so
         return False
 
@@ -293,8 +294,11 @@ def _holds_depth(path: Path) -> bool:
 
 
 def read_array(path: Path, stride: int = 1) -> np.ndarray:
-    """Reads a ``.npy`` of depth frames (T,H,W), or one frame (H,W), memory-mapped so that a stride reads less."""
-    array = map_npy(path)
+    """Reads depth frames (T,H,W), or one frame (H,W), of a ``.npy``, mapped so that a stride reads less, or of a ``.npz``.
+
+    Raises DataError of what is none, such as the poses of a camera.
+    """
+    array = map_npy(path) if path.suffix.lower() == ".npy" else _archived(path)
     if array.ndim == 2:
         array = array[None]
     if array.ndim == 4 and 1 in (array.shape[1], array.shape[3]):  # one channel, as networks want it
@@ -303,7 +307,35 @@ def read_array(path: Path, stride: int = 1) -> np.ndarray:
         raise DataError(
             f"{path}: array of shape {array.shape}, {array.dtype}; expected numbers (frames, height, width)"
         )
+    if array.shape[1:] in ((3, 3), (3, 4), (4, 4)) and _are_matrices(array):
+        raise DataError(f"{path}: holds {len(array)} matrices of a camera, no depth; expected (frames, height, width)")
     return np.ascontiguousarray(array[::stride])
+
+
+def _archived(path: Path) -> np.ndarray:
+    """Returns the array of a ``.npz`` that is called depth, or the only one of two or three dimensions."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            require_room(path, sum(info.file_size for info in archive.zip.infolist()))
+            arrays = {key: array for key in archive.files if isinstance(array := archive[key], np.ndarray)}
+    except DataError:
+        raise
+    except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
+        raise DataError(f"{path}: not a readable .npz archive ({error})") from None
+    called = [key for key in arrays if says_depth(key)]
+    shaped = [key for key, array in arrays.items() if array.ndim in (2, 3) and array.dtype.kind in "uif"]
+    chosen = next((choice[0] for choice in (called, shaped) if len(choice) == 1), None)
+    if chosen is None:
+        raise DataError(f"{path}: arrays {', '.join(arrays) or 'none'}; expected one called depth")
+    return arrays[chosen]
+
+
+def _are_matrices(array: np.ndarray) -> bool:
+    """Returns whether each of some 3x3, 3x4 or 4x4 numbers turns, or projects as a pinhole camera does."""
+    first = array[:, :3, :3].astype(np.float64)
+    turns = np.allclose(first @ first.transpose(0, 2, 1), np.eye(3), atol=1e-3)
+    projects = (first[:, 2] == (0, 0, 1)).all() and not first[:, (0, 1), (1, 0)].any()
+    return bool(turns or projects)
 
 
 def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) -> DepthVideo:
@@ -318,7 +350,7 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
             raise DataError(f"{path}: no depth images ({', '.join(FRAME_SUFFIXES)})")
         times = series.times()
         video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride])
-    elif suffix == ".npy":
+    elif suffix in ARRAY_SUFFIXES:
         video = DepthVideo(read_array(path, stride))
     elif suffix in VIDEO_SUFFIXES:
         frames, time, missing = read_timed_video(path, stride)
@@ -326,7 +358,7 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
             raise DataError(f"{path}: an empty video: no frame can be decoded")
         video = DepthVideo(np.stack(frames), time, missing, ends_early(path))
     else:
-        raise DataError(f"{path}: unknown kind; expected a folder of images, .npy or {', '.join(VIDEO_SUFFIXES)}")
+        raise DataError(f"{path}: unknown kind; expected a folder of images, .npy, .npz or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:
         raise DataError(f"{path}: an empty video: shape {video.frames.shape}")
     return video

@@ -43,13 +43,14 @@ class Lengths:
     def divisor(self, clouds: Sequence[Cloud]) -> tuple[float, dict[str, int]]:
         """Returns what the coordinates are divided by, and a note where the files themselves decided that."""
         declared = {cloud.unit for cloud in clouds} - {""}
-        if self.scale is not None or self.unit != "m" or not declared - {"m"}:
+        if self.scale is not None or self.unit not in UNITS or not declared - {self.unit}:
             return self.scale or 1.0, {}
         if len({cloud.unit for cloud in clouds}) > 1:
             names = ", ".join(sorted(cloud.unit or "none" for cloud in clouds))
             raise DataError(f"its frames declare different units ({names[:80]}); --scale says what they are in")
         (name,) = declared
-        return 1 / UNITS[name], {f"sequences converted from {name} to m, as their files declare": 1}
+        note = f"sequences converted from {name} to {self.unit}, as their files declare"
+        return UNITS[self.unit] / UNITS[name], {note: 1}
 
 
 def assemble(

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dpcli.prepare.cloud_formats.cloud import Cloud
+from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN, Cloud
 
 NOT_FINITE = "points with NaN or infinity dropped"
-AT_ORIGIN = "points at (0,0,0) dropped"
 IMPOSSIBLE = "points at impossible places (such as 1e30 or -9999 on all axes) dropped"
 _STAND_INS = (-9999.0, -99999.0, -999.0, 9999.0, 99999.0, 65535.0, 32767.0, -32768.0, -(2.0**31), 2.0**31 - 1)
 # on all three axes

@@ -22,7 +22,8 @@ _ABOUT_SENSORS = re.compile(  # folders whose texts tell of the vehicle, the cam
     r"oxts|imu|gps|gnss|poses?|odom\w*|calib\w*|labels?|label_\d|time_?stamps?|traj\w*|(in|ex)trinsics?", re.IGNORECASE
 )
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
-    ".e57 .ptx .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx".split()
+    ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
+    " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord".split()
 )
 
 

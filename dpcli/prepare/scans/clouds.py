@@ -71,10 +71,6 @@ class CloudFolders:
         left_out = ("raw", "labels", *(() if self.pattern else ("pattern",)))
         return {k: v for k, v in asdict(self).items() if k not in left_out}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Returns the options alone: with the whole index, going to a worker with each item, work would grow with its square."""
-        return asdict(self)
-
     @cached_property
     def _table(self) -> LabelTable | None:
         if self.label_from_folder:
@@ -108,9 +104,12 @@ class CloudFolders:
         """Returns whether the first good cloud has colors, and which of its columns are not read."""
         for one in self._series:
             try:
-                cloud = read_cloud(one.paths[0], self.bin_columns)
+                clouds = (read_cloud(path, self.bin_columns) for path in one.paths)
+                cloud = next((cloud for cloud in clouds if len(cloud.points)), None)
             except DataError:
                 continue  # a bad sample: the next one tells
+            if cloud is None:  # nothing was seen
+                continue
             return cloud.color is not None, without(cloud.unread, self.keep)
         return False, ()
 
@@ -159,7 +158,7 @@ class CloudFolders:
 
 
 def _require_colors(paths: list[Path], clouds: list[Cloud]) -> None:
-    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None]
+    plain = [path for path, cloud in zip(paths, clouds, strict=True) if cloud.color is None and len(cloud.points)]
     if plain:
         raise DataError(
             f"{plain[0]}: no colors, though the first frame of all has them; expected the same fields throughout"

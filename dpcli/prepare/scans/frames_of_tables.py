@@ -15,7 +15,7 @@ from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.column_names import find_frame_column, words_of
 
 _SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 19: 1e-9}  # digits of a time since 1970 -> seconds
+_EPOCHS = {10: 1.0, 13: 1e-3, 16: 1e-6, 18: 1e-9, 19: 1e-9}  # digits of a time since 1970 -> seconds
 _TIME_WORDS = frozenset(("time", "timestamp", "stamp", "t", "timestamps", "epoch", "utc"))
 SINGLE = (
     "sequences whose frames hold one point each; does the frame column tell the time of each point? (--frame-column)"

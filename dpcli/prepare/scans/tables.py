@@ -14,7 +14,7 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import as_utf8
 from dpcli.prepare.cloud_formats.cloud import Cloud
-from dpcli.prepare.cloud_formats.parquet import ParquetTable
+from dpcli.prepare.cloud_formats.parquet import COLUMNAR, ParquetTable
 from dpcli.prepare.cloud_formats.text_cloud import cloud_of_table
 from dpcli.prepare.cloud_formats.text_numbers import read_text_table
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
@@ -23,7 +23,7 @@ from dpcli.prepare.scans.assembling import Lengths, assemble
 from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
 from dpcli.store.schema import kept_name
 
-TABLES = (".csv", ".tsv", ".parquet", ".txt", ".xyz", ".asc")
+TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
 _FEW = 5  # frames of one point that may be true
 
 
@@ -194,7 +194,7 @@ def _load(
 ) -> Loaded:
     if not facts[0]:
         raise DataError(f"{path}: the file is empty")
-    table = ParquetTable(path) if path.suffix.lower() == ".parquet" else read_text_table(path)
+    table = ParquetTable(path) if path.suffix.lower() in COLUMNAR else read_text_table(path)
     column = frame_column(table, wanted)
     cloud = cloud_of_table(table, keep)
     axes = cloud.columns

@@ -1,4 +1,4 @@
-"""Masks in image files: soft ones as they are, and images of labels, opaque wherever there is one."""
+"""Masks in image files and videos: soft ones as they are, and images of labels, opaque wherever there is one."""
 
 from __future__ import annotations
 
@@ -41,6 +41,19 @@ def read_mask(path: Path) -> np.ndarray:
     except (OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path}: not a readable mask ({error}); export it again") from None
     return _of_colors(path, values, lossy) if values.ndim == 3 else _of_values(path, values, lossy)
+
+
+def mask_of_video(path: Path, rgba: np.ndarray) -> np.ndarray:
+    """Returns the mask u8 (H,W) in a frame u8 (H,W,4) of a video of masks: its alpha, else white, or a color, on black.
+
+    A frame as dark as compression leaves black is an empty mask.
+    """
+    if rgba[..., 3].min(initial=255) < 255:
+        return rgba[..., 3]
+    brightest = rgba[..., :3].max(axis=2)
+    return (
+        np.zeros_like(brightest) if brightest.max(initial=0) < _SMALL_LABEL else _of_colors(path, rgba[..., :3], True)
+    )
 
 
 def _of_colors(path: Path, values: np.ndarray, lossy: bool) -> np.ndarray:

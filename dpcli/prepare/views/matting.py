@@ -219,11 +219,15 @@ def clear_invisible(rgba: np.ndarray) -> np.ndarray:
 
 
 def with_mask(rgba: np.ndarray, mask: Path, name: str) -> np.ndarray:
-    """Returns the frame u8 (H,W,4) with the alpha of a mask file.
+    """Returns the frame u8 (H,W,4) with the alpha of a mask file. Raises DataError as `with_alpha` does."""
+    return with_alpha(rgba, read_mask(mask), str(mask), name)
+
+
+def with_alpha(rgba: np.ndarray, alpha: np.ndarray, mask: str, name: str) -> np.ndarray:
+    """Returns the frame u8 (H,W,4) with the alpha u8 (H,W) of a mask; `mask` and `name` are for messages.
 
     Raises DataError when sizes differ or it looks inverted.
     """
-    alpha = read_mask(mask)
     if alpha.shape != rgba.shape[:2]:
         found, expected = (f"{shape[1]}x{shape[0]}" for shape in (alpha.shape, rgba.shape))
         raise DataError(f"{mask}: the mask is {found}, its frame {name} is {expected}; expected the same size")

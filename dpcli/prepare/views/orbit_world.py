@@ -8,7 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dpcli.errors import DataError
+
 OBJECT_RADIUS = 0.75  # of the sphere around the object over all frames: it fits the default camera's picture
+_NEAREST = 1e-6  # of the scene's size: what is nearer lies in a camera
+_PARALLEL = 0.01  # how much shorter than 1 the mean of rays is that go one way
 
 
 @dataclass(frozen=True)
@@ -83,13 +87,29 @@ def bounding_sphere(points: np.ndarray, steps: int = 200) -> tuple[np.ndarray, f
     return center, float(np.sqrt(((flat - center) ** 2).sum(axis=1).max()))
 
 
+def _in_front(center: np.ndarray, poses: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Returns the center f64 (3) of an object; one that isn't before all cameras is put there where no ray tells how far it is.
+
+    Raises DataError when the rays f64 (V,3) differ, so that cameras look at several things, or away from each other.
+    """
+    depths = poses[:, 2, :3] @ center + poses[:, 2, 3]
+    if depths.min() > _NEAREST * max(np.abs(center).max(), 1.0):
+        return center
+    together = rays.mean(axis=0)
+    if np.linalg.norm(together) < 1 - _PARALLEL:
+        raise DataError(
+            "the cameras don't look at one object that lies before all of them; are the poses of other pictures?"
+        )
+    return center + (1 - depths.min()) * together
+
+
 def sphere_of_silhouettes(
     intrinsics: np.ndarray, poses: np.ndarray, boxes: list[tuple[int, int, int, int]]
 ) -> tuple[np.ndarray, float]:
     """Returns center f64 (3) and radius of an object known by its boxes (left, top, right, bottom) in V pictures.
 
     The center is the point nearest to the rays through the boxes' middles (for parallel rays: nearest to the world's
-    origin besides); the radius is the largest extent of a box around it, at its depth.
+    origin besides, or somewhere before the cameras); the radius is the largest extent of a box around it, at its depth.
     """
     centers = camera_centers(poses)
     middles = np.array([((left + right) / 2, (top + bottom) / 2, 1) for left, top, right, bottom in boxes])
@@ -97,7 +117,7 @@ def sphere_of_silhouettes(
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     system = across.sum(axis=0) + 1e-6 * np.eye(3)
-    center = np.linalg.solve(system, np.einsum("vij,vj->i", across, centers))
+    center = _in_front(np.linalg.solve(system, np.einsum("vij,vj->i", across, centers)), poses, rays)
     radius = 0.0
     for camera, pose, (left, top, right, bottom) in zip(intrinsics, poses, boxes, strict=True):
         seen = pose[:3, :3] @ center + pose[:3, 3]

@@ -128,6 +128,8 @@ def _add(folder: Path, frame: dict[str, Any], role: str, views: dict[bytes, View
         raise DataError(f"time {frame['time']}; expected shares of the clip, frame numbers or seconds")
     if wrong := [key for key in _POSITIVE if lens.get(key, 1) <= 0]:
         raise DataError(f"{wrong[0]} {lens[wrong[0]]:g}; expected more than 0")
+    if wrong := [key for key in _POSITIVE[:2] if lens.get(key, 0) >= np.pi]:
+        raise DataError(f"{wrong[0]} {lens[wrong[0]]:g}; expected radians, below pi (degrees?)")
     time, image = _number(frame, "time"), _image(folder, str(frame["file_path"]))
     key = np.round(pose, 5).tobytes() + repr((role, sorted(lens.items()))).encode()
     view = views.setdefault(key, View(pose, role, lens))
@@ -171,6 +173,10 @@ def _pose(matrix: Any) -> np.ndarray:
         pose = np.vstack([pose.reshape(-1, 4), [[0, 0, 0, 1.0]]])[:4] if pose.size == 12 else pose.reshape(4, 4)
     except (ValueError, TypeError):
         raise DataError("transform_matrix is not 4 x 4 numbers, nor 3 x 4") from None
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-3:
+        raise DataError(
+            f"transform_matrix has the last row {pose[3].tolist()}; expected 0, 0, 0, 1 (is it transposed?)"
+        )
     pose = pose @ _TO_OPENCV
     lengths = np.linalg.norm(pose[:3, :3], axis=0)
     rotation = pose[:3, :3] / np.maximum(lengths, 1e-12)

@@ -67,7 +67,10 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
     boxes, sizes = zip(*(_look(view, times, options) for view in views))
     intrinsics = np.stack([view.intrinsics(*size) for view, size in zip(views, sizes, strict=True)])
     poses = np.stack([view.pose for view in views])
-    world = into_orbit(_UP, poses[0], *sphere_of_silhouettes(intrinsics, poses, list(boxes)))
+    try:
+        world = into_orbit(_UP, poses[0], *sphere_of_silhouettes(intrinsics, poses, list(boxes)))
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
     poses = np.stack([world.pose(pose) for pose in poses])
     crops = [whole_picture(*size) for size in sizes]
     header = ViewsHeader(

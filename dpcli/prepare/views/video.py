@@ -16,6 +16,7 @@ from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, i
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
+from dpcli.prepare.views.masks import mask_of_video, read_mask
 from dpcli.prepare.views.square_crop import Crop, crop_around, pieces, touches_border, union, visible_box, whole_picture
 from dpcli.prepare.views.views_pipeline import Clip, digest_of
 from dpcli.runtime.progress import log
@@ -120,7 +121,8 @@ def video_config(path: Path, options: VideoOptions) -> dict[str, Any]:
         del config["pattern"]
     config["input_digest"] = digest_of(open_frames(path, options.pattern, quiet=True).files)
     if options.mask:
-        config["mask_digest"] = digest_of(image_paths(require_folder(options.mask, "a mask per frame")))
+        masks = require_folder(options.mask, "a mask per frame") if not options.mask.is_file() else None
+        config["mask_digest"] = digest_of(image_paths(masks) if masks else [options.mask])
     if options.views:
         folder = require_folder(options.views, "pictures of other views")
         config["views_digest"] = digest_of(
@@ -140,14 +142,15 @@ class Cutter:
     options: VideoOptions
     mode: str
     background: np.ndarray | None = None
-    masks: tuple[Path, ...] = ()
+    masks: tuple[Path, ...] | Frames = ()
     gaps: dict[int, int] = field(default_factory=dict)  # pixels taken for holes, by frame
 
     def cut(self, wanted: list[int]) -> Iterator[np.ndarray]:
         """Yields u8 (H,W,4), straight alpha, of the frames `wanted`, rising."""
+        masks = self._read_masks(wanted)
         for index, frame in zip(wanted, self.frames.read(wanted)):
             if self.mode == "mask":
-                yield matting.with_mask(frame, self.masks[index], self.frames.names[index])
+                yield matting.with_alpha(frame, *next(masks), self.frames.names[index])
             elif self.mode == "plain":
                 rgba, gap = matting.key_out(frame[..., :3], self.background, self.options.tolerance, self.options.holes)
                 self.gaps[index] = gap
@@ -157,13 +160,21 @@ class Cutter:
             else:
                 yield matting.clear_invisible(frame)
 
+    def _read_masks(self, wanted: list[int]) -> Iterator[tuple[np.ndarray, str]]:
+        """Yields the mask u8 (H,W) of each frame, and what it is called in messages."""
+        if isinstance(self.masks, Frames):
+            for index, rgba in zip(wanted, self.masks.read(wanted)):
+                yield mask_of_video(self.masks.path, rgba), f"{self.masks.path}, frame {index}"
+        else:
+            yield from ((read_mask(self.masks[index]), str(self.masks[index])) for index in wanted)
+
 
 def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int], Crop, tuple[int, int]]:
     """Returns how to cut, which frames, the one crop of them all, and the (width, height) of the source."""
     wanted = _readable(frames, spread_frames(len(frames), options.frames), options.on_error)
     warn_gaps(frames, wanted)
     cutter, (width, height) = _make_cutter(frames, wanted, options)
-    boxes, cut_off, good, empty, apart = [], [], [], [], []
+    boxes, cut_off, good, empty, apart, whole = [], [], [], [], [], 0
     for index, rgba in zip(wanted, cutter.cut(wanted)):
         box = visible_box(rgba, _ISLAND)
         if box is None:
@@ -171,11 +182,17 @@ def _plan_clip(frames: Frames, options: VideoOptions) -> tuple[Cutter, list[int]
             continue
         boxes.append(box)
         good.append(index)
+        whole += cutter.mode == "mask" and rgba[..., 3].min() > 127
         if cutter.mode != "keep" and touches_border(rgba):
             cut_off.append(index)
         if pieces(rgba, _OBJECT) > 1:
             apart.append(index)
     _report_empty(frames, empty, good, cutter.mode, options.on_error)
+    if whole == len(good):
+        raise DataError(
+            f"{options.mask}: every mask covers its whole picture, so nothing is cut out; the background has to be black, or "
+            "label 0 (the whole picture: --background keep)"
+        )
     if cut_off:
         log.warn(f"{frames.path}: the object leaves the picture in {_named(frames, cut_off)}; what is cut off is lost")
     if 2 * len(apart) > len(good):
@@ -273,10 +290,15 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
     ), size
 
 
-def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
-    """Finds a mask for every frame of the clip: by number where all numbers agree, else in order."""
-    masks = open_frames(require_folder(folder, "a mask per frame, as images"))
-    numbered = all(number in integers(name) for number, name in zip(masks.numbers, masks.names))
+def open_masks(place: Path) -> Frames:
+    """Opens the masks of a folder or a video. Raises DataError when there are none."""
+    return open_frames(place if place.is_file() else require_folder(place, "a mask per frame, as images, or a video"))
+
+
+def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...] | Frames:
+    """Finds a mask for every frame of the clip: by number where all numbers agree, else in order; a video's in order."""
+    masks = open_masks(folder)
+    numbered = folder.is_dir() and all(number in integers(name) for number, name in zip(masks.numbers, masks.names))
     if numbered and set(masks.numbers) >= set(frames.numbers) and len(set(masks.numbers)) == len(masks):
         place = dict(zip(masks.numbers, masks.files))
         return tuple(place[number] for number in frames.numbers)
@@ -284,7 +306,7 @@ def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...]:
         raise DataError(
             f"{folder}: {len(masks)} masks for {len(frames)} frames; expected one for each, named alike, with all its objects"
         )
-    return masks.files
+    return masks.files if folder.is_dir() else masks
 
 
 def _report_empty(frames: Frames, empty: list[int], good: list[int], mode: str, on_error: str) -> None:

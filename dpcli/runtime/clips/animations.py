@@ -14,7 +14,7 @@ from dpcli.runtime.clips.video_frames import video_frames
 _GIF_PACKS = 4096  # pixels that a byte of GIF's LZW can't exceed: a code of 12 bits stands for fewer
 _SMALL = 1 << 20  # pixels of a canvas that may be mostly empty
 _MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
-_SHORTEST = 20.0  # ms: players show a frame of no duration about so long
+_SHORTEST, _INSTEAD = 10.0, 100.0  # ms: what is shown so long or less browsers show for a tenth of a second
 
 
 def is_image_file(path: Path) -> bool:
@@ -41,7 +41,8 @@ def animation_times(path: Path) -> tuple[float, ...]:
                 image.seek(index)
                 image.load()
                 times.append(now)
-                now += max(float(image.info.get("duration", 0) or 0), _SHORTEST) / 1000
+                duration = float(image.info.get("duration", 0) or 0)
+                now += (duration if duration > _SHORTEST else _INSTEAD) / 1000
             moves, form = image.format in ("GIF", "PNG", "WEBP", "AVIF"), image.format
     except DataError:
         raise
@@ -71,12 +72,11 @@ def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     from PIL import Image
 
     with reading(path), open_image(path) as image:
-        profile = image.info.get("icc_profile")
+        info = dict(image.info)
         if image.format == "PNG":
-            for frame in video_frames(path, wanted):
-                yield np.array(as_shown(Image.fromarray(frame), profile)) if profile else frame
+            for frame in video_frames(path, wanted, as_stored=True):
+                yield np.array(as_shown(Image.fromarray(frame), info))
             return
         for index in wanted:
             image.seek(index)
-            picture = np.array(as_shown(image).convert("RGBA"))
-            yield picture
+            yield np.array(as_shown(image, image.info | info).convert("RGBA"))

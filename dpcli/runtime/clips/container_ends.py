@@ -30,6 +30,25 @@ def ends_early(path: Path) -> bool:
         return check is not None and check(file, head, size)
 
 
+def empty_frames(path: Path, stream: int) -> int:
+    """Returns how many frames of a stream in an AVI have no bytes, so that the one before stays; 0 for other files.
+
+    Programs that capture write them where they dropped a frame; the header counts them.
+    """
+    names, size, found = (b"%02ddc" % stream, b"%02ddb" % stream), os.path.getsize(path), 0
+    with path.open("rb") as file:
+        if not re.match(rb"RIFF.{4}AVI ", file.read(12), re.DOTALL):
+            return 0
+        at = 12
+        while at + 8 <= size:
+            file.seek(at)
+            name, length, kind = file.read(4), int.from_bytes(file.read(4), "little"), file.read(4)
+            found += name in names and length == 0
+            inside = name == b"RIFF" or name == b"LIST" and kind in (b"movi", b"rec ")
+            at += 12 if inside else 8 + length + length % 2
+    return found
+
+
 def _goes_on(ends: Iterator[int], size: int) -> bool:
     """Returns whether the last of the places where parts end lies beyond the file."""
     last = 0

@@ -6,16 +6,24 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
+
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
+from dpcli.runtime.clips import wide_color
+from dpcli.runtime.clips.color_tags import color_tags
 from dpcli.runtime.progress import log
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".avif")
 _PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many times its bytes beyond them
 _NAMED = 6  # series at most in a message
+_TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds
+_COLORS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # modes of 8 bits
+_GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
 
 
 def is_plausible(width: int, height: int, held: int) -> bool:
@@ -41,6 +49,8 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
 
     with Image.open(path) as image:
         require_plausible(path, *image.size, path.stat().st_size)
+        if (tags := color_tags(path, image.format)) and wide_color.is_wide(*tags):
+            image.info[_TAGS] = tags
         yield image
 
 
@@ -51,16 +61,38 @@ def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image
     return ImageOps.exif_transpose(image)
 
 
-def as_shown(image, profile: bytes | None = None):  # image: PIL.Image.Image -> PIL.Image.Image
-    """Returns the image upright and in sRGB: colors of a wide gamut or of print are converted by their ICC profile.
+def as_shown(image, info: dict | None = None):  # image: PIL.Image.Image -> PIL.Image.Image
+    """Returns the image upright and in sRGB: colors of a wide gamut, of HDR or of print are converted by their ICC profile
+    or color tags, a PNG's by the gamma that it names.
 
-    profile: the one of an image that lost it. A damaged one is passed over, as browsers do.
+    info: what Pillow found in the file of an image that lost it. A damaged profile is passed over, as browsers do.
     """
+    image = upright(image)
+    info = info or image.info
+    profile, tags = info.get("icc_profile"), info.get(_TAGS)
+    if tags and not (profile and image.format == "AVIF"):
+        return _of_tags(image, *tags)
+    if profile:
+        return _of_profile(image, profile)
+    gamma = info.get("gamma") or _GAMMA
+    if "srgb" in info or abs(gamma / _GAMMA - 1) < 0.05 or image.mode not in _COLORS:
+        return image
+    image = image.convert("RGBA")
+    return image.point([*(wide_color.codes_of_gamma(gamma).tolist() * 3), *range(256)])
+
+
+def _of_tags(image, transfer: int, primaries: int):  # -> PIL.Image.Image
+    from PIL import Image
+
+    rgba = np.array(image.convert("RGBA"))
+    rgba[..., :3] = wide_color.to_srgb(rgba[..., :3].astype(np.uint16) * 257, transfer, primaries)
+    return Image.fromarray(rgba)
+
+
+def _of_profile(image, profile: bytes):  # -> PIL.Image.Image
     from PIL import ImageCms
 
-    image = upright(image)
-    profile = profile or image.info.get("icc_profile")
-    if not profile or image.mode not in ("RGB", "RGBA", "CMYK", "P"):
+    if image.mode not in ("RGB", "RGBA", "CMYK", "P"):
         return image
     try:
         own = ImageCms.ImageCmsProfile(BytesIO(profile))
@@ -88,7 +120,8 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
     if len(several) > 1:
         found = ", ".join(f"{_pattern(name, own)} ({len(own)} images)" for name, own in list(several.items())[:_NAMED])
         first = next(iter(several.values()))[0]
-        choose = f"Name one: {option} '{re.sub('[0-9]+', '*', first.name)}', or move" if option else "Move"
+        pattern = _pattern_of_one(first.name, [path.name for own in list(several.values())[1:] for path in own])
+        choose = f"Name one: {option} '{pattern}', or move" if option and pattern else "Move"
         raise DataError(
             f"{folder}: images of {len(several)} series: {found}\n"
             f"{choose} each into a folder of its own and name the one you want: the one that {first.name} belongs to, or another"
@@ -105,6 +138,12 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
             )
         return kept
     return list(paths)
+
+
+def _pattern_of_one(first: str, others: list[str]) -> str:
+    """Returns the pattern that fits the series of a name and none of the `others`; "" where none is as simple."""
+    patterns = [re.sub("[0-9]+", digits, first) for digits in ("*", "*[0-9]", "[0-9]*[0-9]")]
+    return next((one for one in patterns if not any(fnmatchcase(name, one) for name in others)), "")
 
 
 def _pattern(name: str, paths: Sequence[Path]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
-from dpcli.runtime.clips.container_ends import ends_early
+from dpcli.runtime.clips.container_ends import empty_frames, ends_early
 from dpcli.runtime.clips.display_matrix import Matrix, as_it_plays, display_matrix
 from dpcli.runtime.progress import log
 
@@ -40,6 +40,7 @@ _UNKNOWN_MATRICES = {8: "YCgCo", 11: "YDzDx", 14: "ICtCp", 15: "IPT-C2", 16: "YC
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
 _FULL_RANGE = 2
+_ASKEW = 0.02  # of a display matrix: a degree
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,9 @@ def look_at_video(path: Path) -> VideoLook:
     return _look(path, state.st_mtime_ns, state.st_size)
 
 
-def video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
-    """Yields frames by rising index, each u8 (H,W,4), straight alpha, opaque where the video has none.
+def video_frames(path: Path, wanted: Sequence[int], *, as_stored: bool = False) -> Iterator[np.ndarray]:
+    """Yields frames by rising index, each u8 (H,W,4), straight alpha, opaque where the video has none; as_stored: in the
+    colors of the file, not in sRGB.
 
     Decodes from the beginning: jumping to a frame of an inter-coded video isn't exact in every container.
     """
@@ -73,7 +75,7 @@ def video_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
             if frame is None:
                 raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
             matrix = matrix or display_matrix(frame)  # one for all of them
-            yield _rgba(frame, stream.sample_aspect_ratio, matrix)
+            yield _rgba(frame, stream.sample_aspect_ratio, matrix, as_stored)
 
 
 @lru_cache(maxsize=4)
@@ -94,9 +96,12 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         rate = float((stream.codec_context.framerate if bare else stream.average_rate) or 0)
         if bare and rate == _ASSUMED_RATE:
             log.info(f"{path}: a stream without a container: {rate:g} frames per second, if it tells no other (--fps)")
+        if container.format.name == "avi" and stream.frames > len(stamps) + 1:
+            rate = 0.0  # frames are repeated: their own time stamps tell when, or nothing does
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
         _require_known_colors(path, first)
+        _tell_streams(path, container, stream)
         _tell_display(path, first, stream)
     return VideoLook(len(stamps), None if times is None else tuple(times.tolist()), alpha)
 
@@ -118,7 +123,7 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
         container = av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError):
         raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown kind)") from None
-    streams = [one for one in container.streams.video if not one.disposition & one.disposition.attached_pic]
+    streams = _streams(container)
     if not streams:
         container.close()
         raise DataError(f"{path}: no video in this file; expected a clip")
@@ -126,6 +131,17 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
         container.close()
         raise DataError(f"{path}: no decoder for its codec; ffmpeg -i {path.name} -c:v libx264 clip.mp4 converts it")
     return container, streams[0]
+
+
+def _streams(container) -> list:  # of av.VideoStream
+    """Returns the video streams, no pictures of covers, the one that players show first: the default, else the largest."""
+
+    def rank(stream) -> tuple[bool, int]:
+        context = stream.codec_context
+        return not stream.disposition & stream.disposition.default, -(context.width * context.height if context else 0)
+
+    pictured = [one for one in container.streams.video if not one.disposition & one.disposition.attached_pic]
+    return sorted(pictured, key=rank)
 
 
 def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
@@ -187,7 +203,7 @@ def _declared_and_held(
 ) -> tuple[int, int]:
     """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it; cut: it ends early."""
     if stream.frames > count + (not cut):
-        return stream.frames, _packets(path)
+        return stream.frames, _packets(path) + empty_frames(path, stream.index)
     if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
         begins = float((stream.start_time or 0) * stream.time_base)  # some containers count their duration from 0
         seconds = float(container.duration or 0) / 1e6 - max(begins, 0.0)
@@ -205,7 +221,7 @@ def _packets(path: Path) -> int:
 
     options = {"format_whitelist": VIDEO_FORMATS, "ignore_editlist": "1"}
     with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
-        stream = next(one for one in container.streams.video if not one.disposition & one.disposition.attached_pic)
+        stream = _streams(container)[0]
         try:
             return sum(1 for packet in container.demux(stream) if packet.size and not packet.is_corrupt)
         except av.FFmpegError:
@@ -245,6 +261,16 @@ def _require_known_colors(path: Path, frame) -> None:
         )
 
 
+def _tell_streams(path: Path, container, stream) -> None:
+    others = [one for one in _streams(container) if one.index != stream.index and one.codec_context]
+    if others:
+        found = ", ".join(f"{one.index}: {one.codec_context.width}x{one.codec_context.height}" for one in others)
+        log.info(
+            f"{path}: {len(others) + 1} videos in it; {stream.index}, {stream.width}x{stream.height}, is read, as players do; "
+            f"ffmpeg -i IN -map 0:NUMBER -c copy OUT takes out another ({found})"
+        )
+
+
 def _tell_display(path: Path, frame, stream) -> None:
     aspect = stream.sample_aspect_ratio
     if aspect and aspect != 1:
@@ -252,8 +278,13 @@ def _tell_display(path: Path, frame, stream) -> None:
     a, b, c, d = display_matrix(frame)
     if a * d < b * c:
         log.info(f"{path}: mirrored, as it plays")
-    elif frame.rotation:
-        log.info(f"{path}: turned by {frame.rotation % 360} degrees, as it plays")
+    elif turn := round(frame.rotation / 90) % 4:
+        log.info(f"{path}: turned by {90 * turn} degrees, as it plays")
+    if min(abs(a) + abs(d), abs(b) + abs(c)) > _ASKEW * max(map(abs, (a, b, c, d))):
+        log.warn(
+            f"{path}: its display matrix turns it by {abs(np.degrees(np.arctan2(b, a))):.0f} degrees, of which only quarter "
+            "turns are applied; ffmpeg -i IN OUT turns it"
+        )
     if frame.interlaced_frame:
         log.warn(f"{path}: interlaced: each frame shows two moments, line by line; ffmpeg -vf bwdif parts them")
     if int(frame.color_trc) in _HDR:
@@ -261,11 +292,14 @@ def _tell_display(path: Path, frame, stream) -> None:
             f"{path}: an HDR clip ({_HDR[int(frame.color_trc)]}): tone-mapped to SDR as ITU-R BT.2390 has it; players "
             "differ in this, so convert it to SDR first where colors must be theirs"
         )
-    elif wide_color.is_wide(0, int(frame.color_primaries)):
-        log.info(f"{path}: colors of a wide gamut; converted to sRGB")
+    elif wide_color.is_wide(int(frame.color_trc), int(frame.color_primaries)):
+        kind = "linear light" if int(frame.color_trc) == wide_color.LINEAR else "colors of a wide gamut"
+        log.info(f"{path}: {kind}; converted to sRGB")
 
 
-def _rgba(frame, aspect, matrix: Matrix) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
+def _rgba(
+    frame, aspect, matrix: Matrix, as_stored: bool
+) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
     """Returns u8 (H,W,4) of a decoded frame as it is shown: full range, square pixels, turned."""
     width = round(frame.width * aspect) if aspect and aspect != 1 else frame.width
     options = {"threads": 1}  # more convert strips of their own: other rounding at other numbers of cores
@@ -274,7 +308,7 @@ def _rgba(frame, aspect, matrix: Matrix) -> np.ndarray:  # frame: av.VideoFrame,
     if not frame.format.is_rgb and not frame.format.name.startswith("gray"):
         options["src_color_range"] = int(frame.color_range) or (_FULL_RANGE if "yuvj" in frame.format.name else 1)
     transfer, primaries = int(frame.color_trc), int(frame.color_primaries)
-    if wide_color.is_wide(transfer, primaries):
+    if wide_color.is_wide(transfer, primaries) and not as_stored:
         deep = frame.reformat(width, frame.height, "rgba64le", **options).to_ndarray()
         rgb, alpha = wide_color.to_srgb(deep[..., :3], transfer, primaries), deep[..., 3:] >> 8
         picture = np.concatenate((rgb, alpha.astype(np.uint8)), axis=-1)

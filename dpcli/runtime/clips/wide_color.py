@@ -1,4 +1,4 @@
-"""Colors of HDR and wide-gamut clips (PQ, HLG, BT.2020, Display P3) brought to sRGB, as players on plain screens do.
+"""Colors of HDR, linear and wide-gamut clips (PQ, HLG, BT.2020, Display P3) brought to sRGB, as players on plain screens do.
 
 The signal becomes light of the screen by ITU-R BT.2100; light above an SDR white of 203 cd/m2 (BT.2408) is bent below it
 by the curve of BT.2390, section 5.4.1, whose gain is that of the largest channel, so that hues stay; the primaries
@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-PQ, HLG = 16, 18  # transfer functions, by their number in H.273
+LINEAR, PQ, HLG = 8, 16, 18  # transfer functions, by their number in H.273
 _BT2020, _DISPLAY_P3 = 9, 12  # primaries, likewise
 _BT709_XY = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))
 _PRIMARIES_XY = {
@@ -27,7 +27,7 @@ _KNOTS = 4096
 
 def is_wide(transfer: int, primaries: int) -> bool:
     """Returns whether a clip of this transfer function and these primaries (numbers of H.273) isn't shown as stored."""
-    return transfer in (PQ, HLG) or primaries in _PRIMARIES_XY
+    return transfer in (LINEAR, PQ, HLG) or primaries in _PRIMARIES_XY
 
 
 def to_srgb(rgb: np.ndarray, transfer: int, primaries: int) -> np.ndarray:
@@ -43,6 +43,12 @@ def to_srgb(rgb: np.ndarray, transfer: int, primaries: int) -> np.ndarray:
         light *= np.interp(light.max(-1), *_gains())[..., None].astype(np.float32)
     light = light @ _to_bt709(primaries).T
     return _srgb_codes()[np.round(light.clip(0, 1) * (_LEVELS - 1)).astype(np.uint16)]
+
+
+def codes_of_gamma(gamma: float) -> np.ndarray:
+    """Returns the sRGB codes, u8 (256), of levels that a PNG of this gamma (1: linear) stores."""
+    light = np.linspace(0, 1, 256) ** (1 / gamma)
+    return _srgb_codes()[np.round(light * (_LEVELS - 1)).astype(np.uint16)]
 
 
 def pq_light(signal: np.ndarray) -> np.ndarray:
@@ -83,6 +89,8 @@ def _light(transfer: int) -> np.ndarray:
         light = pq_light(signal) / _SDR_WHITE
     elif transfer == HLG:
         light = hlg_scene_light(signal)
+    elif transfer == LINEAR:
+        light = signal
     else:
         light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
     return light.astype(np.float32)

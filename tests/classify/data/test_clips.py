@@ -20,6 +20,7 @@ from dpcli.classify.data.clips import (
     uniform_frames,
 )
 from dpcli.classify.data.validation_split import about_people, carve_validation, default_rule, folds
+from dpcli.classify.data.videos import report_short
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.settings import training_settings
 from dpcli.errors import DataError, UsageError
@@ -42,6 +43,23 @@ def reader(tmp_path) -> CloudsReader:
                 CloudSequence.from_frames(f"v{i}", frames, label=i % 2, split="train" if i < 5 else "test", subject=i)
             )
     return CloudsReader(tmp_path / "c.h5")
+
+
+def test_frames_without_points_are_told_where_clips_show_them(tmp_path, capsys):
+    some, none = np.ones((5, 3), np.float32), np.zeros((0, 3), np.float32)
+    with CloudsWriter(tmp_path / "e.h5", class_names=["a"]) as writer:
+        for name, frames in (
+            ("whole", [some] * 5),
+            ("gaps", [none, some, some, none, some]),
+            ("other", [none, some] * 3),
+        ):
+            writer.write(CloudSequence.from_frames(name, frames, label=0))
+    empty = CloudsReader(tmp_path / "e.h5")
+    report_short(ClipSource(empty, [0, 1], CONFIG), 4)
+    assert "2 frames without points in 1 videos are taken as points at the origin: gaps" in capsys.readouterr().err
+    report_short(ClipSource(empty, [0], CONFIG), 4)
+    report_short(ClipSource(empty, [0, 1], CONFIG.changed(scales=(1.0,)), timing="slots"), 4)
+    assert capsys.readouterr().err == ""
 
 
 def test_every_start_and_spread_clips():

@@ -68,6 +68,17 @@ def test_columns_that_number_count_and_date_are_not_read_and_the_reason_is_told(
     assert set(read) == set(TELLING) and left_out == SENSELESS
 
 
+def test_a_number_that_names_joints_is_read(tmp_path):
+    rng, joint = np.random.default_rng(0), kept_name("joint")
+    with CloudsWriter(tmp_path / "j.h5", class_names=["a", "b"], fields=[joint]) as writer:
+        for k in range(16):
+            frames = [(rng.normal(0, 0.1, (5, 3)) + np.arange(5)[:, None]).astype(np.float32) for _ in range(12)]
+            video = CloudSequence.from_frames(f"v{k}", frames, label=k % 2, split="train")
+            video.extra = {joint: np.tile(np.arange(5, dtype=np.float32), 12)}
+            writer.write(video)
+    assert telling_columns(CloudsReader(tmp_path / "j.h5"), range(16)) == (("joint",), {})
+
+
 def test_few_videos_and_no_classes_leave_out_only_what_is_certain(file):
     reader = CloudsReader(file)
     read, left_out = telling_columns(reader, range(30), by_class=False)

@@ -10,7 +10,13 @@ from dpcli.classify.data.augment import NONE
 from dpcli.classify.data.augment import SPARSE as CHANGE
 from dpcli.classify.data.clips import ClipSource, OneVideo
 from dpcli.classify.data.slots import changed_rows, in_slots, measured, preset_for, slot_rows
-from dpcli.classify.data.validation_split import about_people, carve_validation, cross_folds, default_rule
+from dpcli.classify.data.validation_split import (
+    about_classes,
+    about_people,
+    carve_validation,
+    cross_folds,
+    default_rule,
+)
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.settings import network_config
 from dpcli.errors import DataError, UsageError
@@ -133,7 +139,9 @@ def test_whole_people_share_a_fold(tmp_path):
     assert sorted(set(found.values())) == [0, 1, 2]
     chosen, judged = carve_validation(reader, "cross", 0)
     assert chosen is judged and default_rule(reader, 4) == "cross" and default_rule(reader) == "subject"
-    assert about_people(reader, chosen, judged) == ""
+    assert about_people(reader, chosen, judged) == "" and about_classes(reader, found) == ""
+    by_class = {k: int(reader.labels[k]) for k in range(11)}  # no judge saw another video of its class
+    assert "11 of these videos count as wrong" in about_classes(reader, by_class)
 
 
 def test_the_data_choose_the_preset_unless_another_network_is_named(tmp_path):

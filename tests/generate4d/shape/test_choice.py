@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from dpcli.generate4d.config import FIT_PRESETS
+from dpcli.generate4d.optimizer import SceneOptimizer
 from dpcli.generate4d.shape.choice import guide
 from dpcli.generate4d.shape.config import ShapeConfig
 from dpcli.generate4d.shape.model_file import save_shape_model
@@ -47,3 +51,30 @@ def test_the_network_is_taken_where_it_is_sure(prior, offset, name, said, target
 
 def test_other_priors_have_no_shape(targets):
     assert guide("none", targets) is None and guide("views", targets) is None
+
+
+@pytest.mark.parametrize(("until", "judged"), [(0.5, 2), (1.0, 4), (0.0, 0)])
+def test_the_last_steps_follow_the_input_view_alone(until, judged, targets, monkeypatch):
+    shape, frames = guide("inflated", targets), []
+    drawn = shape.pictures
+    monkeypatch.setattr(shape, "pictures", lambda *given: frames.append(given[0]) or drawn(*given))
+    config = replace(FIT_PRESETS["tiny"], size=32, dense_steps=2, sparse_steps=2, shape_until=until)
+    optimizer = SceneOptimizer(targets, config, seed=0, shape=shape)
+    optimizer.start()
+    for _ in range(config.steps):
+        optimizer.take_step()
+    assert len(frames) == judged
+
+
+def test_what_moves_in_depth_costs_with_and_without_a_shape(targets):
+    for shape in (guide("inflated", targets), None):
+        costs = {}
+        for weight in (0.0, 1000.0):
+            config = replace(FIT_PRESETS["tiny"], size=32, thickness=weight)
+            optimizer = SceneOptimizer(targets, config, seed=0, shape=shape)
+            optimizer.start()
+            with torch.no_grad():
+                instant = optimizer.model.at(optimizer.times[[1]])
+                instant.mean += 0.1 * torch.from_numpy(targets.world_to_camera[0][2, :3]).float()
+                costs[weight] = optimizer._motion_terms(instant, [1]).item()
+        assert costs[1000.0] - costs[0.0] == pytest.approx(10, rel=1e-3)

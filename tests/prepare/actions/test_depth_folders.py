@@ -88,6 +88,31 @@ def test_arrays_of_one_frame_each_are_one_clip_and_arrays_of_many_are_videos(tmp
     assert len(DepthVideos(inputs=(tmp_path / "frames",)).items()) == 3
 
 
+def test_archives_of_one_frame_each_are_one_clip_and_one_of_many_is_a_video(tmp_path):
+    (tmp_path / "frames").mkdir()
+    for t in range(2):
+        np.savez(tmp_path / "frames" / f"{t}.npz", depth=depth(1000 + t), color=np.zeros((6, 8, 3), np.uint8))
+    np.savez(tmp_path / "many.npz", np.stack([depth(1000), depth(1001)]))
+    for path in (tmp_path / "frames", tmp_path / "many.npz"):
+        assert first_depths(read(path)[1]) == [1.0, 1.001]
+    np.savez(tmp_path / "two.npz", a=depth(1), b=depth(2))
+    with pytest.raises(DataError, match="two.npz: arrays a, b; expected one called depth"):
+        read(tmp_path / "two.npz")
+
+
+@pytest.mark.parametrize("matrices", [np.eye(4)[None], np.eye(3)[[1, 2, 0]], [[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]])
+def test_matrices_of_a_camera_are_no_depth(tmp_path, matrices):
+    np.save(tmp_path / "poses.npy", matrices)
+    with pytest.raises(DataError, match="poses.npy: holds 1 matrices of a camera, no depth"):
+        read(tmp_path / "poses.npy")
+
+
+def test_files_that_are_not_read_are_named_where_nothing_else_is_there(tmp_path):
+    (tmp_path / "a.mat").write_bytes(b"MATLAB")
+    with pytest.raises(DataError, match="no depth video in it.*found 1 .mat: save their depth as 16-bit PNG"):
+        read(tmp_path)
+
+
 def test_a_frame_in_two_formats_is_one_frame(tmp_path):
     folder = write(tmp_path / "v", **{str(t): depth(1000 + t) for t in range(2)})
     for t in range(2):

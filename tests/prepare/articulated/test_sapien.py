@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.articulated_sequence import Articulation, study
@@ -103,7 +104,7 @@ def test_limits(tmp_path):
 def test_equal_limits_and_floating_joints_are_fixed(tmp_path):
     for options in ({"limits": "0.5 0.5"}, {"kind": "floating"}, {"kind": "planar"}, {"kind": "fixed"}):
         obj = load(two(tmp_path, **options))
-        assert obj.num_bodies == 1
+        assert obj.num_bodies == 1 and len(obj.notes) == (options != {"kind": "fixed"})
         with pytest.raises(DataError, match="r.urdf: no movable joint"):
             study(obj, Articulation())
     assert load(two(tmp_path, kind="planar")).notes == {"planar joints taken as fixed": 1}
@@ -424,6 +425,18 @@ def test_names_written_on_windows(tmp_path):
     (tmp_path / "meshes" / "c.obj").write_text(CUBE_OBJ)
     elements = [link("a", '<mesh filename="meshes\\c.obj"/>'), link("b", box(1, 1, 1)), joint("j", "a", "b")]
     assert len(load(write_urdf(tmp_path / "r.urdf", *elements)).triangles) == 24
+
+
+def test_an_origin_by_a_quaternion_turns_as_one_by_angles(tmp_path):
+    def placed(origin: str) -> np.ndarray:
+        shape = f'<link name="b"><visual><origin {origin}/><geometry><box size="1 2 3"/></geometry></visual></link>'
+        return load(write_urdf(tmp_path / "r.urdf", link("a", box(1, 1, 1)), shape, joint("j", "a", "b"))).triangles
+
+    x, y, z, w = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_quat()
+    found = placed(f'xyz="1 2 3" quat_xyzw="{x} {y} {z} {w}"')
+    np.testing.assert_allclose(found, placed('xyz="1 2 3" rpy="0.3 -0.7 1.1"'), atol=1e-9)
+    with pytest.raises(DataError, match="quat_xyzw '0 0 0 0' is no rotation"):
+        placed('quat_xyzw="0 0 0 0"')
 
 
 def test_a_declared_encoding_is_read(tmp_path):

@@ -11,8 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError
+from dpcli.ops.open3d_import import load_open3d
+from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
+from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.decode.cloud_files import read_cloud
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
 quick = settings(
@@ -103,7 +107,6 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
         ("x,y,z\n1_000,2,3\n", "column 'x' holds '1_000'"),
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
-        ("x,y,z\n", "a header, but no rows"),
         ("\n\n", "no rows"),
         ("range,azimuth,elevation\n1,2,3\n", "columns range, azimuth, elevation; expected x, y and z"),
         ("x,y,z,pos_x,X\n1,2,3,4,5\n", "columns x, X could each be x"),
@@ -131,6 +134,7 @@ def test_a_row_of_units_below_the_header_counts(tmp_path, row):
         ("pts", "1 2 3 255 0 9\n4 5 6 0 1 2\n", [[255, 0, 9], [0, 1, 2]], ()),
         ("pts", "1 2 3 9\n4 5 6 8\n", None, ("intensity",)),
         ("xyzrgb", "1 2 3 1 0 0.5\n4 5 6 0 0.25 0\n", [[1, 0, 0.5], [0, 0.25, 0]], ()),
+        ("xyzi", "1 2 3 7\n4 5 6 8\n", None, ("intensity",)),
         ("xyzn", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("nx", "ny", "nz")),
         ("xyz", "1 2 3 0 0 1\n4 5 6 0 1 0\n", None, ("columns 4 to 6 (no names)",)),
         ("csv", "x,y,z,snr\n1,2,3,4\n4,5,6,7\n", None, ("snr",)),
@@ -141,6 +145,71 @@ def test_columns_that_a_format_implies_and_those_not_read(tmp_path, suffix, rows
     cloud = read(tmp_path / f"a.{suffix}", rows)
     assert cloud.points.tolist() == [[1, 2, 3], [4, 5, 6]] and cloud.unread == unread
     assert (None if cloud.color is None else cloud.color.tolist()) == color
+
+
+@pytest.mark.parametrize("suffix", ["xyz", "xyzn", "xyzrgb", "pts"])
+def test_what_open3d_writes_as_text_is_read_back(tmp_path, suffix):
+    open3d = load_open3d()
+    rng = np.random.default_rng(0)
+    points, colors = rng.uniform(-3, 3, (20, 3)), rng.uniform(0, 1, (20, 3))
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    cloud.colors = cloud.normals = open3d.utility.Vector3dVector(colors)
+    assert open3d.io.write_point_cloud(str(tmp_path / f"a.{suffix}"), cloud)
+    found = read_text(tmp_path / f"a.{suffix}")
+    np.testing.assert_allclose(found.points, points, atol=1e-9)
+    assert (found.color is not None) == (suffix in ("xyzrgb", "pts"))
+    if found.color is not None:
+        np.testing.assert_allclose(as_bytes([found.color])[0], colors * 255, atol=1)
+
+
+@pytest.mark.parametrize("color", [None, [7, 8, 9]])
+def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
+    rng, scans, expected = np.random.default_rng(0), [], []
+    for angle in (0.0, 0.5):
+        turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        matrix, own = np.eye(4), rng.uniform(-9, 9, (6, 3)).round(6)
+        matrix[:3, :3], matrix[3, :3], own[2] = turn, [10 + angle, 20, 30], 0
+        head = ["3", "2", *(" ".join(map(str, row)) for row in [[0, 0, 0], *np.eye(3).tolist(), *matrix.tolist()])]
+        scans += [*head, *(" ".join(map(str, [*point.tolist(), 0.5, *(color or [])])) for point in own)]
+        expected.append(np.delete(own, 2, 0) @ turn + matrix[3, :3])
+    (tmp_path / "a.ptx").write_text("\r\n".join(scans) + "\r\n")
+    cloud = read_cloud(tmp_path / "a.ptx", keep=["intensity"])
+    np.testing.assert_allclose(cloud.points, np.concatenate(expected), atol=1e-9)
+    assert cloud.dropped == {AT_ORIGIN: 2} and cloud.extra["intensity"].tolist() == [0.5] * 10
+    assert (None if cloud.color is None else cloud.color[-1].tolist()) == color
+    (tmp_path / "a.ptx").write_text("\n".join(scans[:-1]))
+    with pytest.raises(DataError, match="says 6 points, it has room for 5"):
+        read_cloud(tmp_path / "a.ptx")
+    (tmp_path / "a.ptx").write_text("\n".join(scans[1:]))
+    with pytest.raises(DataError, match="row 1 begins no scan"):
+        read_cloud(tmp_path / "a.ptx")
+
+
+def test_whole_numbers_before_three_columns_of_fractions_are_asked_about(tmp_path):
+    scan = "".join(f"{k} 7 1.5 2.25 0.{k}5 128\n" for k in range(3, 6))
+    with pytest.raises(DataError, match="its first 2 columns hold whole numbers, .*which are x, y and z"):
+        read(tmp_path / "a.xyz", scan)
+    assert read(tmp_path / "a.xyz", "row column x y z i\n" + scan).points[0].tolist() == [1.5, 2.25, 0.35]
+    frames = "".join(f"{k // 4} 1.5 2.25 0.{k}5\n" for k in range(12))
+    with pytest.raises(DataError, match="its first column holds whole numbers"):
+        read(tmp_path / "a.xyz", frames)
+    plain = [f"{k} 2.5 {k}.25 0.5\n" for k in (3, 4, 9)]
+    for text in ("".join(plain), "".join(plain) * 3 + "3.5 2.5 4.25 0.5\n", "3 4 5 0.1\n" * 20, "3 4 5.5 0.1\n" * 20):
+        assert read(tmp_path / "a.xyz", text).points[0, 0] == 3
+
+
+@pytest.mark.parametrize(
+    ("suffix", "text"), [("csv", "x,y,z,r,g,b,snr\n"), ("csv", "x;y;z;snr\nm;m;m;\n"), ("pts", "0\n")]
+)
+def test_a_moment_that_saw_nothing_has_no_points(tmp_path, suffix, text):
+    cloud = read(tmp_path / f"a.{suffix}", text, keep=["snr"] if "snr" in text else [])
+    assert cloud.points.shape == (0, 3) and (cloud.color is not None) == ("r,g,b" in text)
+
+
+def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
+    with pytest.raises(DataError, match="--keep-fields t: float32, .* would round its values by up to 0.1;"):
+        read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,1700000000.0\n1,2,4,1700000000.1\n", keep=["t"])
+    assert read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,5\n1,2,4,1700000001\n", keep=["t"]).extra["t"][0] == 5
 
 
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):

@@ -81,6 +81,7 @@ REALSENSE["coeffs"] = [0, 0, 0, 0, 0]
         ("k.json", {"camera": {**PLAIN, "w": 640, "h": 480}}, (640, 480)),
         ("k.json", {"width": 640, "height": 480, "intrinsics": PLAIN}, (640, 480)),
         ("k.json", {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, "frames": [{"a": 1}]}, (640, 480)),
+        ("k.json", {**{k: str(v) for k, v in PLAIN.items()}, "width": "640", "height": "480"}, (640, 480)),
         ("k.yaml", ROS, (640, 480)),
         ("k.yml", OPENCV, (640, 480)),
         ("k.yaml", KALIBR, (640, 480)),
@@ -119,6 +120,7 @@ def test_matrices_of_numpy_and_opencv(tmp_path):
         ("depth_scale", 0.00025, 4000),
         ("depth_units", 0.001, 1000),
         ("scale", 6553.5, 6553.5),
+        ("depth_unit", "mm", 1000),
     ],
 )
 def test_the_depth_scale_in_units_per_meter_or_meters_per_unit(tmp_path, key, value, scale):
@@ -166,6 +168,28 @@ def test_the_depth_factor_and_the_lens_that_a_slam_declares(tmp_path):
         read_calibration(tmp_path / "k.yaml")
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"coeffs": "0.1 -0.05 0.001 -0.002 0.01"},
+        {"distortion": {"k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": -0.002, "k3": 0.01}},
+        {"k1": "0.1", "k2": -0.05, "p1": 0.001, "p2": -0.002, "k3": 0.01},
+        {"RadialDistortion": [0.1, -0.05, 0.01], "TangentialDistortion": [0.001, -0.002]},
+    ],
+)
+def test_a_lens_is_read_however_it_is_written(tmp_path, said):
+    (tmp_path / "k.json").write_text(json.dumps({**PLAIN, **said}))
+    assert read_calibration(tmp_path / "k.json").intrinsics.distortion == (0.1, -0.05, 0.001, -0.002, 0.01)
+
+
+def test_the_info_of_scannets_recordings(tmp_path):
+    matrices = f"m_calibrationColorIntrinsic = 900 {FOUR[5:]}".replace("\n", " ")
+    text = f"m_depthWidth = 640\nm_depthHeight = 480\nm_depthShift = 1000\n{matrices}\n"
+    (tmp_path / "_info.txt").write_text(text + f"m_calibrationDepthIntrinsic = {FOUR}".replace("\n", " ") + "\n")
+    found = read_calibration(tmp_path / "_info.txt")
+    assert (found.intrinsics, found.width, found.depth_scale) == (CAMERA, 640, 1000)
+
+
 def test_a_lens_is_straightened(tmp_path):
     bent = (0.1, -0.05, 0.001, -0.002, 0.01)
     (tmp_path / "k.json").write_text(json.dumps({**REALSENSE, "coeffs": bent}))
@@ -188,6 +212,8 @@ def test_a_lens_is_straightened(tmp_path):
         ("k.json", '{"intrinsic_matrix": [1]}', "its matrix is not of 3x3"),
         ("k.json", json.dumps({**PLAIN, "fx": -1}), "positive focal lengths"),
         ("k.json", json.dumps({"K": [1, 0.5, 3, 0, 1, 3, 0, 0, 1]}), "a skew of 0.5"),
+        ("k.json", json.dumps({**PLAIN, "skew": 2}), "a skew of 2"),
+        ("k.json", json.dumps({**PLAIN, "distortion": {"k1": 0, "xi": 0.9}}), "a coefficient xi"),
         ("k.json", json.dumps({"a": PLAIN, "b": {**PLAIN, "fx": 2}}), r"holds several cameras \(a, b\)"),
         ("k.json", json.dumps({**REALSENSE, "model": "kannala_brandt4", "coeffs": [0.1, 0, 0, 0]}), "kannala_brandt4"),
         (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from dpcli.prepare.closing_line import closing_lines
 from dpcli.prepare.cloud_formats.cloud import Cloud
 from dpcli.prepare.commands.merge import merge
 from dpcli.prepare.pipeline import Conversion, convert
-from dpcli.prepare.scans.assembling import COARSE
+from dpcli.prepare.reader import Item
+from dpcli.prepare.scans.assembling import COARSE, Lengths, assemble
 from dpcli.prepare.scans.cleaning import AT_ORIGIN, IMPOSSIBLE, NOT_FINITE, clean
 from dpcli.prepare.scans.clouds import CloudFolders
 from dpcli.runtime.machines.shards import Shard
@@ -73,6 +76,17 @@ def test_the_shift_is_kept_told_and_undone(tmp_path):
     assert near.shift is None and far.shift.tolist() == np.floor((POINTS + base).min(0)).tolist()
     np.testing.assert_allclose(near.original_frame(0), POINTS, atol=1e-6)
     assert report.closing[1] == "map: (448000, 5411000, 300) was taken off its coordinates; the file keeps it as shift"
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale", "first"),
+    [("m", None, 1.5), ("cm", None, 150), ("mm", None, 1500), ("m", 500.0, 3), ("cm", 10.0, 150), ("span", None, 1500)],
+)
+def test_units_that_files_declare_become_those_of_the_output(unit, scale, first):
+    cloud = Cloud(np.array([[1500.0, 20, 30], [1600, 20, 30]]), unit="mm")
+    sample = assemble(Item("a", Path("a")), [cloud], Lengths(scale, unit))
+    assert sample.sequence.points[0, 0] == first
+    assert any(f"from mm to {unit}," in note for note in sample.notes) is (scale is None and unit in ("m", "cm"))
 
 
 @pytest.mark.parametrize(("kind", "rounded"), [("f4", True), ("f8", False)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 
 import laspy
@@ -124,21 +123,6 @@ def test_folders_of_splits_above_those_of_classes(tmp_path):
     reader = CloudFolders(tmp_path, label_from_folder=True)
     assert reader.class_names == ["run", "walk"]
     assert [(i.label, i.split) for i in reader.items()] == [(1, "test"), (0, "train"), (1, "train")]
-
-
-def test_a_reader_goes_to_a_worker_without_its_index(tmp_path):
-    """It goes with each item: work on many would grow with the square of their number."""
-    for number in range(20):
-        (tmp_path / f"s{number}").mkdir()
-        for frame in range(2):
-            np.save(tmp_path / f"s{number}" / f"{frame}.npy", np.full((4, 3), frame + 1, np.float32))
-    reader = CloudFolders(tmp_path, fps=10)
-    before = len(pickle.dumps(reader))
-    items = reader.items()
-    assert len(items) == 20 and len(pickle.dumps(reader)) == before
-    far, rng = pickle.loads(pickle.dumps(reader)), np.random.default_rng(0)
-    sequence = far.read(items[3], rng).sequence
-    assert np.allclose(sequence.time, [0, 0.1]) and "_series" not in vars(far)
 
 
 def test_a_label_table_beside_the_data_is_no_cloud(tmp_path):
@@ -282,6 +266,13 @@ def test_a_sequence_beside_folders_of_classes_has_no_class(tmp_path):
         save(tmp_path / folder / "0.npy")
     with pytest.raises(DataError, match="'a' lies in no folder of its class"):
         CloudFolders(tmp_path, label_from_folder=True).items()
+
+
+def test_a_first_frame_that_saw_nothing_decides_nothing(tmp_path):
+    (tmp_path / "0.csv").write_text("x,y,z\n")
+    (tmp_path / "1.csv").write_text("x,y,z,r,g,b\n1,2,3,4,5,6\n")
+    sequence = read(tmp_path).sequence
+    assert sequence.num_frames == 1 and sequence.color.tolist() == [[4, 5, 6]]
 
 
 def test_columns_that_are_not_read_are_named(tmp_path):

@@ -160,6 +160,8 @@ def test_columns_that_are_not_there(tmp_path, options, message):
 
 
 def test_tables_that_cannot_be_split(tmp_path):
+    (item,) = TableSequences(write(tmp_path / "0.csv", [], "frame,x,y,z")).items()
+    assert "a header, but no rows" in item.problem
     (item,) = TableSequences(write(tmp_path / "a.csv", [(1, 2, 3)], "x,y,z")).items()
     assert "which column numbers the frames? --frame-column NAME says it; found x, y, z" in item.problem
     (item,) = TableSequences(write(tmp_path / "b.csv", [("", 1, 2, 3), (1, 1, 2, 3)])).items()
@@ -202,6 +204,23 @@ def test_parquet_is_read_as_pyarrow_wrote_it(tmp_path, data):
     (sample,) = sequences(path, sequence_column="run")
     np.testing.assert_allclose(sample.sequence.points, points.astype(np.float32))
     assert sample.sequence.num_frames == len(np.unique(number))
+
+
+@pytest.mark.parametrize("packed", ["uncompressed", "lz4", "zstd"])
+@pytest.mark.parametrize("rows", [2, 100])
+def test_feather_is_read_as_pyarrow_wrote_it(tmp_path, packed, rows):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import feather
+
+    points = np.random.default_rng(0).uniform(1, 9, (7, 3)).astype(np.float16)
+    columns = {"frame": np.repeat([0, 1], [3, 4]), **dict(zip("xyz", points.T))}
+    feather.write_feather(pyarrow.table(columns), str(tmp_path / "a.feather"), compression=packed, chunksize=rows)
+    (sample,) = sequences(tmp_path / "a.feather")
+    np.testing.assert_array_equal(sample.sequence.points, points.astype(np.float32))
+    assert np.diff(sample.sequence.frame_offsets).tolist() == [3, 4]
+    (tmp_path / "a.feather").write_bytes((tmp_path / "a.feather").read_bytes()[:-9])
+    (item,) = TableSequences(tmp_path / "a.feather").items()
+    assert "a.feather: not a readable Feather table" in item.problem
 
 
 def test_a_truncated_parquet_is_named(tmp_path):

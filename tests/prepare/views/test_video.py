@@ -6,6 +6,7 @@ import json
 import subprocess
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from hypothesis import given
@@ -253,6 +254,17 @@ def test_a_stray_piece_does_not_widen_the_crop():
     assert visible_box(picture, 0.01) == alone != visible_box(picture)
 
 
+def write_masks(path: Path, masks: list[np.ndarray]) -> Path:
+    """Masks u8 (H,W) as a video."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=10, options={"crf": "8"})
+        stream.height, stream.width, stream.pix_fmt = *masks[0].shape, "yuv420p"
+        for mask in masks:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.repeat(mask[..., None], 3, -1), "rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
 def test_masks_cut_a_busy_background(tmp_path):
     rng = np.random.default_rng(0)
     busy = [rng.integers(0, 256, (48, 64, 3), np.uint8) for _ in range(3)]
@@ -260,7 +272,8 @@ def test_masks_cut_a_busy_background(tmp_path):
     folder = save(tmp_path / "clip", busy, "{:02d}.png")
     gray = save(tmp_path / "gray", [picture[..., 3] for picture in discs], "m_{}.png")
     ids = save(tmp_path / "ids", [(picture[..., 3] > 127).astype(np.uint8) for picture in discs])
-    for masks in (gray, ids):
+    film = write_masks(tmp_path / "masks.mp4", [picture[..., 3] for picture in discs])
+    for masks in (gray, ids, film):
         found = read(video_clip(folder, VideoOptions(size=64, recenter=False, mask=masks)))
         for frame in range(3):
             strong = discs[frame][..., 3] > 200
@@ -272,7 +285,15 @@ def test_masks_cut_a_busy_background(tmp_path):
     save(tmp_path / "wide", [np.zeros((10, 10), np.uint8)] * 3)
     save(tmp_path / "inverse", [255 - picture[..., 3] for picture in discs])
     save(tmp_path / "empty", [np.zeros((48, 64), np.uint8)] * 3)
+    save(
+        tmp_path / "colors", [np.where(picture[..., 3:] > 127, RED, (0, 0, 255)).astype(np.uint8) for picture in discs]
+    )
+    write_masks(tmp_path / "short.mp4", [discs[0][..., 3]] * 2)
+    write_masks(tmp_path / "dark.mp4", [np.zeros((48, 64), np.uint8)] * 3)
     for name, message in (
+        ("short.mp4", "2 masks for 3 frames"),
+        ("dark.mp4", "an empty mask"),
+        ("colors", "every mask covers its whole picture, so nothing is cut out"),
         ("short", "1 masks for 3 frames"),
         ("each", "masks for 3 frames; expected one for each, named alike, with all its objects"),
         ("wide", "10x10.*64x48"),
@@ -643,6 +664,11 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
         (lambda d: d.update(camera_model="OPENCV_FISHEYE"), "camera_model OPENCV_FISHEYE"),
         (lambda d: d.update(is_fisheye=True), "fisheye"),
         (lambda d: d["frames"][0].update(mask_path="../m.png"), "outside the folder"),
+        (lambda d: d.update(camera_angle_x=40.1), "camera_angle_x 40.1; expected radians, below pi"),
+        (
+            lambda d: d["frames"][0].update(transform_matrix=np.transpose(d["frames"][0]["transform_matrix"]).tolist()),
+            "expected 0, 0, 0, 1 .is it transposed",
+        ),
     ],
 )
 def test_bad_transforms(tmp_path, change, message):
@@ -652,6 +678,23 @@ def test_bad_transforms(tmp_path, change, message):
     (folder / "transforms_train.json").write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
         transforms_clip(folder, SMALL)
+
+
+@pytest.mark.parametrize("cameras, message", [(1, ""), (2, "scene: the cameras don't look at one object")])
+def test_cameras_that_do_not_tell_how_far_the_object_is(tmp_path, cameras, message):
+    """A phone on a stand has the pose of no motion; two cameras back to back see two things."""
+    folder, _ = blender_folder(tmp_path / "scene", cameras=cameras)
+    data = json.loads((folder / "transforms_train.json").read_text())
+    for number, frame in enumerate(data["frames"]):
+        frame["transform_matrix"] = np.diag([1, 1, 1, 1] if number < 3 else [-1, 1, -1, 1]).tolist()
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    if message:
+        with pytest.raises(DataError, match=message):
+            transforms_clip(folder, SMALL)
+        return
+    clip = transforms_clip(folder, SMALL)
+    shift = clip.header.world_to_camera[0, :3, 3]
+    assert np.isfinite(shift).all() and shift[2] > 0.75 and len(read(clip)) == 3
 
 
 # ---- the command -------------------------------------------------------------------------------------------------------

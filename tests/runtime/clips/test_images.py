@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -32,7 +36,15 @@ def test_images_are_upright_as_their_exif_says(tmp_path, orientation):
 
 def shown(rgb: np.ndarray, primaries, gamma: float) -> np.ndarray:
     """sRGB codes u8 (...,3) of codes in these primaries, by the definitions."""
-    light = (rgb / 255.0) ** gamma @ (np.linalg.inv(to_xyz(BT709)) @ to_xyz(primaries)).T
+    return srgb((rgb / 255.0) ** gamma @ (np.linalg.inv(to_xyz(BT709)) @ to_xyz(primaries)).T)
+
+
+def srgb_light(codes: np.ndarray) -> np.ndarray:
+    signal = codes / 255.0
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+
+
+def srgb(light: np.ndarray) -> np.ndarray:
     light = light.clip(0, 1)
     return np.round(255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))
 
@@ -76,6 +88,49 @@ def test_gray_of_any_type_has_its_own_range(tmp_path, gray):
     Image.fromarray(values).save(tmp_path / "a.tif")
     read = read_rgba(tmp_path / "a.tif")
     assert read[0, 0].tolist() == [0, 0, 0, 255] and read[4, 4].tolist() == [102, 102, 102, 255]
+
+
+def with_chunk(png: bytes, name: bytes, data: bytes) -> bytes:
+    """A PNG with one chunk more behind its head."""
+    chunk = struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    return png[:33] + chunk + png[33:]
+
+
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("kind", ["gamma", "cicp", "nclx"])
+def test_colors_of_tags_are_shown_in_srgb(tmp_path, kind, moves):
+    """A linear PNG by gAMA, one of Display P3 by cICP, and an AVIF of it by nclx; against the definitions."""
+    color, data, suffix = (120, 90, 60), io.BytesIO(), "avif" if kind == "nclx" else "png"
+    images = [Image.new("RGBA", (16, 16), (*color, 200)), Image.new("RGBA", (16, 16), (9, 9, 9, 255))]
+    words = {"quality": 100, "subsampling": "4:4:4"} if suffix == "avif" else {}
+    images[0].save(data, suffix.upper(), save_all=moves, append_images=images[1:] if moves else [], **words)
+    stored = data.getvalue()
+    if kind == "nclx":
+        tag = b"colrnclx" + struct.pack(">HH", 1, 13)
+        assert tag in stored
+        stored = stored.replace(tag, b"colrnclx" + struct.pack(">HH", 12, 13))
+    else:
+        chunk = (b"gAMA", struct.pack(">I", 100_000)) if kind == "gamma" else (b"cICP", bytes([12, 13, 0, 1]))
+        stored = with_chunk(stored, *chunk)
+    (tmp_path / f"0.{suffix}").write_bytes(stored)
+    read = next(iter(open_frames(tmp_path / f"0.{suffix}").read([0]))) if moves else read_rgba(tmp_path / f"0.{suffix}")
+    if kind == "gamma":
+        expected = shown(np.array(color), BT709, 1.0)
+    else:
+        expected = srgb(srgb_light(np.array(color)) @ (np.linalg.inv(to_xyz(BT709)) @ to_xyz(P3)).T)
+    np.testing.assert_allclose(read[8, 8, :3], expected, atol=2)
+    assert read[8, 8, 3] == 200
+
+
+@pytest.mark.parametrize("suffix", ["gif", "webp", "png", "avif"])
+def test_frames_shown_for_less_than_browsers_can_stay_a_tenth_of_a_second(tmp_path, suffix):
+    images = [Image.new("RGB", (16, 16), (60 * k, 0, 0)) for k in range(4)]
+    if suffix == "gif":
+        images = [image.quantize(4) for image in images]
+    lasting = [10, 20, 40, 30] if suffix == "gif" else [10, 17, 40, 30]
+    images[0].save(tmp_path / f"a.{suffix}", save_all=True, append_images=images[1:], duration=lasting)
+    expected = np.cumsum([0, 100, *lasting[1:-1]]) / 1000
+    np.testing.assert_allclose(open_frames(tmp_path / f"a.{suffix}").times, expected, atol=1e-6)
 
 
 def test_pages_of_a_tiff_are_no_clip(tmp_path):

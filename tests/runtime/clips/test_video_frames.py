@@ -162,6 +162,44 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
+def test_of_a_turn_that_is_no_quarter_is_told(pictures, tmp_path, capfd):
+    straight = film(pictures, tmp_path / "straight.mp4", *PLAIN)
+    ffmpeg("-display_rotation", 30, "-i", straight, "-c", "copy", tmp_path / "turned.mp4")
+    np.testing.assert_array_equal(decoded(tmp_path / "turned.mp4"), decoded(straight))
+    said = capfd.readouterr().err
+    assert "turns it by 30 degrees, of which only quarter turns are applied" in said and "as it plays" not in said
+
+
+@pytest.mark.parametrize("name, flags, read", [("d.mkv", ("0", "default"), 1), ("n.ts", (), 1), ("f.mp4", (), 0)])
+def test_of_several_videos_in_a_file_the_one_that_plays_is_read(pictures, tmp_path, capfd, name, flags, read):
+    """The default, else the largest; mp4 marks the first as the default."""
+    halves = ("-filter_complex", "[0]split[a][b];[a]scale=32:32[c]", "-map", "[c]", "-map", "[b]")
+    marks = [word for place, flag in enumerate(flags) for word in (f"-disposition:v:{place}", flag)]
+    path = film(pictures, tmp_path / name, *halves, *PLAIN, *marks)
+    assert decoded(path).shape[1] == (32, 64)[read]
+    assert f"2 videos in it; {read}, " in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("codec", [("-c:v", "mjpeg", "-q:v", 1), ("-c:v", "ffv1"), PLAIN])
+def test_an_avi_whose_program_dropped_frames_is_whole(pictures, tmp_path, codec):
+    """Chunks without bytes keep the frame before; with B-frames an AVI tells no times."""
+    words = ("-vf", "fps=30,select='not(mod(n,3))'", "-fps_mode", "vfr", "-enc_time_base", "1/30")
+    look = look_at_video(film(pictures, tmp_path / "d.avi", *codec, *words))
+    assert look.count == COUNT
+    if codec is PLAIN:
+        assert look.times is None
+    else:
+        np.testing.assert_allclose(look.times, np.arange(COUNT) / 10, atol=1e-6)
+
+
+def test_linear_light_becomes_srgb(tmp_path, capfd):
+    """EXR holds light: half of it is the level 188."""
+    Image.new("RGB", (16, 16), (128, 0, 255)).save(tmp_path / "0.png")
+    film(tmp_path, tmp_path / "l.mov", "-c:v", "exr", "-pix_fmt", "gbrpf32le")
+    assert np.abs(decoded(tmp_path / "l.mov")[0, 8, 8, :3].astype(int) - (188, 0, 255)).max() <= 1
+    assert "linear light; converted to sRGB" in capfd.readouterr().err
+
+
 def test_colors_that_are_not_converted_are_refused(pictures, tmp_path):
     tag = ("-bsf:v", "h264_metadata=matrix_coefficients=8")
     with pytest.raises(DataError, match="its colors are YCgCo; expected RGB, or YCbCr"):
@@ -188,6 +226,17 @@ def test_two_series_of_a_folder_are_named(pictures, tmp_path):
         DataError, match=r"(?s)images of 2 series: anya_rgba_.*luigi_rgba_.*--pattern 'anya_rgba_\*\.png'"
     ):
         open_frames(tmp_path)
+
+
+def test_the_pattern_of_the_advice_fits_one_series_alone(pictures, tmp_path):
+    """`*.png` would fit `000_mask.png`, too: color and masks in turn."""
+    for frame in range(12):
+        for name in ("{:03d}.png", "{:03d}_mask.png"):
+            Image.open(pictures / "0.png").save(tmp_path / name.format(frame))
+    with pytest.raises(DataError, match="Name one: --pattern") as error:
+        open_frames(tmp_path)
+    pattern = str(error.value).split("'")[1]
+    assert len(open_frames(tmp_path, pattern)) == 12
 
 
 @pytest.mark.parametrize("pattern, names", [("luigi_*", "luigi_0 luigi_2 luigi_10"), ("*_2.png", "anya_2 luigi_2")])

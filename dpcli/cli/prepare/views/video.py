@@ -50,7 +50,8 @@ class CutOutOptions:
         typer.Option("--holes", help="Enclosed regions of the background's color: keep (filled) or cut (gaps)."),
     ] = "auto"
     mask: Annotated[
-        Path | None, typer.Option("--mask", help="Folder with a mask for each frame, the object white.")
+        Path | None,
+        typer.Option("--mask", help="Folder with a mask for each frame, or a video of them, the object white."),
     ] = None
 
 

@@ -9,11 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.evaluate.video.sources.source import Picture, Source, View
+from dpcli.evaluate.video.sources.source import Picture, Source, View, mean_rate
 from dpcli.npy_files import map_npy
+from dpcli.path_names import first_names
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
+from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
+from dpcli.runtime.progress import log
+
+_ALL = "compare all with those of the same names in a folder TRUTH"
 
 
 class FolderSource(Source):
@@ -25,10 +30,13 @@ class FolderSource(Source):
         self.path = path
         own = _images_in(path)
         folders = {path: own} if own else {}
+        if own and (clips := clips_in(path)):
+            log.info(f"{path}: its images are compared; left out: {first_names(clips)}")
         for child in sorted((p for p in path.iterdir() if p.is_dir()), key=_numbers_in_name) if not folders else ():
             if inside := _images_in(child):
                 folders[child] = inside
         if not folders:
+            refuse_clips(path, _ALL, 'dpc evaluate video "$clip" --truth TRUTH/"$(basename "$clip")"')
             raise DataError(f"{path}: no images in it or in its folders ({', '.join(IMAGE_SUFFIXES)})")
         self.files = list(folders.values())
         self.views = [_view_of_folder("" if folder == path else folder.name) for folder in folders]
@@ -124,11 +132,13 @@ class VideoSource(Source):
     def __init__(self, path: Path) -> None:
         self.path, self.animated = path, is_image_file(path)
         if self.animated:
-            count = len(animation_times(path))
+            times = animation_times(path)
+            count = len(times)
             self.has_alpha = any((frame[..., 3] < 255).any() for frame in animation_frames(path, range(count)))
         else:
             look = look_at_video(path)
-            count, self.has_alpha = look.count, look.has_alpha
+            count, times, self.has_alpha = look.count, look.times, look.has_alpha
+        self.rate = mean_rate(times)
         self.views, self.frames = [_view_of_folder("")], [count]
 
     def pictures(self, view: int, frames: Sequence[int]) -> Iterator[Picture]:

@@ -61,10 +61,20 @@ class Picture:
         return alpha.astype(np.uint8)
 
 
+def mean_rate(times: Sequence[float] | None) -> float | None:
+    """Returns frames a second of rising times in seconds, None where they tell none.
+
+    >>> mean_rate([0.0, 0.5, 1.0])
+    2.0
+    """
+    return (len(times) - 1) / float(times[-1] - times[0]) if times is not None and len(times) > 1 else None
+
+
 class Source(ABC):
     """Gives the videos of one object. `pictures` reads the frames of a view in rising order, one in memory at a time.
 
     frames: of each view, None = any (a scene can be seen at any time). has_alpha: whether the object is cut out.
+    rate: frames a second in the mean, None where it isn't known.
     """
 
     path: Path
@@ -72,6 +82,7 @@ class Source(ABC):
     views: list[View]
     frames: list[int] | None
     has_alpha: bool = True
+    rate: float | None = None
     header: ViewsHeader | None = None
     history: list[dict] = []
 

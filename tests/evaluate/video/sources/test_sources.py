@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -80,11 +81,41 @@ def test_a_video_file_is_opaque(tmp_path: Path) -> None:
     writer.release()
     one = write(tmp_path / "one.h5", clip(views=1), header(("reference",)))
     report = evaluate_video(tmp_path / "a.avi", one)
+    assert not any("frames a second" in note for note in report.notes)
     assert report.views[0].metrics.psnr > 38 and any("has no alpha" in note for note in report.notes)
     turned = evaluate_video(one, tmp_path / "a.avi")
     assert turned.names == ("psnr", "ssim")  # without alpha nobody knows the object
     with pytest.raises(DataError, match="no alpha, so nobody knows"):
         evaluate_video(one, tmp_path / "a.avi", metrics=("psnr_foreground",))
+
+
+def gif(path: Path, duration: int) -> Path:
+    images = [Image.new("RGB", (16, 16), (80 * k, 0, 0)).quantize(2) for k in range(3)]
+    images[0].save(path, save_all=True, append_images=images[1:], duration=duration)
+    return path
+
+
+def test_clips_of_other_rates_are_told(tmp_path: Path) -> None:
+    report = evaluate_video(gif(tmp_path / "a.gif", 40), gif(tmp_path / "b.gif", 100))
+    assert "The prediction plays 25 frames a second, the truth 10: compared by their number." in report.notes
+
+
+def test_a_folder_of_videos_lists_them(tmp_path: Path, capsys) -> None:
+    """The loop of the advice names all of them, and images beside a video are compared alone."""
+    folder = tmp_path / "my clips"
+    folder.mkdir()
+    for name in ("b.gif", "a.gif"):
+        gif(folder / name, 100)
+    with pytest.raises(
+        DataError, match=r"(?s)2 videos, one clip is wanted: a.gif, b.gif\n.*compare all with those"
+    ) as error:
+        open_source(folder)
+    loop = str(error.value).partition("folder TRUTH: ")[2].replace("dpc evaluate video", "echo")
+    said = subprocess.run(["bash", "-c", loop], capture_output=True, text=True).stdout
+    assert said.split("\n")[:-1] == [f"{folder / name} --truth TRUTH/{name}" for name in ("a.gif", "b.gif")]
+    Image.new("RGB", (16, 16)).save(folder / "0.png")
+    assert open_source(folder).frames == [1]
+    assert "its images are compared; left out: a.gif, b.gif" in capsys.readouterr().err
 
 
 def test_inputs_that_are_no_video(tmp_path: Path, truth: Path) -> None:

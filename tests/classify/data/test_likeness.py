@@ -1,0 +1,59 @@
+"""Warnings about videos that a model's training doesn't prepare for: another unit, sensor or length, places rounded, no labels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dpcli.classify.commands.train import _tell_unlabeled
+from dpcli.classify.data.likeness import NOTE, file_like, like, tell_long, tell_rounded, tell_unlike
+from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.model_file import SHIPPED, ModelInfo
+from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
+
+
+def body(scale=1.0, points=300, far=0.0):
+    """Frames of a body as in MSR-Action3D, which the shipped networks learned from."""
+    rng = np.random.default_rng(0)
+    return [(scale * (rng.normal(0, 0.16, (points, 3)) + far)).astype(np.float32) for _ in range(4)]
+
+
+def told(capsys, frames, model="msraction3d-24", **changes):
+    info = ModelInfo(KinetConfig(normalize="center"), ["a"], **changes)
+    tell_unlike("x", like(frames), info, model)
+    return capsys.readouterr().err
+
+
+def test_a_shipped_network_tells_another_unit_and_few_points(capsys):
+    assert told(capsys, body()) == "" == told(capsys, body(2.5)) and told(capsys, []) == ""
+    assert "another unit of length?" in told(capsys, body(1000)) and "within 0.233" in told(capsys, body(0.001))
+    assert "a frame has 20 points in the median, msraction3d-24 takes 2048: repeated" in told(capsys, body(points=20))
+
+
+def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
+    own = tmp_path / "m.safetensors"
+    own.touch()
+    notes = {"notes": {NOTE: like(body(points=5))}, "timing": "slots"}
+    assert told(capsys, body(points=9), own, **notes) == ""
+    assert "a frame has 300 points in the median, 5 in what" in told(capsys, body(), own, **notes)
+    assert "another unit" in told(capsys, body(1000, points=5), own, **notes)
+    for odd in ({}, {"extent": "long", "points": None}, [1]):
+        assert told(capsys, body(1000, points=5), own, notes={NOTE: odd}, timing="slots") == ""  # nothing is known
+
+
+@pytest.mark.parametrize("far, lost", [(100.0, False), (5.4e6, True)])
+def test_places_on_a_map_are_rounded(far, lost, capsys):
+    tell_rounded("x", like(body(far=far)))
+    assert ("float32 rounds them to 0.5" in capsys.readouterr().err) is lost
+
+
+def test_long_and_unlabeled_videos_are_told(capsys, tmp_path):
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a"]) as writer:
+        for name, label, frames in (("short", 0, body()), ("long", -1, body() * 100)):
+            writer.write(CloudSequence.from_frames(name, frames, label=label, split="train"))
+    reader = CloudsReader(tmp_path / "c.h5")
+    assert file_like(reader, [0, 1])["frames"] == 400
+    tell_long(reader, [0, 1], ModelInfo(KinetConfig(), ["a"]), SHIPPED / "msraction3d-24.safetensors")
+    assert "1 of 2 videos are over 5 times as long as any" in capsys.readouterr().err
+    _tell_unlabeled(reader)
+    assert "1 videos of the split 'train' have no label and are left out: long" in capsys.readouterr().err
