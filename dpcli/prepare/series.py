@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.prepare.name_numbers import Name, NumberColumns, parse_name
 from dpcli.prepare.reader import natural_key
 
@@ -106,12 +107,12 @@ def about_series(clips: Sequence[tuple[str, Series]]) -> list[str]:
     lines = []
     for name, series in clips:
         if series.left_out:
-            others = ", ".join(series.left_out[:_LISTED]) + (" ..." if series.left_out[_LISTED:] else "")
-            lines.append(f"{name}: its frames are {series.described()}; left out: {others}")
+            lines.append(
+                f"{name}: its frames are {series.described()}; left out: {first_names(series.left_out, _LISTED)}"
+            )
         gaps = missing_numbers(series.numbers()) if series.times() is None else []
         if gaps:
-            missing = ", ".join(gaps[:_LISTED]) + (" ..." if gaps[_LISTED:] else "")
-            lines.append(f"{name}: its frames are numbered with gaps: {missing} missing")
+            lines.append(f"{name}: its frames are numbered with gaps: {first_names(gaps, _LISTED)} missing")
     more = len(lines) - 2 * _LISTED
     return lines if more <= 0 else [*lines[: 2 * _LISTED], f"... and {more} more such folders"]
 

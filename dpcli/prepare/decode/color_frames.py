@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.clip_folders import clips_in, listed, refuse_clips
+from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
@@ -132,7 +133,7 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
         raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){hint}")
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     if not quiet and (clips := clips_in(folder)):
-        log.info(f"{folder}: its images are the clip; left out: {listed(clips)}")
+        log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:

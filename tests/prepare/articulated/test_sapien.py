@@ -286,7 +286,7 @@ def test_the_command_skips_and_names_bad_objects(tmp_path):
         "--test-categories",
         "Good",
     )
-    assert again.returncode == 2 and "points 99 (now 98)" in again.stderr
+    assert again.returncode == 2 and "points 99, now 98" in again.stderr
 
 
 @pytest.mark.parametrize(
