@@ -28,6 +28,15 @@ def utf8_path(path: Path, library: str) -> str:
     return text
 
 
+def first_names(names: Sequence[str], most: int = 5) -> str:
+    """Returns the first names with commas between, and how many more there are.
+
+    >>> first_names(["a", "b"]), first_names(["a", "b", "c", "d"], 2)
+    ('a, b', 'a, b and 2 more')
+    """
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def short_names(paths: Sequence[str | Path]) -> list[str]:
     """Returns a name for each file: its stem; where several share one, their folder's (`seed0/scores.h5`: seed0). May still repeat."""
     stems = [as_utf8(Path(path).stem) for path in paths]

@@ -16,7 +16,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.progress import log
-from dpcli.runtime.whole_file import check_replaced, whole_file
+from dpcli.runtime.whole_file import check_replaced, refuse_broken_link, whole_file
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -57,6 +57,8 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, fo
     kind = output_kind(path)
     if path.exists() and not force:
         raise UsageError(f"{path}: exists already; --force replaces it")
+    if not kind:
+        refuse_broken_link(path)
     check_replaced(path, ("[0-9]*.png",))
     if not path.parent.is_dir():
         raise DataError(f"{path}: the folder {path.parent} does not exist; create it first")

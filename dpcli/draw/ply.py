@@ -9,6 +9,7 @@ import numpy as np
 from dpcli.draw.palette import part_colors
 from dpcli.draw.sequences import PointSequence
 from dpcli.errors import DataError
+from dpcli.runtime.whole_file import make_folder
 
 _VERTEX = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("part", "<i4")]
@@ -46,10 +47,7 @@ def write_ply_frames(folder: Path, sequence: PointSequence) -> list[Path]:
     """
     if sequence.part is None:
         raise DataError(f"sample {sequence.name!r} has no parts to write; `dpc segment predict` finds them")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"--ply {folder}: the folder cannot be made ({error.strerror})") from None
+    make_folder(folder, "--ply")
     offsets, paths = sequence.frame_offsets, []
     for t in range(sequence.num_frames):
         span = slice(offsets[t], offsets[t + 1])

@@ -11,8 +11,8 @@ import numpy as np
 
 from dpcli.evaluate.bootstrap import Interval, Resampling
 from dpcli.evaluate.text_tables import TextTable
+from dpcli.path_names import first_names
 
-_NAMES_IN_MESSAGE = 5
 _NAMES_IN_NOTE = 10
 
 
@@ -54,13 +54,12 @@ def list_names(names: Sequence[str]) -> str:
     >>> list_names([str(number) for number in range(7)])
     "'0', '1', '2', '3', '4' and 2 more"
     """
-    more = f" and {len(names) - _NAMES_IN_MESSAGE} more" if len(names) > _NAMES_IN_MESSAGE else ""
-    return ", ".join(repr(name) for name in names[:_NAMES_IN_MESSAGE]) + more
+    return first_names([repr(name) for name in names])
 
 
 def left_out_note(entry: LeftOut, kind: str = "", *, named: bool = True) -> str:
     """Returns a sentence of how many samples (of `kind`, in words) were left out and why, with a few names if `named`."""
-    shown = ", ".join(entry.names[:_NAMES_IN_NOTE]) + (", ..." if len(entry.names) > _NAMES_IN_NOTE else "")
+    shown = first_names(entry.names, _NAMES_IN_NOTE)
     count = f"{len(entry.names)} {kind}".rstrip()
     return f"Left out, {entry.reason}: {count}{f' ({shown})' if named else ''}."
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.prepare.reader import Item, split_called
 from dpcli.runtime.progress import log
 
@@ -149,9 +150,9 @@ def labels_of_folders(root: Path, names: Sequence[str], layout: str) -> LabelTab
     divided = len(deep) == len(parts)
     meant = len({parts[name][0] for name in deep}) > 1 or all(split_called(own[0]) for own in parts.values())
     if deep and meant and not divided:  # else `train` may be a class among others
-        odd = [name for name in parts if name not in set(deep)]
+        misplaced = [repr(name) for name in parts if name not in set(deep)]
         raise DataError(
-            f"{root}: {', '.join(map(repr, odd[:5]))}{' ...' if odd[5:] else ''}: not SPLIT/{layout}, as {deep[0]!r} and"
+            f"{root}: {first_names(misplaced)}: not SPLIT/{layout}, as {deep[0]!r} and"
             f" {len(deep)} in all are; move away what makes a sample of it, such as a stray picture"
         )
     classes = {name: own[1 if divided else 0] for name, own in parts.items()}

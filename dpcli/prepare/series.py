@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.prepare.name_numbers import Name, NumberColumns, parse_name
 from dpcli.prepare.reader import natural_key
 
@@ -25,6 +26,12 @@ _BESIDE = re.compile(
     r"(read[-_ ]?me|licen[cs]e|copying|changelog|notes?|poses?|traj\w*|odom\w*|ground[-_ ]?truth|gt|times?|time_?stamps?|"
     r"calib\w*|camera\w*|intrinsics?|extrinsics?|k|labels?|classes|meta\w*|info|index|files?|list|train|val|test|splits?|"
     r"associations?|imu|gps|oxts|config|settings|requirements|cmakelists)([-_. ].*)?",
+    re.IGNORECASE,
+)
+
+_ARRAYS_BESIDE = re.compile(
+    r"((cam(era)?|depth|color|rgb)[-_]?)?(poses|trajectory|odometry|times|time_?stamps?|calib(ration)?|(in|ex)trinsics?|labels|"
+    r"imu|gps|k)",
     re.IGNORECASE,
 )
 
@@ -100,12 +107,12 @@ def about_series(clips: Sequence[tuple[str, Series]]) -> list[str]:
     lines = []
     for name, series in clips:
         if series.left_out:
-            others = ", ".join(series.left_out[:_LISTED]) + (" ..." if series.left_out[_LISTED:] else "")
-            lines.append(f"{name}: its frames are {series.described()}; left out: {others}")
+            lines.append(
+                f"{name}: its frames are {series.described()}; left out: {first_names(series.left_out, _LISTED)}"
+            )
         gaps = missing_numbers(series.numbers()) if series.times() is None else []
         if gaps:
-            missing = ", ".join(gaps[:_LISTED]) + (" ..." if gaps[_LISTED:] else "")
-            lines.append(f"{name}: its frames are numbered with gaps: {missing} missing")
+            lines.append(f"{name}: its frames are numbered with gaps: {first_names(gaps, _LISTED)} missing")
     more = len(lines) - 2 * _LISTED
     return lines if more <= 0 else [*lines[: 2 * _LISTED], f"... and {more} more such folders"]
 
@@ -121,8 +128,10 @@ def is_hidden(name: str) -> bool:
 
 
 def is_beside(name: str) -> bool:
-    """Returns whether a text's name says that it is about the frames (README, poses, times, labels, ...), not one."""
+    """Returns whether a text's or an array's name says that it is about the frames (README, poses, times, ...), not one."""
     stem, suffix = splitext(name)
+    if suffix.lower() in (".npy", ".npz"):
+        return _ARRAYS_BESIDE.fullmatch(stem) is not None
     return suffix.lower() in TEXTS and _BESIDE.fullmatch(stem) is not None
 
 

@@ -17,7 +17,7 @@ from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.file_lock import open_alone
 from dpcli.runtime.progress import log
 from dpcli.runtime.torch_files import load_plain
-from dpcli.runtime.whole_file import DiskFull, disk_full, whole_file
+from dpcli.runtime.whole_file import DiskFull, disk_full, make_folder, whole_file
 from dpcli.text_files import read_json
 
 _TOLD = 3  # differences named when a run can't be continued
@@ -65,7 +65,7 @@ class RunFolder:
         self._continues()
 
     def __enter__(self) -> RunFolder:
-        self.path.mkdir(parents=True, exist_ok=True)
+        make_folder(self.path)
         try:
             self._lock = open_alone(self.path / _LOCK)
         except DpcError:

@@ -12,6 +12,7 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 from dpcli.errors import DataError, DpcError, UsageError
+from dpcli.regular_files import why_unreadable
 
 PICTURES = (".png", ".jpg", ".jpeg")
 FIGURES = (*PICTURES, ".pdf", ".svg")
@@ -122,6 +123,26 @@ def check_writable(path: Path, option: str = "-o") -> None:
         read_only = hasattr(os, "statvfs") and os.statvfs(folder).f_flag & os.ST_RDONLY
         why = "the file system is read-only" if read_only else "no permission"
         raise DataError(f"{option} {path}: the folder {folder} can't be written to ({why}); name another place")
+
+
+def make_folder(folder: Path, option: str = "-o") -> None:
+    """Makes a folder and those above it; nothing where it exists. Raises DataError, or DiskFull, where it can't be made."""
+    refuse_broken_link(folder, option)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        if full := disk_full(str(folder), error):
+            raise full from None
+        raise DataError(
+            f"{option} {folder}: the folder cannot be made ({error.strerror}); name another place"
+        ) from None
+
+
+def refuse_broken_link(folder: Path, option: str = "-o") -> None:
+    """Raises DataError where a folder, or one above it, is a link to nowhere: it neither exists nor can be made."""
+    for one in (folder, *folder.parents):
+        if one.is_symlink() and (reason := why_unreadable(one)):
+            raise DataError(f"{option} {folder}: {one} is {reason}; remove the link, or name another place")
 
 
 def check_regular(path: Path, option: str = "-o") -> None:

@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dpcli.draw.animation import write_pictures
+from dpcli.errors import DataError
+from dpcli.runtime.run_folder import RunFolder
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.support.prepare_helpers import ROOT
 
@@ -132,3 +135,31 @@ def test_a_full_tmpdir_is_named(folder, tmp_path, size):
         return
     assert "TMPDIR" in done.stderr and "no space left" in done.stderr and "set TMPDIR to" in done.stderr, done.stderr
     assert str(tmp_path) in done.stderr and done.stdout == "" and "Traceback" not in done.stderr
+
+
+LOST = [
+    "prepare split c.h5 --fractions 0.5,0,0.5 -o round",
+    "prepare split c.h5 --fractions 0.5,0,0.5 -o lost/below",
+    "generate4d fit c.h5 c.h5 -o lost/",
+    "evaluate weights fetch alexnet --weights lost",
+]
+
+
+@pytest.mark.parametrize("line", LOST)
+def test_an_output_folder_that_is_a_link_to_nowhere_is_named(line, folder, tmp_path, monkeypatch, dpc_here):
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(folder / "c.h5", "c.h5")
+    Path("lost").symlink_to("nowhere")
+    Path("round").symlink_to("round")
+    done = dpc_here(*line.split())
+    words = (" is a link to nowhere, which is missing", " is a link in a circle")["round" in line]
+    assert done.returncode == 3 and f"{words}; remove the link, or name another place" in done.stderr.decode()
+    assert sorted(os.listdir()) == ["c.h5", "lost", "round"]
+
+
+def test_pictures_and_runs_in_a_folder_that_is_a_link_to_nowhere(tmp_path):
+    (tmp_path / "lost").symlink_to("nowhere")
+    with pytest.raises(DataError, match="lost is a link to nowhere, which is missing; remove the link"):
+        write_pictures(tmp_path / "lost", [np.zeros((4, 4, 3), np.uint8)], fps=10)
+    with pytest.raises(DataError, match="lost is a link to nowhere"), RunFolder(tmp_path / "lost", {}, columns=()):
+        pass

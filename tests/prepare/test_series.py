@@ -63,6 +63,9 @@ def test_a_pattern_may_join_what_no_rule_would():
 
 def test_nothing_but_texts_about_frames_is_no_clip():
     assert chosen("poses.txt", "README.txt", "labels.csv") is None
+    assert chosen("poses.npy", "camera_intrinsics.npy", "timestamps.npz") is None
+    assert chosen("0.npy", "1.npy", "K.npy").left_out == ("K.npy",)
+    assert not is_beside("pose_1.npy") and not is_beside("camera1.npy")
     assert is_beside("calib_cam_to_cam.txt") and not is_beside("frame_1.txt") and not is_beside("poses.ply")
 
 

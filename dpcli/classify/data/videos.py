@@ -8,6 +8,7 @@ from dpcli.classify.data.clips import ClipSource
 from dpcli.classify.data.validation_split import CROSS, carve_validation
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
@@ -68,8 +69,8 @@ def report_backward(reader: CloudsReader, sequences: list[int]) -> None:
     names = [reader.names[i] for i, time in times if time is not None and not (np.diff(time) >= 0).all()]
     if names:
         log.warn(
-            f"{reader.path}: time runs back in {len(names)} of {len(sequences)} videos: {', '.join(names[:5])}"
-            f"{' ...' if len(names) > 5 else ''}; frames are taken in the file's order (is a recording cut wrongly?)"
+            f"{reader.path}: time runs back in {len(names)} of {len(sequences)} videos: {first_names(names)}"
+            "; frames are taken in the file's order (is a recording cut wrongly?)"
         )
 
 
@@ -77,9 +78,7 @@ def report_short(source: ClipSource, frames: int) -> None:
     """Names the videos that are dropped or padded, and those with frames without points, with a message each."""
     for names, what in ((source.dropped, "dropped"), (source.padded, "padded by holding their last frame")):
         if names:
-            log.info(
-                f"{len(names)} videos shorter than {frames} frames are {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''}"
-            )
+            log.info(f"{len(names)} videos shorter than {frames} frames are {what}: {first_names(names)}")
     if source.timing != "slots":
         _report_empty(source)
 
@@ -92,8 +91,7 @@ def _report_empty(source: ClipSource) -> None:
     counts = np.bincount(of, minlength=len(ends))
     found = {i: int(counts[i]) for i in source.sequences if counts[i]}
     if found:
-        names = ", ".join(reader.names[i] for i in list(found)[:5])
         log.warn(
             f"{reader.path}: {sum(found.values())} frames without points in {len(found)} videos are taken as points at the origin:"
-            f" {names}{' ...' if len(found) > 5 else ''}"
+            f" {first_names([reader.names[i] for i in found])}"
         )

@@ -51,10 +51,11 @@ def fetch_command(
     from dpcli.evaluate.commands.weights import choose_weights, fetch_chosen_weights
     from dpcli.evaluate.networks.weights import weights_folder
     from dpcli.runtime.progress import log
+    from dpcli.runtime.whole_file import make_folder
 
     entries = choose_weights(names or [], everything)
     if weights is not None:
-        weights.mkdir(parents=True, exist_ok=True)
+        make_folder(weights, "--weights")
     paths, failed = fetch_chosen_weights(entries, weights_folder(weights))
     for path in paths:
         typer.echo(str(path))

@@ -10,7 +10,7 @@ from urllib.request import Request, urlopen
 from dpcli.errors import DataError, DpcError
 from dpcli.evaluate.networks.weights import Checked, Weights, check_file
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.whole_file import whole_file
+from dpcli.runtime.whole_file import make_folder, whole_file
 
 _BLOCK = 1 << 18  # bytes
 _TIMEOUT = 30.0  # seconds without a byte
@@ -36,7 +36,7 @@ def _fetch_file(weights: Weights, path: Path) -> None:
             f"{weights.name}: its publisher has no direct link; download {weights.file} from {weights.url} "
             f"by hand and put it at {path}"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent, "--weights")
     with whole_file(path) as part:
         _download(weights, part)
         log.info(f"{path}: {_check_download(weights, part).finding}")

@@ -17,6 +17,7 @@ from dpcli.runtime.machines.spread import ALONE, Spread
 from dpcli.runtime.pool import ordered_map
 from dpcli.runtime.progress import log
 from dpcli.runtime.signals import stop_requested
+from dpcli.runtime.whole_file import make_folder
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ def _name_scenes(views: Sequence[str], folder: Path) -> list[tuple[Path, Path]]:
         raise UsageError("-: a pipe holds one clip; name files, and a folder with -o, to fit several")
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"-o {folder}: is a file; several clips need a folder for their scenes")
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     paths = sorted(map(Path, views))
     names = [name.removesuffix(".h5").replace("/", "-") for name in short_names(paths)]
     if len(set(names)) < len(names):

@@ -13,7 +13,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.generate4d.out.packed_splats import write_compressed_ply, write_spz
 from dpcli.generate4d.out.splat_files import TO_PLAYER, Splats, camera_list, write_splat, write_splat_ply
-from dpcli.runtime.whole_file import check_replaced, whole_file, write_whole
+from dpcli.runtime.whole_file import check_replaced, refuse_broken_link, whole_file, write_whole
 from dpcli.store import CloudSequence, CloudsWriter
 from dpcli.store.gaussians import GaussianScene, opacity_of
 
@@ -100,6 +100,7 @@ def tables_beside(folder: Path) -> tuple[Path, Path]:
 
 
 def _make_folder(part: Path, folder: Path) -> None:
+    refuse_broken_link(folder)
     try:
         part.mkdir()
     except OSError as error:

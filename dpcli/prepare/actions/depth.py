@@ -52,6 +52,7 @@ _OTHER_PICTURES = re.compile(
 _FOREIGN = tuple(  # that may hold depth, and are not read
     ".mat .h5 .hdf5 .zip .gz .7z .rar .tar .jpg .jpeg .webp .raw .bin .oni .svo .svo2 .r3d .sens .xef .klg .dat .pkl".split()
 )
+_HALF_OF_16_BITS = 1 << 15  # below, inverted millimeters are farther than depth cameras see
 _BACKGROUND_FRAMES = 64  # the median of more changes nothing but the time it takes
 
 
@@ -230,6 +231,12 @@ class DepthVideos:
             return frames
         if kind.kind != "u":
             raise DataError(f"{path}: depths of type {kind}; --invert needs unsigned integers, whose range is known")
+        largest = int(frames.max(initial=0))
+        if self._declared_scale is None and kind.itemsize == 2 and largest < _HALF_OF_16_BITS:
+            raise DataError(
+                f"{path}: its raw values end at {largest}, and --invert counts back from {np.iinfo(kind).max}; invert the"
+                " bits that it uses before, or give --depth-scale if they are meant so"
+            )
         return np.where(frames > 0, np.iinfo(kind).max - frames, 0)
 
     def _camera(self, width: int, height: int, recorded: Calibration | None) -> Intrinsics:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from dpcli.errors import DataError, UsageError, reading
+from dpcli.path_names import first_names
 from dpcli.prepare.actions.mat5 import read_mat5
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, offsets, require_folder
@@ -196,6 +197,4 @@ class MSRAction3D:
                 + (f"; missing by subject {where}" if missing else "")
             )
         extra = sorted(names - set(expected))
-        return lines + (
-            [f"not among the published: {', '.join(extra[:8])}{' ...' if len(extra) > 8 else ''}"] if extra else []
-        )
+        return lines + ([f"not among the published: {first_names(extra, 8)}"] if extra else [])

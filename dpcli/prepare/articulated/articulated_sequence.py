@@ -68,11 +68,6 @@ class Articulation:
                 f"--joint-step {self.joint_step}: expected a fraction of a joint's range, above 0, up to 1"
             )
 
-    @classmethod
-    def of_options(cls, options: dict[str, Any]) -> Articulation:
-        """Returns from the command's options, which share --points with all readers."""
-        return cls(**{"points_per_frame" if key == "points" else key: value for key, value in options.items()})
-
     @property
     def config(self) -> dict[str, Any]:
         """Returns the options that decide the content, for the provenance."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.prepare.articulated.urdf_meshes import MESH_FORMATS, files_inside
-from dpcli.prepare.decode.mesh_counts import require_counts
+from dpcli.prepare.decode.mesh_counts import mesh_source, require_counts
 from dpcli.prepare.reader import natural_key, require_folder
 
 
@@ -51,7 +51,9 @@ def load_shape(path: Path, up: str) -> Shape:
     require_counts(path)
     try:
         options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
-        mesh = trimesh.load(path, force="mesh", process=False, resolver=files_inside(path, path.parent), **options)
+        mesh = trimesh.load(
+            **mesh_source(path), force="mesh", process=False, resolver=files_inside(path, path.parent), **options
+        )
         triangles = np.asarray(mesh.vertices, np.float64)[np.asarray(mesh.faces, np.int64)]
     except Exception as error:  # the readers of eight formats raise many kinds on damaged files
         raise DataError(f"{path}: not a readable mesh ({type(error).__name__}: {error})") from None

@@ -11,7 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import path_inside
-from dpcli.prepare.decode.mesh_counts import require_counts
+from dpcli.prepare.decode.mesh_counts import mesh_source, require_counts
 
 MESH_FORMATS = (".obj", ".stl", ".ply", ".glb", ".gltf", ".off", ".dae")
 _PACKAGES = ("package://", "model://")  # of ROS and Gazebo: the folder of the robot, or one above it
@@ -100,7 +100,9 @@ def _load_mesh(path: Path, name: str, root: Path | None) -> Any:
         raise DataError(f"{path}: its mesh {error}") from None
     try:
         options = {"skip_materials": True} if file.suffix.lower() == ".obj" else {}
-        mesh = trimesh.load(file, force="mesh", process=False, resolver=files_inside(file, root), **options)
+        mesh = trimesh.load(
+            **mesh_source(file), force="mesh", process=False, resolver=files_inside(file, root), **options
+        )
         if mesh.vertices.shape[1:] != (3,):
             raise ValueError(f"its vertices have {mesh.vertices.shape[1]} coordinates, expected 3")
         if len(mesh.faces) and mesh.faces.max() >= len(mesh.vertices):

@@ -9,7 +9,14 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, require_room
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, kept_columns, unnamed_columns, without
+from dpcli.prepare.cloud_formats.cloud import (
+    Cloud,
+    cloud_of_columns,
+    kept_columns,
+    require_columns,
+    unnamed_columns,
+    without,
+)
 
 _POINT_KEYS = ("points", "xyz", "pos", "point_cloud")
 _COLOR_KEYS = ("color", "colors", "rgb")
@@ -78,6 +85,11 @@ def _cloud_of_array(path: Path, array: np.ndarray, keep: Sequence[str]) -> Cloud
         )
     if len(array) in (3, 4) and array.shape[1] > 16:
         raise DataError(f"{path}: array of shape {array.shape}; expected a row for each point: save its transpose (.T)")
+    require_columns(path, *array.shape)
+    if array.shape in ((3, 4), (4, 4)) and np.allclose(array[:3, :3] @ array[:3, :3].T, np.eye(3), atol=1e-3):
+        raise DataError(
+            f"{path}: a matrix {array.shape} that turns, the pose of a camera; expected numbers (points, 3 or more)"
+        )
     kind = np.float32 if array.dtype.kind == "f" and array.itemsize <= 4 else np.float64
     return Cloud(array[:, :3].astype(kind), unread=unnamed_columns(4, array.shape[1]))
 

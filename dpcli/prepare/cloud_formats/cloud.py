@@ -13,6 +13,7 @@ from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors
 
 AT_ORIGIN = "points at (0,0,0) dropped"
 _WHOLE_FLOAT32, _LOST = 1 << 24, 1e-3  # below the first it holds whole numbers; a share of a column's range
+MOST_UNNAMED = 40  # columns; a picture has more
 BEYOND = "points beyond the number that their file's header says dropped"
 
 
@@ -86,6 +87,19 @@ def unnamed_columns(first: int, last: int) -> tuple[str, ...]:
     if last < first:
         return ()
     return (f"column {first} (no name)" if first == last else f"columns {first} to {last} (no names)",)
+
+
+def require_columns(path: Path, rows: int, columns: int) -> None:
+    """Raises DataError where rows hold too few numbers for a point, or so many without names that they are a picture."""
+    if 3 <= columns <= MOST_UNNAMED:
+        return
+    picture = (
+        ", x y z first; is it a picture, such as of depth (dpc prepare depth)? If not, save fewer columns, or name them"
+    )
+    raise DataError(
+        f"{path}: array of shape {(rows, columns)}; expected numbers (points, 3 or more)"
+        + (picture if columns > MOST_UNNAMED else "")
+    )
 
 
 def named_axes(path: Path, names: Sequence[str]) -> tuple[list[int], str] | None:

@@ -9,7 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.prepare.cloud_formats.cloud import Cloud, cloud_of_columns, named_axes, unnamed_columns, without
+from dpcli.prepare.cloud_formats.cloud import (
+    MOST_UNNAMED,
+    Cloud,
+    cloud_of_columns,
+    named_axes,
+    require_columns,
+    unnamed_columns,
+    without,
+)
 from dpcli.prepare.cloud_formats.column_names import find_colors, find_frame_column
 from dpcli.prepare.cloud_formats.text_numbers import TextTable, read_text_table
 
@@ -41,10 +49,8 @@ def cloud_of_table(table: TextTable, keep: Sequence[str] = ()) -> Cloud:
     if not table.names:
         if keep:
             raise DataError(f"{table.path}: --keep-fields {keep[0]}: its columns have no names")
-        if table.width < 3:
-            raise DataError(
-                f"{table.path}: array of shape {(len(table.numbered), table.width)}; expected numbers (points, 3 or more)"
-            )
+        if not 3 <= table.width <= MOST_UNNAMED:
+            require_columns(table.path, len(table.numbered), table.width)
         values = table.columns(range(table.width))  # all of them: a word in any is an error in the file
         first = _first_axis(table, values)
         counted = ("column 1 (no name, numbers of the rows)",) if first else ()

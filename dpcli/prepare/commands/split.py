@@ -17,6 +17,7 @@ from dpcli.prepare.commands.sources import Source, read_source
 from dpcli.prepare.reader import SPLITS
 from dpcli.runtime.provenance import record
 from dpcli.runtime.seeds import PrepareStream, generator
+from dpcli.runtime.whole_file import make_folder
 from dpcli.standard_streams import printable
 from dpcli.store import CloudSequence, CloudsReader
 from dpcli.store.pipes import check_output
@@ -155,7 +156,7 @@ def split(
             wanted = [name for name in counts if name]
             _write_split(reader, splits, wanted, _plan_copy(source, output, entry, compression, force))
             return counts
-        output.mkdir(parents=True, exist_ok=True)
+        make_folder(output)
         for name in counts:
             if name:
                 part = {**entry, "config": {**entry["config"], "part": name}}

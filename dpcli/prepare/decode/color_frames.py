@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.clip_folders import clips_in, listed, refuse_clips
+from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
+_SAID: set[str] = set()
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
@@ -131,7 +133,7 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
         raise DataError(f"{folder}: no frames; expected images ({', '.join(IMAGE_SUFFIXES)}){hint}")
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     if not quiet and (clips := clips_in(folder)):
-        log.info(f"{folder}: its images are the clip; left out: {listed(clips)}")
+        log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:
@@ -147,17 +149,23 @@ def read_rgba(path: Path) -> np.ndarray:
 
     try:
         with open_image(path) as image:
-            return _to_rgba(as_shown(image))
+            return _to_rgba(as_shown(image), path)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         why = "empty" if path.is_file() and path.stat().st_size == 0 else str(error).splitlines()[0]
         raise DataError(f"{path}: not a readable image ({why}); export this frame again") from None
 
 
-def _to_rgba(image) -> np.ndarray:  # image: PIL.Image.Image
+def _to_rgba(image, path: Path) -> np.ndarray:  # image: PIL.Image.Image
     if image.mode.startswith("I") or image.mode == "F":  # 16-bit gray: PIL would clip it at 255
         gray = np.asarray(image, np.float64)
         top = gray.max(initial=0)
         unit = 1 / 255 if image.mode == "F" and top <= 1 else 257.0 if top > 255 else 1.0
+        if unit == 1 and top and image.mode != "F":
+            with log.each_once(_SAID):
+                log.warn(
+                    f"{path.parent}: 16-bit gray of which a picture nowhere exceeds 255 is taken for 0 to 255 there; store "
+                    "8 bits where it is nearly black instead"
+                )
         gray = np.clip(gray / unit, 0, 255).round().astype(np.uint8)
         return np.dstack([gray, gray, gray, np.full_like(gray, 255)])
     return np.array(image.convert("RGBA"))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.ply import read_header
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
+_SOLID = rb"(?i)\s*solid"
+_MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
 
 
 def require_counts(path: Path) -> None:
@@ -20,6 +24,14 @@ def require_counts(path: Path) -> None:
     check = _CHECKS.get(path.suffix.lower())
     if check is not None:
         check(path)
+
+
+def mesh_source(path: Path) -> dict[str, Any]:
+    """Returns what trimesh loads of a mesh file: its path, or the bytes of an OBJ without the mark that hides its first line."""
+    with path.open("rb") as file:
+        if path.suffix.lower() != ".obj" or file.read(len(_MARK)) != _MARK:
+            return {"file_obj": path}
+        return {"file_obj": BytesIO(file.read()), "file_type": "obj"}
 
 
 def _compare(path: Path, what: str, declared: int, found: int) -> None:
@@ -56,10 +68,10 @@ def _check_stl(path: Path) -> None:
     count = int.from_bytes(data[_STL_HEAD - 4 : _STL_HEAD], "little")
     if len(data) in (0, _STL_HEAD + count * _STL_FACE):
         return
-    if len(data) >= _STL_HEAD and (not re.match(rb"\s*solid", data) or b"\0" in data):
+    if len(data) >= _STL_HEAD and (not re.match(_SOLID, data) or b"\0" in data):
         _compare(path, "triangles", count, (len(data) - _STL_HEAD) // _STL_FACE)
         _compare(path, "bytes", _STL_HEAD + count * _STL_FACE, len(data))
-    elif re.match(rb"\s*solid", data) and not re.search(rb"\bendsolid\b[^\n]*\s*\Z", data):
+    elif re.match(_SOLID, data) and not re.search(rb"(?i)\bendsolid\b[^\n]*\s*\Z", data):
         raise DataError(f"{path}: truncated: it doesn't end with endsolid; copy it again")
 
 

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from dpcli.errors import DataError, UsageError
-from dpcli.path_names import path_inside
+from dpcli.path_names import first_names, path_inside
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import is_beside, is_hidden
 from dpcli.regular_files import why_unreadable
@@ -104,8 +104,8 @@ class Recording:
 
     def _list(self, fitting: list[str], what: str) -> str:
         if fitting:
-            return f"choose one that holds {what} with --topic: {', '.join(fitting[:_LISTED])}"
-        held = ", ".join(f"{name} ({kind})" for name, (kind, _) in list(self.topics.items())[:_LISTED])
+            return f"choose one that holds {what} with --topic: {first_names(fitting, _LISTED)}"
+        held = first_names([f"{name} ({kind})" for name, (kind, _) in self.topics.items()], _LISTED)
         return f"no topic holds {what}; it has {held or 'no messages'}"
 
     def messages(self, topic: str, stride: int = 1) -> Iterator[Message]:

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import islice
 from os.path import splitext
 from pathlib import Path
 
@@ -21,6 +22,7 @@ _PREFERRED = (".ply", ".pcd", ".las", ".laz", ".npz", ".npy", ".bin", ".xyz")  #
 _ABOUT_SENSORS = re.compile(  # folders whose texts tell of the vehicle, the camera or the objects
     r"oxts|imu|gps|gnss|poses?|odom\w*|calib\w*|labels?|label_\d|time_?stamps?|traj\w*|(in|ex)trinsics?", re.IGNORECASE
 )
+_LOOKED_AT = 20  # lines of a text that may hold poses
 _FOREIGN = tuple(  # clouds and meshes that others read, and packed ones
     ".e57 .obj .stl .off .drc .glb .gltf .fbx .dae .usdz .fls .rcp .rcs .gz .zip .7z .rar .h5 .hdf5 .mat .xlsx .xls .ods"
     " .pcap .lvx .lvx2 .vtk .vtp .wrl .pkl .pt .pth .tfrecord".split()
@@ -35,22 +37,27 @@ def find_sequences(
     suffixes: of point clouds. pattern: of the names of frames. table: a file that is no cloud, whatever its name. Raises
     DataError when there is none, or when a folder's clip must be chosen.
     """
-    found, others = [], Counter[str]()
+    found, poses, others = [], [], Counter[str]()
     for folder, names, foreign in _folders(root, suffixes, table.resolve() if table else None):
         others += foreign
         series = choose_series(folder, names, pattern=pattern, suffixes=_PREFERRED) if names else None
-        if series and not is_pose(series.paths[0]):
+        if series and is_pose(series.paths[0]):
+            poses.append(series)
+        elif series:
             found.append(replace(series, left_out=(*series.left_out, *_counted(foreign))))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
         advice = f"; found {', '.join(_counted(others))}: save their points as .ply" if others else ""
         raise DataError(f"{root}: no point clouds ({', '.join(suffixes)}){asked}, or folders of them{advice}")
-    return _without_logs(root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())))
+    return _without_logs(
+        root, sorted(found, key=lambda one: natural_key(one.folder.relative_to(root).as_posix())), poses
+    )
 
 
-def _without_logs(root: Path, found: list[Series]) -> list[Series]:
-    """Returns the sequences without the texts of folders such as KITTI's ``oxts``, which the first one names as left out;
-    all of them where there is nothing else.
+def _without_logs(root: Path, found: list[Series], poses: list[Series]) -> list[Series]:
+    """Returns the sequences without the texts of folders such as KITTI's ``oxts``, all of them where there is nothing else.
+
+    The first one names those as left out, and the poses that were found.
     """
 
     def is_log(one: Series) -> bool:
@@ -58,10 +65,9 @@ def _without_logs(root: Path, found: list[Series]) -> list[Series]:
         return one.suffix in TEXTS and any(_ABOUT_SENSORS.fullmatch(part) for part in parts)
 
     logs = [one for one in found if is_log(one)]
-    if len(logs) in (0, len(found)):
-        return found
+    logs = [] if len(logs) == len(found) else logs
     first, *others = [one for one in found if one not in logs]
-    named = [f"{one.folder.relative_to(root).as_posix()}/{one.described()}" for one in logs]
+    named = sorted((one.folder / one.described()).relative_to(root).as_posix() for one in (*poses, *logs))
     return [replace(first, left_out=(*first.left_out, *named)), *others]
 
 
@@ -89,16 +95,25 @@ def is_cloud(name: str, suffixes: Sequence[str]) -> bool:
 
 
 def is_pose(path: Path) -> bool:
-    """Returns whether a text holds the pose of a camera, a 4x4 or 3x4 matrix whose first part is a rotation: no cloud."""
-    if path.suffix.lower() not in TEXTS or path.stat().st_size > 2000:
+    """Returns whether a text holds the pose of a camera, or those of its way: no cloud.
+
+    That is a 4x4 or 3x4 matrix that turns, one in each row, or rows that end with a quaternion, as KITTI and TUM have them.
+    """
+    if path.suffix.lower() not in TEXTS:
         return False
     try:
-        rows = [
-            [float(v) for v in line.replace(",", " ").split()] for line in path.read_text().splitlines() if line.strip()
-        ]
+        with path.open() as file:
+            lines = [line for line in islice(file, _LOOKED_AT) if line.strip() and not line.startswith("#")]
+        rows = [[float(v) for v in line.replace(",", " ").split()] for line in lines]
     except ValueError:  # words, or no text at all
         return False
-    if [len(row) for row in rows] not in ([4] * 4, [4] * 3, [12], [16]):
+    widths = {len(row) for row in rows}
+    if widths == {4} and len(rows) in (3, 4):
+        rows = [[value for row in rows for value in row]]
+    elif len(widths) != 1 or not widths <= {7, 8, 12, 16} or (len(rows) < 3 and widths <= {7, 8}):
         return False
-    matrix = np.array([value for row in rows for value in row]).reshape(-1, 4)
-    return bool(np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-3))
+    values = np.array(rows)
+    if values.shape[1] < 12:
+        return bool(np.allclose((values[:, -4:] ** 2).sum(1), 1, atol=1e-3) and np.ptp(values[:, -4:], 0).any())
+    turns = values[:, :12].reshape(-1, 3, 4)[:, :, :3]
+    return bool(np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-3))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.path_names import as_utf8
+from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns
 from dpcli.prepare.cloud_formats.cloud import Cloud, without
 from dpcli.prepare.decode.cloud_files import SUFFIXES, read_cloud
@@ -149,7 +149,7 @@ class CloudFolders:
         frames = sum(len(item.extra["series"].names) for item in items)
         lines = [f"{len(items)} sequence{'s' if len(items) != 1 else ''} of {frames} frames found"]
         if self._first[1]:
-            lines[0] += f"; not read: {', '.join(self._first[1][:_LISTED])}{' ...' if self._first[1][_LISTED:] else ''}"
+            lines[0] += f"; not read: {first_names(self._first[1], _LISTED)}"
             lines[0] += "" if "no name" in self._first[1][0] else " (--keep-fields)"
         if not self._timed and any(one.frame_times(self.fps) is not None for one in self._series):
             lines.append("the names of some sequences' frames are no times: no times are written (--fps gives them)")

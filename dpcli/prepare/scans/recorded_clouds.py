@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dpcli.errors import DataError, UsageError
-from dpcli.path_names import as_utf8
+from dpcli.path_names import as_utf8, first_names
 from dpcli.prepare.cloud_formats.cloud import without
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample
@@ -124,6 +124,6 @@ class RecordedClouds:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds."""
-        unread = f"; not read: {', '.join(self._first[1][:_LISTED])} (--keep-fields)" if self._first[1] else ""
+        unread = f"; not read: {first_names(self._first[1], _LISTED)} (--keep-fields)" if self._first[1] else ""
         lines = [f"{len(items)} recording{'s' if len(items) != 1 else ''} found{unread}"]
         return lines + (self._table.unnamed(items) if self._table else [])

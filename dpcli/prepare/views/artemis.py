@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
+from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import read_rgba
 from dpcli.prepare.views.artemis_files import (
     Motion,
@@ -282,7 +283,7 @@ def _plan_clip(motion: Motion, frames: list[int], views: list[int], on_error: st
     if not good:
         raise DataError(f"{motion.name}: none of its {len(frames)} frames is whole in all of cameras {_ranges(views)}")
     if cut_off:
-        log.warn(f"the object leaves the picture in {', '.join(cut_off[:8])}{' ...' if len(cut_off) > 8 else ''}")
+        log.warn(f"the object leaves the picture in {first_names(cut_off, 8)}")
     if len(good) == 1:
         log.warn(f"{motion.name}: one frame only; this makes a still object, motion needs two or more")
     return good, [union([row[at] for row in boxes]) for at in range(len(views))]

@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import orbit_of
+from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, read_rgba
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.orbit_world import into_orbit, sphere_of_silhouettes
@@ -81,8 +82,8 @@ def transforms_clip(path: Path, options: VideoOptions) -> Clip:
         0,
         (options.size, options.size),
     )
-    azimuths = ", ".join(f"{np.rad2deg(orbit_of(pose)[0]):.0f}" for pose in poses[:12])
-    log.info(f"{path}: {len(views)} still cameras at azimuths {azimuths}{' ...' if len(poses) > 12 else ''} degrees")
+    azimuths = [f"{np.rad2deg(orbit_of(pose)[0]):.0f}" for pose in poses]
+    log.info(f"{path}: {len(views)} still cameras, azimuths in degrees: {first_names(azimuths, 12)}")
 
     def pictures() -> Iterator[tuple[int, int, np.ndarray]]:
         for number, view in enumerate(views):

@@ -11,6 +11,7 @@ import numpy as np
 
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
+from dpcli.path_names import first_names
 from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, integers, open_frames, read_rgba
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
@@ -321,9 +322,8 @@ def _report_empty(frames: Frames, empty: list[int], good: list[int], mode: str, 
 
 
 def _named(frames: Frames, indices: list[int]) -> str:
-    names = ", ".join(frames.names[index] for index in indices[:_LISTED])
-    more = f" and {len(indices) - _LISTED} more" if len(indices) > _LISTED else ""
-    return f"{len(indices)} {'frame' if len(indices) == 1 else 'frames'}: {names}{more}"
+    names = first_names([frames.names[index] for index in indices], _LISTED)
+    return f"{len(indices)} {'frame' if len(indices) == 1 else 'frames'}: {names}"
 
 
 def _times(frames: Frames, wanted: list[int], fps: float | None) -> np.ndarray:

@@ -49,10 +49,7 @@ def columns_of(layers: ShapeLayers, camera: Camera, step: float) -> tuple[np.nda
             np.maximum(number - 1, 1), number
         )
         depth = front[which] + share * (back - front)[which]
-        x, y = columns[which] + 0.5, rows[which] + 0.5
-        k = camera.intrinsics
-        at = np.stack([(x - k[0, 2]) / k[0, 0] * depth, (y - k[1, 2]) / k[1, 1] * depth, depth], 1)
-        points.append(camera.to_world(at))
+        points.append(camera.to_world(camera.pixel_points(rows[which], columns[which], depth)))
         end = index + (share > 0.5)
         colors.append(layers.color[end, :, rows[which], columns[which]])
     return np.concatenate(points).astype(np.float32), np.concatenate(colors)

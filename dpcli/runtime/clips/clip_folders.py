@@ -6,9 +6,8 @@ import shlex
 from pathlib import Path
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.runtime.clips.video_frames import VIDEO_SUFFIXES
-
-_LISTED = 6  # files at most in a message
 
 
 def clips_in(folder: Path) -> list[str]:
@@ -28,16 +27,6 @@ def refuse_clips(folder: Path, take_all: str, command: str) -> None:
     patterns = " ".join(f"{shlex.quote(str(folder))}/*{kind}" for kind in sorted({Path(name).suffix for name in names}))
     count = f"{len(names)} videos" if len(names) > 1 else "a video"
     raise DataError(
-        f"{folder}: {count}, one clip is wanted: {listed(names)}\n"
+        f"{folder}: {count}, one clip is wanted: {first_names(names)}\n"
         f"Name one of them: {folder / names[0]}; or {take_all}: for clip in {patterns}; do {command}; done"
     )
-
-
-def listed(names: list[str]) -> str:
-    """Returns the first names of many, with a word on the others.
-
-    >>> listed(["a.mp4", "b.mp4"])
-    'a.mp4, b.mp4'
-    """
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return f"{', '.join(names[:_LISTED])}{more}"

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.path_names import first_names
 from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.color_tags import color_tags
 from dpcli.runtime.progress import log
@@ -130,11 +131,10 @@ def one_series(folder: Path, paths: Sequence[Path], option: str = "", quiet: boo
         others = [path.name for path in paths if path not in kept]
         if len(others) >= len(kept):
             return list(paths)
-        more = f" and {len(others) - _NAMED} more" if len(others) > _NAMED else ""
         if not quiet:
             log.warn(
                 f"{folder}: left out {len(others)} of {len(paths)} images, whose names are not like {kept[0].name}: "
-                f"{', '.join(others[:_NAMED])}{more}"
+                f"{first_names(others, _NAMED)}"
             )
         return kept
     return list(paths)

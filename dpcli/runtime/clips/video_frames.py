@@ -17,7 +17,8 @@ from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early
-from dpcli.runtime.clips.display_matrix import Matrix, as_it_plays, display_matrix
+from dpcli.runtime.clips.cropping import Margins, margins
+from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
@@ -70,12 +71,13 @@ def video_frames(path: Path, wanted: Sequence[int], *, as_stored: bool = False) 
     container, stream = _open(path)
     with closing(container):
         frames, matrix = enumerate(_decoded(path, container, stream)), None
+        hidden = _margins(path, container, stream)
         for index in wanted:
             frame = next((frame for at, frame in frames if at == index), None)
             if frame is None:
                 raise DataError(f"{path}: frame {index} cannot be decoded; copy the video again")
             matrix = matrix or display_matrix(frame)  # one for all of them
-            yield _rgba(frame, stream.sample_aspect_ratio, matrix, as_stored)
+            yield as_it_plays(_rgba(frame, stream.sample_aspect_ratio, hidden, as_stored), matrix)
 
 
 @lru_cache(maxsize=4)
@@ -103,6 +105,10 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         _require_known_colors(path, first)
         _tell_streams(path, container, stream)
         _tell_display(path, first, stream)
+        left, right, top, bottom = _margins(path, container, stream)
+        if left + right + top + bottom:
+            shown = f"{first.width - left - right}x{first.height - top - bottom} of {first.width}x{first.height}"
+            log.info(f"{path}: its margins are cut off, as it plays: {shown}")
     return VideoLook(len(stamps), None if times is None else tuple(times.tolist()), alpha)
 
 
@@ -153,6 +159,7 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     if wanted and stream.metadata.get("alpha_mode", stream.metadata.get("ALPHA_MODE")) == "1":
         context = av.CodecContext.create(wanted, "r")
     context.thread_type = "AUTO"
+    context.flags |= av.codec.context.Flags.unaligned  # else columns that H.264 and HEVC cut off on the left are shown
     begun = False
     for packet in container.demux(stream):
         try:
@@ -297,10 +304,15 @@ def _tell_display(path: Path, frame, stream) -> None:
         log.info(f"{path}: {kind}; converted to sRGB")
 
 
-def _rgba(
-    frame, aspect, matrix: Matrix, as_stored: bool
-) -> np.ndarray:  # frame: av.VideoFrame, aspect: Fraction | None
-    """Returns u8 (H,W,4) of a decoded frame as it is shown: full range, square pixels, turned."""
+def _margins(path: Path, container, stream) -> Margins:
+    """Returns what isn't shown of the frames of a stream."""
+    place = [one.index for one in container.streams.video].index(stream.index)
+    return margins(path, place, (stream.width, stream.height))
+
+
+# frame: av.VideoFrame, aspect: Fraction | None
+def _rgba(frame, aspect, hidden: Margins, as_stored: bool) -> np.ndarray:
+    """Returns u8 (H,W,4) of a decoded frame as it is shown but for turns: full range, square pixels, without margins."""
     width = round(frame.width * aspect) if aspect and aspect != 1 else frame.width
     options = {"threads": 1}  # more convert strips of their own: other rounding at other numbers of cores
     if not frame.format.is_rgb:
@@ -314,7 +326,9 @@ def _rgba(
         picture = np.concatenate((rgb, alpha.astype(np.uint8)), axis=-1)
     else:
         picture = _levels(frame, width, options)
-    return as_it_plays(picture, matrix)
+    left, right, top, bottom = hidden
+    left, right = (round(margin * width / frame.width) for margin in (left, right))
+    return picture[top : picture.shape[0] - bottom, left : width - right]
 
 
 def _levels(frame, width: int, options: dict[str, int]) -> np.ndarray:

@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
+from dpcli.runtime.whole_file import make_folder
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
-from dpcli.segment.kinematics.urdf_writer import make_folder, tree_json, write_trees, write_urdf
+from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
 from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.parts import PartsReader, PartsWriter
 
@@ -47,10 +49,7 @@ def _chosen(reader: PartsReader, sequence: str | None) -> list[int]:
     if sequence is None:
         return list(range(len(reader)))
     if sequence not in reader.names:
-        shown = ", ".join(reader.names[:5])
-        raise UsageError(
-            f"--sequence {sequence}: not in {reader.path}; it has {shown}{', ...' if len(reader) > 5 else ''}"
-        )
+        raise UsageError(f"--sequence {sequence}: not in {reader.path}; it has {first_names(reader.names)}")
     return [reader.names.index(sequence)]
 
 

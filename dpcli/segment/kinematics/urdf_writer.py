@@ -10,8 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from dpcli.draw.palette import part_colors
-from dpcli.errors import DpcError
-from dpcli.runtime.whole_file import write_whole
+from dpcli.runtime.whole_file import make_folder, write_whole
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, PartJoint
 from dpcli.segment.kinematics.part_surfaces import part_surface
 from dpcli.store.joints import FIXED, FREE, PRISMATIC, REVOLUTE, TYPES
@@ -37,14 +36,6 @@ def write_urdf(path: Path, tree: KinematicTree, name: str) -> None:
         robot.append(_joint(joint, tree, origins))
     ElementTree.indent(robot)
     write_whole(path, b'<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="utf-8") + b"\n")
-
-
-def make_folder(folder: Path) -> None:
-    """Makes a folder and those above it; nothing where it exists. Raises DpcError where it can't be made."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DpcError(f"{folder}: cannot be made ({error.strerror})") from None
 
 
 def link_origins(tree: KinematicTree) -> np.ndarray:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dpcli.segment.scene.carrying import MovingObject, extended
 from dpcli.segment.scene.ego_motion import OVERLAP, register_frames
 from dpcli.segment.scene.ground import find_up, height_above_ground, level
 from dpcli.segment.scene.line_of_sight import range_jumps
 from dpcli.segment.scene.moving_objects import find_moving_objects
 from dpcli.segment.scene.settings import SceneSettings
+from dpcli.segment.scene.tracking import MovingObject, extended, moved
 from dpcli.segment.scene.world import Frame, World
 
 _SURE = 50.0  # points explained better that make an object two thirds surer
@@ -41,11 +41,11 @@ class SceneExplanation:
 
         An object that was not met in one of the two frames keeps its motion between the nearest frames it was met in.
         """
-        moved = np.eye(4)
+        own = np.eye(4)
         if part > 0:
             known = self.objects[part - 1]
-            moved = extended(known, target) @ np.linalg.inv(extended(known, source))
-        return np.linalg.inv(self.pose[target]) @ moved @ self.pose[source]
+            own = extended(known, target) @ np.linalg.inv(extended(known, source))
+        return np.linalg.inv(self.pose[target]) @ own @ self.pose[source]
 
 
 def explain_scene(frames: list[np.ndarray], sensor: list[np.ndarray], settings: SceneSettings) -> SceneExplanation:
@@ -90,7 +90,7 @@ def _build_world(
     run = np.concatenate([[0], np.cumsum(overlap < OVERLAP)])
     world = [
         Frame(
-            frame @ pose[:3, :3].T + pose[:3, 3],
+            moved(frame, pose),
             height,
             None if eye is None else pose[:3, :3] @ (turn[:3, :3] @ eye) + pose[:3, 3],
             settings.ground,

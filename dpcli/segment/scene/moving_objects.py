@@ -1,13 +1,13 @@
-"""Moving objects of a scene: proposed by clusters that other frames contradict, carried through all frames, and judged."""
+"""Moving objects of a scene: proposed by clusters that other frames contradict, tracked through all frames, and judged."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.scene.carrying import MovingObject, carry, claim_around, merge_alike, moved
 from dpcli.segment.scene.clusters import cluster, groups
 from dpcli.segment.scene.object_motion import refine, search_velocity
 from dpcli.segment.scene.settings import SceneSettings
+from dpcli.segment.scene.tracking import MovingObject, claim_around, merge_alike, moved, track
 from dpcli.segment.scene.world import UNSEEN, Frame, World
 
 _FEWEST = 6  # points of an object in the frame that proposes it
@@ -88,7 +88,7 @@ def _propose(frame: Frame) -> list[tuple[np.ndarray, float]]:
 
 
 def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings, demand: float) -> MovingObject | None:
-    """Returns the object of these points of frame t, carried through all frames, or None where they may as well stand.
+    """Returns the object of these points of frame t, tracked through all frames, or None where they may as well stand.
 
     demand: times the usual evidence that it needs.
     """
@@ -105,7 +105,7 @@ def _explain(own: np.ndarray, t: int, world: World, settings: SceneSettings, dem
             best, least = motions, float(cost)
     one = MovingObject(t, {t: own}, {t: np.eye(4)}, demand=demand)
     for u, motion in best.items():
-        carry(one, t, u - t, motion, world)
+        track(one, t, u - t, motion, world)
     return one if _judge(one, world, settings) else None
 
 

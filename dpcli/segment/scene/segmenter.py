@@ -12,6 +12,7 @@ from torch import Tensor
 from dpcli.runtime.progress import log
 from dpcli.segment.scene.explain import explain_scene
 from dpcli.segment.scene.settings import SceneSettings
+from dpcli.segment.scene.tracking import moved
 from dpcli.segment.segmenters import Flows, Segmenter
 from dpcli.store import CloudSequence
 from dpcli.store.parts import PartsSample
@@ -47,9 +48,9 @@ class SceneSegmenter(Segmenter):
         order = np.arange(count) if sequence.time is None else np.argsort(sequence.time, kind="stable")
         to_meters = np.diag([unit, unit, unit, 1.0])
         to_meters[:3, 3] = -unit * np.median(sequence.points, axis=0)
-        clouds = [_moved(np.float64(sequence.frame(t)), to_meters) for t in range(count)]
+        clouds = [moved(np.float64(sequence.frame(t)), to_meters) for t in range(count)]
         origins = np.zeros((2, 3)) if sequence.shift is None else np.stack([np.zeros(3), -sequence.shift])
-        found = explain_scene([clouds[t] for t in order], list(_moved(origins, to_meters)), self.settings)
+        found = explain_scene([clouds[t] for t in order], list(moved(origins, to_meters)), self.settings)
         place = np.argsort(order)
         self._tell(sequence.name, [int(order[t]) for t in found.apart], found.dropped)
         label = np.concatenate([found.labels[place[t]] for t in range(count)])
@@ -80,13 +81,9 @@ class SceneSegmenter(Segmenter):
             )
 
 
-def _moved(points: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    return points @ motion[:3, :3].T + motion[:3, 3]
-
-
 def _moved_by_parts(points: np.ndarray, label: np.ndarray, motions: np.ndarray) -> np.ndarray:
     """Returns points f64 (N,3) that follow the motions (K,4,4) of their labels (N)."""
     target = np.empty_like(points)
     for part in np.unique(label):
-        target[label == part] = _moved(points[label == part], motions[part])
+        target[label == part] = moved(points[label == part], motions[part])
     return target

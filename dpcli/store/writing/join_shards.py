@@ -12,6 +12,7 @@ import numpy as np
 
 from dpcli.config_diff import differences
 from dpcli.errors import DataError, UsageError
+from dpcli.path_names import first_names
 from dpcli.runtime.machines.shards import Shard, shard_of
 from dpcli.runtime.machines.spread import Workers
 from dpcli.store import CloudsReader, CloudsWriter, PartsReader, PartsWriter, ScoresReader, ScoresWriter
@@ -128,10 +129,7 @@ def _common_history(pieces: list[_Piece]) -> list[dict[str, Any]]:
         seen[piece.shard.index] = piece.path
     missing = [f"{index}/{first.shard.count}" for index in range(first.shard.count) if index not in seen]
     if missing:
-        more = f" and {len(missing) - 8} more" if len(missing) > 8 else ""
-        raise UsageError(
-            f"--shard {', '.join(missing[:8])}{more}: missing; make {'them' if missing[1:] else 'it'} first"
-        )
+        raise UsageError(f"--shard {first_names(missing, 8)}: missing; make {'them' if missing[1:] else 'it'} first")
     return first.history
 
 

@@ -116,7 +116,7 @@ def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
     source = ClipSource(reader, range(6), config, timing="slots", folds={0: 0, 1: 1, 2: 0})
     clips = torch.from_numpy(np.stack([source.load(source.video_clips(k, 1)[0], k) for k in range(6)]))
     model = Kinet(config)
-    nobody = model.static._speakers(torch.tensor([0, 1, 0, -1, -1, -1]))
+    nobody = model.static._voting_members(torch.tensor([0, 1, 0, -1, -1, -1]))
     assert nobody.tolist() == [[False, True], [True, False], [False, True], [False, True], [True, False], [False, True]]
     model.train().static_logits(clips[:1]).sum().backward()
     grads = [sum(p.grad is not None for p in one.parameters()) for one in model.static.members]

@@ -37,7 +37,7 @@ def test_a_folder_becomes_a_file(tmp_path):
         assert reader.length_unit == "raw depth unit" and len(reader.class_names) == 20
     assert "already complete" in dpc("prepare", "msraction3d", tmp_path / "raw", "-o", out, "--scale", "1").stderr
     other = dpc("prepare", "msraction3d", tmp_path / "raw", "-o", out)
-    assert other.returncode == 2 and "scale 1.0 (now 300.0)" in other.stderr and "--force" in other.stderr
+    assert other.returncode == 2 and "scale 1.0, now 300.0" in other.stderr and "--force" in other.stderr
 
 
 def test_skipped_samples_are_listed_and_the_good_ones_kept(tmp_path):

@@ -103,6 +103,13 @@ def test_bytes_the_wrong_way_round_are_no_depth(tmp_path):
     assert not sample_of(tmp_path / "v.npy", noise).notes
 
 
+def test_values_of_fewer_bits_are_not_counted_back_from_sixteen(tmp_path):
+    with pytest.raises(DataError, match="its raw values end at 3095, and --invert counts back from 65535"):
+        sample_of(tmp_path / "v.npy", 4095 - SCENE, invert=True)
+    assert sample_of(tmp_path / "v.npy", 65535 - SCENE, invert=True).sequence.points[0, 2] == 1
+    sample_of(tmp_path / "v.npy", 4095 - SCENE, invert=True, depth_scale=30_000)
+
+
 def test_one_channel_is_no_other_dimension(tmp_path):
     for frames in (SCENE[..., None], SCENE[:, None]):
         np.testing.assert_allclose(sample_of(tmp_path / "v.npy", frames).sequence.points[0, 2], 1.0)

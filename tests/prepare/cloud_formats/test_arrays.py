@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.arrays import guess_bin_columns, read_bin, read_npy, read_npz
 from dpcli.prepare.cloud_formats.colors import as_bytes
+from dpcli.prepare.decode.cloud_files import read_cloud
 from dpcli.prepare.scans.clouds import CloudFolders
 
 quick = settings(
@@ -62,6 +63,18 @@ def test_archives_whose_points_are_called_otherwise(tmp_path, arrays):
     np.testing.assert_array_equal(cloud.points, points)
     assert (cloud.color is not None) == ("rgb" in arrays)
     assert cloud.unread == tuple(name for name in arrays if name in ("snr", "normals", "label"))
+
+
+def test_pictures_and_poses_are_no_points(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones((48, 64)))
+    with pytest.raises(DataError, match=r"\(48, 64\); .* is it a picture, such as of depth"):
+        read_npy(tmp_path / "a.npy")
+    np.savetxt(tmp_path / "a.txt", np.ones((48, 64)))
+    with pytest.raises(DataError, match=r"\(48, 64\); .* is it a picture"):
+        read_cloud(tmp_path / "a.txt")
+    np.save(tmp_path / "a.npy", np.eye(4))
+    with pytest.raises(DataError, match="the pose of a camera"):
+        read_npy(tmp_path / "a.npy")
 
 
 def test_an_array_that_lies_on_its_side_is_refused(tmp_path):

@@ -261,6 +261,22 @@ def test_texts_of_a_vehicles_sensors_are_no_clouds(tmp_path):
     assert len(CloudFolders(tmp_path / "oxts").items()) == 1  # who names it, gets it
 
 
+@pytest.mark.parametrize(
+    "row",
+    [
+        "1 0 0 {} 0 1 0 0 0 0 1 0",
+        "130503{}.5 1 2 3 0 0 0.6 0.8\n1 1 2 3 0 0 1 0\n#",
+        "1,0,0,0,0,1,0,{},0,0,1,0,0,0,0,1",
+    ],
+)
+def test_the_way_of_a_camera_is_no_cloud(tmp_path, row):
+    save(tmp_path / "velodyne" / "0.npy")
+    (tmp_path / "00.txt").write_text("".join(row.format(k) + "\n" for k in range(300)))
+    reader = CloudFolders(tmp_path)
+    assert [item.name for item in reader.items()] == ["velodyne"]
+    assert reader.summary(reader.items())[1] == "velodyne: its frames are 0.npy; left out: 00.txt"
+
+
 def test_a_sequence_beside_folders_of_classes_has_no_class(tmp_path):
     for folder in ("a", "wave/b"):
         save(tmp_path / folder / "0.npy")

@@ -711,7 +711,7 @@ def test_the_command_writes_once_and_tells_other_configurations_apart(tmp_path, 
     again = dpc("prepare", "video", folder, "--size", 32, "-o", out)
     assert again.returncode == 0 and b"already complete" in again.stderr and out.read_bytes() == before
     other = dpc("prepare", "video", folder, "--size", 48, "-o", out)
-    assert other.returncode == 2 and b"size 32 (now 48)" in other.stderr
+    assert other.returncode == 2 and b"size 32, now 48" in other.stderr
     save(folder, moving(4))
     assert dpc("prepare", "video", folder, "--size", 32, "-o", out).returncode == 2  # another input
     piped = dpc("prepare", "video", folder, "--size", 32, "-o", "-")

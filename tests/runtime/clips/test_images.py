@@ -82,12 +82,13 @@ def test_images_that_are_srgb_or_have_a_damaged_profile_stay(tmp_path, profile):
 
 
 @pytest.mark.parametrize("gray", [np.float32(0.4), np.float32(102), np.uint16(102 * 257), np.uint16(102)])
-def test_gray_of_any_type_has_its_own_range(tmp_path, gray):
+def test_gray_of_any_type_has_its_own_range(tmp_path, capsys, gray):
     values = np.zeros((8, 8), gray.dtype)
     values[2:] = gray
     Image.fromarray(values).save(tmp_path / "a.tif")
     read = read_rgba(tmp_path / "a.tif")
     assert read[0, 0].tolist() == [0, 0, 0, 255] and read[4, 4].tolist() == [102, 102, 102, 255]
+    assert ("is taken for 0 to 255" in capsys.readouterr().err) == (gray.dtype == np.uint16 and gray < 256)
 
 
 def with_chunk(png: bytes, name: bytes, data: bytes) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import subprocess
 from pathlib import Path
 
@@ -160,6 +161,43 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     tags = ("-colorspace", matrix, "-color_range", kind)
     film(tmp_path, tmp_path / "c.mp4", *PLAIN, "-vf", scale, *tags)
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
+
+
+def with_clean_aperture(mp4: bytes, aperture: tuple[int, ...]) -> bytes:
+    """An MP4 whose index comes last, with a `clap` box at the end of the sample entry of its one video."""
+    data, (start, stop), above = bytearray(mp4), (0, len(mp4)), []
+    for name, skipped in zip((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"), (8, 8, 8, 8, 8, 16, 86)):
+        while data[start + 4 : start + 8] != name:
+            start += int.from_bytes(data[start : start + 4], "big")
+        above.append(start)
+        start, stop = start + skipped, start + int.from_bytes(data[start : start + 4], "big")
+    data[stop:stop] = struct.pack(">I4s8i", 40, b"clap", *aperture)
+    for at in above:
+        data[at : at + 4] = struct.pack(">I", int.from_bytes(data[at : at + 4], "big") + 40)
+    return bytes(data)
+
+
+@pytest.mark.parametrize("name", ["c.mp4", "c.mov", "c.mkv"])
+def test_margins_that_a_container_cuts_off_are_not_shown(pictures, tmp_path, capfd, name):
+    """40 x 30, whose middle lies 4 to the right of the frame's and 3 above: columns 16 to 56, rows 14 to 44."""
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN)
+    cut = with_clean_aperture(whole.read_bytes(), (40, 1, 30, 1, 4, 1, -6, 2))
+    (tmp_path / "c.mp4").write_bytes(cut)
+    if name != "c.mp4":
+        ffmpeg("-i", tmp_path / "c.mp4", "-c", "copy", tmp_path / name)
+    np.testing.assert_array_equal(decoded(tmp_path / name), decoded(whole)[:, 14:44, 16:56])
+    assert "its margins are cut off, as it plays: 40x30 of 64x64" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("margins", ["crop_left=8", "crop_left=2:crop_top=4:crop_right=6"])
+def test_margins_that_a_codec_cuts_off_are_not_shown(pictures, tmp_path, margins):
+    left, right, top = {"crop_left=8": (8, 0, 0)}.get(margins, (2, 6, 4))
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN)
+    ffmpeg("-i", whole, "-c", "copy", "-bsf:v", f"h264_metadata={margins}", tmp_path / "cut.mp4")
+    np.testing.assert_array_equal(
+        decoded(tmp_path / "cut.mp4")[..., 3, 3, :], decoded(whole)[:, top:, left : SIDE - right][..., 3, 3, :]
+    )
+    assert decoded(tmp_path / "cut.mp4").shape[1:3] == (SIDE - top, SIDE - left - right)
 
 
 def test_of_a_turn_that_is_no_quarter_is_told(pictures, tmp_path, capfd):

@@ -29,8 +29,8 @@ class PointSlots(Backbone):
 
     In training each learns from its own share of a batch, so that all of them cost what one network costs; their errors
     differ, and the mean of their scores has fewer. Beside each stands a forest on descriptors of the videos that it learned
-    from: another kind of errors. A clip may be marked with the member that must not learn from it, and
-    alone says what it shows then: so all videos train, and all are judged by a network that never saw them. Reads of the
+    from: another kind of errors. A clip may be marked with the member that must not learn from it; that member alone
+    classifies it then: so all videos train, and all are judged by a network that never saw them. Reads of the
     config: num_frames (slots), points_per_frame, widths (the layers of a point; the width of a slot), columns, members,
     dropout.
     """
@@ -47,22 +47,22 @@ class PointSlots(Backbone):
         return [Grouping(points, times, points[:, :0], times[:, :0], nothing)]
 
     def forward(self, groups: list[Grouping]) -> Tensor:
-        """Class logits (B,C): the logarithm of the mean scores of the members that `_speakers` names; of a clip without any
-        point, which tells nothing, all classes alike."""
+        """Class logits (B,C): the logarithm of the mean scores of the members that `_voting_members` names; of a clip without any
+        point all classes alike."""
         clips = torch.cat([groups[0].points, groups[0].columns], -1)
         clips = clips.unflatten(1, (self.config.num_frames, self.config.points_per_frame))
-        speakers = self._speakers(clips[..., 3].amax((1, 2)).long() - 2)
+        voting = self._voting_members(clips[..., 3].amax((1, 2)).long() - 2)
         total = clips.new_zeros(len(clips), self.config.num_classes)
-        for member, asked in zip(self.members, speakers.T):
+        for member, asked in zip(self.members, voting.T):
             if asked.any():
                 which = asked.nonzero()[:, 0]
                 total = total.index_add(0, which, member.scores(clips[which], self.forest_share).to(total))
-        logits = torch.log(total.clamp(min=_LEAST) / speakers.sum(1, keepdim=True))
+        logits = torch.log(total.clamp(min=_LEAST) / voting.sum(1, keepdim=True))
         empty = (clips[..., 3] == 0).flatten(1).all(1, keepdim=True)
         return torch.where(empty & (not self.training), torch.zeros_like(logits), logits)
 
-    def _speakers(self, unseen: Tensor) -> Tensor:
-        """Returns who says something about which clip, bool (B,K): in training one member, not the one that must not see it;
+    def _voting_members(self, unseen: Tensor) -> Tensor:
+        """Returns which members classify which clip, bool (B,K): in training one of them, not the one that must not see it;
         else that one, or all where a clip has no mark.
 
         unseen: the members that must not see the clips, i64 (B), below 0 where there is none.
@@ -90,7 +90,7 @@ class _Member(nn.Module):
         self.points = nn.Sequential(*_layer(4 + len(config.columns), first), *_layer(first, second))
         self.slots = nn.Sequential(*_layer(2 * second + 1, width))
         self.position = nn.Parameter(torch.zeros(config.num_frames, width))
-        self.over_time = nn.ModuleList(_OverTime(width, step) for step in _STEPS)
+        self.over_time = nn.ModuleList(_TemporalConvolution(width, step) for step in _STEPS)
         self.dropout, self.classify = nn.Dropout(config.dropout), ClipLinear(2 * width, config.num_classes)
         self.forest = Forest(*config.forest, config.num_classes)
         nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
@@ -117,7 +117,7 @@ class _Member(nn.Module):
         return self.classify(self.dropout(torch.cat([found.mean(1), found.amax(1)], -1)))
 
 
-class _OverTime(nn.Module):
+class _TemporalConvolution(nn.Module):
     """Reads each slot together with the slots before and after it, `step` apart: (B,T,W) to the same shape."""
 
     def __init__(self, width: int, step: int) -> None:

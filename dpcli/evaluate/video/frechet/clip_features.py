@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from dpcli.evaluate.video.frechet.distance import (
     single_video_distance,
 )
 from dpcli.evaluate.video.frechet.frame_inputs import prepare_frame
-from dpcli.evaluate.video.frechet.variants import FeatureVariant, feature_choices, feature_variant
+from dpcli.evaluate.video.frechet.variants import FeatureVariant, feature_variant
 
 if TYPE_CHECKING:
     import torch
@@ -203,9 +203,3 @@ def _own_distance(variant: FeatureVariant, pair: VideoPair, options: dict[str, s
     if variant.aggregation == "closed form":
         return single_video_distance(pair.predicted.rows[0], pair.truth.rows[0])
     return frechet_distance(pair.predicted, pair.truth, **options)
-
-
-def feature_report(found: FeatureDistance, every: int = 1) -> dict[str, Any]:
-    """Returns a distance with its denominators and choices, for JSON."""
-    counts = {key: getattr(found, key) for key in ("value", "videos", "clips", "frames")}
-    return {**counts, "each": list(found.each), "unit": "", "choices": feature_choices(found.variant, every)}

@@ -11,8 +11,9 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.source import Picture, Source, View, mean_rate
 from dpcli.npy_files import map_npy
+from dpcli.path_names import first_names
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
-from dpcli.runtime.clips.clip_folders import clips_in, listed, refuse_clips
+from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
@@ -30,7 +31,7 @@ class FolderSource(Source):
         own = _images_in(path)
         folders = {path: own} if own else {}
         if own and (clips := clips_in(path)):
-            log.info(f"{path}: its images are compared; left out: {listed(clips)}")
+            log.info(f"{path}: its images are compared; left out: {first_names(clips)}")
         for child in sorted((p for p in path.iterdir() if p.is_dir()), key=_numbers_in_name) if not folders else ():
             if inside := _images_in(child):
                 folders[child] = inside

@@ -1,4 +1,4 @@
-"""Objects carried through the frames: their points and motions in each, and which of them are one."""
+"""Tracking of moving objects: their points and motions in each frame, and which of them are pieces of one."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _CLOSE = 0.15  # the same for points that may as well stand
 _STANDING = 0.15  # mean cost of standing still below which a point may as well stand
 _AROUND = 1.0  # meters around its box in which points in doubt are its own
 _FOOT = (0.25, 0.4)  # meters beside an object, and share of the ground's height, where low points are its own
-_FOUND = 0.3  # share of an object's points that must meet a frame's for it to be carried there
+_FOUND = 0.3  # share of an object's points that must meet a frame's for it to be tracked there
 _JERK = (0.3, 0.3)  # meters, and share of a step: how far steps that follow one another may differ
-_UNSTEADY = 2.5  # times the evidence for something that could only be carried with a jerk
+_UNSTEADY = 2.5  # times the evidence for something that could only be tracked with a jerk
 _ALIKE = (0.3, 0.25)  # the same for two pieces of one object
 _APART = 1.5  # meters between pieces of one object
 
@@ -27,7 +27,7 @@ class MovingObject:
     """Holds an object: its points in each frame, numbers i64, and its motion, f64 (4,4) in the world, from `start` to it.
 
     saved: what its motion explains better than standing still, in points that a frame contradicts. demand: times
-    the usual evidence that it needs, more than 1 for pieces of a larger cluster, and what could only be carried with a jerk.
+    the usual evidence that it needs, more than 1 for pieces of a larger cluster, and what could only be tracked with a jerk.
     """
 
     start: int
@@ -63,8 +63,8 @@ def extended(known: dict[int, np.ndarray], frame: int) -> np.ndarray:
     return np.linalg.matrix_power(step, frame - edge) @ known[edge]
 
 
-def carry(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -> None:
-    """Carries an object from frame t over `way` frames again and again, as far as it is met; `step` (4,4): its first."""
+def track(one: MovingObject, t: int, way: int, step: np.ndarray, world: World) -> None:
+    """Tracks an object from frame t, `way` (1 or -1 ...) frames at a time, as long as it is met; `step` (4,4): its first motion."""
     while 0 <= t + way < len(world.frames) and world.run[t + way] == world.run[t]:
         here, there = world.frames[t], world.frames[t + way]
         points = here.points[one.points[t]]
