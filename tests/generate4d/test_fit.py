@@ -75,7 +75,7 @@ def test_a_fit_learns_the_pictures_and_writes_a_scene(tmp_path, dpc):
     assert (tmp_path / "sheet.png").stat().st_size > 1000
     assert result.part_probability.sum(1) == pytest.approx(1, abs=1e-4)
     same = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny", *steps(60, 60))
-    assert same.returncode == 0 and "finished" in same.stderr.decode()
+    assert same.returncode == 0 and "already complete" in same.stderr.decode()
     again = dpc("generate4d", "fit", views, "-o", scene, "--preset", "tiny")
     assert again.returncode == 2 and "--force" in again.stderr.decode()
 
@@ -215,7 +215,7 @@ def test_a_finished_fit_still_draws_its_picture(tmp_path, dpc_here):
     assert dpc_here(*words, "--picture", tmp_path / "first.png").returncode == 0
     before = scene.read_bytes()
     done = dpc_here(*words, "--picture", tmp_path / "later.png")
-    assert done.returncode == 0 and b"finished" in done.stderr and scene.read_bytes() == before
+    assert done.returncode == 0 and b"already complete" in done.stderr and scene.read_bytes() == before
     first, later = (imageio.imread(tmp_path / name).astype(int) for name in ("first.png", "later.png"))
     assert first.shape == (9 * SIZE, 5 * SIZE, 3) and np.abs(first - later).max() <= 1
 
