@@ -10,8 +10,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from dpcli.classify.data.augment import AUGMENTATIONS, Augmentation
-from dpcli.classify.data.validation_split import CROSS
-from dpcli.classify.network.config import KinetConfig
+from dpcli.classify.network.config import CROSS, KinetConfig
 from dpcli.classify.presets import BACKBONE_CHANGES, PRESETS, VARIANT_CHANGES, backbone_changes
 from dpcli.classify.training.run_settings import RunSettings
 from dpcli.classify.training.schedule import Schedule

@@ -18,7 +18,6 @@ from dpcli.classify.data.likeness import NOTE as NOTE_LIKE
 from dpcli.classify.data.likeness import file_like, tell_rounded
 from dpcli.classify.data.slots import measured, preset_for
 from dpcli.classify.data.validation_split import (
-    CROSS,
     about_classes,
     about_people,
     carve_validation,
@@ -27,6 +26,7 @@ from dpcli.classify.data.validation_split import (
     default_rule,
 )
 from dpcli.classify.data.videos import report_backward, report_short
+from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.kinet import STREAMS, Kinet
 from dpcli.classify.network.model_file import ModelInfo, find_model, load_model, save_model
 from dpcli.classify.settings import TrainingSettings, training_settings, with_classes

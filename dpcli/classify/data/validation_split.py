@@ -5,11 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from dpcli.classify.network.config import CROSS
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.seeds import ClassifyStream, generator
 from dpcli.store import CloudsReader
-
-CROSS = "cross"  # every video is judged by members of a network that never saw it
 
 
 def labeled(reader: CloudsReader, split: str) -> list[int]:

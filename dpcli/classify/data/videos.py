@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from dpcli.classify.data.clips import ClipSource
-from dpcli.classify.data.validation_split import CROSS, carve_validation
+from dpcli.classify.data.validation_split import carve_validation
+from dpcli.classify.network.config import CROSS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names

@@ -10,6 +10,8 @@ from dpcli.errors import UsageError
 from dpcli.runtime.settings.fields import check, setting
 from dpcli.runtime.settings.stored import from_json
 
+CROSS = "cross"  # the rule of validation by which every video is judged by members that never saw it
+
 _MOST_POINTS = 1 << 22  # of a clip: 85 times those of the thesis
 
 
