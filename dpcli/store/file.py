@@ -13,7 +13,7 @@ import numpy as np
 from dpcli import __version__
 from dpcli.errors import DataError, reading
 from dpcli.path_names import as_utf8
-from dpcli.runtime.whole_file import refuse_pipe
+from dpcli.runtime.whole_file import require_file
 from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
@@ -48,9 +48,7 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CAC
     outside itself (external links, virtual data sets, external storage) or to Python objects.
     """
     path = Path(path)
-    if path.is_dir():
-        raise DataError(f"{path}: a folder, expected an HDF5 file; `dpc prepare` turns raw folders into one")
-    refuse_pipe(path)
+    require_file(path)
     with open(path, "rb") as raw:
         magic = raw.read(8)
     if not magic:

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from dpcli.errors import DataError, DpcError, Stopped, UsageError
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, file_kind
+from dpcli.store.pipes import input_file
 
 
 def write(path: Path, sequences: list[CloudSequence], **options) -> Path:
@@ -341,6 +342,18 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
         )
         peaks.append(int(run.stdout) / 1024)
     assert peaks[1] - peaks[0] < 12, peaks
+
+
+def test_a_folder_tells_of_its_files(tmp_path):
+    for names, said in (
+        ((), "`dpc prepare` turns"),
+        (("b.h5", "a.h5", "x.txt"), r"holds a.h5, b.h5: name one, or all .*\*.h5"),
+    ):
+        for name in names:
+            (tmp_path / name).touch()
+        for opened in (lambda: CloudsReader(tmp_path), input_file(tmp_path).__enter__):
+            with pytest.raises(DataError, match=f"a folder, expected an HDF5 file; .*{said}"):
+                opened()
 
 
 def test_missing_folder_is_said(tmp_path):
