@@ -13,6 +13,7 @@ import numpy as np
 
 from tests.fuzz.mutators import NAMES, VALUES, text
 
+_MOST = 1 << 20  # bytes that are read and written again: this process lives as long as all of its inputs
 _TYPES = ("f4", "f8", "i8", "u1", "S4", "c8", "f2", ">i4", "u8", "b1")
 
 
@@ -36,6 +37,8 @@ def _change(file: h5py.File, rng: random.Random) -> None:
     holders = [one for one in ("/", *names) if len(file[one].attrs)]
     if holders and rng.random() < 0.35:
         _change_attribute(file[rng.choice(holders)].attrs, rng)
+    elif isinstance(file[name], h5py.Dataset) and file[name].nbytes > _MOST:  # a damage before made it huge
+        _removed(file, name, rng)
     elif isinstance(file[name], h5py.Dataset) and rng.random() < 0.8:
         rng.choice((_other_values, _other_values, _other_type, _other_shape, _huge, _text_values))(file, name, rng)
     else:
