@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from dpcli import __version__
+from dpcli.runtime.whole_file import refuse_folder
 
 # Options that change how the work runs but not its result: left out, so that equal work gives equal bytes.
 _VALUED = {"-o", "--output", "--jobs", "--shard", "--dask", "--picture", "--animation", "--device", "--log", "--report"}
@@ -28,7 +29,8 @@ def command_line(argv: list[str] | None = None) -> str:
 
 
 def file_digest(path: str | Path) -> str:
-    """Returns the SHA-256 of a file's bytes, in hexadecimal."""
+    """Returns the SHA-256 of a file's bytes, in hexadecimal. Raises DataError for a folder."""
+    refuse_folder(Path(path))
     digest = hashlib.sha256()
     with open(path, "rb") as file:
         while block := file.read(1 << 20):

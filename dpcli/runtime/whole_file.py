@@ -154,16 +154,18 @@ def check_regular(path: Path, option: str = "-o") -> None:
         raise UsageError(f"{option} {path}: is not a regular file; to write into a pipe use `-o - | ...`")
 
 
-def require_file(path: Path) -> None:
-    """Raises DataError for a folder, and UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only
-    once from its begin.
-    """
+def refuse_folder(path: Path) -> None:
+    """Raises DataError for a folder where an HDF5 file is expected, which tells of such files in it."""
     if path.is_dir():
         held = sorted(as_utf8(one.name) for one in path.glob("*.h5") if not one.name.startswith("."))
         takes = f"it holds {first_names(held)}: name one, or all where a command takes several ({path}/*.h5)"
         advice = takes if held else "`dpc prepare` turns raw folders into one"
         raise DataError(f"{path}: a folder, expected an HDF5 file; {advice}")
-    if path.exists() and not path.is_file():
+
+
+def refuse_pipe(path: Path) -> None:
+    """Raises UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
+    if path.exists() and not path.is_file() and not path.is_dir():
         raise UsageError(
             f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -"
         )

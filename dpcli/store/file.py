@@ -13,7 +13,7 @@ import numpy as np
 from dpcli import __version__
 from dpcli.errors import DataError, reading
 from dpcli.path_names import as_utf8
-from dpcli.runtime.whole_file import require_file
+from dpcli.runtime.whole_file import refuse_folder, refuse_pipe
 from dpcli.store.heap_check import check_heaps
 from dpcli.store.schema import KINDS, SCHEMA, Field, fields_of, find_field
 
@@ -48,7 +48,8 @@ def open_store(path: str | Path, kinds: Sequence[str] = KINDS, cache: int = _CAC
     outside itself (external links, virtual data sets, external storage) or to Python objects.
     """
     path = Path(path)
-    require_file(path)
+    refuse_folder(path)
+    refuse_pipe(path)
     with open(path, "rb") as raw:
         magic = raw.read(8)
     if not magic:

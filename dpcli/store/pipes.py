@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from dpcli.errors import DataError, UsageError
-from dpcli.runtime.whole_file import DiskFull, check_regular, check_writable, disk_full, require_file
+from dpcli.runtime.whole_file import DiskFull, check_regular, check_writable, disk_full, refuse_pipe
 
 _PAGES = (".html", ".htm", ".md", ".tex")
 _PIECE = 1 << 20  # pieces of 1 MiB: a closed pipe is then noticed early
@@ -29,7 +29,7 @@ def input_file(argument: str | Path, stdin: BinaryIO | None = None) -> Iterator[
         path = Path(argument)
         if not path.exists():
             raise DataError(f"{path}: no such file")
-        require_file(path)
+        refuse_pipe(path)
         yield path
         return
     stream = stdin or standard_input()

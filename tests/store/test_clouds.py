@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dpcli.errors import DataError, DpcError, Stopped, UsageError
+from dpcli.runtime.provenance import file_digest
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter, file_kind
-from dpcli.store.pipes import input_file
 
 
 def write(path: Path, sequences: list[CloudSequence], **options) -> Path:
@@ -351,7 +351,7 @@ def test_a_folder_tells_of_its_files(tmp_path):
     ):
         for name in names:
             (tmp_path / name).touch()
-        for opened in (lambda: CloudsReader(tmp_path), input_file(tmp_path).__enter__):
+        for opened in (lambda: CloudsReader(tmp_path), lambda: file_digest(tmp_path)):
             with pytest.raises(DataError, match=f"a folder, expected an HDF5 file; .*{said}"):
                 opened()
 
