@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -196,6 +197,20 @@ def test_a_damaged_png_is_refused_before_its_claims_are_believed(tmp_path):
     for read in (read_image, lambda path: read_png(path, 1)):
         with pytest.raises(DataError, match="a.png: a (damaged|truncated) PNG"):
             read(tmp_path / "a.png")
+
+
+def test_frames_of_an_avi_without_bytes_are_counted(tmp_path):
+    from dpcli.prepare.decode.depth_files import LEFT_OUT, read_depth_video
+
+    depth = np.random.default_rng(0).integers(1000, 2000, (9, 12, 16)).astype(np.uint16)
+    data = write_video(tmp_path / "a.avi", depth).read_bytes()
+    third = [match.start() for match in re.finditer(b"00dc", data)][2]
+    length = int.from_bytes(data[third + 4 : third + 8], "little")
+    (tmp_path / "a.avi").write_bytes(  # what the chunk held becomes one that nobody reads
+        data[: third + 4] + bytes(4) + b"JUNK" + (length - 8).to_bytes(4, "little") + data[third + 16 :]
+    )
+    video = read_depth_video(tmp_path / "a.avi")
+    assert len(video.frames) == 8 and video.notes == {LEFT_OUT: 1}
 
 
 @pytest.mark.parametrize("stride", [1, 2])

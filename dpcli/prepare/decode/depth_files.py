@@ -19,7 +19,7 @@ from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
-from dpcli.runtime.clips.container_ends import ends_early
+from dpcli.runtime.clips.container_ends import empty_frames, ends_early
 from dpcli.runtime.clips.video_frames import missing_frames
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
@@ -34,6 +34,7 @@ _GRAY_NOISE, _COLORED_SHARE = (
 )  # levels between channels, and share of pixels beyond: a color map has most of them
 _GRAY16 = 0x10003159  # what OpenCV calls the pixel format gray16le
 _EIGHT_BITS = {int.from_bytes(tag, "little") for tag in (b"Y800", b"I420", b"Y42B", b"444P", b"NV12", b"YUY2", b"UYVY")}
+LEFT_OUT = "frames without bytes, which the recording program left out"
 _TICK = 0.0011  # seconds by which a container's time stamps may be off: it counts milliseconds
 
 
@@ -356,7 +357,9 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         frames, time, missing = read_timed_video(path, stride)
         if not frames:
             raise DataError(f"{path}: an empty video: no frame can be decoded")
-        video = DepthVideo(np.stack(frames), time, missing, ends_early(path))
+        left = empty_frames(path, 0)
+        notes = {LEFT_OUT: left} if left else {}
+        video = DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy, .npz or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:

@@ -201,6 +201,8 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
             f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
         )
+    if left := empty_frames(path, stream.index):
+        log.warn(f"{path}: {left} frames have no bytes: the program that recorded it left them out, as they are here")
     if cut:
         log.warn(f"{path}: the file ends before its container does; frames behind the {held} that it holds may be lost")
 

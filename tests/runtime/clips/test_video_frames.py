@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import subprocess
 from pathlib import Path
@@ -219,11 +220,12 @@ def test_of_several_videos_in_a_file_the_one_that_plays_is_read(pictures, tmp_pa
 
 
 @pytest.mark.parametrize("codec", [("-c:v", "mjpeg", "-q:v", 1), ("-c:v", "ffv1"), PLAIN])
-def test_an_avi_whose_program_dropped_frames_is_whole(pictures, tmp_path, codec):
+def test_an_avi_whose_program_dropped_frames_is_whole(pictures, tmp_path, capfd, codec):
     """Chunks without bytes keep the frame before; with B-frames an AVI tells no times."""
     words = ("-vf", "fps=30,select='not(mod(n,3))'", "-fps_mode", "vfr", "-enc_time_base", "1/30")
     look = look_at_video(film(pictures, tmp_path / "d.avi", *codec, *words))
     assert look.count == COUNT
+    assert re.search(r"d.avi: \d+ frames have no bytes", capfd.readouterr().err)
     if codec is PLAIN:
         assert look.times is None
     else:
