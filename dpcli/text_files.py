@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from dpcli.errors import DataError, DpcError
 
+_DEEPEST = 100  # lists and mappings in each other
+_MOST_PLACES = 1000  # of one list
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -45,7 +48,31 @@ def parse_json(text: str | bytes, where: object) -> Any:
         raise DataError(f"{where}: is not JSON (its text is not UTF-8); save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
         raise DataError(f"{where}: is not JSON ({error})") from None
+    check_depth(value, where)
     return value
+
+
+def check_depth(value: Any, where: object) -> None:
+    """Raises DataError where lists and mappings lie deeper in each other than any real file's, or in a circle, or one in
+    so many places that a small file becomes a huge one, as YAML allows. What walks through them may then call itself.
+    """
+    level = [(value, 1)] if isinstance(value, (dict, list)) else []
+    for _ in range(_DEEPEST):
+        places: Counter[int] = Counter()
+        inside: dict[int, Any] = {}
+        for one, times in level:
+            for child in one.values() if isinstance(one, dict) else one:
+                if isinstance(child, (dict, list)):
+                    inside[id(child)] = child
+                    places[id(child)] += times
+        if not inside:
+            return
+        if max(places.values()) > _MOST_PLACES:
+            raise DataError(
+                f"{where}: names one of its lists in more than {_MOST_PLACES} places; no file of this kind does"
+            )
+        level = [(child, places[key]) for key, child in inside.items()]
+    raise DataError(f"{where}: nested more than {_DEEPEST} deep; no file of this kind is")
 
 
 def read_toml(path: Path) -> dict[str, Any]:

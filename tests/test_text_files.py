@@ -3,7 +3,7 @@
 import pytest
 
 from dpcli.errors import DataError
-from dpcli.text_files import read_json, read_text
+from dpcli.text_files import check_depth, parse_json, read_json, read_text
 
 
 @pytest.mark.parametrize(
@@ -23,3 +23,25 @@ def test_a_byte_order_mark_and_pairs_of_surrogates_are_read(tmp_path):
     path.write_bytes("é".encode("latin-1"))
     with pytest.raises(DataError, match="byte 0 is 0xe9"):
         read_text(path)
+
+
+def test_what_is_nested_deeper_than_walkers_go_is_refused():
+    for depth, text in (
+        (100, "[" * 100 + "]" * 100),
+        (101, '{"a":' * 101 + "1" + "}" * 101),
+        (500, "[" * 500 + "]" * 500),
+    ):
+        if depth > 100:
+            with pytest.raises(DataError, match="a.json: nested more than 100 deep"):
+                parse_json(text, "a.json")
+        else:
+            assert parse_json(text, "a.json")
+    circle: list = []
+    circle.append({"a": circle})
+    with pytest.raises(DataError, match="nested more than 100 deep"):
+        check_depth(circle, "a.yaml")
+    laughs = ["ha"]
+    for _ in range(12):
+        laughs = [laughs] * 10
+    with pytest.raises(DataError, match="in more than 1000 places"):
+        check_depth(laughs, "a.yaml")

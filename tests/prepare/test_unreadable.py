@@ -210,7 +210,12 @@ def test_frames_of_an_avi_without_bytes_are_counted(tmp_path):
         data[: third + 4] + bytes(4) + b"JUNK" + (length - 8).to_bytes(4, "little") + data[third + 16 :]
     )
     video = read_depth_video(tmp_path / "a.avi")
-    assert len(video.frames) == 8 and video.notes == {LEFT_OUT: 1}
+    assert len(video.frames) == 8 and video.notes == {LEFT_OUT: 1} and not video.missing
+    (tmp_path / "b.avi").write_bytes(
+        data[:48] + bytes([65]) + data[49:]
+    )  # the main header promises more than the stream's
+    video = read_depth_video(tmp_path / "b.avi")
+    assert len(video.frames) == 9 and video.missing == 56
 
 
 @pytest.mark.parametrize("stride", [1, 2])

@@ -5,7 +5,6 @@ Whatever a file declares is used, or refused by its name.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.npy_files import map_npy
 from dpcli.prepare.cloud_formats.column_names import UNITS, unit_of
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, LensIntrinsics
+from dpcli.text_files import check_depth, parse_json
 
 _FX, _FY = ("fx", "fl_x", "f_x", "fx_depth"), ("fy", "fl_y", "f_y", "fy_depth")
 _CX = ("cx", "ppx", "c_x", "mx_depth")
@@ -147,10 +147,7 @@ def _parsed(path: Path, text: str) -> dict[str, Any]:
         lines = (re.split(r"\s*[=:]\s*", line.strip(), maxsplit=1) for line in text.splitlines())
         data = {pair[0]: _number_or_text(pair[1]) for pair in lines if len(pair) == 2}
     else:
-        try:
-            data = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise DataError(f"{path}: is not JSON ({error})") from None
+        data = parse_json(text, path)
     if not isinstance(data, dict):
         raise DataError(f"{path}: {_EXPECTED}")
     return data
@@ -164,6 +161,7 @@ def _yaml(path: Path, text: str) -> Any:
         data = next((part for part in yaml.safe_load_all(plain) if part), None)
     except (yaml.YAMLError, RecursionError) as error:
         raise DataError(f"{path}: is not YAML ({' '.join(str(error).split())})") from None
+    check_depth(data, path)
     return {_OF_SLAM.sub("", str(key)): value for key, value in data.items()} if isinstance(data, dict) else data
 
 

@@ -19,7 +19,7 @@ from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import check_picture, decode_gray_png
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
-from dpcli.runtime.clips.container_ends import empty_frames, ends_early
+from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.video_frames import missing_frames
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
@@ -143,7 +143,8 @@ def _declared_frames(capture) -> int:
 def _missing(path: Path, declared: int, count: int, times: np.ndarray | None, stride: int) -> int:
     """Returns how many frames the file lacks; it is opened again only where OpenCV's guess of its length says more."""
     seen = count * stride  # but for the last few
-    return missing_frames(path, seen, times if stride == 1 else None) if declared > seen else 0
+    missing = missing_frames(path, seen, times if stride == 1 else None) if declared > seen else 0
+    return missing or max(promised_frames(path) - max(declared, seen), 0)
 
 
 def _is_plain(stream: VideoStream) -> bool:

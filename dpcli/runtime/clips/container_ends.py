@@ -49,6 +49,18 @@ def empty_frames(path: Path, stream: int) -> int:
     return found
 
 
+def promised_frames(path: Path) -> int:
+    """Returns how many frames the main header of an AVI with one stream promises; 0 for other files.
+
+    Decoders go by the header of the stream, which may promise fewer.
+    """
+    with path.open("rb") as file:
+        head = file.read(64)
+    if not re.match(rb"RIFF.{4}AVI LIST.{4}hdrlavih", head, re.DOTALL) or len(head) < 64:
+        return 0
+    return int.from_bytes(head[48:52], "little") if int.from_bytes(head[56:60], "little") == 1 else 0
+
+
 def _goes_on(ends: Iterator[int], size: int) -> bool:
     """Returns whether the last of the places where parts end lies beyond the file."""
     last = 0

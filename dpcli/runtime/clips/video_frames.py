@@ -16,7 +16,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.clips import wide_color
-from dpcli.runtime.clips.container_ends import empty_frames, ends_early
+from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.cropping import Margins, margins
 from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix
 from dpcli.runtime.progress import log
@@ -200,6 +200,10 @@ def _check_whole(path: Path, container, stream, count: int, times: np.ndarray | 
         raise DataError(
             f"{path}: only {held}{of} frames can be decoded; it is truncated or damaged: "
             "copy it again, or cut the good part out"
+        )
+    if (promised := promised_frames(path)) > max(declared, held) + empty_frames(path, stream.index):
+        log.warn(
+            f"{path}: its main header promises {promised} frames; it holds {held}, as the header of its stream says"
         )
     if left := empty_frames(path, stream.index):
         log.warn(f"{path}: {left} frames have no bytes: the program that recorded it left them out, as they are here")

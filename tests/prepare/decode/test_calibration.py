@@ -226,6 +226,12 @@ def test_a_lens_is_straightened(tmp_path):
         ("cameras.txt", "1 OPENCV_FISHEYE 640 480 1 2 3 4 5 6 7 8\n", "camera model OPENCV_FISHEYE"),
         ("cameras.txt", COLMAP + "2 PINHOLE 640 480 1 2 3 4\n", "holds 2 different cameras"),
         ("k.yaml", "a: [1,", "is not YAML"),
+        (
+            "k.yaml",
+            "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9 if n else ['1'] * 9)}]\n" for n in range(9)),
+            "places",
+        ),
+        ("k.json", '{"fx":' + "[" * 600 + "]" * 600 + "}", "nested more than 100 deep"),
     ],
 )
 def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
