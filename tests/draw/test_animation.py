@@ -11,7 +11,7 @@ import pytest
 
 from dpcli.draw.animation import output_kind, write_pictures
 from dpcli.errors import DataError, DpcError, UsageError
-from tests.support.browser import needs_browser, open_page
+from tests.support.browser import held_page, needs_browser, open_page
 
 
 def moving_square(count: int = 6, shape: tuple[int, int] = (31, 40)) -> list[np.ndarray]:
@@ -118,22 +118,23 @@ def test_a_browser_shows_the_colors_that_were_written(tmp_path, side):
     write_pictures(tmp_path / "a.mp4", [picture] * 3, fps=10)
     film = base64.b64encode((tmp_path / "a.mp4").read_bytes()).decode()
     page = tmp_path / "a.html"
-    page.write_text(f"""<html><body><video id="v" muted src="data:video/mp4;base64,{film}"></video><script>
-    const video = document.querySelector("video"), canvas = document.createElement("canvas");
-    video.onseeked = () => {{
-      [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
-      const context = canvas.getContext("2d");
-      context.drawImage(video, 0, 0);
-      const at = (k) => [...context.getImageData((k + 0.5) * video.videoWidth / 6, video.videoHeight / 2, 1, 1).data];
-      if (at(5)[0] === 0) {{ setTimeout(video.onseeked, 100); return; }}  // the white place: no picture is decoded yet
-      document.documentElement.dataset.seen = [0, 1, 2, 3, 4, 5].map((k) => at(k).slice(0, 3).join()).join(" ");
-    }};
-    video.onloadeddata = () => {{ video.currentTime = 0.1; }};
-    </script></body></html>""")
-    for _ in range(5):  # the browser's made-up time may be over before a picture is decoded
-        html, said = open_page(page.as_uri(), tmp_path, "--virtual-time-budget=8000")
-        if seen := re.search(r'data-seen="([^"]*)"', html):
-            break
+    with held_page() as (hold, go_on):
+        page.write_text(f"""<html><body>{hold}<video id="v" muted src="data:video/mp4;base64,{film}"></video><script>
+        const video = document.querySelector("video"), canvas = document.createElement("canvas");
+        video.onseeked = () => {{
+          [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
+          const context = canvas.getContext("2d");
+          context.drawImage(video, 0, 0);
+          const at = (k) =>
+            [...context.getImageData((k + 0.5) * video.videoWidth / 6, video.videoHeight / 2, 1, 1).data];
+          if (at(5)[0] === 0) {{ setTimeout(video.onseeked, 100); return; }}  // the white place: no picture is decoded yet
+          document.documentElement.dataset.seen = [0, 1, 2, 3, 4, 5].map((k) => at(k).slice(0, 3).join()).join(" ");
+          {go_on}
+        }};
+        video.onloadeddata = () => {{ video.currentTime = 0.1; }};
+        </script></body></html>""")
+        html, said = open_page(page.as_uri(), tmp_path)
+    seen = re.search(r'data-seen="([^"]*)"', html)
     assert seen, said[-2000:]
     read = np.array([[int(level) for level in color.split(",")] for color in seen[1].split()])
     assert np.abs(read - colors).max() <= 8

@@ -6,6 +6,10 @@ import os
 import shutil
 import signal
 import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -32,6 +36,36 @@ def open_page(address: str, folder: Path, *flags: str) -> tuple[str, str]:
             os.killpg(process.pid, signal.SIGKILL)  # its helpers too: they would keep the pipes open
             said = process.communicate()[1]
     pytest.fail(f"{_TRIES} browsers hung for {_SECONDS} s on {address}: {said[-1000:]}")
+
+
+@contextmanager
+def held_page() -> Iterator[tuple[str, str]]:
+    """HTML that keeps a page from being loaded, and so the browser waiting in real time, and JavaScript that lets it go on.
+
+    A browser with a made-up time (`--virtual-time-budget`) is over it before its other threads have decoded a video.
+    """
+    done = threading.Event()
+
+    class Answer(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.path == "/done":
+                done.set()
+            else:
+                done.wait(_SECONDS / 2)
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_words: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Answer) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}"
+        try:
+            yield f'<img src="{address}/hold">', f'new Image().src = "{address}/done";'
+        finally:
+            done.set()
+            server.shutdown()
 
 
 # JavaScript for a page's end: `pressed(where, key)` focuses an element and presses a key there, and returns whether the page
