@@ -13,6 +13,7 @@ _SEQUENCES, _FRAMES = 16, 3  # looked at, spread evenly: the line takes millisec
 _POINTS = 1 << 18
 _LONG_UNIT = 12  # letters of a unit that is told once only, behind the lengths
 _SHIFTS_SHOWN = 20
+_EVEN = 1.5  # ratio of two intervals between frames of which the longer one isn't a gap
 
 
 def closing_lines(reader: CloudsReader, notes: Mapping[str, int]) -> list[str]:
@@ -67,7 +68,12 @@ def _frames(reader: CloudsReader) -> str:
     ends = np.cumsum(counts)[:-1] - 1
     steps = np.delete(steps, ends[ends < len(steps)])
     steps = steps[steps > 0]
-    return f"{shown} at {_number(float(1 / median(steps)))} fps" if len(steps) else shown
+    if not len(steps):
+        return shown
+    middle, least, most = float(median(steps)), float(steps.min()), float(steps.max())
+    even = most < _EVEN * middle and middle < _EVEN * least
+    apart = "" if even else f", {_number(least)} to {_number(most)} s apart"
+    return f"{shown} at {_number(1 / middle)} fps{apart}"
 
 
 def _shifts(reader: CloudsReader) -> list[str]:

@@ -137,6 +137,11 @@ def test_the_closing_line_is_what_a_person_can_check(tmp_path):
         "median distance 2.08 m, extent 2 x 1 x 0.5 m, 3 frames at 30 fps, 6 points at (0,0,0) dropped,"
         " 3 points with NaN or infinity dropped"
     ]
+    (tmp_path / "in" / "2.npy").rename(tmp_path / "in" / "7.npy")
+    assert (
+        "3 frames at 2.86 fps, 0.1 to 0.6 s apart,"
+        in convert_folder(tmp_path / "in", tmp_path / "d.h5", fps=10).closing[0]
+    )
     frames_of(tmp_path / "many" / "a", box)
     frames_of(tmp_path / "many" / "b", box, box)
     one = convert(CloudFolders(tmp_path / "many"), tmp_path / "b.h5", Conversion(jobs=1)).closing
