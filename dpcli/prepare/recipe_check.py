@@ -246,12 +246,17 @@ def check_folder(name: str, raw: Path | None, make_reader: Callable[[], Any], *,
 
 
 def _index_lines(reader: Any, errors: list[str]) -> Iterator[str]:
-    """Yields what the index finds without opening data: list lines without a file, strange names, labels out of range."""
-    items = reader.items()
+    """Yields what the index finds without opening data: list lines without a file, strange names, labels out of range,
+    links to nowhere.
+    """
+    from dpcli.prepare.pipeline import all_items
+
+    items, unread = all_items(reader)
     bad = [item for item in items if item.problem]
     for line in reader.summary(items):
         log.info(line)
-    yield f"{'MISSING ' if bad else 'ok      '} index: {len(items) - len(bad)} samples to convert, {len(bad)} that cannot be"
+    good, bad = len(items) - len(bad), bad + unread
+    yield f"{'MISSING ' if bad else 'ok      '} index: {good} samples to convert, {len(bad)} that cannot be"
     for item in bad[:_SHOWN]:
         yield f"           {item.name}: {item.problem}"
     if len(bad) > _SHOWN:
