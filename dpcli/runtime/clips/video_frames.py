@@ -216,7 +216,7 @@ def _declared_and_held(
 ) -> tuple[int, int]:
     """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it; cut: it ends early."""
     if stream.frames > count + (not cut):
-        return stream.frames, _packets(path) + empty_frames(path, stream.index)
+        return stream.frames, count + _hidden_packets(path) + empty_frames(path, stream.index)
     if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
         begins = float((stream.start_time or 0) * stream.time_base)  # some containers count their duration from 0
         seconds = float(container.duration or 0) / 1e6 - max(begins, 0.0)
@@ -228,15 +228,20 @@ def _declared_and_held(
     return stream.frames, count
 
 
-def _packets(path: Path) -> int:
-    """Returns how many whole packets of the video lie in the file, also those before and after what plays."""
+def _hidden_packets(path: Path) -> int:
+    """Returns how many whole packets of the video lie before and after what plays, as an edit list says."""
+    return _packets(path, {"ignore_editlist": "1"}) - _packets(path, {})
+
+
+def _packets(path: Path, options: dict[str, str]) -> int:
+    """Returns how many whole packets of the video are shown, by FFmpeg's demuxer with these options."""
     import av
 
-    options = {"format_whitelist": VIDEO_FORMATS, "ignore_editlist": "1"}
+    options = {"format_whitelist": VIDEO_FORMATS, **options}
     with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
-        stream = _streams(container)[0]
+        packets = container.demux(_streams(container)[0])
         try:
-            return sum(1 for packet in container.demux(stream) if packet.size and not packet.is_corrupt)
+            return sum(1 for one in packets if one.size and not one.is_corrupt and not one.is_discard)
         except av.FFmpegError:
             return 0
 
