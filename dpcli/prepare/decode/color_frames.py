@@ -20,6 +20,7 @@ from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
+_CAMERAS = ("cameras.json", "cameras.txt", "cameras.bin", "poses_bounds.npy", "sparse")  # of others
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
@@ -134,6 +135,11 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     if not quiet and (clips := clips_in(folder)):
         log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
+    if not quiet and (cameras := [name for name in _CAMERAS if (folder / name).exists()]):
+        log.warn(
+            f"{folder}: {first_names(cameras)}: not read; the camera of a clip is taken to stand still, and where it moves the "
+            "object seems to. Cameras are read from transforms.json, with a time for each frame"
+        )
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:
