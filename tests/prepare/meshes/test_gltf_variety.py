@@ -502,6 +502,12 @@ def test_clips_by_name_by_number_and_by_what_is_listed(tmp_path, wanted, name):
         load_animation(path, "9", 2)
 
 
+@pytest.mark.parametrize("wanted", ["Layer0", "mixamo.com|layer0", "Armature|mixamo.com|Layer0"])
+def test_any_end_of_a_clip_s_name_behind_a_bar_names_it(tmp_path, wanted):
+    path = named("Armature|mixamo.com|Layer0", "Armature|Run", "NoLayer0").write(tmp_path / "m.glb")
+    assert load_animation(path, wanted, 2).name == "m Armature|mixamo.com|Layer0"
+
+
 def test_all_clips_at_once(tmp_path, dpc):
     path = named("Rig|Walk", "Rig|run/fast", "walk", "").write(tmp_path / "m.glb")
     options = ("--frames", 2, "--size", 16, "--tracks", 8, "--jobs", 1, "--azimuths", "60")
