@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,6 +22,9 @@ from dpcli.prepare.decode.color_frames import open_frames
 from dpcli.runtime.clips.animations import animation_frames
 
 RATES = [Fraction(24000, 1001), Fraction(25), Fraction(30), Fraction(25, 2), Fraction(60), Fraction(30000, 1001)]
+
+
+SQUARE = Fraction(1)
 
 
 @dataclass(frozen=True)
@@ -95,12 +98,18 @@ def pictures(count: int, width: int, height: int, alpha: bool, gray: bool = Fals
     return made
 
 
-def write(path: Path, kind: Kind, rgba: np.ndarray, rate: Fraction, ticks: list[int]) -> None:
-    """Writes frames at `ticks` of a clock that ticks `rate` times a second."""
+def write(
+    path: Path, kind: Kind, rgba: np.ndarray, rate: Fraction, ticks: list[int], turn: int = 0, aspect: Fraction = SQUARE
+) -> None:
+    """Writes frames at `ticks` of a clock that ticks `rate` times a second. turn: in degrees to the left, as it plays."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.options))
         stream.height, stream.width, stream.pix_fmt = *rgba.shape[1:3], kind.pixels
         stream.codec_context.time_base = 1 / rate
+        if aspect != SQUARE:
+            stream.codec_context.sample_aspect_ratio = aspect
+        if turn:
+            stream.set_display_rotation(turn)
         for picture, tick in zip(rgba, ticks):
             frame = av.VideoFrame.from_ndarray(picture, "rgba").reformat(format=kind.pixels, threads=1)
             frame.pts, frame.time_base = tick, 1 / rate
@@ -150,6 +159,28 @@ def test_what_is_stored_exactly_is_read_exactly(clip):
 @given(clips(CLOSE))
 def test_what_is_stored_nearly_is_read_nearly(clip):
     check(clip)
+
+
+TURNING = {"mp4", "mov", "mkv", "webm"}  # containers that tell how a picture is turned and its pixels' shape
+SHOWN = [
+    replace(kind, containers=" ".join(sorted(known)))
+    for kind in (*EXACT, *CLOSE)
+    if (known := {*kind.containers.split()} & TURNING) and not kind.has_alpha
+]
+
+
+@settings(max_examples=40, deadline=None)
+@given(clips(SHOWN), st.sampled_from([0, 90, 180, 270]), st.sampled_from([SQUARE, Fraction(4, 3), Fraction(10, 11)]))
+def test_what_is_turned_and_stretched_is_read_as_it_plays(clip, turn, aspect):
+    kind, container, rate, (width, height), ticks = clip
+    aspect = aspect if container in ("mp4", "mov") else SQUARE  # PyAV tells Matroska's writer none
+    rgba = pictures(len(ticks), width, height, False, kind.pixels.startswith("gray"))
+    with TemporaryDirectory() as folder:
+        write(path := Path(folder, f"clip.{container}"), kind, rgba, rate, ticks, turn, aspect)
+        frames = open_frames(path)
+        read = np.stack(list(frames.read(range(len(frames)))))
+    wide = pictures(len(ticks), round(width * aspect), height, False, kind.pixels.startswith("gray"))
+    assert_like(read, np.rot90(wide, turn // 90, axes=(1, 2)), max(kind.error, 4))
 
 
 CV2_CODES = {"FFV1": ("avi mkv", 0.0), "MJPG": ("avi mov mkv", 5), "mp4v": ("mp4 mov", 6), "XVID": ("avi", 6)}
