@@ -75,7 +75,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, bool]:
         with open_image(path) as image:
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
-            has_alpha = "A" in image.getbands() or "transparency" in image.info
+            has_alpha = not {"A", "a"}.isdisjoint(image.getbands()) or "transparency" in image.info
             return np.asarray(as_shown(image).convert("RGBA")), has_alpha
     except DataError:
         raise
