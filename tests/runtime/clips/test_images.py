@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from dpcli.errors import DataError
+from dpcli.evaluate.video.sources.media import FolderSource
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
@@ -89,6 +90,26 @@ def test_gray_of_any_type_has_its_own_range(tmp_path, capsys, gray):
     read = read_rgba(tmp_path / "a.tif")
     assert read[0, 0].tolist() == [0, 0, 0, 255] and read[4, 4].tolist() == [102, 102, 102, 255]
     assert ("is taken for 0 to 255" in capsys.readouterr().err) == (gray.dtype == np.uint16 and gray < 256)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["t_0.1", "t_0.25", "t_0.3", "t_1.05", "t_1.2"],
+        ["v2.1", "v2.9", "v2.10", "v2.20"],  # counted, as its trailing 0 tells
+        ["at 31-12-2023 23.59.59", "at 13-01-2024 00.00.01", "at 13-02-2024 00.00.01"],
+        ["f (1)", "f (2)", "f (10)"],
+    ],
+)
+def test_a_clip_and_its_evaluation_take_images_in_the_order_that_their_names_tell(tmp_path, names):
+    for level, name in enumerate(names):
+        Image.new("RGB", (8, 8), (level, 0, 0)).save(tmp_path / f"{name}.png")
+    frames = open_frames(tmp_path)
+    assert list(frames.names) == [f"{name}.png" for name in names]
+    assert sorted(set(frames.numbers)) == list(frames.numbers)
+    assert [int(one.rgba[0, 0, 0]) for one in FolderSource(tmp_path).pictures(0, range(len(names)))] == [
+        *range(len(names))
+    ]
 
 
 def tiff_of(pixels: np.ndarray, photometric: int, extra: int | None = None) -> bytes:
