@@ -33,6 +33,7 @@ from dpcli.store.views import ViewsHeader
 _LISTED = 8
 _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen the crop
 _OBJECT = 0.2  # of the largest piece: one that large, apart from it, is another object
+_ANNOTATIONS = (".json", ".txt", ".xml", ".npy", ".npz")  # of LabelMe, YOLO, CVAT, SAM
 _NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
 
 
@@ -307,7 +308,15 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
 
 def open_masks(place: Path) -> Frames:
     """Opens the masks of a folder or a video. Raises DataError when there are none."""
-    return open_frames(place if place.is_file() else require_folder(place, "a mask per frame, as images, or a video"))
+    if place.is_file():
+        return open_frames(place)
+    folder = require_folder(place, "a mask per frame, as images, or a video")
+    if not image_paths(folder) and (other := [p.name for p in sorted(folder.iterdir()) if p.suffix in _ANNOTATIONS]):
+        raise DataError(
+            f"{place}: {first_names(other, 3)}: annotations and arrays are not read as masks; draw each frame's as a PNG, "
+            '255 where the object is (labelme_export_json, CVAT\'s "Segmentation mask" and the like do it)'
+        )
+    return open_frames(folder)
 
 
 def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...] | Frames:

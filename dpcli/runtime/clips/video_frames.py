@@ -5,10 +5,12 @@ PyAV decodes: it brings decoders of AV1 and of the alpha of VP8 and VP9, which O
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.cropping import Margins, margins
 from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix
+from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
@@ -41,6 +44,8 @@ _UNKNOWN_MATRICES = {8: "YCgCo", 11: "YDzDx", 14: "ICtCp", 15: "IPT-C2", 16: "YC
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
 _FULL_RANGE = 2
+_ALPHA_LAYER = re.compile(rb"\x4e[\x01\x09]\xa5")  # supplemental information of HEVC, of type 165: of an alpha channel
+_HEAD = 1024  # bytes of a packet that hold such information, before its picture
 _ASKEW = 0.02  # of a display matrix: a degree
 
 
@@ -103,6 +108,7 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
         _require_known_colors(path, first)
+        _require_one_layer(path, stream)
         _tell_streams(path, container, stream)
         _tell_display(path, first, stream)
         left, right, top, bottom = _margins(path, container, stream)
@@ -128,7 +134,7 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
     try:
         container = av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError):
-        raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown kind)") from None
+        raise DataError(f"{path}: not a readable video ({no_video(path)})") from None
     streams = _streams(container)
     if not streams:
         container.close()
@@ -161,9 +167,11 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     context.thread_type = "AUTO"
     context.flags |= av.codec.context.Flags.unaligned  # else columns that H.264 and HEVC cut off on the left are shown
     begun = False
-    for packet in container.demux(stream):
+    # A packet without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
+    packets = (packet for packet in container.demux(stream) if packet.size)
+    for packet in chain(packets, [None]):
         try:
-            frames = context.decode(packet if packet.size else None)
+            frames = context.decode(packet)
         except av.FFmpegError as error:
             if begun:
                 raise DataError(f"{path}: a frame cannot be decoded ({error.strerror}); copy the video again") from None
@@ -277,6 +285,21 @@ def _require_known_colors(path: Path, frame) -> None:
             f"{path}: its colors are {_UNKNOWN_MATRICES[tag]}; expected RGB, or YCbCr of BT.601, 709 or 2020; "
             "ffmpeg -i IN -vf zscale=matrix=709 OUT converts some"
         )
+
+
+def _require_one_layer(path: Path, stream) -> None:
+    """Raises DataError for HEVC with an alpha layer, as QuickTime writes it: FFmpeg shows what lies below as opaque."""
+    import av
+
+    if stream.codec_context.name != "hevc":
+        return
+    with av.open("file:" + utf8_path(path, "FFmpeg"), options={"format_whitelist": VIDEO_FORMATS}) as container:
+        packet = next((packet for packet in container.demux(stream.index) if packet.size), b"")
+        if _ALPHA_LAYER.search((stream.codec_context.extradata or b"") + bytes(packet)[:_HEAD]):
+            raise DataError(
+                f"{path}: its alpha lies in a layer of HEVC that is not decoded; FFmpeg 9 converts it: "
+                "ffmpeg -view_ids -1 -i IN -c:v prores_ks -pix_fmt yuva444p10le OUT.mov"
+            )
 
 
 def _tell_streams(path: Path, container, stream) -> None:

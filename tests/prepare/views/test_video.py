@@ -664,6 +664,10 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
         (lambda d: d["frames"][0].update(time="soon"), "time 'soon'; expected a number"),
         (lambda d: d["frames"][0].update(time=1e300), "time 1e.300; expected shares"),
         (lambda d: d.update(fl_x=float("nan")), "fl_x nan; expected a number"),
+        (
+            lambda d: d.update(fl_x=1.04),
+            "a focal length of 1.04 pixels for pictures of 64x48; expected pixels, not shares",
+        ),
         (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
         (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),
         (lambda d: d["frames"][1].update(time=0), "r_0_1.png and r_0_0.png are of one camera at one time, 0"),
@@ -762,6 +766,19 @@ def test_images_and_animations_are_known_by_their_content(tmp_path):
     (tmp_path / "half").write_bytes((tmp_path / "moving-gif").read_bytes()[:200])
     with pytest.raises(DataError, match="not a readable animation"):
         open_frames(tmp_path / "half")
+
+
+def test_annotations_given_as_masks_and_cameras_beside_frames_are_told(tmp_path, capfd):
+    """Neither LabelMe's polygons nor COLMAP's cameras are read; the clip is, with a word."""
+    folder = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    (folder / "sparse").mkdir()
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels" / "0.json").write_text('{"shapes": []}')
+    words = ("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32")
+    assert exit_code(*words, "--mask", tmp_path / "labels") == 3
+    assert "labels: 0.json: annotations and arrays are not read as masks; draw" in capfd.readouterr().err
+    assert exit_code(*words) == 0
+    assert "clip: sparse: not read; the camera of a clip is taken to stand still" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(("other", "pattern"), [("fox_{}.png", "anya_*.png"), ("preview.png", "")])
