@@ -41,6 +41,7 @@ _SPARSE = {
     "widths": ((64, 64), (96,)),
     "dropout": 0.4,
     "members": 4,
+    "copies": True,
 }
 
 
