@@ -12,6 +12,7 @@ from typing import Any
 from dpcli.errors import DataError, DpcError
 
 _DEEPEST = 100  # lists and mappings in each other
+_TOO_DEEP = f"nested more than {_DEEPEST} deep, as no file of this kind is"
 _MOST_PLACES = 1000  # of one list
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
@@ -46,7 +47,9 @@ def parse_json(text: str | bytes, where: object) -> Any:
         raise DataError(f"{where}: is not JSON (half of a letter, a lone surrogate, in a string)") from None
     except UnicodeDecodeError:
         raise DataError(f"{where}: is not JSON (its text is not UTF-8); save it as UTF-8") from None
-    except (ValueError, RecursionError) as error:
+    except RecursionError:
+        raise DataError(f"{where}: {_TOO_DEEP}") from None
+    except ValueError as error:
         raise DataError(f"{where}: is not JSON ({error})") from None
     check_depth(value, where)
     return value
@@ -72,7 +75,7 @@ def check_depth(value: Any, where: object) -> None:
                 f"{where}: names one of its lists in more than {_MOST_PLACES} places; no file of this kind does"
             )
         level = [(child, places[key]) for key, child in inside.items()]
-    raise DataError(f"{where}: nested more than {_DEEPEST} deep; no file of this kind is")
+    raise DataError(f"{where}: {_TOO_DEEP}")
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -86,7 +89,9 @@ def read_toml(path: Path) -> dict[str, Any]:
             raise DpcError("reading TOML on Python 3.10 needs a package: pip install tomli") from None
     try:
         return tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except RecursionError:
+        raise DataError(f"{path}: {_TOO_DEEP}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: not TOML ({error})") from None
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None

@@ -12,7 +12,7 @@ from dpcli.text_files import check_depth, parse_json, read_json, read_text
 def test_what_is_no_json_is_said_with_the_name(data, tmp_path):
     path = tmp_path / "meta.json"
     path.write_bytes(data)
-    with pytest.raises(DataError, match="meta.json: is not (JSON|text)"):
+    with pytest.raises(DataError, match="meta.json: (is not (JSON|text)|nested)"):
         read_json(path)
 
 

@@ -270,7 +270,8 @@ def read_positions(file: h5py.File) -> tuple[list[int], list[int]] | None:
     """Returns the places that `write_positions` wrote; None when the file is no shard."""
     if "position" not in file or "skipped_position" not in file:
         return None
-    return file["position"][:].tolist(), file["skipped_position"][:].tolist()
+    with reading(file.filename):
+        return file["position"][:].tolist(), file["skipped_position"][:].tolist()
 
 
 def read_strings(file: h5py.File, name: str, *, optional: bool = False) -> list[str]:

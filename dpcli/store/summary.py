@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from dpcli.errors import reading
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.embedding import EmbeddingReader
 from dpcli.store.file import file_kind, open_store, read_provenance, root_attributes
@@ -45,7 +46,8 @@ def summary(path: str | Path) -> dict[str, Any]:
         "embedding": _embedding,
         "statistics": _statistics,
     }[kind]
-    return {**common, **own(path)}
+    with reading(path):
+        return {**common, **own(path)}
 
 
 def _datasets(file: h5py.File) -> list[dict[str, Any]]:

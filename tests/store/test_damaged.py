@@ -4,6 +4,7 @@ import random
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from itertools import product
 
 import h5py
@@ -147,6 +148,17 @@ READ = {
 }
 
 
+def _damage_chunk(path, name, values):
+    """Lets a data set be compressed, and one byte in the middle of its first chunk be another."""
+    with h5py.File(path, "a") as file:
+        del file[name]
+        made = file.create_dataset(name, data=values, chunks=values.shape, compression="gzip")
+        chunk = made.id.get_chunk_info(0)
+    bytes_ = bytearray(path.read_bytes())
+    bytes_[chunk.byte_offset + chunk.size // 2] ^= 0x55
+    path.write_bytes(bytes_)
+
+
 def _damages(values, is_text):
     """Another type and shape, which are refused always, and odd values, which are refused or read."""
     if is_text:
@@ -183,6 +195,12 @@ def test_no_field_of_any_kind_can_be_a_bug(kind, tmp_path):
                 assert str(path) in str(error), (name, error)
                 refused = True
             assert refused or not must, (name, made)
+        if values.size and values.dtype.kind != "O":
+            path.write_bytes(whole)
+            _damage_chunk(path, name, values)
+            for read in (READ[kind], summary):
+                with suppress(DataError):
+                    read(path)
 
 
 @pytest.mark.parametrize("kind", KINDS)

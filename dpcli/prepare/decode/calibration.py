@@ -159,7 +159,9 @@ def _yaml(path: Path, text: str) -> Any:
     plain = re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
     try:
         data = next((part for part in yaml.safe_load_all(plain) if part), None)
-    except (yaml.YAMLError, RecursionError) as error:
+    except RecursionError:
+        raise DataError(f"{path}: nested deeper than any calibration") from None
+    except yaml.YAMLError as error:
         raise DataError(f"{path}: is not YAML ({' '.join(str(error).split())})") from None
     check_depth(data, path)
     return {_OF_SLAM.sub("", str(key)): value for key, value in data.items()} if isinstance(data, dict) else data

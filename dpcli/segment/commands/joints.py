@@ -10,7 +10,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.whole_file import make_folder
+from dpcli.runtime.whole_file import make_folder, whole_file
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
@@ -103,15 +103,24 @@ def _write_json(trees: Trees, output: Path, reader: PartsReader, path: Path, for
 def _write_folder(trees: Trees, output: Path, reader: PartsReader, path: Path, force: bool) -> None:
     if output.suffix:
         raise UsageError(f"-o {output}: expected a name that ends in {', '.join(SUFFIXES)}, or a folder")
-    make_folder(output)
+    if output.exists():  # replaced by --force, which keeps what else is there
+        _fill_folder(output, trees, reader)
+        return
+    make_folder(output.parent)
+    with whole_file(output) as folder:  # a stop leaves no half of it, and the same command may run again
+        make_folder(folder)
+        _fill_folder(folder, trees, reader)
+
+
+def _fill_folder(folder: Path, trees: Trees, reader: PartsReader) -> None:
     objects, taken = [], set()
     for index, sequence, tree in trees:
         name = _file_name(sequence.name)
         name = f"{name}_{index}" if name in taken else name
         taken.add(name)
-        write_urdf(output / f"{name}.urdf", tree, sequence.name)
+        write_urdf(folder / f"{name}.urdf", tree, sequence.name)
         objects.append(tree_json(tree, sequence.name, reader.length_unit))
-    write_trees(output / "joints.json", objects)
+    write_trees(folder / "joints.json", objects)
 
 
 def _file_name(name: str) -> str:

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from dpcli.segment.commands.joints import find_joints
 from dpcli.store import CloudsReader, PartsReader, PartsWriter
 from dpcli.store.joints import VALUE
 
@@ -92,6 +93,23 @@ def test_a_folder_holds_one_object_for_each_sequence(parts, tmp_path, dpc_here):
     assert done.returncode == 0, done.stderr
     with PartsReader(parts) as reader:
         assert {path.stem for path in (tmp_path / "robots").glob("*.urdf")} == set(reader.names)
+
+
+def test_a_folder_that_could_not_be_filled_is_not_left(parts, tmp_path, monkeypatch):
+    """Else the same command, which a full disk's sentence asks for, would be refused for what it had left."""
+
+    def make():
+        find_joints(str(parts), tmp_path / "new" / "robots", sequence=None, picture=None, force=False)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "dpcli.segment.commands.joints.write_trees", lambda path, _: (path.parent / "no" / "x").write_bytes(b"")
+        )
+        with pytest.raises(OSError):
+            make()
+    assert list((tmp_path / "new").iterdir()) == []
+    make()
+    assert (tmp_path / "new" / "robots" / "joints.json").is_file()
 
 
 @pytest.mark.parametrize(
