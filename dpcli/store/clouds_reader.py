@@ -12,7 +12,7 @@ import numpy as np
 from dpcli.errors import DataError, reading
 from dpcli.store.file import open_store, read_positions, read_provenance, read_skipped, read_strings, root_attributes
 from dpcli.store.schema import KEPT
-from dpcli.store.sequence import OF_PARTS, POINT_FIELDS, CloudSequence
+from dpcli.store.sequence import NO_LENGTHS, OF_PARTS, POINT_FIELDS, CloudSequence, are_lengths
 
 OPTIONAL = ("time", *POINT_FIELDS, *OF_PARTS)
 _OF_FRAMES = ("time", *OF_PARTS)
@@ -187,10 +187,8 @@ class CloudsReader:
                 values[key] = self._set(key)[first + low : first + high][wanted - low]
             else:
                 values[key] = _pick(self._set(key)[span], offsets - offsets[0], picks)
-        if not np.isfinite(values["points"]).all():
-            raise DataError(
-                f"{self.path}: {self.names[index]!r} holds NaN or infinite coordinates; make the file again"
-            )
+        if not are_lengths(values["points"]):
+            raise DataError(f"{self.path}: {self.names[index]!r} has coordinates of {NO_LENGTHS}; make the file again")
         shift = self.shifts[index]
         made = CloudSequence(
             self.names[index],

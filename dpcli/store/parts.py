@@ -14,7 +14,7 @@ from dpcli.errors import DataError, UsageError, reading
 from dpcli.store.clouds_reader import CloudsReader
 from dpcli.store.clouds_writer import PACKED, CloudsWriter
 from dpcli.store.schema import fields_of
-from dpcli.store.sequence import CloudSequence
+from dpcli.store.sequence import LONGEST, NO_LENGTHS, CloudSequence, are_lengths
 
 _TOLERANCE = 1e-3  # of float32 probabilities and rotations
 _FIELD = fields_of("parts")
@@ -68,6 +68,8 @@ class PartsSample:
                     f"{where}: flow {source} -> {target} has shape {flow.shape}, expected one row for each "
                     f"of the {sizes[source]} points of frame {source}"
                 )
+        if all(map(are_lengths, self.flow)):
+            return
         bad = [np.flatnonzero(~np.isfinite(flow).all(axis=1)) for flow in self.flow]
         count, total = sum(map(len, bad)), sum(map(len, self.flow))
         if count:
@@ -77,6 +79,7 @@ class PartsSample:
                 f"{where}: {count} of {total} points with NaN or infinite flow, the first is point "
                 f"{bad[row][0]} of flow {source} -> {target}"
             )
+        raise DataError(f"{where}: flow holds {NO_LENGTHS}; predict again")
 
 
 def _check_probability(probability: np.ndarray, where: str) -> None:
@@ -94,7 +97,7 @@ def _check_probability(probability: np.ndarray, where: str) -> None:
 def _check_motion(motion: np.ndarray, where: str) -> None:
     """Raises DataError unless motions are rigid: the last row 0 0 0 1, the first three columns a rotation."""
     rotation = motion[..., :3, :3].astype(np.float64)
-    rigid = np.isfinite(motion).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
+    rigid = (np.abs(motion) < LONGEST).all((-1, -2)) & (motion[..., 3, :] == [0, 0, 0, 1]).all(-1)
     with np.errstate(invalid="ignore", over="ignore"):
         rigid &= (np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)) < _TOLERANCE).all((-1, -2))
         rigid[rigid] = np.linalg.det(rotation[rigid]) > 0

@@ -20,6 +20,18 @@ OF_PARTS = {
     one.name: one.shape[2:] for one in TABLES["clouds"] if one.shape[:2] == ("F", "parts")
 }  # name -> shape of what is said of one part in one frame
 
+LONGEST = 1e12  # the cube of which float32 still holds; a street in nanometers is shorter
+NO_LENGTHS = f"NaN, infinity or a number beyond {LONGEST:.0e}"
+
+
+def are_lengths(values: np.ndarray) -> bool:
+    """Returns whether all numbers of an array are finite, and so small that what is computed from them is so, too.
+
+    >>> are_lengths(np.array([1.0, -2e9])), are_lengths(np.array([1.0, np.nan])), are_lengths(np.array([3e37]))
+    (True, False, False)
+    """
+    return not values.size or bool(-LONGEST < values.min() and values.max() < LONGEST)
+
 
 @dataclass
 class CloudSequence:
@@ -112,8 +124,10 @@ class CloudSequence:
             raise DataError(
                 f"{where}: frame_offsets must rise from 0 to {len(self.points)}, found {offsets[:4]}...{offsets[-1]}"
             )
-        if not np.isfinite(self.points).all():
+        if not are_lengths(self.points):
             bad = int((~np.isfinite(self.points)).any(1).sum())
+            if not bad:
+                raise DataError(f"{where}: holds {NO_LENGTHS}; drop such points before writing")
             raise DataError(
                 f"{where}: {bad} of {len(self.points)} points are NaN or infinite; drop them before writing"
             )
@@ -164,12 +178,14 @@ class CloudSequence:
     def validate_values(self) -> None:
         """Raises DataError where a field beside the points, of the right type and shape, holds what nobody can work with."""
         where = f"sample {self.name!r}"
-        if self.scene_flow is not None and not np.isfinite(self.scene_flow).all():
-            raise DataError(f"{where}: scene_flow holds NaN or infinity; drop the points whose motion is unknown")
-        for name in ("time", *OF_PARTS):
+        if self.scene_flow is not None and not are_lengths(self.scene_flow):
+            raise DataError(f"{where}: scene_flow holds {NO_LENGTHS}; drop the points whose motion is unknown")
+        if self.time is not None and not np.isfinite(self.time).all():
+            raise DataError(f"{where}: time holds NaN or infinity; make the file again")
+        for name in OF_PARTS:
             values = getattr(self, name)
-            if values is not None and not np.isfinite(values).all():
-                raise DataError(f"{where}: {name} holds NaN or infinity; make the file again")
+            if values is not None and not are_lengths(values):
+                raise DataError(f"{where}: {name} holds {NO_LENGTHS}; make the file again")
         if self.part is not None and self.part.min(initial=-1) < -1:
             raise DataError(f"{where}: part holds {self.part.min()}, expected -1 (unknown) or 0, 1, ...")
         if self.joint is not None:

@@ -143,6 +143,7 @@ def _bad(sequence: CloudSequence, **changes) -> CloudSequence:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda s: _bad(s, points=np.full_like(s.points, 3e37)), r"a number beyond 1e\+12"),
         (lambda s: _bad(s, points=np.full_like(s.points, np.nan)), "NaN or infinite"),
         (lambda s: _bad(s, label=3), "out of range; expected -1 .unknown. or 0..2"),
         (lambda s: _bad(s, frame_offsets=s.frame_offsets[::-1]), "frame_offsets must rise"),
@@ -292,12 +293,14 @@ def test_truncated_files_are_refused(tmp_path, three, keep):
 def test_nan_in_a_file_is_found_when_read(tmp_path, three):
     path = write(tmp_path / "a.h5", three)
 
-    def poison(file):
-        file["points"][3] = np.nan
+    for value in (np.nan, np.inf, -5.9e37):  # of the last, squares are infinite
 
-    _edit(path, poison)
-    with pytest.raises(DataError, match="NaN or infinite"):
-        CloudsReader(path).read(0)
+        def poison(file, value=value):
+            file["points"][3, 1] = value
+
+        _edit(path, poison)
+        with pytest.raises(DataError, match="coordinates of NaN, infinity or a number beyond"):
+            CloudsReader(path).read(0)
     CloudsReader(path).read(1)
 
 

@@ -57,6 +57,7 @@ _AMBIGUOUS = 20.0  # raw units per meter; a file that declares fewer may have me
 _ASPECT = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 _COLMAP = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}  # how many parameters
 _MOST_NUMBERS = 64  # in an array
+_MOST_PIXELS = 1_000_000  # of a side of a picture
 _EXPECTED = (
     'expected {"fx": .., "fy": .., "cx": .., "cy": ..} in pixels, a 3x3 or 4x4 matrix, or what RealSense, Open3D, ROS or'
     " COLMAP write"
@@ -216,7 +217,7 @@ def _of_matrix(path: Path, values: Any) -> list[float]:
     try:
         flat = np.asarray(values, np.float64).reshape(-1)
         matrix = flat.reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[flat.size])[:3, :3]
-    except (KeyError, ValueError, TypeError):
+    except (KeyError, ValueError, TypeError, OverflowError):
         raise DataError(f"{path}: its matrix is not of 3x3 or 4x4 numbers; {_EXPECTED}") from None
     if not matrix[:2, 2].any() and matrix[2, :2].any():  # the principal point in the last row: column by column
         matrix = matrix.T
@@ -259,7 +260,7 @@ def _of_colmap(path: Path, cameras: list[list[str]]) -> Calibration:
         values = [values[0], *values]
     fx, fy, cx, cy, *lens = values
     corner = [fx, fy, cx - 0.5, cy - 0.5]  # COLMAP counts from the corner of the first pixel, not from its center
-    return Calibration(_intrinsics(path, corner, tuple(lens)), int(width), int(height), source=str(path))
+    return Calibration(_intrinsics(path, corner, tuple(lens)), *_pixel_counts(path, width, height), source=str(path))
 
 
 def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
@@ -274,7 +275,7 @@ def _of_mapping(path: Path, data: dict[str, Any]) -> Calibration:
         raise DataError(f"{path}: declares a skew of {own['skew']:g}; expected pixels that are rectangles")
     numbers = _pixels(path, own)
     lens = _lens(path, own)
-    size = _resolution(own)
+    size = _resolution(path, own)
     scale = _depth_scale(path, own, data)
     return Calibration(_intrinsics(path, numbers, lens), *size, scale, str(path))
 
@@ -327,13 +328,26 @@ def _pixels(path: Path, own: dict[str, Any]) -> list[float]:
 
 
 def _are_numbers(values: list[Any]) -> bool:
-    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
+    """Returns whether all values are numbers that a camera may have: neither NaN, infinite nor astronomical."""
+    return all(
+        isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e15 for value in values
+    )
 
 
-def _resolution(own: dict[str, Any]) -> tuple[int, int]:
+def _resolution(path: Path, own: dict[str, Any]) -> tuple[int, int]:
     size = own.get("resolution")
     pair = size if isinstance(size, list) and len(size) == 2 else [_first(own, _WIDTH), _first(own, _HEIGHT)]
-    return (int(pair[0]), int(pair[1])) if _are_numbers(pair) and min(pair) > 0 else (0, 0)
+    if not all(isinstance(value, (int, float)) for value in pair) or any(value <= 0 for value in pair):
+        return 0, 0
+    return _pixel_counts(path, *pair)
+
+
+def _pixel_counts(path: Path, width: float, height: float) -> tuple[int, int]:
+    if not 0 < width <= _MOST_PIXELS or not 0 < height <= _MOST_PIXELS:
+        raise DataError(
+            f"{path}: pictures of {str(width):.20} x {str(height):.20} pixels; expected 1 to {_MOST_PIXELS:,} a side"
+        )
+    return int(width), int(height)
 
 
 def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
@@ -347,7 +361,9 @@ def _lens(path: Path, own: dict[str, Any]) -> tuple[float, ...]:
         bent = own.get("tangential_distortion", own.get("tangentialdistortion")) or [0.0, 0.0]
         values = [*radial[:2], *bent, *radial[2:]] if isinstance(radial, list) and isinstance(bent, list) else None
     flat = np.asarray(values if isinstance(values, list) else [], object).reshape(-1).tolist()
-    return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat) if _are_numbers(flat) else ()
+    if not _are_numbers(flat):
+        raise DataError(f"{path}: its lens has the coefficients {str(flat):.80}; expected numbers")
+    return lens_coefficients(path, str(_first(own, _MODEL) or ""), flat)
 
 
 def _named_terms(path: Path, terms: dict[str, Any]) -> list[Any]:
@@ -385,6 +401,6 @@ def _depth_scale(path: Path, own: dict[str, Any], whole: dict[str, Any]) -> floa
         return None
     if isinstance(value, str) and (unit := unit_of(f"in {value}")):
         return 1 / UNITS[unit]
-    if not _are_numbers([value]) or not value > 0 or not np.isfinite(value):
+    if not _are_numbers([value]) or not value > 0:
         raise DataError(f"{path}: its depth scale is {value!r}; expected raw units per meter, or meters per raw unit")
     return float(value) if value >= 1 else float(f"{1 / value:.12g}")

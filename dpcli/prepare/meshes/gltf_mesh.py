@@ -19,6 +19,7 @@ from dpcli.runtime.progress import log
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _BRIGHTEST = 8.0  # of vertex colors: a little above 1 is light, far above it is another range
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
+_FLAT = 1e-5  # between a triangle's normal and those of its corners
 _MOST_VERTICES = 20_000_000  # of all instances of a node
 
 
@@ -211,7 +212,7 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
     color = _colors(file, read("COLOR_0", None, np.ones((count, 4), np.float32)), where)
     bones, weights, inverse_bind = _binding(file, node, attributes, positions, skins, where)
     targets, nowhere = entry.get("targets") or None, np.zeros((count, 2), np.float32)
-    return _Piece(
+    piece = _Piece(
         node,
         positions,
         _whole_normals(file, read("NORMAL", 3, computed, finite=False), computed, where),
@@ -226,6 +227,22 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
         targets and _deltas(file, targets, "NORMAL", count, where),
         read(f"TEXCOORD_{emission_set}", 2, nowhere),
     )
+    return piece if "NORMAL" in attributes else _flat(piece)
+
+
+def _flat(piece: _Piece) -> _Piece:
+    """Returns a piece whose triangles share no vertex and so have normals of their own, as glTF asks for without any."""
+    corners = piece.triangles.reshape(-1)
+    triangles = np.arange(len(corners)).reshape(-1, 3)
+    own = {key: getattr(piece, key)[corners] for key in ("positions", "uv", "color", "bones", "weights", "emission_uv")}
+    normals = vertex_normals(own["positions"], triangles)
+    if piece.targets is None and np.abs(normals - piece.normals[corners]).max(initial=0) < _FLAT:
+        return piece  # as it is: nothing is bent
+    deltas = {
+        key: None if getattr(piece, key) is None else getattr(piece, key)[:, corners]
+        for key in ("targets", "normal_targets")
+    }
+    return replace(piece, triangles=triangles, normals=normals, **own, **deltas)
 
 
 def _name_lost(file: Gltf, entry: dict[str, Any], sets: tuple[int | None, int | None], where: str) -> None:

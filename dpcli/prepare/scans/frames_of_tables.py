@@ -89,6 +89,37 @@ def seconds_of(column: str, values: np.ndarray) -> float:
     return 0.0 if whole else 1.0
 
 
+@dataclass(frozen=True)
+class Clock:
+    """Holds the seconds f64 (N) of each row of a table, as a column told them that doesn't number the frames."""
+
+    column: str
+    seconds: np.ndarray
+
+    def times(self, part: Rows) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (T), of a frame's earliest row; None where they don't rise."""
+        starts = np.minimum.reduceat(self.seconds[part.rows], part.offsets[:-1])
+        return starts - starts[0] if (np.diff(starts) > 0).all() else None
+
+
+def find_clock(table: Table, names: Sequence[str]) -> Clock | None:
+    """Returns the times that one of the columns ``names`` tells, in seconds or of a unit in its name; None without one."""
+    for name in names:
+        words = words_of(name)
+        if not set(words) & _TIME_WORDS:
+            continue
+        try:
+            values = table.columns([table.names.index(name)])[:, 0]
+        except DataError:
+            values = np.array(clock_seconds(table.words(table.names.index(name))))
+            unit = 1.0
+        else:
+            unit = seconds_of(name, values) if np.isfinite(values).all() else 0.0
+        if unit and len(values):
+            return Clock(name, (values - values[0]) * unit)
+    return None
+
+
 def frame_column(table: Table, wanted: str) -> str:
     """Returns the name of the column of frames: the one ``wanted``, or the one whose name says it. Raises DataError."""
     known = ", ".join(table.names)[:200] or "none: it has no header"

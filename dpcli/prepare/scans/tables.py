@@ -20,7 +20,7 @@ from dpcli.prepare.cloud_formats.text_numbers import read_text_table
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
-from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Rows, frame_column, split_rows
+from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Clock, Rows, find_clock, frame_column, split_rows
 from dpcli.store.schema import kept_name
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
@@ -103,7 +103,8 @@ class TableSequences:
                 loaded = self._load(path)
             except DataError:
                 continue  # a bad sample: the next one tells
-            return loaded.cloud.color is not None, loaded.parts[0].times(loaded.column, self.fps) is not None
+            timed = all(loaded.times(part, self.fps) is not None for part in loaded.parts)
+            return loaded.cloud.color is not None, timed
         return False, bool(self.fps)
 
     @cached_property
@@ -144,9 +145,9 @@ class TableSequences:
         part = loaded.parts[item.extra["part"]]
         if item.extra["color"] and loaded.cloud.color is None:
             raise DataError(f"{item.path}: no colors, though the first table of all has them")
-        time = part.times(loaded.column, self.fps)
+        time = loaded.times(part, self.fps)
         if item.extra["time"] and time is None:
-            raise DataError(f"{item.path}: {loaded.column!r} holds no times, though that of the first table does")
+            raise DataError(f"{item.path}: no column tells times that rise, though the first table has one")
         clouds = loaded.frames(part)[:: self.stride]
         time = time[:: self.stride] if time is not None and item.extra["time"] else None
         sample = assemble(item, clouds, Lengths(self.scale, self.unit), color=item.extra["color"], time=time)
@@ -161,21 +162,38 @@ class TableSequences:
         good = next((item for item in items if not item.problem), None)
         if good:
             loaded = self._load(good.path)
-            unused = ", ".join(name for name in loaded.unused if name not in self.keep)
-            lines[0] += f", frames by column {loaded.column!r}" + (
-                f"; not read: {unused} (--keep-fields)" if unused else ""
-            )
+            clock = loaded.clock_used(self.fps) if self._found[1] else ""
+            unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, clock))
+            lines[0] += f", frames by column {loaded.column!r}"
+            if clock:
+                lines[0] += f", times by column {clock!r}"
+            lines[0] += f"; not read: {unused} (--keep-fields)" if unused else ""
         return lines + (self._label_table.unnamed(items) if self._label_table else [])
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """Holds a table that was read: all its points, its sequences, the frame column, and columns that nobody asked for."""
+    """Holds a table that was read: all its points, its sequences, the frame column, columns that nobody asked for, and the
+    times that one of these tells.
+    """
 
     cloud: Cloud
     parts: list[Rows]
     column: str
     unused: tuple[str, ...]
+    clock: Clock | None
+
+    def times(self, part: Rows, fps: float | None) -> np.ndarray | None:
+        """Returns seconds since the first frame, f64 (T): by the frame column or ``fps``, else by the clock; else None."""
+        told = part.times(self.column, fps)
+        return self.clock.times(part) if told is None and self.clock else told
+
+    def clock_used(self, fps: float | None) -> str:
+        """Returns the name of the column that tells the times, "" where none does, or the frame column."""
+        used = (
+            self.clock and self.parts[0].times(self.column, fps) is None and self.clock.times(self.parts[0]) is not None
+        )
+        return self.clock.column if self.clock and used else ""
 
     def frames(self, part: Rows) -> list[Cloud]:
         """Returns the frames of one sequence."""
@@ -199,7 +217,7 @@ def _load(
     cloud = cloud_of_table(table, keep)
     axes = cloud.columns
     unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
-    return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused)
+    return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused, find_clock(table, unused))
 
 
 def _tables_below(folder: Path) -> Iterator[Path]:

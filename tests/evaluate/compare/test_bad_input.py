@@ -98,7 +98,7 @@ def emptied(file) -> None:
         ),
         ("parts", put("part_motion", 0, math.nan), "'s0': motion of part 0"),
         ("truth", put("pose", 0, math.nan), "pose"),
-        ("truth", put("points", 0, math.nan), "'s0' holds NaN or infinite coordinates"),
+        ("truth", put("points", 0, math.nan), "'s0' has coordinates of NaN, infinity"),
     ],
 )
 def test_bad_numbers_are_named(run, scores, parts, tmp_path, what, change, words):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -68,33 +69,33 @@ REALSENSE = {"width": 640, "height": 480, "ppx": CX, "ppy": CY, "fx": FX, "fy": 
 REALSENSE["coeffs"] = [0, 0, 0, 0, 0]
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "size"),
-    [
-        ("k.json", PLAIN, (0, 0)),
-        ("k.json", {"intrinsic_matrix": COLUMNS, "width": 640, "height": 480}, (640, 480)),
-        ("k.json", {"intrinsic_matrix": ROWS}, (0, 0)),
-        ("k.json", {"camera_matrix": NESTED, "dist_coeffs": [[0, 0, 0, 0, 0]]}, (0, 0)),
-        ("k.json", {"K": COLUMNS, "w": 640, "h": 480}, (640, 480)),
-        ("k.json", REALSENSE, (640, 480)),
-        ("k.json", {"depth": REALSENSE, "color": {**REALSENSE, "fx": 900}}, (640, 480)),
-        ("k.json", {"camera": {**PLAIN, "w": 640, "h": 480}}, (640, 480)),
-        ("k.json", {"width": 640, "height": 480, "intrinsics": PLAIN}, (640, 480)),
-        ("k.json", {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, "frames": [{"a": 1}]}, (640, 480)),
-        ("k.json", {**{k: str(v) for k, v in PLAIN.items()}, "width": "640", "height": "480"}, (640, 480)),
-        ("k.yaml", ROS, (640, 480)),
-        ("k.yml", OPENCV, (640, 480)),
-        ("k.yaml", KALIBR, (640, 480)),
-        ("k.yaml", SLAM, (640, 480)),
-        ("k.yaml", SLAM.replace("Camera.f", "Camera1.f").replace("Camera.c", "Camera1.c"), (640, 480)),
-        ("k.yaml", f"K: {ROWS}\nD: [0, 0, 0, 0, 0]\nwidth: 640\nheight: 480\n", (640, 480)),
-        ("scene0000_00.txt", SCANNET, (640, 480)),
-        ("intrinsic_depth.txt", FOUR, (0, 0)),
-        ("k.txt", "[[610.0, 0, 325.25],\n [0, 609.5, 237.75],\n [0, 0, 1]]", (0, 0)),
-        ("k.txt", f"{FX} {FY} {CX} {CY}", (0, 0)),
-        ("cameras.txt", COLMAP, (640, 480)),
-    ],
-)
+FORMS = [
+    ("k.json", PLAIN, (0, 0)),
+    ("k.json", {"intrinsic_matrix": COLUMNS, "width": 640, "height": 480}, (640, 480)),
+    ("k.json", {"intrinsic_matrix": ROWS}, (0, 0)),
+    ("k.json", {"camera_matrix": NESTED, "dist_coeffs": [[0, 0, 0, 0, 0]]}, (0, 0)),
+    ("k.json", {"K": COLUMNS, "w": 640, "h": 480}, (640, 480)),
+    ("k.json", REALSENSE, (640, 480)),
+    ("k.json", {"depth": REALSENSE, "color": {**REALSENSE, "fx": 900}}, (640, 480)),
+    ("k.json", {"camera": {**PLAIN, "w": 640, "h": 480}}, (640, 480)),
+    ("k.json", {"width": 640, "height": 480, "intrinsics": PLAIN}, (640, 480)),
+    ("k.json", {"fl_x": FX, "fl_y": FY, "cx": CX, "cy": CY, "w": 640, "h": 480, "frames": [{"a": 1}]}, (640, 480)),
+    ("k.json", {**{k: str(v) for k, v in PLAIN.items()}, "width": "640", "height": "480"}, (640, 480)),
+    ("k.yaml", ROS, (640, 480)),
+    ("k.yml", OPENCV, (640, 480)),
+    ("k.yaml", KALIBR, (640, 480)),
+    ("k.yaml", SLAM, (640, 480)),
+    ("k.yaml", SLAM.replace("Camera.f", "Camera1.f").replace("Camera.c", "Camera1.c"), (640, 480)),
+    ("k.yaml", f"K: {ROWS}\nD: [0, 0, 0, 0, 0]\nwidth: 640\nheight: 480\n", (640, 480)),
+    ("scene0000_00.txt", SCANNET, (640, 480)),
+    ("intrinsic_depth.txt", FOUR, (0, 0)),
+    ("k.txt", "[[610.0, 0, 325.25],\n [0, 609.5, 237.75],\n [0, 0, 1]]", (0, 0)),
+    ("k.txt", f"{FX} {FY} {CX} {CY}", (0, 0)),
+    ("cameras.txt", COLMAP, (640, 480)),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "size"), FORMS)
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
 def test_every_form_of_one_camera(tmp_path, name, content, size, mark):
     path = tmp_path / name
@@ -238,6 +239,22 @@ def test_what_cannot_be_used_is_named(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
     with pytest.raises(DataError, match=f"{name}: .*{message}"):
         read_calibration(tmp_path / name)
+
+
+@pytest.mark.parametrize(("name", "content", "size"), FORMS)
+def test_numbers_that_no_camera_has_are_refused_or_not_used(tmp_path, name, content, size):
+    text = content if isinstance(content, str) else json.dumps(content)
+    for place in re.finditer(r"(?<![\w.%])\d+\.?\d*", text):
+        for odd in ("1e999", "-1e999", "9" * 400, ".nan" if name.endswith(("yaml", "yml")) else "NaN", "1e200"):
+            (tmp_path / name).write_text(text[: place.start()] + odd + text[place.end() :])
+            try:
+                found = read_calibration(tmp_path / name)
+            except DataError as error:
+                assert str(tmp_path / name) in str(error)
+            else:
+                lens = getattr(found.intrinsics, "distortion", ())
+                camera = (found.intrinsics.fx, found.intrinsics.fy, found.intrinsics.cx, found.intrinsics.cy)
+                assert np.isfinite([*camera, *lens, found.depth_scale or 1.0]).all() and found.width <= 1e6
 
 
 def test_a_file_that_is_missing_or_no_text(tmp_path):

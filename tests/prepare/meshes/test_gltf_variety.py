@@ -412,6 +412,20 @@ def test_normals_that_are_no_numbers_come_from_the_triangles(tmp_path, capsys):
     assert "2 normals are NaN or infinite; computed from the triangles" in capsys.readouterr().err
 
 
+def test_without_normals_every_triangle_is_flat(tmp_path):
+    """As glTF asks: a fold of two triangles has two normals, not a smooth one along its edge."""
+    file = quad()
+    primitive = file.tree["meshes"][0]["primitives"][0]
+    primitive["attributes"] = {"POSITION": file.add([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])}
+    primitive["indices"] = file.add([0, 1, 2, 1, 0, 3], "u4")
+    primitive["targets"] = [{"POSITION": file.add([[0, 0, 0], [0, 0, 0], [0, 0, 0], [0, 0, 1]])}]
+    file.tree["meshes"][0]["weights"] = [0.5]
+    mesh = load(file, tmp_path)
+    assert mesh.triangles.tolist() == [[0, 1, 2], [3, 4, 5]]
+    np.testing.assert_allclose(mesh.normals[0], [[0, 0, 1]] * 3 + [[0, 1, 0]] * 3, atol=1e-6)
+    np.testing.assert_allclose(mesh.positions[0, 5], [0, 0, 1.5], atol=1e-6)
+
+
 def test_of_keys_at_one_time_the_last_counts(tmp_path):
     file = quad()
     del file.tree["animations"]
@@ -562,7 +576,7 @@ def archive(*names: str) -> bytes:
     data = io.BytesIO()
     with zipfile.ZipFile(data, "w") as file:
         for name in names:
-            file.writestr(name, b"x")
+            file.writestr(zipfile.ZipInfo(name), b"x")  # of no date: the names of tests hold these bytes
     return data.getvalue()
 
 

@@ -88,6 +88,40 @@ def test_times_are_what_the_column_tells_or_absent(tmp_path, name, values, expec
     np.testing.assert_allclose(sample.sequence.time, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("time", [10.25, 10.5, 11], [0, 0.25, 0.75]),
+        ("timestamp_us", [0, 40_000, 90_000], [0, 0.04, 0.09]),
+        ("Time [ms]", [0, 40, 90], [0, 0.04, 0.09]),
+        ("stamp", ["23:59:59.95", "00:00:00", "00:00:00.05"], [0, 0.05, 0.1]),
+        ("time", [3, 4, 5], None),  # of which unit?
+        ("time", [0.5, 0.5, 0.5], None),
+        ("time", [0.5, 0.1, 0.9], None),
+        ("dwell", [0.5, 0.6, 0.9], None),
+        ("time", [0.5, "", 0.9], None),
+    ],
+)
+def test_a_column_of_times_beside_that_of_frames_tells_the_times(tmp_path, name, values, expected):
+    rows = [(frame, 1, 2, k, value) for frame, value in zip((7, 8, 9), values) for k in (1, 2)]
+    reader = TableSequences(write(tmp_path / "a.csv", rows, f"frame,x,y,z,{name}"), frame_column="frame")
+    (item,) = reader.items()
+    if expected is None:
+        assert reader.read(item, RNG).sequence.time is None and name in reader.summary([item])[0].split("not read: ")[1]
+    else:
+        np.testing.assert_allclose(reader.read(item, RNG).sequence.time, expected, atol=1e-6)
+        assert f"times by column {name!r}" in reader.summary([item])[0] and "not read" not in reader.summary([item])[0]
+    (sample,) = sequences(tmp_path / "a.csv", frame_column="frame", fps=10)
+    np.testing.assert_allclose(sample.sequence.time, [0, 0.1, 0.2])
+
+
+def test_times_of_points_are_those_of_the_first_of_a_frame(tmp_path):
+    rows = [(f, 1, 2, k, 5 + f / 10 + k / 100) for f in (0, 1, 2) for k in (1, 2, 3)]
+    (sample,) = sequences(write(tmp_path / "a.csv", rows, "frame,x,y,z,t"), frame_column="frame")
+    np.testing.assert_allclose(sample.sequence.time, [0, 0.1, 0.2], atol=1e-6)
+    assert sample.sequence.num_frames == 3
+
+
 def test_numbers_that_fall_are_told_and_counters_that_are_full_go_on(tmp_path):
     (sample,) = sequences(write(tmp_path / "a.csv", frames(2, 0, 1)))
     assert sample.notes == {FELL: 1} and sample.sequence.points[:, 0].tolist()[::2] == [0, 1, 2]
