@@ -95,21 +95,19 @@ class Network:
 
 
 def choose_angles(model: ShapeNetwork, logits: Tensor) -> Tensor:
-    """Returns the angles (T,2) of a clip's frames, each in the light of all: logits (T,2,bins).
+    """Returns the mean angles (T,2) of a clip's frames, each in the light of all: logits (T,2,bins).
 
-    Frames of a clip err alike, so that all together count as one. A turn about the vertical within one standard deviation
-    of 0 becomes 0: seen from the side, one that isn't sure costs more than one that is missed. The other angle, which is
-    never sure of an object seen from its end, is the most likely one: there a missed one costs more.
+    Frames of a clip err alike, so that all together count as one. An angle within one standard deviation of 0 becomes 0:
+    a turn that isn't sure costs more, seen from the side, than one that is missed.
     """
     evidence = logits.log_softmax(-1) / len(logits)
     bins = torch.arange(logits.shape[-1])
     turns = -_TURN_COST * (bins[:, None] - bins).abs()
     before, after = _passed_on(evidence, turns), _passed_on(evidence.flip(0), turns).flip(0)
     share = (before + evidence + after).softmax(-1)
-    across = share[:, 0]
-    mean = (across * model.centers).sum(-1)
-    spread = (across * (model.centers - mean[:, None]).square()).sum(-1).sqrt()
-    return torch.stack([torch.where(mean.abs() > spread, mean, 0.0), model.centers[share[:, 1].argmax(-1)]], -1)
+    mean = (share * model.centers).sum(-1)
+    spread = (share * (model.centers - mean[..., None]).square()).sum(-1).sqrt()
+    return torch.where(mean.abs() > spread, mean, 0.0)
 
 
 def lengthened(depth: Tensor, second: Tensor, cut: Tensor, plane: Tensor) -> Tensor:

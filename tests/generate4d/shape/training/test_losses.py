@@ -57,8 +57,8 @@ def test_a_clip_is_turned_as_all_paths_together_say_or_not_at_all():
     model = ShapeNetwork(ShapeConfig(widths=(4, 8), hidden=8, bins=3))
     logits = torch.from_numpy(np.random.default_rng(1).normal(size=(4, 2, 3)) * 2).float()
     logits[:, 0, 2] += 12  # turned for sure; about the other axis nothing is
-    found, exchanged = choose_angles(model, logits), choose_angles(model, logits.flip(1)).flip(1)
-    for axis, (sure, likely) in enumerate([(found, exchanged), (exchanged, found)]):
+    found = choose_angles(model, logits)
+    for axis in range(2):
         own, shares = logits[:, axis].log_softmax(-1) / 4, np.zeros((4, 3))
         for path in itertools.product(range(3), repeat=4):
             worth = sum(own[t, k] for t, k in enumerate(path)) - sum(abs(a - b) for a, b in itertools.pairwise(path))
@@ -66,9 +66,8 @@ def test_a_clip_is_turned_as_all_paths_together_say_or_not_at_all():
         shares /= shares.sum(1, keepdims=True)
         mean = shares @ model.centers.numpy()
         spread = np.sqrt((shares * (model.centers.numpy() - mean[:, None]) ** 2).sum(1))
-        assert sure[:, axis].numpy() == pytest.approx(np.where(np.abs(mean) > spread, mean, 0), abs=1e-4)
-        assert torch.equal(likely[:, axis], model.centers[shares.argmax(1)])
-    assert (found[:, 0] > 0.5).all() and (exchanged[:, 1] == 0).all()
+        assert found[:, axis].numpy() == pytest.approx(np.where(np.abs(mean) > spread, mean, 0), abs=1e-4)
+    assert (found[:, 0] > 0.5).all() and (found[:, 1] == 0).all()
 
 
 def test_confidence_is_the_share_that_was_better():
