@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
+_ORIENTATION = 0x0112  # of EXIF
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
@@ -145,11 +147,24 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
 
 def read_rgba(path: Path) -> np.ndarray:
     """Reads one image as u8 (H,W,4), straight alpha. Raises DataError when unreadable."""
+    with _readable(path) as image:
+        return _to_rgba(as_shown(image), path)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Returns the width and height of one image as it is shown, by its header. Raises DataError when unreadable."""
+    with _readable(path) as image:
+        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+        return image.size[::-1] if turned else image.size
+
+
+@contextmanager
+def _readable(path: Path):  # -> Iterator[PIL.Image.Image]
     from PIL import Image
 
     try:
         with open_image(path) as image:
-            return _to_rgba(as_shown(image), path)
+            yield image
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         why = "empty" if path.is_file() and path.stat().st_size == 0 else str(error).splitlines()[0]
         raise DataError(f"{path}: not a readable image ({why}); export this frame again") from None

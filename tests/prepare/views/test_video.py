@@ -347,6 +347,19 @@ def test_bad_clips_are_told_what_to_do(tmp_path, kind, message):
         video_clip(bad_clip(tmp_path, kind), SMALL)
 
 
+def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
+    """A damaged header may tell of 16 million pixels, which took 300 MB; pictures that EXIF turns are of one size."""
+    folder = save(tmp_path / "clip", moving(3))
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    Image.fromarray(np.rot90(moving(1)[0])).save(folder / "1.png", exif=turned)
+    assert video_clip(folder, SMALL).header is not None
+    Image.new("RGBA", (4000, 4000)).save(folder / "2.png")
+    monkeypatch.setattr("dpcli.prepare.decode.color_frames.read_rgba", None)
+    with pytest.raises(DataError, match="2.png is 4000x4000, 0.png is 64x48"):
+        video_clip(folder, SMALL)
+
+
 @pytest.mark.parametrize(("kind", "left"), [("one empty", [0, 1]), ("corrupt png", [0, 2])])
 def test_skip_leaves_bad_frames_out_and_keeps_the_times(tmp_path, kind, left):
     clip = video_clip(bad_clip(tmp_path, kind), VideoOptions(size=32, on_error="skip", fps=10))
