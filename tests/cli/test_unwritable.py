@@ -222,6 +222,13 @@ def test_where_nobody_can_make_a_file_is_said_alike(resume):
         pass
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc")
+@pytest.mark.parametrize("name", ["o.mp4", "o.gif", "o.png"])
+def test_a_clip_where_nobody_can_make_a_file_is_said_alike(name):
+    with pytest.raises(DataError, match=rf"/proc/{name}: cannot be written \(.*\); name a file in an existing folder"):
+        write_pictures(Path("/proc", name), [np.zeros((16, 16, 3), np.uint8)], fps=10)
+
+
 def test_a_word_that_is_empty_is_no_input(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("afile").touch()
