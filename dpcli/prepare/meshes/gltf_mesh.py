@@ -19,7 +19,6 @@ from dpcli.runtime.progress import log
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _BRIGHTEST = 8.0  # of vertex colors: a little above 1 is light, far above it is another range
 _MOST_LOST = 0.1  # of the vertices may lack weights: more is a broken file
-_FLAT = 1e-5  # between a triangle's normal and those of its corners
 _MOST_VERTICES = 20_000_000  # of all instances of a node
 
 
@@ -40,6 +39,7 @@ class _Piece:
     targets: np.ndarray | None
     normal_targets: np.ndarray | None
     emission_uv: np.ndarray
+    faceted: bool
 
 
 def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
@@ -93,7 +93,10 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         emission_uv=joined("emission_uv"),
     )
     culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]
-    return replace(mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None)
+    faceted = np.concatenate([np.full(len(piece.triangles), piece.faceted) for piece in pieces])
+    return replace(
+        mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None, faceted=faceted if faceted.any() else None
+    )
 
 
 def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -212,7 +215,7 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
     color = _colors(file, read("COLOR_0", None, np.ones((count, 4), np.float32)), where)
     bones, weights, inverse_bind = _binding(file, node, attributes, positions, skins, where)
     targets, nowhere = entry.get("targets") or None, np.zeros((count, 2), np.float32)
-    piece = _Piece(
+    return _Piece(
         node,
         positions,
         _whole_normals(file, read("NORMAL", 3, computed, finite=False), computed, where),
@@ -226,23 +229,8 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
         targets and _deltas(file, targets, "POSITION", count, where),
         targets and _deltas(file, targets, "NORMAL", count, where),
         read(f"TEXCOORD_{emission_set}", 2, nowhere),
+        "NORMAL" not in attributes,  # then the specification asks for flat shading, and viewers do it
     )
-    return piece if "NORMAL" in attributes else _flat(piece)
-
-
-def _flat(piece: _Piece) -> _Piece:
-    """Returns a piece whose triangles share no vertex and so have normals of their own, as glTF asks for without any."""
-    corners = piece.triangles.reshape(-1)
-    triangles = np.arange(len(corners)).reshape(-1, 3)
-    own = {key: getattr(piece, key)[corners] for key in ("positions", "uv", "color", "bones", "weights", "emission_uv")}
-    normals = vertex_normals(own["positions"], triangles)
-    if piece.targets is None and np.abs(normals - piece.normals[corners]).max(initial=0) < _FLAT:
-        return piece  # as it is: nothing is bent
-    deltas = {
-        key: None if getattr(piece, key) is None else getattr(piece, key)[:, corners]
-        for key in ("targets", "normal_targets")
-    }
-    return replace(piece, triangles=triangles, normals=normals, **own, **deltas)
 
 
 def _name_lost(file: Gltf, entry: dict[str, Any], sets: tuple[int | None, int | None], where: str) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from dpcli.segment.multibody.explanation import Explanation, body_of, label_points, refit, without_empty
+from dpcli.segment.multibody.explanation import Body, Explanation, body_of, label_points, refit, without_empty
 from dpcli.segment.multibody.frames import Frames
 from dpcli.segment.multibody.hypotheses import Hypothesis, find_hypotheses
 from dpcli.segment.multibody.settings import MultibodySettings
 from dpcli.segment.multibody.tracks import TrackedFrames, patch_hypotheses
 
-_TRIED = 4  # bodies tried on the whole per round
+_TRIED = 4  # bodies fitted and tried on the whole per round
 _GAIN = 1e-5  # of the energy for which a body that was taken out stays out
 _FITS = ((False, 1.0), (True, 0.7), (True, 0.4))  # onto own points only, residual in spacings
 
@@ -63,17 +63,18 @@ class Search:
     def _grow(self, found: Explanation) -> Explanation:
         """Returns the explanation with further bodies, as long as the energy falls."""
         while len(found.bodies) < self.settings.most_bodies:
-            tried = [
-                label_points(self.frames, [*found.bodies, self.pool[h]], self.settings)
-                for h in self._most_promising(found)
-            ]
+            tried = [self._with(found, self.pool[h]) for h in self._most_promising(found)]
             if not tried:
                 break
-            best = self._fitted(min(tried, key=lambda one: one.energy))
+            best = min(tried, key=lambda one: one.energy)
             if best.energy >= found.energy - 1e-6:
                 break
             found = best
         return found
+
+    def _with(self, found: Explanation, body: Body) -> Explanation:
+        """Returns the explanation with a further body, fitted: a motion that is a spacing off explains a small part badly."""
+        return self._fitted(label_points(self.frames, [*found.bodies, body], self.settings))
 
     def _most_promising(self, found: Explanation) -> list[int]:
         """Returns the hypotheses by which connected points would save most, the best first."""
