@@ -16,7 +16,7 @@ import numpy as np
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.path_names import utf8_path
 from dpcli.runtime.progress import log
-from dpcli.runtime.whole_file import check_replaced, refuse_broken_link, whole_file
+from dpcli.runtime.whole_file import check_replaced, not_writable, refuse_broken_link, whole_file
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -64,9 +64,20 @@ def write_pictures(path: Path, pictures: Iterable[np.ndarray], fps: float, *, fo
         raise DataError(f"{path}: the folder {path.parent} does not exist; create it first")
     try:
         with whole_file(path) as part:
+            if kind:
+                _try_name(path, part)
             {".mp4": _mp4, ".gif": _gif, ".png": _png, "": _folder}[kind](part, pictures, fps)
     except OSError as error:
         raise DpcError(f"{path}: cannot be written ({error})") from None
+
+
+def _try_name(path: Path, part: Path) -> None:
+    """Raises DataError, before any picture is drawn, where no file can be made: an encoder doesn't tell why it ends."""
+    try:
+        part.touch()
+        part.unlink()
+    except OSError as error:
+        raise not_writable(path, error) from None
 
 
 def _mp4(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:

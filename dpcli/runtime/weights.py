@@ -62,9 +62,16 @@ def find_weights(name: str | Path, shipped: Path | None, maker: str, option: str
         raise UsageError(
             f"{option} {name}: this training has no best.safetensors yet; {now}run its `{maker}` again to continue it"
         )
+    what = (
+        "holds no trained model"
+        if Path(name).is_dir()
+        else "not a regular file"
+        if Path(name).exists()
+        else "no such file"
+    )
     ours = ", ".join(shipped_models(shipped)) if shipped else ""
     raise UsageError(
-        f"{option} {name}: no such file; give a .safetensors file, a folder made by `{maker}`"
+        f"{option} {name}: {what}; give a .safetensors file, a folder made by `{maker}`"
         f" or a shipped model ({ours or 'none in this installation'})"
     )
 

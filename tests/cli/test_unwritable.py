@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 from dpcli.draw.animation import write_pictures
-from dpcli.errors import DataError
+from dpcli.errors import DataError, UsageError
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.weights import find_weights
 from dpcli.runtime.whole_file import DiskFull
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from dpcli.store.pipes import check_output
+from dpcli.store.writing.journal import Journal
 from tests.support.prepare_helpers import ROOT
 
 COMMANDS = [
@@ -103,11 +105,20 @@ def test_what_is_complete_needs_no_room(folder, dpc):
         "prepare split absent.h5 -o d",
         "info absent.h5",
         "classify train absent.h5 -o t",
+        "generate4d train-prior absent.h5 -o t",
     ],
 )
 def test_an_input_that_is_not_there_is_bad_data_everywhere(folder, dpc, line):
     done = dpc(*line.split(), cwd=folder)
     assert done.returncode == 3 and b"absent.h5: no such file" in done.stderr
+
+
+@pytest.mark.parametrize(("name", "said"), [("folder", "holds no trained model"), ("pipe", "not a regular file")])
+def test_what_is_there_and_no_model_is_not_called_missing(name, said, tmp_path):
+    (tmp_path / "folder").mkdir()
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UsageError, match=f"{name}: {said}; give a .safetensors file"):
+        find_weights(tmp_path / name, None, "dpc classify train")
 
 
 @pytest.mark.parametrize("size", ["0k", "16k", "600k"])
@@ -211,6 +222,13 @@ def test_where_nobody_can_make_a_file_is_said_alike(resume):
         pass
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc")
+@pytest.mark.parametrize("name", ["o.mp4", "o.gif", "o.png"])
+def test_a_clip_where_nobody_can_make_a_file_is_said_alike(name):
+    with pytest.raises(DataError, match=rf"/proc/{name}: cannot be written \(.*\); name a file in an existing folder"):
+        write_pictures(Path("/proc", name), [np.zeros((16, 16, 3), np.uint8)], fps=10)
+
+
 def test_a_word_that_is_empty_is_no_input(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("afile").touch()
@@ -233,3 +251,16 @@ def test_a_second_full_disk_says_that_the_first_runs_samples_are_kept(tmp_path, 
     assert "nothing was left" not in str(told.value)
     with CloudsWriter(tmp_path / "o.h5", resume=True, provenance={"seed": 1}) as writer:
         assert writer.written_names == ["a"]
+
+
+def test_the_sample_that_found_no_room_is_not_counted_as_kept(tmp_path, monkeypatch):
+    def full(self, *given: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with (
+        pytest.raises(DiskFull, match="the 1 samples done are kept"),
+        CloudsWriter(tmp_path / "o.h5", resume=True) as writer,
+    ):
+        writer.write(CloudSequence.from_frames("a", [np.ones((4, 3), np.float32)] * 2))
+        monkeypatch.setattr(Journal, "append", full)
+        writer.write(CloudSequence.from_frames("b", [np.ones((4, 3), np.float32)] * 2))

@@ -120,7 +120,7 @@ def _models_in(place: Path) -> list[Path]:
     if place.is_file():
         return [place]
     if not place.is_dir():
-        raise UsageError(f"{place}: no such file or folder")
+        raise DataError(f"{place}: no such file or folder")
     found = sorted(path for path in place.rglob("*") if path.suffix.lower() in (".glb", ".gltf"))
     if not found:
         raise DataError(f"{place}: no .glb or .gltf file in it; name models or folders of them")

@@ -64,6 +64,7 @@ class ResumableWriter(ABC):
         self.provenance = [provenance] if isinstance(provenance, dict) else list(provenance or [])
         self.written_names: list[str] = []
         self._journal: Journal | None = None
+        self._recorded = 0
         self._open(force)
 
     def _about(self) -> dict[str, Any]:
@@ -153,6 +154,7 @@ class ResumableWriter(ABC):
         """Makes the sample count as written. given, placed: as `Journal.append`."""
         if self._journal:
             self._journal.append(given, placed)
+            self._recorded += 1
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -176,7 +178,8 @@ class ResumableWriter(ABC):
 
     def _kept(self) -> str:
         """Returns what a run that continues finds, in words; "" where that is nothing."""
-        return f"the {len(self)} samples done are kept" if self._journal and len(self) else ""
+        # not `len`, which counts the sample that found no room, too
+        return f"the {self._recorded} samples done are kept" if self._journal and self._recorded else ""
 
     def _leave_journal(self, kept: bool) -> None:
         if self._journal and kept:
