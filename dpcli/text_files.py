@@ -79,7 +79,9 @@ def check_depth(value: Any, where: object) -> None:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Returns the content of a TOML file; DataError when it is none. Before Python 3.11 the reader is a package of its own."""
+    """Returns the content of a TOML file; DataError when it is none, or not there. Before Python 3.11 the reader is a package
+    of its own.
+    """
     if sys.version_info >= (3, 11):
         import tomllib
     else:
@@ -88,10 +90,16 @@ def read_toml(path: Path) -> dict[str, Any]:
         except ImportError:
             raise DpcError("reading TOML on Python 3.10 needs a package: pip install tomli") from None
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(read_text(path))
     except RecursionError:
         raise DataError(f"{path}: {_TOO_DEEP}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: not TOML ({error})") from None
+    except IsADirectoryError:
+        raise DataError(f"{path}: is a folder; expected a TOML file") from None
     except FileNotFoundError:
         raise DataError(f"{path}: no such file") from None
+    except OSError as error:
+        raise DataError(f"{path}: can't be read ({(error.strerror or str(error)).lower()})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(f"{path}: not TOML ({error})") from None
+    except ValueError:
+        raise DataError(f"{path}: not TOML (it holds a number too long to be one)") from None

@@ -41,6 +41,7 @@ _SPARSE = {
     "widths": ((64, 64), (96,)),
     "dropout": 0.4,
     "members": 4,
+    "copies": True,
 }
 
 
@@ -62,14 +63,14 @@ PRESETS = {
     "sparse": _preset(
         KinetConfig(**_SPARSE),
         Schedule(
-            25,
+            50,
             0,
-            batch=64,
+            batch=128,
             learning_rate=2e-3,
             weight_decay=0.02,
             label_smoothing=0.1,
             clips_per_video=16,
-            validate_every=5,
+            validate_every=10,
         ),
         "sparse",
         timing="slots",

@@ -94,7 +94,13 @@ def read_labels(path: Path) -> LabelTable:
         first = next((line for line in text.split("\n") if line.strip() and line[0] != "#"), "")
         divider = next((mark for mark in ",;\t" if mark in first), ",")
         lines = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=divider)]
-    except (OSError, csv.Error) as error:
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file; expected a CSV table of name,label") from None
+    except OSError as error:
+        raise DataError(
+            f"{path}: can't be read ({(error.strerror or str(error)).lower()}); expected a CSV table"
+        ) from None
+    except csv.Error as error:
         raise DataError(f"{path}: cannot be read as a CSV table ({error})") from None
     numbered = [(number, row) for number, row in enumerate(lines, start=1) if any(row)]
     while numbered and numbered[0][1][0].startswith("#"):  # comments above the header

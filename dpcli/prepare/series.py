@@ -17,8 +17,8 @@ import numpy as np
 
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
-from dpcli.prepare.name_numbers import Name, NumberColumns, parse_name
 from dpcli.prepare.reader import natural_key
+from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name
 
 _LISTED = 5
 TEXTS = (".txt", ".csv", ".tsv")

@@ -97,7 +97,13 @@ def write_whole(path: Path, content: bytes, *, many_writers: bool = False) -> No
         with whole_file(path, many_writers=many_writers) as part:
             part.write_bytes(content)
     except OSError as error:
-        raise DataError(f"{path}: cannot be written ({error.strerror}); name a file in an existing folder") from None
+        raise not_writable(path, error) from None
+
+
+def not_writable(path: Path, error: OSError) -> DataError:
+    """Returns the error that tells why no file can be made under a name, for a reason other than want of room."""
+    why = os.strerror(error.errno) if error.errno else str(error).partition("\n")[0]  # HDF5's own words are long
+    return DataError(f"{path}: cannot be written ({why}); name a file in an existing folder")
 
 
 def _remove(part: Path) -> None:
@@ -115,6 +121,14 @@ def check_target(path: Path, option: str, kinds: Sequence[str]) -> None:
         raise DataError(f"{option} {path}: the folder {path.parent} does not exist; create it first")
     if path.is_dir():
         raise DataError(f"{option} {path}: is a folder; name a file in it")
+
+
+def refuse_existing(path: str | Path, force: bool) -> None:
+    """Raises, for an output that is one file, DataError where a folder is, UsageError where a file is and `force` is off."""
+    if Path(path).is_dir():
+        raise DataError(f"{path}: is a folder; name a file in it")
+    if Path(path).exists() and not force:
+        raise UsageError(f"{path}: exists already; --force replaces it")
 
 
 def check_writable(path: Path, option: str = "-o") -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
@@ -40,8 +41,7 @@ def write_embedding(
     force: bool = False,
 ) -> None:
     """Writes the file whole or not at all. UsageError when it exists and `force` is off, DataError on malformed arrays."""
-    if Path(path).exists() and not force:
-        raise UsageError(f"{path}: exists already; --force replaces it")
+    refuse_existing(path, force)
     _check(str(path), names, labels, splits, streams)
     with AtomicFile(path) as file:
         write_root(

@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import open_store, read_provenance, root_attributes, write_root
 from dpcli.store.schema import TABLES
 from dpcli.store.writing.atomic_file import AtomicFile
@@ -225,8 +226,7 @@ def write_scene(
     force: bool = False,
 ) -> None:
     """Writes one scene whole or not at all. UsageError when `path` exists and `force` is off; DataError as `validate`."""
-    if Path(path).exists() and not force:
-        raise UsageError(f"{path}: exists already; --force replaces it")
+    refuse_existing(path, force)
     scene.validate(f"{path}")
     history = [provenance] if isinstance(provenance, dict) else list(provenance or [])
     with AtomicFile(path) as file:

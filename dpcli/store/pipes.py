@@ -86,7 +86,7 @@ def check_output(path: Path, option: str, inputs: Iterable[str | Path]) -> None:
         check_writable(path, option)
         return
     check_regular(path, option)
-    for given in map(str, inputs):
+    for given in filter(None, map(str, inputs)):  # an empty word, or part of one, names nothing
         name = _regular_file(sys.stdin.buffer) if given == "-" and sys.stdin is not None else Path(given)
         if name is None or not (os.path.exists(name) and path.exists()):
             continue

@@ -10,7 +10,8 @@ from types import TracebackType
 import h5py
 import numpy as np
 
-from dpcli.errors import DataError, UsageError, reading
+from dpcli.errors import DataError, reading
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.file import STRING, open_store, read_provenance, read_strings, root_attributes, write_root
 from dpcli.store.schema import fields_of
 from dpcli.store.writing.atomic_file import AtomicFile
@@ -126,8 +127,7 @@ class ViewsWriter:
         part: np.ndarray | None = None,
         force: bool = False,
     ) -> None:
-        if Path(path).exists() and not force:
-            raise UsageError(f"{path}: exists already; --force replaces it")
+        refuse_existing(path, force)
         header.validate()
         track = None if track is None else np.asarray(track, _FIELD["track"].dtype)
         part = None if part is None else np.asarray(part, _FIELD["part"].dtype)

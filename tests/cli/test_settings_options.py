@@ -12,7 +12,7 @@ import pytest
 import typer
 
 from dpcli.cli.settings_options import options_of
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, UsageError
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import check, setting
 
@@ -79,7 +79,7 @@ def run(*words: str) -> int:
 
 
 def refusal(*words: str) -> str:
-    with pytest.raises(UsageError) as caught:
+    with pytest.raises((UsageError, DataError)) as caught:
         run(*words)
     assert received == []
     return str(caught.value)

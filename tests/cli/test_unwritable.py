@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import subprocess
@@ -14,7 +15,9 @@ import pytest
 from dpcli.draw.animation import write_pictures
 from dpcli.errors import DataError
 from dpcli.runtime.run_folder import RunFolder
+from dpcli.runtime.whole_file import DiskFull
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
+from dpcli.store.pipes import check_output
 from tests.support.prepare_helpers import ROOT
 
 COMMANDS = [
@@ -163,3 +166,70 @@ def test_pictures_and_runs_in_a_folder_that_is_a_link_to_nowhere(tmp_path):
         write_pictures(tmp_path / "lost", [np.zeros((4, 4, 3), np.uint8)], fps=10)
     with pytest.raises(DataError, match="lost is a link to nowhere"), RunFolder(tmp_path / "lost", {}, columns=()):
         pass
+
+
+ONE_FILE = [
+    "prepare clouds raw -o taken.h5",
+    "prepare merge c.h5 -o taken.h5",
+    "classify baseline c.h5 -o taken.h5",
+    "classify fuse s.h5 s2.h5 -o taken.h5",
+    "segment joints c.h5 -o taken.h5",
+    "segment predict c.h5 -o taken.h5",
+    "classify explain pac c.h5 --model msraction3d-16 -o taken.h5",
+    "evaluate report s.h5 -o taken.html",
+    "generate4d view c.h5 -o taken.html",
+    "info c.h5 --page taken.html",
+]
+
+
+@pytest.mark.parametrize("force", ["", " --force"])
+@pytest.mark.parametrize("line", ONE_FILE)
+def test_a_folder_in_the_place_of_an_output_file_is_said_alike(line, force, folder, tmp_path, monkeypatch, dpc_here):
+    """Also with --force, and whether or not the command first looks whether its work is done."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("c.h5", "s.h5"):
+        shutil.copyfile(folder / name, name)
+    shutil.copyfile("s.h5", "s2.h5")
+    shutil.copytree(folder / "raw", "raw")
+    for name in ("taken.h5", "taken.html"):
+        Path(name).mkdir()
+        Path(name, "mine").touch()
+    done = dpc_here(*(line + force * ("info" not in line)).split())
+    said = done.stderr.decode()
+    assert done.returncode == 3 and f"{line.split()[-1]}: is a folder; name a file in it" in said, said
+    assert Path("taken.h5", "mine").exists() and Path("taken.html", "mine").exists()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc")
+@pytest.mark.parametrize("resume", [False, True])
+def test_where_nobody_can_make_a_file_is_said_alike(resume):
+    """With and without a journal, which is opened first."""
+    with (
+        pytest.raises(DataError, match=r"/proc/o.h5: cannot be written \(.*\); name a file in an existing folder"),
+        CloudsWriter("/proc/o.h5", resume=resume),
+    ):
+        pass
+
+
+def test_a_word_that_is_empty_is_no_input(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("afile").touch()
+    check_output(Path("afile"), "-o", [""])
+
+
+def test_a_second_full_disk_says_that_the_first_runs_samples_are_kept(tmp_path, monkeypatch):
+    one = CloudSequence.from_frames("a", [np.ones((4, 3), np.float32)] * 2)
+    with pytest.raises(DataError), CloudsWriter(tmp_path / "o.h5", resume=True, provenance={"seed": 1}) as writer:
+        writer.write(one)
+        writer.keep = True
+        raise DataError("stopped")
+
+    def full(self, *given: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch, pytest.raises(DiskFull, match="what an earlier run had done is kept") as told:
+        patch.setattr(CloudsWriter, "write_again", full)
+        CloudsWriter(tmp_path / "o.h5", resume=True, provenance={"seed": 1})
+    assert "nothing was left" not in str(told.value)
+    with CloudsWriter(tmp_path / "o.h5", resume=True, provenance={"seed": 1}) as writer:
+        assert writer.written_names == ["a"]

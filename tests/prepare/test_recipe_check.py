@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from typer.testing import CliRunner
@@ -291,3 +292,15 @@ def test_masks_and_views_of_a_clip_are_looked_for(clip):
     shutil.copy(clip / "0.png", views / "3_rgba" / "5.png")
     assert check("video", clip, "--views", views).exit_code == 0
     assert "-o/--output FILE is missing" in str(CliRunner().invoke(app, ["prepare", "video", str(clip)]).exception)
+
+
+def test_files_of_ones_own_are_checked_by_the_index_alone(tmp_path, dpc_here):
+    for name in ("0", "1"):
+        np.save(tmp_path / f"{name}.npy", np.ones((4, 8, 8), np.uint16))
+    done = dpc_here("prepare", "depth", tmp_path, "--check")
+    assert done.returncode == 0 and b"2 samples to convert, 0 that cannot be" in done.stdout, done.stderr
+    (tmp_path / "2.npy").symlink_to("nowhere.npy")
+    done = dpc_here("prepare", "depth", tmp_path, "--check")
+    assert done.returncode == 3 and b"a link to nowhere.npy, which is missing" in done.stdout
+    done = dpc_here("prepare", "synthetic", "gestures", "--check")
+    assert done.returncode == 3 and b"reads no files" in done.stderr

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dpcli import __version__
-from dpcli.errors import UsageError
+from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.runtime.settings import value_types as kinds
 from dpcli.runtime.settings.catalog import Catalog, Given
 from dpcli.runtime.settings.fields import check, setting, settings_of
@@ -60,10 +60,9 @@ CATALOG = Catalog(network=Network, schedule=Schedule)
 BASE = {"network": Network(), "schedule": Schedule()}
 
 
-def refusal(work: Any, *arguments: Any) -> str:
-    with pytest.raises(UsageError) as caught:
+def refusal(work: Any, *arguments: Any, kind: type[DpcError] = UsageError) -> str:
+    with pytest.raises(kind) as caught:
         work(*arguments)
-    assert caught.value.exit_code == 2
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -208,22 +207,26 @@ def test_config_reads_tables_and_flat_keys(config):
         ("static-radius = 1\nstatic_radius = 1", "static_radius is given twice, as static-radius and static_radius"),
         ("lr = 1\nlr = 2", "not TOML ("),
         ("lr = \n", "not TOML (Invalid value (at line 1"),
-        (b"note = '\xe9'", "not UTF-8 text; save it as UTF-8"),
-        ("batch = 1" + "0" * 10_000, "holds a number too long"),
+        (b"note = '\xe9'", "is not text in UTF-8 (byte 8 is 0xe9); save it as UTF-8"),
+        ("batch = 1" + "0" * 10_000, "not TOML (it holds a number too long to be one)"),
     ],
 )
 def test_a_bad_config_is_told_in_a_sentence(config, text, sentence):
     path = config(text)
-    said = refusal(CATALOG.read_config, path)
+    kind = DataError if "TOML" in sentence or "UTF-8" in sentence else UsageError
+    said = refusal(CATALOG.read_config, path, kind=kind)
     assert said.startswith(f"{path}: {sentence}")
     assert len(said) < len(str(path)) + 200
 
 
 def test_a_config_that_cannot_be_read_is_told(tmp_path):
-    assert refusal(CATALOG.read_config, tmp_path / "no.toml") == f"{tmp_path / 'no.toml'}: no such file"
-    assert refusal(CATALOG.read_config, tmp_path) == f"{tmp_path}: is a folder; expected a TOML file"
     (tmp_path / "file").touch()
-    assert refusal(CATALOG.read_config, tmp_path / "file" / "a.toml").endswith("can't be read (not a directory)")
+    for path, words in (
+        (tmp_path / "no.toml", "no such file"),
+        (tmp_path, "is a folder; expected a TOML file"),
+        (tmp_path / "file" / "a.toml", "can't be read (not a directory)"),
+    ):
+        assert refusal(CATALOG.read_config, path, kind=DataError) == f"{path}: {words}"
 
 
 def test_later_sources_stand_over_earlier_ones():

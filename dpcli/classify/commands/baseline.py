@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from dpcli.classify.data.columns import not_read, telling_columns
 from dpcli.classify.data.descriptors import descriptors
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import DataError
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store import CloudsReader, ScoresWriter, input_file, output_file
 from dpcli.store.pipes import refuse_repeats
 
@@ -49,8 +49,8 @@ def baseline(data: str, *, output: str | None = None, seed: int = 0, force: bool
     anything is computed, for an output that exists.
     """
     refuse_repeats([data, *([output] if output else [])])
-    if output not in (None, "-") and Path(str(output)).exists() and not force:
-        raise UsageError(f"{output}: exists already; --force replaces it")
+    if output not in (None, "-"):
+        refuse_existing(str(output), force)
     with ExitStack() as stack:
         path = stack.enter_context(input_file(data))
         reader = stack.enter_context(CloudsReader(path))

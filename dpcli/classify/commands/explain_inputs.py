@@ -8,7 +8,7 @@ from pathlib import Path
 from dpcli.classify.network.kinet import STREAMS
 from dpcli.classify.network.model_file import ModelInfo
 from dpcli.errors import UsageError
-from dpcli.runtime.whole_file import check_target
+from dpcli.runtime.whole_file import check_target, refuse_existing
 
 
 def chosen_streams(text: str | None, info: ModelInfo) -> tuple[str, ...]:
@@ -33,5 +33,5 @@ def check_targets(output: str, force: bool, *pictures: tuple[Path | None, str, S
     for path, option, kinds in pictures:
         if path is not None:
             check_target(path, option, kinds)
-    if output != "-" and Path(output).exists() and not force:
-        raise UsageError(f"{output}: exists already; --force replaces it")
+    if output != "-":
+        refuse_existing(output, force)

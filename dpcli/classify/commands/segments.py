@@ -22,7 +22,7 @@ from dpcli.runtime import provenance
 from dpcli.runtime.device import choose_device
 from dpcli.runtime.progress import Progress, log
 from dpcli.runtime.tuning import keep_freed_memory
-from dpcli.runtime.whole_file import write_whole
+from dpcli.runtime.whole_file import refuse_existing, write_whole
 from dpcli.store import CloudsReader, input_file
 from dpcli.store.tables.segments import SUFFIXES, Segment, Segments, segments_text
 
@@ -76,8 +76,7 @@ def _suffix(task: ModelTask) -> str:
     path = Path(str(task.output))
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"-o {path}: segments are written as {' or '.join(SUFFIXES)}; name such a file")
-    if path.exists() and not task.force:
-        raise UsageError(f"{path}: exists already; --force replaces it")
+    refuse_existing(path, task.force)
     return path.suffix.lower()
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dpcli.classify.data.augment import NONE, Augmentation
-from dpcli.classify.data.slots import changed_rows, in_slots, signed_columns, slot_rows
+from dpcli.classify.data.slots import changed_rows, in_slots, slot_rows
 from dpcli.classify.network.config import KinetConfig
 from dpcli.errors import DataError
 from dpcli.runtime.seeds import ClassifyStream, generator
@@ -171,7 +171,7 @@ class ClipSource:
             rows = slot_rows(self.reader.read(number, clip.frames, fields=fields), config)
             if whole and self.augmentation != NONE:
                 self._rows[number] = rows
-        made = in_slots(changed_rows(rows, self.augmentation, signed_columns(config), rng), config, rng)
+        made = in_slots(changed_rows(rows, self.augmentation, config.signed_columns, rng), config, rng)
         if number in self.folds:
             made[..., 3] *= 2 + self.folds[number]  # 1 says no more than that there is a point
         return made

@@ -94,17 +94,12 @@ def slot_rows(sequence: CloudSequence, config: KinetConfig) -> np.ndarray:
     return rows[np.linalg.norm(rows[:, :3], axis=1) < FARTHEST]
 
 
-def signed_columns(config: KinetConfig) -> list[int]:
-    """Returns the places of the columns that are speeds: their middle is 0."""
-    return [place for place, middle in enumerate(config.scales[1::2]) if middle == 0]
-
-
 def _about_the_video(columns: np.ndarray, config: KinetConfig) -> np.ndarray:
     """Returns columns f32 (N,F) in which a video's own level counts half, or, but for speeds, not at all.
 
     Who is slow, or far away, does the same gestures with lower speeds and intensities.
     """
-    signed = signed_columns(config)
+    signed = config.signed_columns
     level = np.quantile(np.abs(columns), _FAST, axis=0).clip(_SLOWEST)
     own = columns - np.median(columns, 0)
     own[:, signed] = (columns * 2 / (1 + level))[:, signed]

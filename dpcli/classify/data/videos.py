@@ -28,7 +28,19 @@ def select_videos(reader: CloudsReader, split: str, info: ModelInfo, model_name:
         raise DataError(f"{reader.path}: no sample of split {wanted!r}; it has {sorted(set(reader.splits))}")
     if split == "auto":
         log.info(f"scoring split {wanted!r}: {len(chosen)} of {len(reader)} videos (--split chooses)")
+        _tell_trained(reader, chosen, model_name)
     return chosen
+
+
+def _tell_trained(reader: CloudsReader, chosen: list[int], model_name: str) -> None:
+    """Warns where videos that train are among those that were chosen for want of test videos."""
+    count = sum(reader.splits[i] == "train" for i in chosen)
+    if count:
+        log.warn(
+            f"{reader.path}: no video is of the split 'test', so all are scored; {count} of {len(chosen)} are of the split 'train',"
+            f" and what {model_name} learned from comes out better than new videos do: score others (--split names a split), or"
+            " hold some out before training (`dpc prepare split`)"
+        )
 
 
 def held_out(reader: CloudsReader, info: ModelInfo, model_name: str) -> list[int]:

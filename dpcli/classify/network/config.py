@@ -109,6 +109,11 @@ class KinetConfig:
     )
     dropout: float = setting(0.0, "Dropout before each head's last layer.", least=0, below=1)
     members: int = setting(1, "Networks whose scores are averaged (backbone slots).", least=1, most=64)
+    copies: bool = setting(
+        False,
+        "Learn also from mirrored and time-reversed copies of a clip, each kind of them with a classifier of its own, and average"
+        " their scores (backbone slots).",
+    )
     columns: tuple[str, ...] = ()  # what the file keeps of a point that the backbone slots reads; follows from the data
     forest: tuple[int, int] = (
         0,
@@ -140,6 +145,11 @@ class KinetConfig:
             )
         self._check_reach("temporal_radius", self.temporal_radius)
         self._check_reach("static_temporal_radius", self.static_radius)
+
+    @property
+    def signed_columns(self) -> list[int]:
+        """The places of the columns that are speeds: their middle is 0."""
+        return [place for place, middle in enumerate(self.scales[1::2]) if middle == 0]
 
     def _check_reach(self, name: str, radius: int) -> None:
         """Raises UsageError unless the frames of a neighborhood have a slot each, and points for all slots."""

@@ -22,9 +22,10 @@ from dpcli.runtime.progress import log
 from dpcli.store import CloudsReader
 
 _PROBE, _HEAD = 3, 12  # videos a class, at most, for which the last layers alone, or the heads alone, learn
-_CLIPS = {"probe": (3000, 3000), "head": (5000, 5000), "all": (6000, 9000)}  # that each stream sees in all
-_RATES = {"probe": 2e-3, "head": 1e-3, "all": 5e-4}
-_EPOCHS = 5, 100  # at least, at most
+_CLIPS = {"probe": 3000, "head": 5000, "all": 9000}  # that each stream sees in all
+_RATES = {"probe": 2e-3, "head": 1e-3}
+_EPOCHS = 5, 100  # at least, at most, of what is frozen but for its last layers
+_SHORTEST = 4  # where everything learns: this part of the epochs of a training from nothing, at least
 _UNIT = 2.0  # times as large or small as what a network learned from: another unit
 _LOOKED_AT = 50  # videos
 
@@ -45,25 +46,32 @@ def settings_from(info: ModelInfo, reader: CloudsReader, part: str | None) -> di
     """
     base = PRESETS["sparse" if info.timing == "slots" else "quick"]
     chosen = part_for(reader) if part in (None, "auto") else part
-    videos = len(labeled(reader, "train"))
-    least, most = _EPOCHS
-    epochs, dynamic = (min(max(round(clips / videos), least), most) for clips in _CLIPS[chosen])
-    if not base["schedule"].epochs_dynamic:
-        dynamic = 0
-    schedule = replace(
-        base["schedule"],
-        epochs=epochs,
-        epochs_dynamic=dynamic,
-        learning_rate=_RATES[chosen],
-        fine_tune=chosen,
-        validate_every=max(1, epochs // 10),
-    )
     return {
         **base,
         "network": _in_its_unit(info.config, reader).changed(forest=(0, 0)),
-        "schedule": schedule,
+        "schedule": _schedule(base["schedule"], chosen, len(labeled(reader, "train"))),
         "run": replace(base["run"], timing=info.timing),
     }
+
+
+def _schedule(preset: Schedule, part: str, videos: int) -> Schedule:
+    """Returns how long and how fast a part of a network learns from so many videos.
+
+    Where everything learns, it is at the preset's rate and for up to its epochs, since a slower or shorter training ends below
+    one from nothing.
+    """
+    epochs = []
+    for own in preset.stage_epochs:
+        least, most = (-(-own // _SHORTEST), own) if part == "all" else _EPOCHS
+        epochs.append(min(max(round(_CLIPS[part] / videos), least), most) if own else 0)
+    return replace(
+        preset,
+        epochs=epochs[0],
+        epochs_dynamic=epochs[1],
+        learning_rate=_RATES.get(part, preset.learning_rate),
+        fine_tune=part,
+        validate_every=max(1, epochs[0] // 10),
+    )
 
 
 def _in_its_unit(config: KinetConfig, reader: CloudsReader) -> KinetConfig:

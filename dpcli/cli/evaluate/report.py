@@ -83,9 +83,10 @@ def _form(output: str | None, as_markdown: bool, as_latex: bool) -> str:
 
 
 def _check_output(output: str | None, force: bool) -> None:
+    from dpcli.runtime.whole_file import refuse_existing
+
     if output in (None, "-"):
         return
-    if Path(output).exists() and not force:
-        raise UsageError(f"{output}: exists already; --force replaces it")
+    refuse_existing(output, force)
     if not Path(output).absolute().parent.is_dir():
         raise DataError(f"-o {output}: the folder {Path(output).parent} does not exist; create it first")

@@ -10,7 +10,7 @@ import typer
 from dpcli.cli.help_groups import LABELS, RUNNING
 
 FileOrPipe = Annotated[str, typer.Option("-o", "--output", help="File to write, or - for a pipe.")]
-Check = Annotated[bool, typer.Option("--check", help="Only compare the folder with its recipe; list what is missing.")]
+Check = Annotated[bool, typer.Option("--check", help="Convert nothing; list what is there and what is missing.")]
 Compression = Annotated[
     Literal["none", "lzf", "gzip"],
     typer.Option("--compression", rich_help_panel=RUNNING, help="How the coordinates are compressed."),

@@ -19,6 +19,7 @@ from dpcli.generate4d.out.splat_files import camera_list
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import log
 from dpcli.runtime.seeds import generator
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store import CloudSequence, input_file, output_file
 from dpcli.store.gaussians import GaussianScene, read_scene, scene_origin
 
@@ -88,8 +89,8 @@ def _export_files(
         raise UsageError(f"-o {output}: expected a name that ends in .json")
     if single and not output.name.lower().endswith(f".{kind}"):
         raise UsageError(f"-o {output}: expected a name that ends in .{kind}, or a folder for one file a frame")
-    if (form in _TABLES or single) and output.exists() and not force:
-        raise UsageError(f"{output}: exists already; --force replaces it")
+    if form in _TABLES or single:
+        refuse_existing(output, force)
     if form in _TABLES:
         write_json(output, camera_list(scene, axes) if form == "cameras" else scene.metrics)
     elif single:

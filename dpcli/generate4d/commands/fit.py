@@ -143,7 +143,15 @@ def _run_folder(output: str, run: str | None) -> Path:
 
 
 def _preview_writer(folder: RunFolder, targets: Targets) -> Callable[[Model4D], None]:
-    return lambda model: write_preview(model, targets, folder.file("preview.png"))
+    path = folder.file("preview.png")
+
+    def write(model: Model4D) -> None:
+        first = not path.exists()
+        write_preview(model, targets, path)
+        if first:  # before the first step: whoever waits can look at the start from all sides
+            log.info(f"{path}: a look at it from all sides, drawn again as the fit goes on")
+
+    return write
 
 
 def _load_prior(supervision: Supervision, targets: Targets, device: str) -> Prior | None:

@@ -8,6 +8,7 @@ from dpcli.errors import UsageError
 from dpcli.generate4d.out.export import keep_opaque
 from dpcli.generate4d.viewer import write_page
 from dpcli.runtime.progress import log
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store import input_file
 from dpcli.store.gaussians import read_scene, scene_origin
 
@@ -28,8 +29,7 @@ def view_scene(
     """
     if output.suffix.lower() not in (".html", ".htm"):
         raise UsageError(f"-o {output}: expected a name that ends in .html")
-    if output.exists() and not force:
-        raise UsageError(f"{output}: exists already; --force replaces it")
+    refuse_existing(output, force)
     with input_file(scene_file) as place:
         scene, (root, history) = read_scene(place), scene_origin(place)
     scene = keep_opaque(scene, min_opacity)

@@ -56,6 +56,11 @@ def sample_surface(
     """
     points = points_of(layers, camera)
     if not len(points.position):
+        if layers.presence.any():
+            raise DataError(
+                f"the object is too thin or too clear: at {max(layers.presence.shape[1:])} pixels no alpha of the frame to"
+                f" start from is above {layers.presence.max():.2f}, expected 0.5; take --prior none --set start=sphere"
+            )
         raise DataError(
             "the reference view shows nothing in the frame to start from (alpha is zero); prepare the clip again"
         )

@@ -131,11 +131,19 @@ def _make_plain(path: Path, tree: Any) -> None:
     etree.cleanup_namespaces(tree)
     if root.tag != "robot":
         raise DataError(f"{path}: its root element is <{root.tag}>; expected <robot>, this is not a URDF")
+    root.set("name", root.get("name", "robot"))  # nothing here depends on it
     for origin in root.iter("origin"):
         if origin.get("quat_xyzw"):
             origin.set("rpy", " ".join(map(repr, _roll_pitch_yaw(path, origin.attrib.pop("quat_xyzw")))))
+    for shape in root.findall("link/visual"):
+        if not shape.findall("geometry/*"):
+            link = shape.getparent().get("name")
+            raise DataError(
+                f"{path}: link {link!r} has a <visual> without geometry; expected {', '.join(_SHAPES)} in it, or remove it"
+            )
     for shape in root.findall("link/collision"):
-        if any(isinstance(part.tag, str) and part.tag not in _SHAPES for part in shape.findall("geometry/*")):
+        kinds = [part.tag for part in shape.findall("geometry/*") if isinstance(part.tag, str)]
+        if not kinds or not {*kinds} <= {*_SHAPES}:
             shape.getparent().remove(shape)
 
 

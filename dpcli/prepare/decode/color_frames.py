@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,10 +17,13 @@ from dpcli.prepare.series import about_series, choose_series
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
+from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
 _SAID: set[str] = set()
+_CAMERAS = ("cameras.json", "cameras.txt", "cameras.bin", "poses_bounds.npy", "sparse")  # of others
+_ORIENTATION = 0x0112  # of EXIF
 _ALL = "take all, each into a file of its own"
 FOLDER_FPS = 16.0  # 32 frames in 2 seconds: how the usual test clips were sampled
 
@@ -65,16 +69,16 @@ def open_frames(path: Path, pattern: str = "", *, quiet: bool = False) -> Frames
 
 
 def image_paths(folder: Path) -> list[Path]:
-    """Returns images directly in a folder, by the integers in their names that aren't the same in all, from left to
-    right.
+    """Returns images directly in a folder, by the numbers in their names, from left to right: fractions and dates as such
+    where most are named alike, else the integers that aren't the same in all.
     """
     found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     found.sort(key=natural_key)
     columns = _telling_columns([path.stem for path in found])
     order = [tuple(numbers) for numbers in zip(*columns)]
     if found and len(set(order)) == len(found):
-        return [path for _, path in sorted(zip(order, found))]
-    return found
+        found = [path for _, path in sorted(zip(order, found))]
+    return in_order(found)
 
 
 def frame_numbers(stems: Sequence[str]) -> list[int]:
@@ -134,22 +138,43 @@ def _open_folder(folder: Path, pattern: str, quiet: bool) -> Frames:
     paths = paths if pattern else one_series(folder, paths, option="--pattern", quiet=quiet)
     if not quiet and (clips := clips_in(folder)):
         log.info(f"{folder}: its images are the clip; left out: {first_names(clips)}")
+    if not quiet and (cameras := [name for name in _CAMERAS if (folder / name).exists()]):
+        log.warn(
+            f"{folder}: {first_names(cameras)}: not read; the camera of a clip is taken to stand still, and where it moves the "
+            "object seems to. Cameras are read from transforms.json, with a time for each frame"
+        )
     stems = [path.stem for path in paths]
     twins = sorted({stem for stem in stems if stems.count(stem) > 1})
     if twins:
         raise DataError(
             f"{folder}: {twins[0]!r} is there with two suffixes; choose with --pattern '*{paths[0].suffix}'"
         )
-    return Frames(folder, tuple(p.name for p in paths), tuple(frame_numbers(stems)), tuple(paths))
+    numbers = frame_numbers(stems)
+    if any(a >= b for a, b in zip(numbers, numbers[1:])):
+        numbers = list(range(len(stems)))  # fractions: 0.25 comes before 0.3
+    return Frames(folder, tuple(p.name for p in paths), tuple(numbers), tuple(paths))
 
 
 def read_rgba(path: Path) -> np.ndarray:
     """Reads one image as u8 (H,W,4), straight alpha. Raises DataError when unreadable."""
+    with _readable(path) as image:
+        return _to_rgba(as_shown(image), path)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Returns the width and height of one image as it is shown, by its header. Raises DataError when unreadable."""
+    with _readable(path) as image:
+        turned = image.getexif().get(_ORIENTATION, 1) in (5, 6, 7, 8)
+        return image.size[::-1] if turned else image.size
+
+
+@contextmanager
+def _readable(path: Path):  # -> Iterator[PIL.Image.Image]
     from PIL import Image
 
     try:
         with open_image(path) as image:
-            return _to_rgba(as_shown(image), path)
+            yield image
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         why = "empty" if path.is_file() and path.stat().st_size == 0 else str(error).splitlines()[0]
         raise DataError(f"{path}: not a readable image ({why}); export this frame again") from None

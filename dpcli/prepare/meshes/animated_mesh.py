@@ -52,7 +52,8 @@ class AnimatedMesh:
     color: linear RGBA f32 (V,4). uv: f32 (V,2), v downwards. bones i64 and weights f32 (V,J): skinning, sums 1.
     bone_pose: f64 (T,B,4,4) bone to world. bone_parent: i64 (B), -1 for roots; parents may come after children.
     emission_uv: f32 (V,2) where the emission's textures are looked up, None: at uv. one_sided: bool (F) triangles that
-    are not seen from behind, None: all are seen from both sides.
+    are not seen from behind, None: all are seen from both sides. faceted: bool (F) triangles that are lit by the plane they
+    lie in, not by the normals of their corners, None: none.
     """
 
     name: str
@@ -71,6 +72,7 @@ class AnimatedMesh:
     bone_name: tuple[str, ...] = field(default=())
     emission_uv: np.ndarray | None = None
     one_sided: np.ndarray | None = None
+    faceted: np.ndarray | None = None
 
     @property
     def num_frames(self) -> int:

@@ -39,6 +39,7 @@ class _Piece:
     targets: np.ndarray | None
     normal_targets: np.ndarray | None
     emission_uv: np.ndarray
+    faceted: bool
 
 
 def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
@@ -92,7 +93,10 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
         emission_uv=joined("emission_uv"),
     )
     culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]
-    return replace(mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None)
+    faceted = np.concatenate([np.full(len(piece.triangles), piece.faceted) for piece in pieces])
+    return replace(
+        mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None, faceted=faceted if faceted.any() else None
+    )
 
 
 def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) -> np.ndarray:
@@ -225,6 +229,7 @@ def _read_primitive(file: Gltf, node: int, entry: dict[str, Any], skins: Any) ->
         targets and _deltas(file, targets, "POSITION", count, where),
         targets and _deltas(file, targets, "NORMAL", count, where),
         read(f"TEXCOORD_{emission_set}", 2, nowhere),
+        "NORMAL" not in attributes,  # then the specification asks for flat shading, and viewers do it
     )
 
 

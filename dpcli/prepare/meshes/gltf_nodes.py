@@ -56,7 +56,7 @@ def clip_names(file: Gltf) -> list[str]:
 
 
 def choose_clip(file: Gltf, wanted: str | None) -> int:
-    """Returns the index of a clip by name, by what follows the last | of it, in any case, or by its number from 0.
+    """Returns the index of a clip by name, by what follows a | of it, in any case, or by its number from 0.
 
     None: the first.
     """
@@ -67,8 +67,9 @@ def choose_clip(file: Gltf, wanted: str | None) -> int:
         return 0
     if wanted in names:
         return names.index(wanted)
-    for spell in (str.lower, lambda name: name.split("|")[-1].lower()):
-        same = [index for index, name in enumerate(names) if spell(name) == wanted.lower()]
+    asked, lower = wanted.lower(), [name.lower() for name in names]
+    for fits in (asked.__eq__, lambda name: name.endswith(f"|{asked}")):
+        same = [index for index, name in enumerate(lower) if fits(name)]
         if len(same) == 1:
             return same[0]
     if wanted.isdecimal() and int(wanted) < len(names):

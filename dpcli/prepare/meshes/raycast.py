@@ -26,7 +26,8 @@ class FrameCaster:
         self.mesh, self.shading = mesh, shading
         self.positions, self.normals = mesh.positions[frame], mesh.normals[frame]
         a, b, c = (self.positions[mesh.triangles[:, k]] for k in range(3))
-        self._across = None if mesh.one_sided is None else np.cross(b - a, c - a)
+        plain = mesh.one_sided is None and mesh.faceted is None
+        self._across = None if plain else np.cross(b - a, c - a)
         open3d = load_open3d()
         self._tensor = open3d.core.Tensor
         self._scene = open3d.t.geometry.RaycastingScene(nthreads=1)  # one process per CPU is the parallelism
@@ -115,7 +116,7 @@ class FrameCaster:
             color[:, :3] *= self._light(triangle, corners, weights, direction)[:, None]
         if any(any(m.emission) for m in mesh.materials):
             color[:, :3] += emitted(mesh, mesh.material[triangle], corners, weights)
-        if self._across is not None:
+        if mesh.one_sided is not None:
             behind = np.einsum("na,na->n", self._across[triangle], direction) > 0
             color[behind & mesh.one_sided[triangle], 3] = 0
         color[:, :3] = to_srgb(np.clip(color[:, :3], 0, 1))
@@ -126,12 +127,20 @@ class FrameCaster:
     ) -> np.ndarray:
         """Returns how much light (N) comes from each point, 1 on a plain or unlit surface."""
         normal = np.einsum("nk,nka->na", weights, self.normals[corners])
+        if self.mesh.faceted is not None:
+            normal = np.where(self.mesh.faceted[triangle, None], _unit(self._across[triangle]), normal)
         length = np.sqrt(np.einsum("na,na->n", normal, normal))
         facing = np.where(np.einsum("na,na->n", normal, direction) > 0, -1, 1)
         half = 0.5 + 0.5 * facing * (normal @ _LIGHT) / np.maximum(length, 1e-9)
         light = 1 - self.shading * (0.7 - 0.8 * half)  # wraps around: no side is black, as under an open sky
         unlit = np.array([m.unlit for m in self.mesh.materials])
         return np.where(unlit[self.mesh.material[triangle]], 1, light).astype(np.float32)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Returns f32 (N,3) of length 1, 0 where they have none."""
+    vectors = vectors.astype(np.float64)
+    return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)).astype(np.float32)
 
 
 def pixel_rays(intrinsics: np.ndarray, pose: np.ndarray, rows: slice, columns: slice, samples: int) -> np.ndarray:

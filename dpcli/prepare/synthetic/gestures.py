@@ -125,9 +125,14 @@ class SyntheticGestures:
         return asdict(self)
 
     @property
+    def seen_subjects(self) -> int:
+        """Returns how many subjects there are videos of: with few videos of a class not all of them."""
+        return min(self.subjects, self.videos_per_class)
+
+    @property
     def train_subjects(self) -> int:
-        """Returns how many subjects, from 1 on, train; the others test: six of ten."""
-        return max(1, min(self.subjects - 1, round(0.6 * self.subjects)))
+        """Returns how many subjects, from 1 on, train; the others that are seen test: six of ten."""
+        return max(1, min(self.seen_subjects - 1, round(0.6 * self.seen_subjects)))
 
     def items(self) -> list[Item]:
         """Returns the index in its final order. Raises DataError when the raw data are not what they should be."""
@@ -184,7 +189,10 @@ class SyntheticGestures:
 
     def summary(self, items: list[Item]) -> list[str]:
         """Returns lines for the log about what the index holds and lacks."""
-        split = f"subjects 1-{self.train_subjects} train, the others test"
+        seen, train = self.seen_subjects, self.train_subjects
+        split = f"subjects 1-{train} of {seen} train, the others test"
+        if seen == 1:
+            split = "all are of subject 1 and train; with --videos-per-class 2 or more, another subject tests"
         return [f"{len(items)} videos of {len(CLASS_NAMES)} gestures; {split}"]
 
 

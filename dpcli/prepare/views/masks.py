@@ -14,6 +14,7 @@ from dpcli.runtime.progress import log
 _SMALL_LABEL = 64  # no mask is that dark; values below are labels
 _LABELS = 64  # values at most in an image of labels
 _VOID = 255  # beside small labels: in some data sets, such as PASCAL VOC, that nobody decided
+_WIDE_VOIDS = (10_000, 65_535)  # the same beside other labels of 16 bits, such as KITTI MOTS has them
 _COLORFUL = 48  # gray levels between channels: more than compression does to a gray mask
 _NOISE = 32  # gray levels: compression leaves no more where nothing is
 _RIPPLE = 24  # gray levels between neighbors within a label, after compression
@@ -29,7 +30,8 @@ def read_mask(path: Path) -> np.ndarray:
     """
     try:
         with open_image(path) as stored:
-            lossy, image = stored.format in ("JPEG", "WEBP", "AVIF"), upright(stored)
+            lossy = stored.format in ("JPEG", "AVIF") or stored.format == "WEBP" and not _is_lossless(path)
+            image = upright(stored)
             if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
                 alpha = np.array(image.convert("RGBA").getchannel("A"))
                 if alpha.min(initial=255) < 255:
@@ -41,6 +43,13 @@ def read_mask(path: Path) -> np.ndarray:
     except (OSError, ValueError, SyntaxError) as error:
         raise DataError(f"{path}: not a readable mask ({error}); export it again") from None
     return _of_colors(path, values, lossy) if values.ndim == 3 else _of_values(path, values, lossy)
+
+
+def _is_lossless(path: Path) -> bool:
+    """Returns whether a WebP file holds a picture as it was, in a chunk named VP8L, perhaps after those of its properties."""
+    with open(path, "rb") as file:
+        start = file.read(64)
+    return b"VP8L" in start and b"VP8 " not in start
 
 
 def mask_of_video(path: Path, rgba: np.ndarray) -> np.ndarray:
@@ -91,12 +100,15 @@ def _opaque(where: np.ndarray) -> np.ndarray:
 
 
 def _opaque_labels(path: Path, labels: np.ndarray) -> np.ndarray:
-    """Returns 255 wherever the label isn't 0. The log tells of 255 beside small labels, which some take for "undecided"."""
-    others = labels[(labels > 0) & (labels != _VOID)]
-    if (labels == _VOID).any() and len(others) and others.max() < _SMALL_LABEL:
+    """Returns 255 wherever the label isn't 0. The log tells of labels that some data sets have for "undecided"."""
+    found = set(np.unique(labels).tolist()) - {0}
+    small, wide = {label for label in found if label < _SMALL_LABEL}, found & {*_WIDE_VOIDS}
+    void = _VOID if _VOID in found and small == found - {_VOID} else min(wide, default=0)
+    if void and len(found) > 1:
+        beside = f"labels below {_SMALL_LABEL}" if void == _VOID else "other labels"
         with log.each_once(_SAID):
             log.info(
-                f"{path.parent}: masks: 255 beside labels below {_SMALL_LABEL} is read as the object, like every label but 0; "
+                f"{path.parent}: masks: {void} beside {beside} is read as the object, like every label but 0; "
                 "where it means undecided, write 0"
             )
     return _opaque(labels > 0)

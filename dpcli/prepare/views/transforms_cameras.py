@@ -28,6 +28,7 @@ _DISTORTION += (*(f"ftheta_p{place}" for place in range(5)), "latlong", "rolling
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "RADIAL", "SIMPLE_RADIAL", "FULL_OPENCV", "PERSPECTIVE")
 _TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL axes: y up, z back
 _LAST_TIME = 1e9  # in any unit
+_WIDEST = 0.1  # of a picture's side: a lens of 157 degrees, which no pinhole has
 _SHAPE = 0.01  # how much two shapes of pictures may differ and still be one picture at two sizes
 
 
@@ -60,6 +61,11 @@ class View:
         fx, fy = (own or other for own, other in (focal, focal[::-1]))
         if not fx:
             raise DataError(f"{place.parent}: views without cameras: no camera_angle_x and no fl_x")
+        if fx < _WIDEST * (width / across) or fy < _WIDEST * (height / down):
+            raise DataError(
+                f"{place.parent}: a focal length of {min(fx, fy):g} pixels for pictures of {width / across:g}x{height / down:g}; "
+                "expected pixels, not shares of the picture or millimeters"
+            )
         cx, cy = lens.get("cx", 0.5 * width / across), lens.get("cy", 0.5 * height / down)
         return np.array([[fx * across, 0, cx * across], [0, fy * down, cy * down], [0, 0, 1.0]])
 

@@ -12,7 +12,15 @@ import numpy as np
 from dpcli.errors import DataError, UsageError
 from dpcli.ops.cameras import DEFAULT_FOVY, DEFAULT_RADIUS, orbit_pose, pinhole
 from dpcli.path_names import first_names
-from dpcli.prepare.decode.color_frames import FOLDER_FPS, Frames, image_paths, integers, open_frames, read_rgba
+from dpcli.prepare.decode.color_frames import (
+    FOLDER_FPS,
+    Frames,
+    image_paths,
+    image_size,
+    integers,
+    open_frames,
+    read_rgba,
+)
 from dpcli.prepare.reader import require_folder
 from dpcli.prepare.views import matting
 from dpcli.prepare.views.given_views import OrbitCamera, find_views, read_cameras, six_views
@@ -25,6 +33,7 @@ from dpcli.store.views import ViewsHeader
 _LISTED = 8
 _ISLAND = 0.01  # of the object: a smaller piece apart from it does not widen the crop
 _OBJECT = 0.2  # of the largest piece: one that large, apart from it, is another object
+_ANNOTATIONS = (".json", ".txt", ".xml", ".npy", ".npz")  # of LabelMe, YOLO, CVAT, SAM
 _NO_NAMES = {"ref", "rgba", "rgb", "images", "image", "img", "imgs", "frames"}
 
 
@@ -248,6 +257,16 @@ def _readable(frames: Frames, wanted: list[int], on_error: str) -> list[int]:
     return good
 
 
+def _require_one_size(frames: Frames, wanted: list[int], sizes: list[tuple[int, int]]) -> None:
+    for index, size in zip(wanted, sizes):
+        if size != sizes[0]:
+            first, here = (f"{width}x{height}" for width, height in (sizes[0], size))
+            raise DataError(
+                f"{frames.path}: {frames.names[index]} is {here}, {frames.names[wanted[0]]} is {first}\n"
+                "One crop serves the whole clip: export all frames at one size"
+            )
+
+
 def warn_gaps(frames: Frames, wanted: list[int]) -> None:
     """Says in the log where the numbers of frames jump."""
     steps = np.diff(frames.numbers)
@@ -262,14 +281,11 @@ def warn_gaps(frames: Frames, wanted: list[int]) -> None:
 def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tuple[Cutter, tuple[int, int]]:
     """Looks at every frame once: one size, alpha or none, what is around the object."""
     shape, borders, clear = None, [], []
+    if frames.path.is_dir():  # by their headers first: a damaged one may tell of 16 million pixels
+        _require_one_size(frames, wanted, [image_size(frames.files[index]) for index in wanted])
     for index, frame in zip(wanted, frames.read(wanted)):
         shape = shape or frame.shape
-        if frame.shape != shape:
-            first, here = f"{shape[1]}x{shape[0]}", f"{frame.shape[1]}x{frame.shape[0]}"
-            raise DataError(
-                f"{frames.path}: {frames.names[index]} is {here}, {frames.names[wanted[0]]} is {first}\n"
-                "One crop serves the whole clip: export all frames at one size"
-            )
+        _require_one_size(frames, [wanted[0], index], [shape[1::-1], frame.shape[1::-1]])
         clear.append(bool((frame[..., 3] < 255).any()))
         borders.append(matting.border_pixels(frame[..., :3]))
     size = (shape[1], shape[0])
@@ -292,7 +308,15 @@ def _make_cutter(frames: Frames, wanted: list[int], options: VideoOptions) -> tu
 
 def open_masks(place: Path) -> Frames:
     """Opens the masks of a folder or a video. Raises DataError when there are none."""
-    return open_frames(place if place.is_file() else require_folder(place, "a mask per frame, as images, or a video"))
+    if place.is_file():
+        return open_frames(place)
+    folder = require_folder(place, "a mask per frame, as images, or a video")
+    if not image_paths(folder) and (other := [p.name for p in sorted(folder.iterdir()) if p.suffix in _ANNOTATIONS]):
+        raise DataError(
+            f"{place}: {first_names(other, 3)}: annotations and arrays are not read as masks; draw each frame's as a PNG, "
+            '255 where the object is (labelme_export_json, CVAT\'s "Segmentation mask" and the like do it)'
+        )
+    return open_frames(folder)
 
 
 def find_masks(frames: Frames, folder: Path) -> tuple[Path, ...] | Frames:

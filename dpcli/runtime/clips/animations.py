@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError, reading
+from dpcli.runtime.clips.gif_pictures import check_canvas, gif_canvases
 from dpcli.runtime.clips.images import as_shown, open_image
 from dpcli.runtime.clips.video_frames import video_frames
 
-_GIF_PACKS = 4096  # pixels that a byte of GIF's LZW can't exceed: a code of 12 bits stands for fewer
-_SMALL = 1 << 20  # pixels of a canvas that may be mostly empty
 _MANY_JPEGS = (".mjpg", ".mjpeg")  # JPEG images one after the other, which are a video
 _SHORTEST, _INSTEAD = 10.0, 100.0  # ms: what is shown so long or less browsers show for a tenth of a second
 
@@ -35,7 +34,8 @@ def animation_times(path: Path) -> tuple[float, ...]:
     times, now = [], 0.0
     try:
         with open_image(path) as image:
-            _check_canvas(path, image.format, image.width * image.height)
+            if image.format == "GIF":
+                check_canvas(path, image.width * image.height, path.stat().st_size)
             first = int(getattr(image, "default_image", False))  # what viewers show that can't play an APNG
             for index in range(first, getattr(image, "n_frames", 1)):
                 image.seek(index)
@@ -55,19 +55,11 @@ def animation_times(path: Path) -> tuple[float, ...]:
     return tuple(times)
 
 
-def _check_canvas(path: Path, kind: str | None, pixels: int) -> None:
-    """Raises DataError for a GIF's canvas that its bytes can't fill: each frame is laid out at that size."""
-    size = path.stat().st_size
-    if kind == "GIF" and pixels > _GIF_PACKS * size + _SMALL:
-        raise DataError(
-            f"{path}: its canvas claims {pixels} pixels, a file of {size} bytes can't hold them; export it again"
-        )
-
-
 def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
     """Yields frames by rising index, each u8 (H,W,4) with straight alpha.
 
-    FFmpeg decodes APNG: Pillow lays one frame over another as if what is below were opaque.
+    FFmpeg decodes APNG: Pillow lays one frame over another as if what is below were opaque. Nor does it lay a GIF's as
+    browsers do.
     """
     from PIL import Image
 
@@ -76,6 +68,12 @@ def animation_frames(path: Path, wanted: Sequence[int]) -> Iterator[np.ndarray]:
         if image.format == "PNG":
             for frame in video_frames(path, wanted, as_stored=True):
                 yield np.array(as_shown(Image.fromarray(frame), info))
+            return
+        if image.format == "GIF":
+            canvases = enumerate(gif_canvases(path, *image.size))
+            for index in wanted:
+                shown = next(canvas for at, canvas in canvases if at == index)
+                yield np.array(as_shown(Image.fromarray(shown), info))
             return
         for index in wanted:
             image.seek(index)

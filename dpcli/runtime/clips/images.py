@@ -23,6 +23,7 @@ _PIXELS, _PIXELS_A_BYTE = 1 << 24, 10  # that any picture may have; and as many 
 _NAMED = 6  # series at most in a message
 _TAGS = "transfer and primaries"  # of H.273, beside what Pillow finds
 _COLORS = ("1", "L", "LA", "P", "PA", "RGB", "RGBA")  # modes of 8 bits
+_PHOTOMETRIC, _WHITE_IS_ZERO = 262, 0  # a tag of TIFF, and what it may say
 _GAMMA = 1 / 2.2  # of sRGB, as PNG writes it
 
 
@@ -55,10 +56,16 @@ def open_image(path: Path):  # -> Iterator[PIL.Image.Image]
 
 
 def upright(image):  # image: PIL.Image.Image -> PIL.Image.Image
-    """Returns the image turned and mirrored as its EXIF orientation asks for; itself where there is none."""
-    from PIL import ImageOps
+    """Returns the image turned and mirrored as its EXIF orientation asks for, with straight alpha; itself where there is none.
 
-    return ImageOps.exif_transpose(image)
+    Gray of 16 bits whose file has white at 0 is turned round: Pillow does so with 8 bits alone.
+    """
+    from PIL import Image, ImageOps
+
+    turned = ImageOps.exif_transpose(image)
+    if image.mode.startswith("I;16") and getattr(image, "tag_v2", {}).get(_PHOTOMETRIC) == _WHITE_IS_ZERO:
+        return Image.fromarray(65535 - np.asarray(turned))
+    return turned.convert("LA") if image.mode == "La" else turned
 
 
 def as_shown(image, info: dict | None = None):  # image: PIL.Image.Image -> PIL.Image.Image

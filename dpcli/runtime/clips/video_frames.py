@@ -5,10 +5,12 @@ PyAV decodes: it brings decoders of AV1 and of the alpha of VP8 and VP9, which O
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from dpcli.runtime.clips import wide_color
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.cropping import Margins, margins
 from dpcli.runtime.clips.display_matrix import as_it_plays, display_matrix
+from dpcli.runtime.clips.other_files import no_video
 from dpcli.runtime.progress import log
 
 VIDEO_SUFFIXES = (
@@ -41,6 +44,8 @@ _UNKNOWN_MATRICES = {8: "YCgCo", 11: "YDzDx", 14: "ICtCp", 15: "IPT-C2", 16: "YC
 _BT709, _BT601, _BT2020 = 1, 5, 9
 _SD_LINES, _SD_COLUMNS = 576, 1279  # larger pictures without a tag are BT.709, as players have it
 _FULL_RANGE = 2
+_ALPHA_LAYER = re.compile(rb"\x4e[\x01\x09]\xa5")  # supplemental information of HEVC, of type 165: of an alpha channel
+_HEAD = 1024  # bytes of a packet that hold such information, before its picture
 _ASKEW = 0.02  # of a display matrix: a degree
 
 
@@ -103,6 +108,7 @@ def _look(path: Path, changed: int, size: int) -> VideoLook:
         times = frame_times(np.array(stamps), rate if 0 < rate < 10_000 else None)
         _check_whole(path, container, stream, len(stamps), times, failed)
         _require_known_colors(path, first)
+        _require_one_layer(path, stream)
         _tell_streams(path, container, stream)
         _tell_display(path, first, stream)
         left, right, top, bottom = _margins(path, container, stream)
@@ -128,7 +134,7 @@ def _open(path: Path):  # -> (av.container.InputContainer, av.VideoStream)
     try:
         container = av.open(name, options={"format_whitelist": VIDEO_FORMATS}, metadata_errors="replace")
     except (av.FFmpegError, OSError, ValueError):
-        raise DataError(f"{path}: not a readable video (empty, damaged, or of an unknown kind)") from None
+        raise DataError(f"{path}: not a readable video ({no_video(path)})") from None
     streams = _streams(container)
     if not streams:
         container.close()
@@ -161,9 +167,11 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     context.thread_type = "AUTO"
     context.flags |= av.codec.context.Flags.unaligned  # else columns that H.264 and HEVC cut off on the left are shown
     begun = False
-    for packet in container.demux(stream):
+    # A packet without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
+    packets = (packet for packet in container.demux(stream) if packet.size)
+    for packet in chain(packets, [None]):
         try:
-            frames = context.decode(packet if packet.size else None)
+            frames = context.decode(packet)
         except av.FFmpegError as error:
             if begun:
                 raise DataError(f"{path}: a frame cannot be decoded ({error.strerror}); copy the video again") from None
@@ -216,7 +224,7 @@ def _declared_and_held(
 ) -> tuple[int, int]:
     """Returns how many frames a file declares, 0 where it doesn't, and how many of them lie in it; cut: it ends early."""
     if stream.frames > count + (not cut):
-        return stream.frames, _packets(path) + empty_frames(path, stream.index)
+        return stream.frames, count + _hidden_packets(path) + empty_frames(path, stream.index)
     if not stream.frames and times is not None and stream.average_rate and len(container.streams) == 1:
         begins = float((stream.start_time or 0) * stream.time_base)  # some containers count their duration from 0
         seconds = float(container.duration or 0) / 1e6 - max(begins, 0.0)
@@ -228,15 +236,20 @@ def _declared_and_held(
     return stream.frames, count
 
 
-def _packets(path: Path) -> int:
-    """Returns how many whole packets of the video lie in the file, also those before and after what plays."""
+def _hidden_packets(path: Path) -> int:
+    """Returns how many whole packets of the video lie before and after what plays, as an edit list says."""
+    return _packets(path, {"ignore_editlist": "1"}) - _packets(path, {})
+
+
+def _packets(path: Path, options: dict[str, str]) -> int:
+    """Returns how many whole packets of the video are shown, by FFmpeg's demuxer with these options."""
     import av
 
-    options = {"format_whitelist": VIDEO_FORMATS, "ignore_editlist": "1"}
+    options = {"format_whitelist": VIDEO_FORMATS, **options}
     with av.open("file:" + utf8_path(path, "FFmpeg"), options=options, metadata_errors="replace") as container:
-        stream = _streams(container)[0]
+        packets = container.demux(_streams(container)[0])
         try:
-            return sum(1 for packet in container.demux(stream) if packet.size and not packet.is_corrupt)
+            return sum(1 for one in packets if one.size and not one.is_corrupt and not one.is_discard)
         except av.FFmpegError:
             return 0
 
@@ -272,6 +285,21 @@ def _require_known_colors(path: Path, frame) -> None:
             f"{path}: its colors are {_UNKNOWN_MATRICES[tag]}; expected RGB, or YCbCr of BT.601, 709 or 2020; "
             "ffmpeg -i IN -vf zscale=matrix=709 OUT converts some"
         )
+
+
+def _require_one_layer(path: Path, stream) -> None:
+    """Raises DataError for HEVC with an alpha layer, as QuickTime writes it: FFmpeg shows what lies below as opaque."""
+    import av
+
+    if stream.codec_context.name != "hevc":
+        return
+    with av.open("file:" + utf8_path(path, "FFmpeg"), options={"format_whitelist": VIDEO_FORMATS}) as container:
+        packet = next((packet for packet in container.demux(stream.index) if packet.size), b"")
+        if _ALPHA_LAYER.search((stream.codec_context.extradata or b"") + bytes(packet)[:_HEAD]):
+            raise DataError(
+                f"{path}: its alpha lies in a layer of HEVC that is not decoded; export it as ProRes 4444, or as "
+                "WebM with alpha, with the program that shows it"
+            )
 
 
 def _tell_streams(path: Path, container, stream) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dpcli import __version__
-from dpcli.errors import DataError, UsageError
+from dpcli.errors import UsageError
 from dpcli.runtime.settings import value_types as kinds
 from dpcli.runtime.settings.fields import Setting, nearest, settings_of, shown
 from dpcli.text_files import read_toml
@@ -87,12 +87,12 @@ class Catalog:
     def read_config(self, path: str | Path) -> dict[str, Any]:
         """Return values by public name from a TOML file, whose tables are groups; keys outside of tables are legal too.
 
-        Raises UsageError, which names the file, when there is no such file, it is not TOML, or says something illegal.
+        Raises DataError when there is no such file or it is not TOML, UsageError, which names it, when it says something illegal.
         """
         said: dict[str, str] = {}
         values: dict[str, Any] = {}
         try:
-            for place, name, value in self._entries(_read_table(Path(path))):
+            for place, name, value in self._entries(read_toml(Path(path))):
                 one = self.find(name)
                 if one.name in said:
                     raise UsageError(f"{one.name} is given twice, as {said[one.name]} and {place}; leave one out")
@@ -141,22 +141,6 @@ class Catalog:
         """Return the public name most like this one, which may be meant for a field's name; None when none is alike."""
         public = {one.field: one.name for one in self.settings.values()} | {name: name for name in self.settings}
         return public.get(nearest(_plain(name), public) or "")
-
-
-def _read_table(path: Path) -> dict[str, Any]:
-    """Return the content of a TOML file. Raises UsageError, without the path, for one that can't be read."""
-    try:
-        return read_toml(path)
-    except DataError as error:
-        if isinstance(error.__context__, UnicodeDecodeError):
-            raise UsageError("not UTF-8 text; save it as UTF-8") from None
-        raise UsageError(str(error).removeprefix(f"{path}: ")) from None
-    except IsADirectoryError:
-        raise UsageError("is a folder; expected a TOML file") from None
-    except (ValueError, RecursionError):  # a number of thousands of digits, or lists in lists without end
-        raise UsageError("holds a number too long, or lists too deep, to be settings") from None
-    except OSError as error:
-        raise UsageError(f"can't be read ({(error.strerror or str(error)).lower()})") from None
 
 
 def _plain(name: str) -> str:

@@ -10,7 +10,7 @@ from dpcli.errors import DataError, UsageError
 from dpcli.path_names import first_names
 from dpcli.runtime import provenance
 from dpcli.runtime.progress import Progress, log
-from dpcli.runtime.whole_file import make_folder, whole_file
+from dpcli.runtime.whole_file import make_folder, refuse_existing, whole_file
 from dpcli.segment.kinematics.joints_picture import joints_picture
 from dpcli.segment.kinematics.kinematic_tree import KinematicTree, joint_counts, kinematic_tree
 from dpcli.segment.kinematics.urdf_writer import tree_json, write_trees, write_urdf
@@ -27,7 +27,9 @@ def find_joints(parts: str, output: Path, *, sequence: str | None, picture: Path
     a folder for a URDF of each sequence. picture: of the one, or the first. Raises UsageError for an output that exists
     (without `force`) or can't hold what was asked for, DataError for a sequence whose motions are unknown.
     """
-    if str(output) != "-" and output.exists() and not force:
+    if output.suffix in SUFFIXES:
+        refuse_existing(output, force)
+    elif str(output) != "-" and output.exists() and not force:
         raise UsageError(f"{output}: exists already; --force replaces it")
     with input_file(parts) as path, PartsReader(path) as reader:
         chosen = _chosen(reader, sequence)

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from dpcli.config_diff import differences
 from dpcli.errors import DataError, UsageError
 from dpcli.runtime.progress import log
+from dpcli.runtime.whole_file import refuse_existing
 from dpcli.store.writing.journal import sweep
 
 WORK = ("config", "seed", "inputs", "version")  # what makes two commands the same work, data and program included
@@ -38,6 +39,7 @@ def already_made(
     """
     if not target.exists():
         return False
+    refuse_existing(target, force=True)
     try:
         history = reader(target).provenance
     except DataError as error:

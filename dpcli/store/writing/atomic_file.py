@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 
 from dpcli.errors import DataError, DpcError
-from dpcli.runtime.whole_file import check_regular, disk_full, put_in_place
+from dpcli.runtime.whole_file import check_regular, disk_full, not_writable, put_in_place
 
 
 class _HeldOpen(h5py.File):
@@ -42,7 +42,7 @@ class AtomicFile:
         if not self.target.parent.is_dir():
             raise DataError(f"{self.target}: the folder {self.target.parent} does not exist; create it first")
         if self.target.is_dir():
-            raise DataError(f"{self.target}: is a folder, expected a file name such as {self.target.name}.h5")
+            raise DataError(f"{self.target}: is a folder; name a file in it")
         check_regular(self.target)
         try:
             self.file = _HeldOpen(self.part, mode)
@@ -55,8 +55,9 @@ class AtomicFile:
             full = None if busy else self.problem(error)
             if full is not None:
                 raise full from None
-            why = "another dpc is writing it" if busy else str(error).splitlines()[0]
-            raise DpcError(f"{self.target}: cannot write ({why})") from None
+            if not busy:
+                raise not_writable(self.target, error) from None
+            raise DpcError(f"{self.target}: cannot write (another dpc is writing it)") from None
 
     def __enter__(self) -> h5py.File:
         return self.file

@@ -15,10 +15,15 @@ from typing import Any
 
 from dpcli.config_diff import differences
 from dpcli.errors import DpcError, Stopped, UsageError
-from dpcli.runtime.whole_file import DiskFull, disk_full
+from dpcli.runtime.whole_file import DiskFull, disk_full, not_writable, refuse_existing
 from dpcli.store.file import write_positions, write_root, write_skipped
 from dpcli.store.writing.atomic_file import AtomicFile
 from dpcli.store.writing.journal import Journal, Placed, data_suffix, journal_path, second_path
+
+_STILL_KEPT = (
+    "what an earlier run had done is kept. Make room for that once more and for the rest, then run the same command again to"
+    " continue"
+)
 
 
 class ResumableWriter(ABC):
@@ -51,8 +56,7 @@ class ResumableWriter(ABC):
         force: bool,
         resume: bool,
     ) -> None:
-        if Path(path).exists() and not force:
-            raise UsageError(f"{path}: exists already; --force replaces it")
+        refuse_existing(path, force)
         self.path, self.resume, self.keep = Path(path), resume, False
         self.skipped: list[tuple[str, str]] = []
         self.positions: tuple[Sequence[int], Sequence[int]] | None = None
@@ -87,7 +91,10 @@ class ResumableWriter(ABC):
         if (
             self.resume and self.path.parent.is_dir() and not self.path.is_dir()
         ):  # AtomicFile explains what is wrong otherwise
-            before = Journal(journal_path(self.path), self._about())
+            try:
+                before = Journal(journal_path(self.path), self._about())
+            except OSError as error:
+                raise disk_full(self.path, error) or not_writable(self.path, error) from None
         try:
             if before and before.other and not force:
                 raise self._kept_of(before.other, before.about)
@@ -97,8 +104,15 @@ class ResumableWriter(ABC):
             if before:
                 self._continue(before, force)
         except BaseException as error:
+            full = before and before.data_name and not force and disk_full(self.path, error, _STILL_KEPT)
             self._give_up(before)
-            self._leave(type(error), error, None)
+            try:
+                self._leave(type(error), error, None)
+            except DiskFull:
+                if not full:
+                    raise
+            if full:
+                raise full from None
             raise
 
     def _kept_of(self, other: dict[str, Any], mine: dict[str, Any]) -> UsageError:

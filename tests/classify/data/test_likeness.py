@@ -7,6 +7,7 @@ import pytest
 
 from dpcli.classify.commands.train import _tell_unlabeled
 from dpcli.classify.data.likeness import NOTE, file_like, like, tell_long, tell_rounded, tell_unlike
+from dpcli.classify.data.videos import select_videos
 from dpcli.classify.network.config import KinetConfig
 from dpcli.classify.network.model_file import SHIPPED, ModelInfo
 from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
@@ -45,6 +46,18 @@ def test_a_model_tells_by_what_it_learned_from(capsys, tmp_path):
 def test_places_on_a_map_are_rounded(far, lost, capsys):
     tell_rounded("x", like(body(far=far)))
     assert ("float32 rounds them to 0.5" in capsys.readouterr().err) is lost
+
+
+@pytest.mark.parametrize(
+    "split, other, told", [("auto", "train", True), ("all", "train", False), ("auto", "test", False)]
+)
+def test_training_videos_scored_for_want_of_test_videos_are_told(split, other, told, capsys, tmp_path):
+    with CloudsWriter(tmp_path / "c.h5", class_names=["a"]) as writer:
+        for name, own in (("one", "train"), ("two", other), ("three", "")):
+            writer.write(CloudSequence.from_frames(name, body(), label=0, split=own))
+    chosen = select_videos(CloudsReader(tmp_path / "c.h5"), split, ModelInfo(KinetConfig(), ["a"]), "runs/own")
+    assert chosen == ([1] if other == "test" else [0, 1, 2])
+    assert ("no video is of the split 'test', so all are scored; 2 of 3 are" in capsys.readouterr().err) is told
 
 
 def test_long_and_unlabeled_videos_are_told(capsys, tmp_path):

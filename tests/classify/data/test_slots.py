@@ -25,7 +25,9 @@ from dpcli.store import CloudSequence, CloudsReader, CloudsWriter
 from dpcli.store.schema import kept_name
 
 SPEED = kept_name("speed")
-SMALL = {"frames": 4, "points": 8, "widths": ((8, 8), (16,)), "members": 2, "dropout": 0.0}
+SMALL = {"frames": 4, "points": 8, "widths": ((8, 8), (16,)), "members": 2, "dropout": 0.0, "copies": False}
+
+NO_FOREST = torch.tensor(0.0)
 
 
 def video(name="v", frames=12, points=3, place=(0.0, 0.0, 2.0), scale=1.0, seed=0, label=0):
@@ -104,9 +106,9 @@ def test_a_batch_in_training_is_shared_by_the_members_in_its_order(tmp_path):
     together = model.static_logits(clips)
     members = model.static.members
     for k in range(2):
-        assert torch.allclose(together[k::2], torch.log_softmax(members[k](clips[k::2]), -1), atol=1e-5)
+        assert torch.allclose(together[k::2], torch.log(members[k].scores(clips[k::2], NO_FOREST)), atol=1e-5)
     mean = torch.softmax(model.eval().static_logits(clips), -1)
-    expected = torch.stack([torch.softmax(one(clips), -1) for one in members]).mean(0)
+    expected = torch.stack([one.scores(clips, NO_FOREST) for one in members]).mean(0)
     assert torch.allclose(mean, expected, atol=1e-6)
 
 
@@ -123,9 +125,29 @@ def test_no_member_learns_from_the_fold_that_it_judges_alone(tmp_path):
     assert grads[0] == 0 < grads[1]
     scores = torch.softmax(model.eval().static_logits(clips), -1)
     for k, member in ((0, 0), (1, 1), (2, 0)):
-        assert torch.allclose(
-            scores[k], torch.softmax(model.static.members[member](clips[k : k + 1]), -1)[0], atol=1e-6
-        )
+        alone = model.static.members[member].scores(clips[k : k + 1], NO_FOREST)
+        assert torch.allclose(scores[k], alone[0], atol=1e-6)
+
+
+def test_copies_are_mirrored_or_reversed_and_have_classifiers_of_their_own(tmp_path):
+    config = config_of(tmp_path, [video()]).changed(copies=True)
+    clip = torch.from_numpy(in_slots(slot_rows(video(), config), config, np.random.default_rng(0)))[None]
+    member = Kinet(config).static.members[0]
+    kinds = torch.arange(4)
+    plain, mirrored, reverse, both = member._copied(clip.expand(4, -1, -1, -1), kinds)
+    assert torch.equal(plain, clip[0]) and torch.equal(mirrored[..., 0], -plain[..., 0])
+    assert torch.equal(mirrored[..., 1:], plain[..., 1:]) and torch.equal(
+        both, mirrored.flip(0) * both[..., 4:5].new_tensor([1, 1, 1, 1, -1, -1])
+    )
+    assert torch.equal(reverse[..., :4], plain.flip(0)[..., :4]) and torch.equal(
+        reverse[..., 4:], -plain.flip(0)[..., 4:]
+    )
+    one = torch.tensor([2])
+    member.train()(member._copied(clip, one), one).sum().backward()
+    assert (member.classify.weight.grad.view(4, 2, -1).abs().sum((1, 2)) > 0).tolist() == [False, False, True, False]
+    member.eval()
+    each = [torch.softmax(member(member._copied(clip, one), one), -1) for one in kinds[:, None]]
+    assert torch.allclose(member.scores(clip, NO_FOREST), torch.stack(each).mean(0), atol=1e-6)
 
 
 def test_whole_people_share_a_fold(tmp_path):

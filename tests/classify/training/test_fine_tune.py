@@ -9,8 +9,9 @@ import torch
 from dpcli.classify.commands.train import train
 from dpcli.classify.network.kinet import Kinet
 from dpcli.classify.network.model_file import ModelInfo, load_model, save_model
+from dpcli.classify.presets import PRESETS
 from dpcli.classify.settings import network_config, training_settings
-from dpcli.classify.training.fine_tune import freeze, part_for, settings_from, train_mode
+from dpcli.classify.training.fine_tune import _schedule, freeze, part_for, settings_from, train_mode
 from dpcli.classify.training.optimizer_step import StageStep
 from dpcli.classify.training.schedule import Schedule
 from dpcli.errors import UsageError
@@ -60,6 +61,15 @@ def test_the_number_of_videos_chooses_what_learns(videos, part, tmp_path):
     schedule = base["schedule"]
     assert schedule.fine_tune == part and base["run"].timing == "uniform" and base["network"] == info.config
     assert 5 <= schedule.epochs <= 100 and schedule.epochs * 2 * videos <= 12_000
+
+
+@pytest.mark.parametrize("videos, epochs", [(40, (80, 60)), (200, (45, 45)), (5000, (20, 15))])
+def test_where_everything_learns_it_is_at_the_rate_of_a_training_from_nothing(videos, epochs):
+    quick = PRESETS["quick"]["schedule"]
+    schedule = _schedule(quick, "all", videos)
+    assert schedule.stage_epochs == epochs and schedule.learning_rate == quick.learning_rate
+    assert _schedule(quick, "head", videos).stage_epochs == (max(5, min(100, 5000 // videos)),) * 2
+    assert _schedule(PRESETS["sparse"]["schedule"], "all", videos).epochs_dynamic == 0
 
 
 def test_bodies_in_another_unit_are_made_as_tall_as_the_model_knows_them(tmp_path, capsys):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from dpcli.errors import UsageError
 from dpcli.generate4d.config import FIT_PRESETS
 from dpcli.generate4d.optimizer import SceneOptimizer
 from dpcli.generate4d.shape.choice import guide
@@ -47,6 +48,15 @@ def targets():
 def test_the_network_is_taken_where_it_is_sure(prior, offset, name, said, targets, tmp_path, capsys):
     found = guide(prior, targets, _weights(tmp_path / "w.safetensors", offset))
     assert found.name == name and said in capsys.readouterr().err
+
+
+def test_without_weights_auto_inflates_and_says_so(targets, tmp_path, monkeypatch, capsys):
+    for where in ("choice", "model_file"):
+        monkeypatch.setattr(f"dpcli.generate4d.shape.{where}.SHIPPED", tmp_path)
+    assert guide("auto", targets).name == "inflated"
+    assert "shape: inflated silhouette; this installation has no shape network" in capsys.readouterr().err
+    with pytest.raises(UsageError, match="--prior-model creatures: no such file"):
+        guide("network", targets)
 
 
 def test_other_priors_have_no_shape(targets):

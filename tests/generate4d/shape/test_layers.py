@@ -72,9 +72,10 @@ def test_points_drawn_from_a_ball_lie_on_it_evenly():
     assert np.median(np.linalg.norm(points, axis=1)) == pytest.approx(radius, rel=0.06)
     depth = points @ camera.world_to_camera[2, :3] / radius
     assert np.mean(np.abs(depth) < 0.5) == pytest.approx(0.5, abs=0.12)  # as much area in the middle as at both ends
-    empty = Inflated().layers(np.zeros((1, 4, 16, 16), np.float32), camera)[0]
-    with pytest.raises(DataError, match="shows nothing"):
-        sample_surface(empty, camera, 10, np.random.default_rng(0))
+    for alpha, said in ((0.0, "shows nothing"), (0.3, r"at 16 pixels no alpha .* is above 0\.30.*--set start=sphere")):
+        empty = Inflated().layers(np.full((1, 4, 16, 16), alpha, np.float32), camera)[0]
+        with pytest.raises(DataError, match=said):
+            sample_surface(empty, camera, 10, np.random.default_rng(0))
 
 
 def test_a_cut_out_is_flat_and_stands_at_the_origin():

@@ -158,6 +158,8 @@ def test_mimic_joints_follow(tmp_path):
         ([link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")], "joint 'j' has the axis"),
         ([link("a"), '<joint name="j" type="revolute"><child link="a"/></joint>'], "not a valid URDF"),
         ([link("a", '<box size="1 x 1"/>')], "not a valid URDF"),
+        (['<link name="a"><visual/></link>'], "link 'a' has a <visual> without geometry; expected box"),
+        (['<link name="a"><visual><geometry/></visual></link>'], "link 'a' has a <visual> without geometry"),
     ],
 )
 def test_broken_urdfs_end_with_a_sentence(elements, words, tmp_path):
@@ -449,6 +451,14 @@ def test_an_origin_by_a_quaternion_turns_as_one_by_angles(tmp_path):
     np.testing.assert_allclose(found, placed('xyz="1 2 3" rpy="0.3 -0.7 1.1"'), atol=1e-9)
     with pytest.raises(DataError, match="quat_xyzw '0 0 0 0' is no rotation"):
         placed('quat_xyzw="0 0 0 0"')
+
+
+def test_a_robot_without_a_name_and_a_collision_without_geometry_are_read(tmp_path):
+    path = write_urdf(tmp_path / "r.urdf", link("a", box(1, 2, 3)), link("b", box(1, 1, 1)), joint("j", "a", "b"))
+    named = load(path)
+    text = re.sub('<robot name="[^"]*"', "<robot", path.read_text()).replace("</link>", "<collision/></link>")
+    path.write_text(text)
+    np.testing.assert_array_equal(load(path).triangles, named.triangles)
 
 
 def test_a_declared_encoding_is_read(tmp_path):

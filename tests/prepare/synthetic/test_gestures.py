@@ -164,6 +164,17 @@ def test_items_are_balanced_over_classes_subjects_and_splits():
     assert subjects == {"train": set(range(1, 7)), "test": {7, 8, 9, 10}}
 
 
+@pytest.mark.parametrize(
+    "videos, train, words", [(2, 1, "1-1 of 2"), (5, 3, "1-3 of 5"), (10, 6, "1-6 of 10"), (1, 1, "all are")]
+)
+def test_fewer_videos_than_subjects_leave_some_to_test(videos, train, words):
+    reader = SyntheticGestures(videos_per_class=videos, subjects=10)
+    items = reader.items()
+    seen = {split: {i.subject for i in items if i.split == split} for split in ("train", "test")}
+    assert seen == {"train": set(range(1, train + 1)), "test": set(range(train + 1, videos + 1))}
+    assert words in reader.summary(items)[0]
+
+
 def test_a_video_depends_on_its_generator_and_the_seed_alone():
     reader = SyntheticGestures(frames=3, size=64)
     item = reader.items()[7]

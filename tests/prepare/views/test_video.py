@@ -347,6 +347,19 @@ def test_bad_clips_are_told_what_to_do(tmp_path, kind, message):
         video_clip(bad_clip(tmp_path, kind), SMALL)
 
 
+def test_a_picture_of_another_size_is_refused_before_it_is_decoded(tmp_path, monkeypatch):
+    """A damaged header may tell of 16 million pixels, which took 300 MB; pictures that EXIF turns are of one size."""
+    folder = save(tmp_path / "clip", moving(3))
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    Image.fromarray(np.rot90(moving(1)[0])).save(folder / "1.png", exif=turned)
+    assert video_clip(folder, SMALL).header is not None
+    Image.new("RGBA", (4000, 4000)).save(folder / "2.png")
+    monkeypatch.setattr("dpcli.prepare.decode.color_frames.read_rgba", None)
+    with pytest.raises(DataError, match="2.png is 4000x4000, 0.png is 64x48"):
+        video_clip(folder, SMALL)
+
+
 @pytest.mark.parametrize(("kind", "left"), [("one empty", [0, 1]), ("corrupt png", [0, 2])])
 def test_skip_leaves_bad_frames_out_and_keeps_the_times(tmp_path, kind, left):
     clip = video_clip(bad_clip(tmp_path, kind), VideoOptions(size=32, on_error="skip", fps=10))
@@ -651,6 +664,10 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
         (lambda d: d["frames"][0].update(time="soon"), "time 'soon'; expected a number"),
         (lambda d: d["frames"][0].update(time=1e300), "time 1e.300; expected shares"),
         (lambda d: d.update(fl_x=float("nan")), "fl_x nan; expected a number"),
+        (
+            lambda d: d.update(fl_x=1.04),
+            "a focal length of 1.04 pixels for pictures of 64x48; expected pixels, not shares",
+        ),
         (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
         (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),
         (lambda d: d["frames"][1].update(time=0), "r_0_1.png and r_0_0.png are of one camera at one time, 0"),
@@ -749,6 +766,19 @@ def test_images_and_animations_are_known_by_their_content(tmp_path):
     (tmp_path / "half").write_bytes((tmp_path / "moving-gif").read_bytes()[:200])
     with pytest.raises(DataError, match="not a readable animation"):
         open_frames(tmp_path / "half")
+
+
+def test_annotations_given_as_masks_and_cameras_beside_frames_are_told(tmp_path, capfd):
+    """Neither LabelMe's polygons nor COLMAP's cameras are read; the clip is, with a word."""
+    folder = save(tmp_path / "clip", [disc((20 + 2 * k, 24), 8) for k in range(3)], "{}.png")
+    (folder / "sparse").mkdir()
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels" / "0.json").write_text('{"shapes": []}')
+    words = ("prepare", "video", folder, "-o", tmp_path / "v.h5", "--size", "32")
+    assert exit_code(*words, "--mask", tmp_path / "labels") == 3
+    assert "labels: 0.json: annotations and arrays are not read as masks; draw" in capfd.readouterr().err
+    assert exit_code(*words) == 0
+    assert "clip: sparse: not read; the camera of a clip is taken to stand still" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(("other", "pattern"), [("fox_{}.png", "anya_*.png"), ("preview.png", "")])

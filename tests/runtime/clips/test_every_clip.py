@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import struct
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,8 +19,12 @@ from PIL import Image
 
 from dpcli.errors import DataError
 from dpcli.prepare.decode.color_frames import open_frames
+from dpcli.runtime.clips.animations import animation_frames
 
 RATES = [Fraction(24000, 1001), Fraction(25), Fraction(30), Fraction(25, 2), Fraction(60), Fraction(30000, 1001)]
+
+
+SQUARE = Fraction(1)
 
 
 @dataclass(frozen=True)
@@ -93,12 +98,18 @@ def pictures(count: int, width: int, height: int, alpha: bool, gray: bool = Fals
     return made
 
 
-def write(path: Path, kind: Kind, rgba: np.ndarray, rate: Fraction, ticks: list[int]) -> None:
-    """Writes frames at `ticks` of a clock that ticks `rate` times a second."""
+def write(
+    path: Path, kind: Kind, rgba: np.ndarray, rate: Fraction, ticks: list[int], turn: int = 0, aspect: Fraction = SQUARE
+) -> None:
+    """Writes frames at `ticks` of a clock that ticks `rate` times a second. turn: in degrees to the left, as it plays."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.options))
         stream.height, stream.width, stream.pix_fmt = *rgba.shape[1:3], kind.pixels
         stream.codec_context.time_base = 1 / rate
+        if aspect != SQUARE:
+            stream.codec_context.sample_aspect_ratio = aspect
+        if turn:
+            stream.set_display_rotation(turn)
         for picture, tick in zip(rgba, ticks):
             frame = av.VideoFrame.from_ndarray(picture, "rgba").reformat(format=kind.pixels, threads=1)
             frame.pts, frame.time_base = tick, 1 / rate
@@ -148,6 +159,28 @@ def test_what_is_stored_exactly_is_read_exactly(clip):
 @given(clips(CLOSE))
 def test_what_is_stored_nearly_is_read_nearly(clip):
     check(clip)
+
+
+TURNING = {"mp4", "mov", "mkv", "webm"}  # containers that tell how a picture is turned and its pixels' shape
+SHOWN = [
+    replace(kind, containers=" ".join(sorted(known)))
+    for kind in (*EXACT, *CLOSE)
+    if (known := {*kind.containers.split()} & TURNING) and not kind.has_alpha
+]
+
+
+@settings(max_examples=40, deadline=None)
+@given(clips(SHOWN), st.sampled_from([0, 90, 180, 270]), st.sampled_from([SQUARE, Fraction(4, 3), Fraction(10, 11)]))
+def test_what_is_turned_and_stretched_is_read_as_it_plays(clip, turn, aspect):
+    kind, container, rate, (width, height), ticks = clip
+    aspect = aspect if container in ("mp4", "mov") else SQUARE  # PyAV tells Matroska's writer none
+    rgba = pictures(len(ticks), width, height, False, kind.pixels.startswith("gray"))
+    with TemporaryDirectory() as folder:
+        write(path := Path(folder, f"clip.{container}"), kind, rgba, rate, ticks, turn, aspect)
+        frames = open_frames(path)
+        read = np.stack(list(frames.read(range(len(frames)))))
+    wide = pictures(len(ticks), round(width * aspect), height, False, kind.pixels.startswith("gray"))
+    assert_like(read, np.rot90(wide, turn // 90, axes=(1, 2)), max(kind.error, 4))
 
 
 CV2_CODES = {"FFV1": ("avi mkv", 0.0), "MJPG": ("avi mov mkv", 5), "mp4v": ("mp4 mov", 6), "XVID": ("avi", 6)}
@@ -240,6 +273,38 @@ def test_frames_of_an_apng_lie_over_one_another_as_browsers_have_them(tmp_path, 
     np.testing.assert_allclose(frames.times, [0, 0.1, 0.2, 0.3])
 
 
+def gif_of(width: int, height: int, pictures: list[tuple[int, int, np.ndarray, int, int | None]]) -> bytes:
+    """A GIF of left, top, colors u8 (H,W) into a palette, what becomes of them, and the color that is clear; uncompressed."""
+    palette = b"\0\0\0\xff\xff\xff\xff\0\0\0\xff\0" + bytes(3 * 252)
+    data = b"GIF89a" + struct.pack("<2H3B", width, height, 0xF7, 1, 0) + palette  # white is the background
+    for left, top, colors, after, clear in pictures:
+        codes = [256, *colors.reshape(-1).tolist(), 257]
+        body = sum(code << 9 * place for place, code in enumerate(codes)).to_bytes(9 * len(codes) // 8 + 1, "little")
+        data += struct.pack("<4BH2B", 0x21, 0xF9, 4, after << 2 | (clear is not None), 10, clear or 0, 0)
+        data += struct.pack("<B4H", 0x2C, left, top, *colors.shape[::-1]) + bytes([0, 8, len(body)]) + body + b"\0"
+    return data + b";"
+
+
+def test_what_no_picture_of_a_gif_covers_is_clear_as_in_browsers(tmp_path):
+    red, green = (np.full((2, 3), color, np.uint8) for color in (2, 3))
+    laid = [(1, 1, red, 2, None), (0, 0, green, 1, None), (2, 1, red, 3, None), (3, 2, green, 0, None)]
+    holes = np.array([[2, 3, 2], [2, 2, 3]], np.uint8)
+    (tmp_path / "a.gif").write_bytes(gif_of(5, 3, [*laid, (0, 0, holes, 0, 2)]))  # the last but one lies half outside
+    frames = open_frames(tmp_path / "a.gif")
+    letters = np.array([".", "R", "G"])
+    read = [
+        " ".join("".join(row) for row in letters[(one[..., 3] > 0) * (1 + (one[..., 1] > 0))])
+        for one in frames.read(range(5))
+    ]
+    assert read == [
+        "..... .RRR. .RRR.",
+        "GGG.. GGG.. .....",
+        "GGG.. GGRRR ..RRR",
+        "GGG.. GGG.. ...GG",
+        "GGG.. GGG.. ...GG",
+    ]
+
+
 def test_a_canvas_that_a_gif_cannot_fill_is_refused_before_it_is_laid_out(tmp_path):
     frames = [Image.fromarray(np.full((8, 8), level, np.uint8)) for level in (0, 255)]
     frames[0].save(tmp_path / "a.gif", save_all=True, append_images=frames[1:], duration=100)
@@ -249,3 +314,8 @@ def test_a_canvas_that_a_gif_cannot_fill_is_refused_before_it_is_laid_out(tmp_pa
     open_frames(tmp_path / "a.gif")
     with pytest.raises(DataError, match=r"b.gif: its canvas claims 16711425 pixels"):
         open_frames(tmp_path / "b.gif")
+    place = data.rindex(b",\0\0\0\0")
+    data[6:10], data[place + 5 : place + 9] = b"\x08\0\x08\0", b"\0\x30\0\x30"  # its second picture, not its canvas
+    (tmp_path / "b.gif").write_bytes(data)
+    with pytest.raises(DataError, match=r"b.gif: its canvas claims 150994944 pixels"):
+        list(animation_frames(tmp_path / "b.gif", [0, 1]))

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from dpcli.errors import DataError
+from dpcli.evaluate.video.sources.media import FolderSource
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
@@ -89,6 +90,52 @@ def test_gray_of_any_type_has_its_own_range(tmp_path, capsys, gray):
     read = read_rgba(tmp_path / "a.tif")
     assert read[0, 0].tolist() == [0, 0, 0, 255] and read[4, 4].tolist() == [102, 102, 102, 255]
     assert ("is taken for 0 to 255" in capsys.readouterr().err) == (gray.dtype == np.uint16 and gray < 256)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["t_0.1", "t_0.25", "t_0.3", "t_1.05", "t_1.2"],
+        ["v2.1", "v2.9", "v2.10", "v2.20"],  # counted, as its trailing 0 tells
+        ["at 31-12-2023 23.59.59", "at 13-01-2024 00.00.01", "at 13-02-2024 00.00.01"],
+        ["f (1)", "f (2)", "f (10)"],
+    ],
+)
+def test_a_clip_and_its_evaluation_take_images_in_the_order_that_their_names_tell(tmp_path, names):
+    for level, name in enumerate(names):
+        Image.new("RGB", (8, 8), (level, 0, 0)).save(tmp_path / f"{name}.png")
+    frames = open_frames(tmp_path)
+    assert list(frames.names) == [f"{name}.png" for name in names]
+    assert sorted(set(frames.numbers)) == list(frames.numbers)
+    assert [int(one.rgba[0, 0, 0]) for one in FolderSource(tmp_path).pictures(0, range(len(names)))] == [
+        *range(len(names))
+    ]
+
+
+def tiff_of(pixels: np.ndarray, photometric: int, extra: int | None = None) -> bytes:
+    """A TIFF of pixels (H,W,C) as they are, byte for byte; extra: what its last channel is, 1 for alpha that is in the others."""
+    height, width, channels = pixels.shape
+    data, bits = pixels.astype(pixels.dtype.newbyteorder("<")).tobytes(), 8 * pixels.itemsize
+    tags = [(256, width), (257, height), (258, bits | (bits << 16) * (channels > 1)), (259, 1), (262, photometric)]
+    tags += [(273, 8), (277, channels), (278, height), (279, len(data)), *([(338, extra)] if extra is not None else [])]
+    made = b"".join(struct.pack("<HHII", tag, 3, channels if tag == 258 else 1, value) for tag, value in tags)
+    return b"II*\0" + struct.pack("<I", 8 + len(data)) + data + struct.pack("<H", len(tags)) + made + bytes(4)
+
+
+def test_white_at_0_and_alpha_in_the_gray_of_a_tiff_are_read(tmp_path):
+    """Pillow turns round 8 bits with white at 0, not 16, and converts no gray that alpha was multiplied into."""
+    gray = np.arange(0, 64, dtype=np.uint8).reshape(8, 8) * 4
+    clear = np.full_like(gray, 51)
+    cases = {
+        "8.tif": (tiff_of(255 - gray[..., None], 0), 255),
+        "16.tif": (tiff_of(65535 - gray[..., None].astype(np.uint16) * 257, 0), 255),
+        "up.tif": (tiff_of(gray[..., None].astype(np.uint16) * 257, 1), 255),
+        "la.tif": (tiff_of(np.dstack([np.rint(gray / 5).astype(np.uint8), clear]), 1, 1), 51),
+    }
+    for name, (data, alpha) in cases.items():
+        (tmp_path / name).write_bytes(data)
+        read = read_rgba(tmp_path / name).astype(int)
+        assert (read[..., 3] == alpha).all() and np.abs(read[..., 0] - gray).max() <= (3 if alpha < 255 else 0), name
 
 
 def with_chunk(png: bytes, name: bytes, data: bytes) -> bytes:

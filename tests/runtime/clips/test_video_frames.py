@@ -74,6 +74,29 @@ def test_alpha_that_a_container_has_is_used(pictures, tmp_path, name):
     assert np.abs(read[inside][:, :3].astype(int) - written[inside][:, :3]).mean() < 6
 
 
+def test_alpha_in_a_layer_of_hevc_is_refused_by_name(pictures, tmp_path):
+    """FFmpeg 8 decodes only what lies below it, which is opaque."""
+    words = ("-c:v", "libx265", "-tag:v", "hvc1", "-pix_fmt", "yuva420p", "-x265-params", "alpha=1:log-level=none")
+    path = film(pictures, tmp_path / "sticker.mov", *words)
+    ffmpeg("-i", path, "-c", "copy", tmp_path / "sticker.mkv")
+    for name in ("sticker.mov", "sticker.mkv"):
+        with pytest.raises(
+            DataError, match="its alpha lies in a layer of HEVC that is not decoded; export it as ProRes 4444"
+        ):
+            look_at_video(tmp_path / name)
+
+
+def test_pictures_that_stay_in_theora_end_no_clip(pictures, tmp_path):
+    """Its packets without bytes, as recorders of screens write them, in the middle and at the end."""
+    held = ("-vf", "fps=30,tpad=stop_mode=clone:stop_duration=2", "-c:v", "libtheora", "-q:v", 10, "-g", 60)
+    path = film(pictures, tmp_path / "screen.ogv", *held)
+    look, read = look_at_video(path), decoded(path)
+    assert look.times[-1] > look.times[COUNT - 1] - 1e-6 and look.count >= COUNT
+    for frame, at in enumerate(np.searchsorted(look.times, np.arange(COUNT) / 10 + 0.01) - 1):
+        assert abs(look.times[at] - frame / 10) < 1e-3
+        assert read[at, 28, :, 0].argmax() in range(6 + 4 * frame, 30 + 4 * frame)
+
+
 @pytest.mark.parametrize("name", ["h264.mp4", "ffv1.avi"])
 def test_without_alpha_everything_is_opaque(pictures, tmp_path, name):
     words = {"h264.mp4": ("-pix_fmt", "yuv420p"), "ffv1.avi": ("-c:v", "ffv1", "-pix_fmt", "bgr0")}[name]
@@ -296,6 +319,24 @@ def test_a_pattern_that_chooses_nothing_is_told(pictures, tmp_path):
         open_frames(pictures / "0.png", "b_*")
 
 
+@pytest.mark.parametrize(
+    "start, said",
+    [
+        (b"PK\3\4", "an archive; unpack it first"),
+        (b"\0\0\0\x18ftypheic", "a HEIC picture, which is not read; convert it"),
+        (b"\x93NUMPY\1\0", "an array of NumPy"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "a pointer of Git LFS"),
+        (b"<!DOCTYPE html>", "a web page in place of a download"),
+        (b'\xef\xbb\xbf{"annotations": []}', "JSON; where it holds annotations, draw their masks"),
+        (b"", "(empty)"),
+    ],
+)
+def test_what_is_no_video_is_told_by_what_it_is(tmp_path, start, said):
+    (tmp_path / "clip.mp4").write_bytes(start)
+    with pytest.raises(DataError, match=f"clip.mp4: not a readable video .*{re.escape(said)}"):
+        look_at_video(tmp_path / "clip.mp4")
+
+
 def test_a_folder_of_videos_lists_them(pictures, tmp_path):
     folder = tmp_path / "my clips"
     folder.mkdir()
@@ -351,12 +392,21 @@ def test_labels_that_were_compressed_are_told_from_soft_masks(tmp_path, image, s
     np.testing.assert_allclose(read_mask(tmp_path / f"s.{suffix}"), np.asarray(soft).astype(int), atol=12)
 
 
-def test_every_label_but_0_is_opaque_and_255_beside_small_ones_is_told(tmp_path, capfd):
-    labels = LABELS.copy()
-    labels[LABELS != np.roll(LABELS, 1, 1)] = 255
+@pytest.mark.parametrize(
+    "void, scale, said", [(255, 1, "255 beside labels below 64"), (10_000, 1001, "10000 beside other labels")]
+)
+def test_every_label_but_0_is_opaque_and_what_may_mean_undecided_is_told(tmp_path, capfd, void, scale, said):
+    labels = (LABELS.astype(np.uint16) * scale).astype(np.uint8 if void == 255 else np.uint16)
+    labels[LABELS != np.roll(LABELS, 1, 1)] = void
     Image.fromarray(labels).save(tmp_path / "m.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where(labels > 0, 255, 0))
-    assert "255 beside labels below 64 is read as the object" in capfd.readouterr().err
+    assert f"{said} is read as the object" in capfd.readouterr().err
+
+
+def test_labels_in_a_webp_without_loss_are_labels(tmp_path):
+    for name, words in (("a.webp", {}), ("b.webp", {"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"})):
+        Image.fromarray(LABELS).convert("RGB").save(tmp_path / name, lossless=True, **words)
+        np.testing.assert_array_equal(read_mask(tmp_path / name), np.where(LABELS > 0, 255, 0))
 
 
 @pytest.mark.parametrize(

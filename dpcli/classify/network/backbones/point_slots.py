@@ -22,6 +22,7 @@ _REACH = 3  # slots that a layer over time sees
 _STEPS = (1, 2, 4)  # between these slots, a layer each
 _DROPPED = 0.1  # after each layer over time
 _LEAST = 1e-12  # the probability that 0 is taken for
+_COPIES = 4  # of a clip: as it is, mirrored, reversed in time, and both
 
 
 class PointSlots(Backbone):
@@ -32,7 +33,7 @@ class PointSlots(Backbone):
     from: another kind of errors. A clip may be marked with the member that must not learn from it; that member alone
     classifies it then: so all videos train, and all are judged by a network that never saw them. Reads of the
     config: num_frames (slots), points_per_frame, widths (the layers of a point; the width of a slot), columns, members,
-    dropout.
+    copies, dropout.
     """
 
     def __init__(self, config: KinetConfig) -> None:
@@ -81,7 +82,12 @@ class PointSlots(Backbone):
 
 
 class _Member(nn.Module):
-    """Classifies clips (B,T,P,5+F): place, more than 0 where there is a point, time within the slot, columns."""
+    """Classifies clips (B,T,P,5+F): place, more than 0 where there is a point, time within the slot, columns.
+
+    With `copies` it learns from mirrored and reversed clips, too, as self-supervised label augmentation does (Lee et al.,
+    2020): what a gesture becomes by them is not in a file, so each kind of copy has a classifier of its own, while all share
+    the layers below, which thus see four times as many movements.
+    """
 
     def __init__(self, config: KinetConfig) -> None:
         super().__init__()
@@ -91,21 +97,44 @@ class _Member(nn.Module):
         self.slots = nn.Sequential(*_layer(2 * second + 1, width))
         self.position = nn.Parameter(torch.zeros(config.num_frames, width))
         self.over_time = nn.ModuleList(_TemporalConvolution(width, step) for step in _STEPS)
-        self.dropout, self.classify = nn.Dropout(config.dropout), ClipLinear(2 * width, config.num_classes)
+        self.copies, self.speeds = _COPIES if config.copies else 1, config.signed_columns
+        self.dropout = nn.Dropout(config.dropout)
+        self.classify = ClipLinear(2 * width, self.copies * config.num_classes)
         self.forest = Forest(*config.forest, config.num_classes)
         nn.init.trunc_normal_(self.classify.weight, std=0.01)  # the first steps shall not have to unlearn large ones
 
     def scores(self, clips: Tensor, share: Tensor) -> Tensor:
-        """Returns the probabilities (B,C); outside of training the geometric mean of the layers' and, with its share, the
-        forest's."""
-        logits = self(clips)
-        if not self.training and share > 0:
+        """Returns the probabilities (B,C): in training of one copy of each clip, drawn at random; else the mean over all copies,
+        and the geometric mean of it and, with its share, the forest's."""
+        if self.training:
+            kinds = torch.randint(self.copies, (len(clips),)).to(clips.device)
+            return torch.softmax(self(self._copied(clips, kinds), kinds), -1)
+        total = clips.new_zeros(len(clips), self.forest.classes)
+        for kind in range(self.copies):
+            kinds = torch.full((len(clips),), kind, device=clips.device)
+            total = total + torch.softmax(self(self._copied(clips, kinds), kinds), -1)
+        logits = torch.log((total / self.copies).clamp(min=_LEAST))
+        if share > 0:
             described = torch.from_numpy(clip_descriptors(clips.cpu().numpy())).to(clips.device)
-            logits = (1 - share) * torch.log_softmax(logits, -1) + share * torch.log(self.forest(described))
+            logits = (1 - share) * logits + share * torch.log(self.forest(described))
         return torch.softmax(logits, -1)
 
-    def forward(self, clips: Tensor) -> Tensor:
-        """Returns the logits (B,C) of the layers alone."""
+    def _copied(self, clips: Tensor, kinds: Tensor) -> Tensor:
+        """Returns the copies of clips (B,T,P,5+F) of the kinds i64 (B): 0 as it is, 1 mirrored, 2 reversed, 3 both.
+
+        Reversed, every speed has the other sign.
+        """
+        if self.copies == 1:
+            return clips
+        signs = clips.new_ones(2, clips.shape[-1])
+        signs[0, 0] = -1
+        signs[1, [4, *(5 + place for place in self.speeds)]] = -1
+        mirrored, reverse = (kinds % 2 == 1)[:, None, None, None], (kinds >= 2)[:, None, None, None]
+        clips = torch.where(mirrored, clips * signs[0], clips)
+        return torch.where(reverse, clips.flip(1) * signs[1], clips)
+
+    def forward(self, clips: Tensor, kinds: Tensor) -> Tensor:
+        """Returns the logits (B,C) of the layers alone, of clips that are copies of the kinds i64 (B)."""
         here = clips[..., 3].flatten().nonzero()[:, 0]
         known = self.points(torch.cat([clips[..., :3], clips[..., 4:]], -1).flatten(0, 2).index_select(0, here))
         values = known.new_zeros(clips[..., 3].numel(), known.shape[-1]).index_copy(0, here, known)
@@ -114,7 +143,8 @@ class _Member(nn.Module):
         found = self.slots(torch.cat(pooled, -1).flatten(0, 1)).view(*count.shape[:2], -1) + self.position
         for layer in self.over_time:
             found = found + layer(found)
-        return self.classify(self.dropout(torch.cat([found.mean(1), found.amax(1)], -1)))
+        logits = self.classify(self.dropout(torch.cat([found.mean(1), found.amax(1)], -1)))
+        return logits.unflatten(-1, (self.copies, -1))[torch.arange(len(clips), device=clips.device), kinds]
 
 
 class _TemporalConvolution(nn.Module):

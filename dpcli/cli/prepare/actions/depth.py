@@ -115,4 +115,5 @@ def depth(
             topic=topic,
         ),
         conversion,
+        inputs[0],
     )

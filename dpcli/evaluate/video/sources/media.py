@@ -15,6 +15,7 @@ from dpcli.path_names import first_names
 from dpcli.runtime.clips.animations import animation_frames, animation_times, is_image_file
 from dpcli.runtime.clips.clip_folders import clips_in, refuse_clips
 from dpcli.runtime.clips.images import IMAGE_SUFFIXES, as_shown, one_series, open_image
+from dpcli.runtime.clips.name_numbers import in_order
 from dpcli.runtime.clips.video_frames import look_at_video, video_frames
 from dpcli.runtime.progress import log
 
@@ -51,7 +52,7 @@ class FolderSource(Source):
 
 def _images_in(folder: Path) -> list[Path]:
     found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
-    return one_series(folder, sorted(found, key=_numbers_in_name))
+    return one_series(folder, in_order(sorted(found, key=_numbers_in_name)))
 
 
 def _numbers_in_name(path: Path) -> tuple:
@@ -75,7 +76,7 @@ def _read_image(path: Path) -> tuple[np.ndarray, bool]:
         with open_image(path) as image:
             if image.mode.startswith(("I", "F")):
                 raise DataError(f"{path}: pixels of type {image.mode}; expected an 8-bit color picture")
-            has_alpha = "A" in image.getbands() or "transparency" in image.info
+            has_alpha = not {"A", "a"}.isdisjoint(image.getbands()) or "transparency" in image.info
             return np.asarray(as_shown(image).convert("RGBA")), has_alpha
     except DataError:
         raise

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from decimal import Decimal
 from functools import lru_cache
 from os.path import splitext
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -160,6 +162,21 @@ class NumberColumns:
             if all(len(number) == digits and (number[0] in "12" or digits == 18) for number in numbers):
                 return [Decimal(number).scaleb(-places) for number in numbers]
         return None
+
+
+def in_order(paths: Sequence[Path]) -> list[Path]:
+    """Returns files by the numbers in their names, fractions and dates as such, those that are named otherwise at the end.
+
+    Where most have a name of their own shape they stay in the order in which they come.
+    """
+    names = [parse_name(path.name) for path in paths]
+    (shape, count), *_ = Counter(name.shape for name in names).most_common(1) or [("", 0)]
+    if count <= len(paths) // 2:
+        return list(paths)
+    columns = NumberColumns([name for name in names if name.shape == shape])
+    alike = [path for path, name in zip(paths, names) if name.shape == shape]
+    others = [path for path, name in zip(paths, names) if name.shape != shape]
+    return sorted(alike, key=lambda path: columns.key(parse_name(path.name))) + others
 
 
 def _counts_after_point(column: Sequence[str]) -> bool:
