@@ -297,8 +297,8 @@ def _require_one_layer(path: Path, stream) -> None:
         packet = next((packet for packet in container.demux(stream.index) if packet.size), b"")
         if _ALPHA_LAYER.search((stream.codec_context.extradata or b"") + bytes(packet)[:_HEAD]):
             raise DataError(
-                f"{path}: its alpha lies in a layer of HEVC that is not decoded; export it as ProRes 4444, or as "
-                "WebM with alpha, with the program that shows it"
+                f"{path}: its alpha lies in a layer of HEVC that is not decoded; FFmpeg 9 converts it: "
+                "ffmpeg -view_ids -1 -i IN -c:v prores_ks -pix_fmt yuva444p10le OUT.mov"
             )
 
 
