@@ -102,6 +102,8 @@ def write_whole(path: Path, content: bytes, *, many_writers: bool = False) -> No
 
 def not_writable(path: Path, error: OSError) -> DataError:
     """Returns the error that tells why no file can be made under a name, for a reason other than want of room."""
+    if error.errno == errno.ENOENT and not path.absolute().parent.is_dir():
+        return DataError(f"{path}: the folder {path.parent} does not exist; create it first")
     why = os.strerror(error.errno) if error.errno else str(error).partition("\n")[0]  # HDF5's own words are long
     return DataError(f"{path}: cannot be written ({why}); name a file in an existing folder")
 
