@@ -26,7 +26,7 @@ MORE = """
 help: --help
 info: info gestures.h5
 split: prepare split part-0.h5 --fractions 0.5,0.25,0.25 -o OUT
-render: generate4d view views.h5 -o OUT.html
+animal: prepare synthetic animal --size 128 -o OUT.h5
 evaluate classification: evaluate classification scores.h5 --split all
 train-prior: generate4d train-prior -o OUT --steps 50
 """
