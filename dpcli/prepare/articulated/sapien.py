@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
@@ -19,6 +18,8 @@ from dpcli.prepare.articulated.object_splits import SplitRule
 from dpcli.prepare.articulated.urdf import load_object, missing_meshes, read_skeleton
 from dpcli.prepare.articulated.urdf_meshes import is_missing
 from dpcli.prepare.reader import SPLITS, Item, Sample, describe, natural_key
+from dpcli.runtime.progress import log
+from dpcli.text_files import read_json
 
 _OTHERS = ("xacro", "sdf", "xml", "usd", "usda", "usdc", "mjcf")  # of robots that are no URDF
 _EXPECTED = "a .urdf file, or a folder of objects, each a folder with a mobility.urdf or another .urdf"
@@ -78,10 +79,13 @@ def _long_name(raw: Path, found: FoundObject) -> str:
 
 def _model_category(meta: Path) -> str:
     try:
-        category = json.loads(meta.read_text())["model_cat"]
-        return category.strip() if isinstance(category, str) else ""
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        category = read_json(meta)["model_cat"] if meta.is_file() else ""
+    except (KeyError, TypeError, IndexError):
         return ""
+    except (DataError, OSError) as error:
+        log.warn(f"its category is not known: {error}")
+        return ""
+    return category.strip() if isinstance(category, str) else ""
 
 
 @lru_cache(maxsize=3)

@@ -467,7 +467,7 @@ def test_a_declared_encoding_is_read(tmp_path):
     assert len(load(path).joints) == 1
 
 
-def test_objects_within_objects_and_the_category_of_their_meta_file(tmp_path):
+def test_objects_within_objects_and_the_category_of_their_meta_file(tmp_path, capfd):
     for where in ("x/bucket", "x/bucket/100454", "y/bucket", "y/.cache"):
         cabinet(tmp_path / where / "mobility.urdf")
         (tmp_path / where / "meta.json").write_text(json.dumps({"model_cat": "Bucket"}))
@@ -479,6 +479,11 @@ def test_objects_within_objects_and_the_category_of_their_meta_file(tmp_path):
     ]
     (tmp_path / "x/bucket/meta.json").write_text('{"model_cat": 3}')
     assert {f.category for f in find_objects(tmp_path / "x")} == {"Bucket", ""}
+    for damaged in ('{"model_cat": "a\\ud800"}', "{", "[" * 500, "3"):
+        (tmp_path / "x/bucket/meta.json").write_text(damaged)
+        find_objects.cache_clear()
+        assert {f.category for f in find_objects(tmp_path / "x")} == {"Bucket", ""}
+        assert damaged == "3" or "its category is not known: " in capfd.readouterr().err
 
 
 @pytest.mark.parametrize(
