@@ -159,8 +159,11 @@ def _handle(number: int, frame: FrameType | None) -> None:
 
 
 def _unwind(number: int, frame: FrameType | None) -> None:
-    """Raises Ended, but not within an import: a library that is half there turns it into anything, an abort even."""
-    if not _is_importing(frame):
+    """Raises Ended, but not within an import: a library that is half there turns it into anything, an abort even.
+
+    Nor while a pool starts a worker: one that it doesn't know of yet takes the word to end that another one waits for.
+    """
+    if not _must_be_whole(frame):
         raise Ended
     _retry_unwinding()
 
@@ -178,9 +181,12 @@ def _reraise_dropped(dropped: SimpleNamespace) -> None:
         sys.__unraisablehook__(dropped)
 
 
-def _is_importing(frame: FrameType | None) -> bool:
+def _must_be_whole(frame: FrameType | None) -> bool:
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
+        code = frame.f_code
+        if code.co_filename.startswith("<frozen importlib"):
+            return True
+        if code.co_name == "submit" and "concurrent" in code.co_filename:
             return True
         frame = frame.f_back
     return False

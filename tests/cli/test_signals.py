@@ -214,3 +214,32 @@ def test_who_reads_a_pipe_does_not_wait_for_the_one_that_stands_by():
     assert process.poll() is None
     process.communicate(timeout=30)
     assert process.returncode == 0
+
+
+AS_A_WORKER_STARTS = """
+import os, signal, sys
+from multiprocessing.process import BaseProcess
+start, started = BaseProcess.start, []
+def start_and_stop(self):
+    start(self)
+    started.append(self)
+    if len(started) == 1:
+        os.kill(os.getpid(), signal.{name})
+BaseProcess.start = start_and_stop
+from dpcli.__main__ import main
+sys.argv = ["dpc", *sys.argv[1:]]
+main()
+"""
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_as_a_worker_starts_ends_the_command(name, tmp_path):
+    """The pool didn't know of that worker, which took the word to end that another one waited for: for ever."""
+    words = "prepare synthetic gestures --videos-per-class 1 --frames 8 --size 32 --jobs 2 -o".split()
+    done = subprocess.run(
+        [sys.executable, "-c", AS_A_WORKER_STARTS.format(name=name), *words, tmp_path / "a.h5"],
+        capture_output=True,
+        timeout=60,
+        cwd=ROOT,
+    )
+    assert done.returncode == CODES[getattr(signal, name)], done.stderr
