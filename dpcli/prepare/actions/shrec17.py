@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import asdict, dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -149,14 +150,16 @@ class Shrec17:
     def _frame_paths(self, item: Item) -> tuple[list[Path], dict[str, int]]:
         """Returns the files 0_depth.png ... as many as the list says; more of them are left out and counted."""
         found = dict(folder_files(item.path, item.extra["root"], "_depth.png"))
-        wanted = [f"{k}_depth.png" for k in range(item.extra["frames"])]
-        missing = [name for name in wanted if name not in found]
-        if missing:
+        count = item.extra["frames"]  # of a text that may be damaged: no list of so many is made
+        wanted = list(takewhile(found.__contains__, (f"{k}_depth.png" for k in range(count))))
+        if len(wanted) < count:
+            numbers = [name.partition("_")[0] for name in found]
+            there = sum(one.isdecimal() and one == str(int(one)) and int(one) < count for one in numbers)
             raise DataError(
-                f"{item.path}: {len(missing)} of the {len(wanted)} frames that the list promises are missing, "
-                f"the first: {missing[0]}"
+                f"{item.path}: {count - there} of the {count} frames that the list promises are missing, "
+                f"the first: {len(wanted)}_depth.png"
             )
-        more = len(found) - len(wanted)
+        more = len(found) - count
         return [found[name] for name in wanted], {"frames beyond the count in the list left out": more} if more else {}
 
     def _regions(self, item: Item, frames: int) -> tuple[np.ndarray, np.ndarray]:

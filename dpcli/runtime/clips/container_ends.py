@@ -56,7 +56,7 @@ def promised_frames(path: Path) -> int:
     """
     with path.open("rb") as file:
         head = file.read(64)
-    if not re.match(rb"RIFF.{4}AVI LIST.{4}hdrlavih", head, re.DOTALL) or len(head) < 64:
+    if not re.match(rb"RIFF.{4}AVI LIST.{8}avih", head, re.DOTALL) or len(head) < 64:
         return 0
     return int.from_bytes(head[48:52], "little") if int.from_bytes(head[56:60], "little") == 1 else 0
 
