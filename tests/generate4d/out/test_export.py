@@ -245,7 +245,7 @@ def test_cameras_and_metrics_replace_nothing_unasked(scene_file, tmp_path, monke
     export_scene(str(scene_file), str(tmp_path / "mine.json"), form="metrics", force=True, **usual)
     assert json.loads((tmp_path / "mine.json").read_text()) == {"psnr": 31.5}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.json", "mine.ply", "notes.txt", "scene.h5"]
-    with pytest.raises(DataError, match="cannot be written"):
+    with pytest.raises(DataError, match="does not exist; create it first"):
         export_scene(str(scene_file), str(tmp_path / "no" / "a.json"), form="cameras", force=False, **usual)
 
 
