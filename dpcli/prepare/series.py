@@ -18,7 +18,7 @@ import numpy as np
 from dpcli.errors import DataError
 from dpcli.path_names import first_names
 from dpcli.prepare.reader import natural_key
-from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name
+from dpcli.runtime.clips.name_numbers import Name, NumberColumns, parse_name, tell_unclear_order
 
 _LISTED = 5
 TEXTS = (".txt", ".csv", ".tsv")
@@ -165,6 +165,7 @@ def _objects(group: list[Name]) -> list[list[Name]]:
 
 def _made(folder: Path, names: list[Name]) -> Series:
     columns = NumberColumns(names)
+    tell_unclear_order(folder, [name.text for name in names])
     ordered = tuple(name.text for name in sorted(names, key=columns.key))
     numbered = bool(names[0].numbers)
     pattern = columns.pattern() if numbered else f"*{names[0].suffix}"

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from dpcli.runtime.progress import log
+
 _DATE = re.compile(
     r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
 )
@@ -23,6 +25,8 @@ _YEAR_LAST = re.compile(
 )
 _SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
+_HALF_DAY = re.compile(r"\d[.:_-]\d\d[ _.-]?[ap]\.?m(?![a-z])", re.IGNORECASE)  # a time before or after noon
+_SAID: set[str] = set()
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NOTHING = Decimal(0)
 _EPOCHS = ((10, 0), (13, 3), (16, 6), (19, 9), (18, 9))  # digits of a time since 1970, or GPS's 1980 -> decimal places
@@ -175,8 +179,25 @@ def in_order(paths: Sequence[Path]) -> list[Path]:
         return list(paths)
     columns = NumberColumns([name for name in names if name.shape == shape])
     alike = [path for path, name in zip(paths, names) if name.shape == shape]
+    tell_unclear_order(alike[0].parent, [path.name for path in alike])
     others = [path for path, name in zip(paths, names) if name.shape != shape]
     return sorted(alike, key=lambda path: columns.key(parse_name(path.name))) + others
+
+
+def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
+    """Warns where dates or times in names may mean two things, so that their numbers may give another order than time."""
+    dates = [match for name in names if (match := _YEAR_LAST.search(name)) and not _since_1970_told_last(match)]
+    why = ""
+    if len({match.groups()[:3] for match in dates}) > 1:
+        why = f"whether day or month stands first in {dates[0][0]} and the like"
+    elif len(names) > 1 and any(map(_HALF_DAY.search, names)):
+        why = "when it was by clocks of 12 hours"
+    if why:
+        with log.each_once(_SAID):
+            log.warn(
+                f"{folder}: {why} can't be told from the names; the numbers order them as they stand. Names such as"
+                " 2024-03-05_14-30-00 tell it"
+            )
 
 
 def _counts_after_point(column: Sequence[str]) -> bool:

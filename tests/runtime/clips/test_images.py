@@ -13,6 +13,7 @@ from PIL import Image
 from dpcli.errors import DataError
 from dpcli.evaluate.video.sources.media import FolderSource
 from dpcli.prepare.decode.color_frames import open_frames, read_rgba
+from dpcli.runtime.clips.name_numbers import in_order
 from tests.support.color_profile import BT709, P3, color_profile, to_xyz
 
 TURNS = {
@@ -186,3 +187,19 @@ def test_pages_of_a_tiff_are_no_clip(tmp_path):
     images[0].save(tmp_path / "a.tif", save_all=True, append_images=images[1:])
     with pytest.raises(DataError, match="3 pages, which tell no times; write each into a folder"):
         open_frames(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["01-02-2024 10.00.00.png", "02-01-2024 10.00.00.png"], "whether day or month stands first in 01-02-2024"),
+        (["01-02-2024 10.00.00.png", "01-02-2024 10.00.05.png"], ""),
+        (["13-02-2024 10.00.00.png", "14-01-2024 10.00.00.png"], ""),
+        (["shot 12.00.00 PM.png", "shot 1.00.00 PM.png"], "clocks of 12 hours"),
+        (["cam 1pma.png", "cam 2pma.png"], ""),
+    ],
+)
+def test_names_that_may_mean_two_times_are_told(names, words, tmp_path, capfd):
+    in_order([tmp_path / name for name in names])
+    told = capfd.readouterr().err
+    assert words in told if words else not told
