@@ -136,10 +136,15 @@ def _make_plain(path: Path, tree: Any) -> None:
         if origin.get("quat_xyzw"):
             origin.set("rpy", " ".join(map(repr, _roll_pitch_yaw(path, origin.attrib.pop("quat_xyzw")))))
     for shape in root.findall("link/visual"):
-        if not shape.findall("geometry/*"):
-            link = shape.getparent().get("name")
+        link = shape.getparent().get("name")
+        count = sum(isinstance(one.tag, str) for one in shape.findall("geometry/*"))
+        if count == 0:
             raise DataError(
                 f"{path}: link {link!r} has a <visual> without geometry; expected {', '.join(_SHAPES)} in it, or remove it"
+            )
+        if count > 1:
+            raise DataError(
+                f"{path}: link {link!r} has {count} shapes in one <visual>; give each a <visual> of its own"
             )
     for shape in root.findall("link/collision"):
         kinds = [part.tag for part in shape.findall("geometry/*") if isinstance(part.tag, str)]

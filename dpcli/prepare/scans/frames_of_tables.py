@@ -102,22 +102,21 @@ class Clock:
         return starts - starts[0] if (np.diff(starts) > 0).all() else None
 
 
-def find_clock(table: Table, names: Sequence[str]) -> Clock | None:
-    """Returns the times that one of the columns ``names`` tells, in seconds or of a unit in its name; None without one."""
+def find_clocks(table: Table, names: Sequence[str]) -> list[Clock]:
+    """Returns the times that some of the columns ``names`` tell, in seconds or of a unit in the column's name."""
+    found = []
     for name in names:
-        words = words_of(name)
-        if not set(words) & _TIME_WORDS:
+        if not set(words_of(name)) & _TIME_WORDS:
             continue
         try:
             values = table.columns([table.names.index(name)])[:, 0]
         except DataError:
-            values = np.array(clock_seconds(table.words(table.names.index(name))))
-            unit = 1.0
+            values, unit = np.array(clock_seconds(table.words(table.names.index(name)))), 1.0
         else:
             unit = seconds_of(name, values) if np.isfinite(values).all() else 0.0
         if unit and len(values):
-            return Clock(name, (values - values[0]) * unit)
-    return None
+            found.append(Clock(name, (values - values[0]) * unit))
+    return found
 
 
 def frame_column(table: Table, wanted: str) -> str:

@@ -20,7 +20,7 @@ from dpcli.prepare.cloud_formats.text_numbers import read_text_table
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, natural_key
 from dpcli.prepare.scans.assembling import Lengths, assemble
-from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Clock, Rows, find_clock, frame_column, split_rows
+from dpcli.prepare.scans.frames_of_tables import JOINED, SINGLE, Clock, Rows, find_clocks, frame_column, split_rows
 from dpcli.store.schema import kept_name
 
 TABLES = (".csv", ".tsv", ".parquet", ".feather", ".txt", ".xyz", ".asc")
@@ -162,7 +162,9 @@ class TableSequences:
         good = next((item for item in items if not item.problem), None)
         if good:
             loaded = self._load(good.path)
-            clock = loaded.clock_used(self.fps) if self._found[1] else ""
+            first = loaded.parts[0]
+            used = self._found[1] and first.times(loaded.column, self.fps) is None and loaded.clock(first)
+            clock = used.column if used else ""
             unused = ", ".join(name for name in loaded.unused if name not in (*self.keep, clock))
             lines[0] += f", frames by column {loaded.column!r}"
             if clock:
@@ -174,26 +176,24 @@ class TableSequences:
 @dataclass(frozen=True)
 class Loaded:
     """Holds a table that was read: all its points, its sequences, the frame column, columns that nobody asked for, and the
-    times that one of these tells.
+    times that some of these tell.
     """
 
     cloud: Cloud
     parts: list[Rows]
     column: str
     unused: tuple[str, ...]
-    clock: Clock | None
+    clocks: list[Clock]
 
     def times(self, part: Rows, fps: float | None) -> np.ndarray | None:
-        """Returns seconds since the first frame, f64 (T): by the frame column or ``fps``, else by the clock; else None."""
+        """Returns seconds since the first frame, f64 (T): by the frame column or ``fps``, else by a clock; else None."""
         told = part.times(self.column, fps)
-        return self.clock.times(part) if told is None and self.clock else told
+        clock = self.clock(part) if told is None else None
+        return clock.times(part) if clock else told
 
-    def clock_used(self, fps: float | None) -> str:
-        """Returns the name of the column that tells the times, "" where none does, or the frame column."""
-        used = (
-            self.clock and self.parts[0].times(self.column, fps) is None and self.clock.times(self.parts[0]) is not None
-        )
-        return self.clock.column if self.clock and used else ""
+    def clock(self, part: Rows) -> Clock | None:
+        """Returns the first clock whose times rise from frame to frame of a sequence; None without one."""
+        return next((one for one in self.clocks if one.times(part) is not None), None)
 
     def frames(self, part: Rows) -> list[Cloud]:
         """Returns the frames of one sequence."""
@@ -217,7 +217,7 @@ def _load(
     cloud = cloud_of_table(table, keep)
     axes = cloud.columns
     unused = tuple(name for name in table.names if name and name not in {*axes, column, sequences})
-    return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused, find_clock(table, unused))
+    return Loaded(cloud, split_rows(table, column, sequences, gap), column, unused, find_clocks(table, unused))
 
 
 def _tables_below(folder: Path) -> Iterator[Path]:

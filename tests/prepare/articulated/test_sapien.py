@@ -160,6 +160,7 @@ def test_mimic_joints_follow(tmp_path):
         ([link("a", '<box size="1 x 1"/>')], "not a valid URDF"),
         (['<link name="a"><visual/></link>'], "link 'a' has a <visual> without geometry; expected box"),
         (['<link name="a"><visual><geometry/></visual></link>'], "link 'a' has a <visual> without geometry"),
+        ([link("a", '<box size="1 1 1"/><sphere radius="1"/>')], "link 'a' has 2 shapes in one <visual>"),
     ],
 )
 def test_broken_urdfs_end_with_a_sentence(elements, words, tmp_path):

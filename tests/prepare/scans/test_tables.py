@@ -120,6 +120,9 @@ def test_times_of_points_are_those_of_the_first_of_a_frame(tmp_path):
     (sample,) = sequences(write(tmp_path / "a.csv", rows, "frame,x,y,z,t"), frame_column="frame")
     np.testing.assert_allclose(sample.sequence.time, [0, 0.1, 0.2], atol=1e-6)
     assert sample.sequence.num_frames == 3
+    rows = [(f, 1, 2, k, k / 100, 5 + f / 10) for f in (0, 1, 2) for k in (1, 2, 3)]  # first the time within a frame
+    (sample,) = sequences(write(tmp_path / "b.csv", rows, "frame,x,y,z,t,timestamp"), frame_column="frame")
+    np.testing.assert_allclose(sample.sequence.time, [0, 0.1, 0.2], atol=1e-6)
 
 
 def test_numbers_that_fall_are_told_and_counters_that_are_full_go_on(tmp_path):
