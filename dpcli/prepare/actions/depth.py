@@ -32,6 +32,7 @@ from dpcli.prepare.decode.depth_files import (
     read_depth_video,
     says_depth,
 )
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.decode.pinhole_camera import Intrinsics, back_project
 from dpcli.prepare.labels import LabelTable, labels_of_folders, read_labels
 from dpcli.prepare.reader import Item, Sample, describe, drop_empty_frames, natural_key, offsets
@@ -309,8 +310,9 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     suffixes = (*VIDEO_SUFFIXES, *ARRAY_SUFFIXES)
     found += [(recording, None) for recording in find_recordings(path)]
     clips = {os.fspath(recording) for recording, _ in found}
-    for folder, folders, files in os.walk(path):  # frames are many: they are neither sorted nor asked what they are
-        folders[:] = [name for name in folders if not is_hidden(name)]
+    for folder, folders, files in walk_folders(
+        path
+    ):  # frames are many: they are neither sorted nor asked what they are
         for name in folders:
             if series := frame_series(Path(folder, name), pattern):
                 found.append((Path(folder, name), series))
@@ -322,7 +324,7 @@ def find_videos(path: Path, pattern: str = "") -> list[tuple[Path, Series | None
     found.sort(key=lambda one: natural_key(one[0].relative_to(path).as_posix()))
     if not found:
         asked = f" whose names fit --pattern '{pattern}'" if pattern else ""
-        below = (name.lower() for _, _, files in os.walk(path) for name in files if not is_hidden(name))
+        below = (name.lower() for _, _, files in walk_folders(path) for name in files if not is_hidden(name))
         others = Counter(splitext(name)[1] for name in below if name.endswith(_FOREIGN))
         seen = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
         raise DataError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
+from dpcli.prepare.decode.folder_listing import walk_folders
 from dpcli.prepare.reader import natural_key
 from dpcli.prepare.series import TEXTS, Series, choose_series, is_hidden
 
@@ -79,8 +79,7 @@ def _folders(root: Path, suffixes: Sequence[str], table: Path | None) -> Iterato
     """Yields every folder at or below ``root`` with the names of its point clouds, and how many it has in formats that
     are not read, by suffix; no folder that has neither.
     """
-    for folder, below, names in os.walk(root):
-        below[:] = [name for name in below if not is_hidden(name)]
+    for folder, _, names in walk_folders(root):
         clouds = [name for name in names if is_cloud(name, suffixes) and Path(folder, name).is_file()]
         if table is not None:
             clouds = [name for name in clouds if Path(folder, name).resolve() != table]

@@ -15,7 +15,7 @@ from dpcli.ops.open3d_import import load_open3d
 from dpcli.prepare.cloud_formats.cloud import AT_ORIGIN
 from dpcli.prepare.cloud_formats.colors import as_bytes
 from dpcli.prepare.cloud_formats.column_names import find_axes, find_colors, find_frame_column
-from dpcli.prepare.cloud_formats.text_cloud import read_text
+from dpcli.prepare.cloud_formats.text_cloud import BLOCKS, read_text
 from dpcli.prepare.decode.cloud_files import read_cloud
 
 POINTS = [[0.126, -0.132, 0.64], [0.105, -0.536, 0.362], [-1.265, -0.623, 0.041]]
@@ -71,6 +71,8 @@ def test_what_csv_writers_write_is_read_back(tmp_path, data):
         "0,1,2\n0.126,-0.132,0.64\n0.105,-0.536,0.362\n-1.265,-0.623,0.041\n",
         ",0,1,2,3\n0,0.126,-0.132,0.64,9\n1,0.105,-0.536,0.362,9\n2,-1.265,-0.623,0.041,8\n",
         "1 0.126 -0.132 0.64\n2 0.105 -0.536 0.362\n3 -1.265 -0.623 0.041\n",
+        '"x" "y" "z"\n"1" 0.126 -0.132 0.64\n"2" 0.105 -0.536 0.362\n"3" -1.265 -0.623 0.041\n',
+        "x,y,z\n0.126,\u22120.132,0.64\n0.105,\u22120.536,0.362\n\u22121.265,\u22120.623,0.041\n",
         "Points:0,Points:1,Points:2,id\n0.126,-0.132,0.64,0\n0.105,-0.536,0.362,1\n-1.265,-0.623,0.041,2\n",
     ],
 )
@@ -111,6 +113,9 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("range,azimuth,elevation\n1,2,3\n", "columns range, azimuth, elevation; expected x, y and z"),
         ("x,y,z,pos_x,X\n1,2,3,4,5\n", "columns x, X could each be x"),
         ("x_mm,y_mm,z_m\n1,2,3\n", "different units"),
+        ("# frame 0\n1 2 3\n# frame 1\n4 5 6\n", "comments such as '# frame 1' divide its rows into frames"),
+        ("x y z\n1 2 3\n// Scan no: 2\n4 5 6\n", "comments such as '// Scan no: 2' divide its rows into frames"),
+        ("x [ms],y [ms],z [ms]\n1,2,3\n", "expected x, y and z among them"),
         ("frame,x,y,z\n0,1,2,3\n1,1,2,3\n", "'frame' numbers 2 frames; --frame-column frame"),
     ],
 )
@@ -212,6 +217,12 @@ def test_kept_columns_that_float32_would_round_are_refused(tmp_path):
     assert read(tmp_path / "a.csv", "x,y,z,t\n1,2,3,5\n1,2,4,1700000001\n", keep=["t"]).extra["t"][0] == 5
 
 
+def test_comments_and_empty_lines_between_rows(tmp_path):
+    assert len(read(tmp_path / "a.xyz", "1 2 3\n# 5 outliers left out\n4 5 6\n# frame 7\n").points) == 2
+    assert read(tmp_path / "a.xyz", "1 2 3\n\n4 5 6\n\n\n").dropped == {}
+    assert read(tmp_path / "a.xyz", "1 2 3\n\n\n4 5 6\n").dropped == {BLOCKS: 1}
+
+
 def test_one_frame_of_a_table_is_a_cloud(tmp_path):
     assert read(tmp_path / "a.csv", "frame,x,y,z\n7,1,2,3\n7,4,5,6\n").points.tolist() == [[1, 2, 3], [4, 5, 6]]
 
@@ -238,6 +249,11 @@ def test_bytes_that_are_no_text(tmp_path):
         ("Points_m_XYZ:0 Points_m_XYZ:1 Points_m_XYZ:2 intensity", [0, 1, 2], ""),
         ("X1 (mm)|Y1 (mm)|Z1 (mm)|X2 (mm)|Y2 (mm)|Z2 (mm)", [0, 1, 2], "mm"),
         ("x (in)|y (in)|z (in)", [0, 1, 2], "in"),
+        ("x [µm]|y [µm]|z [µm]", [0, 1, 2], "um"),
+        ("x_um y_um z_um", [0, 1, 2], "um"),
+        ("x [dm]|y [dm]|z [dm]", [0, 1, 2], "dm"),
+        ("x in mm|y in mm|z in mm", [0, 1, 2], "mm"),
+        ("X-Koord. [m]|Y-Koord. [m]|Z-Koord. [m]|Höhe [cm]", [0, 1, 2], "m"),
     ],
 )
 def test_styles_of_headers(names, places, unit):
