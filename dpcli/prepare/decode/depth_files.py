@@ -20,6 +20,7 @@ from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
 from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
+from dpcli.regular_files import stand_in
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
 from dpcli.runtime.clips.video_frames import missing_frames
 
@@ -287,6 +288,13 @@ def _portable_map(data: bytes, path: Path) -> np.ndarray | None:
 
 def read_frame(path: Path) -> np.ndarray:
     """Reads one frame (H,W) of a folder: an image, or an array in ``.npy`` or ``.npz``."""
+    try:
+        return _frame(path)
+    except DataError as error:
+        raise (stand_in(path) or error) from None
+
+
+def _frame(path: Path) -> np.ndarray:
     if path.suffix.lower() not in ARRAY_SUFFIXES:
         return read_image(path)
     array = read_array(path)
@@ -424,17 +432,24 @@ def read_depth_video(path: Path, stride: int = 1, series: Series | None = None) 
         white = first.suffix.lower() in (".tif", ".tiff") and has_white_at_zero(first.read_bytes())
         notes = {WHITE_AT_ZERO: 1} if white else {}
         video = DepthVideo(read_frames(series, stride), None if times is None else times[::stride], notes=notes)
-    elif suffix in ARRAY_SUFFIXES:
-        video = DepthVideo(read_array(path, stride))
-    elif suffix in VIDEO_SUFFIXES:
-        frames, time, missing = read_timed_video(path, stride)
-        if not frames:
-            raise DataError(f"{path}: an empty video: no frame can be decoded")
-        left = empty_frames(path, 0)
-        notes = {LEFT_OUT: left} if left else {}
-        video = DepthVideo(np.stack(frames), time, missing, ends_early(path), notes)
+    elif suffix in (*ARRAY_SUFFIXES, *VIDEO_SUFFIXES):
+        try:
+            video = _read_file(path, stride)
+        except DataError as error:
+            raise (stand_in(path) or error) from None
     else:
         raise DataError(f"{path}: unknown kind; expected a folder of images, .npy, .npz or {', '.join(VIDEO_SUFFIXES)}")
     if video.frames.size == 0:
         raise DataError(f"{path}: an empty video: shape {video.frames.shape}")
     return video
+
+
+def _read_file(path: Path, stride: int) -> DepthVideo:
+    """Reads an array or a video file. Raises DataError when it can't be read, or holds no frame."""
+    if path.suffix.lower() in ARRAY_SUFFIXES:
+        return DepthVideo(read_array(path, stride))
+    frames, time, missing = read_timed_video(path, stride)
+    if not frames:
+        raise DataError(f"{path}: an empty video: no frame can be decoded")
+    left = empty_frames(path, 0)
+    return DepthVideo(np.stack(frames), time, missing, ends_early(path), {LEFT_OUT: left} if left else {})

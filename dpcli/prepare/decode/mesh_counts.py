@@ -10,9 +10,11 @@ from typing import Any
 
 from dpcli.errors import DataError
 from dpcli.prepare.cloud_formats.ply import read_header
+from dpcli.runtime.progress import log
 
 _STL_HEAD, _STL_FACE = 84, 50  # bytes
 _SOLID = rb"(?i)\s*solid"
+_SAID: set[str] = set()
 _MARK = b"\xef\xbb\xbf"  # of UTF-8, before the first line
 
 
@@ -27,7 +29,11 @@ def require_counts(path: Path) -> None:
 
 
 def mesh_source(path: Path) -> dict[str, Any]:
-    """Returns what trimesh loads of a mesh file: its path, or the bytes of an OBJ without the mark that hides its first line."""
+    """Returns what trimesh loads of a mesh file: its path, or the bytes of an OBJ without the mark that hides its first line,
+    and those of a binary STL without what lies behind its triangles.
+    """
+    if path.suffix.lower() == ".stl" and (end := _end_of_stl(data := path.read_bytes())):
+        return {"file_obj": BytesIO(data[:end]), "file_type": "stl"}
     with path.open("rb") as file:
         if path.suffix.lower() != ".obj" or file.read(len(_MARK)) != _MARK:
             return {"file_obj": path}
@@ -68,11 +74,27 @@ def _check_stl(path: Path) -> None:
     count = int.from_bytes(data[_STL_HEAD - 4 : _STL_HEAD], "little")
     if len(data) in (0, _STL_HEAD + count * _STL_FACE):
         return
-    if len(data) >= _STL_HEAD and (not re.match(_SOLID, data) or b"\0" in data):
+    if end := _end_of_stl(data):
+        with log.each_once(_SAID):
+            log.warn(f"{path}: {len(data) - end} bytes behind its {count} triangles were passed over")
+    elif _is_binary(data):
         _compare(path, "triangles", count, (len(data) - _STL_HEAD) // _STL_FACE)
         _compare(path, "bytes", _STL_HEAD + count * _STL_FACE, len(data))
     elif re.match(_SOLID, data) and not re.search(rb"(?i)\bendsolid\b[^\n]*\s*\Z", data):
         raise DataError(f"{path}: truncated: it doesn't end with endsolid; copy it again")
+
+
+def _is_binary(data: bytes) -> bool:
+    return len(data) >= _STL_HEAD and (not re.match(_SOLID, data) or b"\0" in data)
+
+
+def _end_of_stl(data: bytes) -> int:
+    """Returns where the triangles of a binary STL end, if something lies behind that is no triangle: zeros, or bytes that
+    make no whole number of them; else 0. Whole triangles behind are a count that is wrong.
+    """
+    end = _STL_HEAD + int.from_bytes(data[_STL_HEAD - 4 : _STL_HEAD], "little") * _STL_FACE
+    behind = data[end:] if _is_binary(data) else b""
+    return end if _STL_HEAD < end and behind and (len(behind) % _STL_FACE or not any(behind)) else 0
 
 
 def _check_ply(path: Path) -> None:

@@ -190,6 +190,27 @@ def test_scans_of_a_ptx_stand_where_their_matrices_say(tmp_path, color):
         read_cloud(tmp_path / "a.ptx")
 
 
+def test_a_ptx_written_by_its_description_gives_the_places_in_the_world(tmp_path):
+    """The description: a point lies at the scanner's place plus x, y and z along the scanner's axes, which the header lists
+    before the matrix that repeats them.
+    """
+    rng = np.random.default_rng(1)
+    place, world = np.array([448_262.5, 5_411_932.25, 103.125]), rng.uniform(-20, 20, (5, 3))
+    axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))  # a row each
+    own = [" ".join(f"{float(np.dot(point, axis)):.9f}" for axis in axes) for point in world]
+    rows = [[f"{value:.12f}" for value in axis] for axis in axes]
+    where = [f"{value:.6f}" for value in place]
+    head = ["5", "1", " ".join(where), *map(" ".join, rows)]
+    matrix = [" ".join([*row, "0.000000"]) for row in rows] + [" ".join([*where, "1.000000"])]
+    lines = [*head, *matrix, *(f"{point} 0.250000 10 20 30" for point in own)]
+    (tmp_path / "a.ptx").write_text("\n".join(lines) + "\n")
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.ptx").points, world + place, atol=1e-6)
+    lines[len(head) : len(head) + 4] = [" ".join(row) for row in zip(*(line.split() for line in matrix))]
+    (tmp_path / "a.ptx").write_text("\n".join(lines) + "\n")
+    with pytest.raises(DataError, match="the matrix in rows 7 to 10 doesn't end with 0 0 0 1 in its last column"):
+        read_cloud(tmp_path / "a.ptx")
+
+
 def test_whole_numbers_before_three_columns_of_fractions_are_asked_about(tmp_path):
     scan = "".join(f"{k} 7 1.5 2.25 0.{k}5 128\n" for k in range(3, 6))
     with pytest.raises(DataError, match="its first 2 columns hold whole numbers, .*which are x, y and z"):
