@@ -35,6 +35,8 @@ _NUMBER = r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?"
 _GROUPED = re.compile(r"[-+]?\d{1,3}([.,' \u00a0\u202f])\d{3}(\1\d{3})*([.,]\d+)?")
 _FRACTION = re.compile(r"[-+]?\d+\.\d+")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2}(,\d{3})+")
+_POINTED = re.compile(r"[-+]?[1-9]\d{0,2}(\.\d{3})+")
+_BELOW_THOUSAND = re.compile(r"[-+]?[1-9]\d{0,2}")  # which groups of thousands leave as they are
 _EDGES = " \r\n\x00"  # no tabs: they may stand for empty cells
 _HEAD = 200  # lines among which the header is looked for
 _LOOKED_AT = 30  # lines before the numbers, and rows that tell what the columns hold
@@ -90,7 +92,8 @@ class TextTable:
 
     def columns(self, places: Sequence[int]) -> np.ndarray:
         """Returns some columns as numbers f64 (N,k), NaN where a cell is empty. Raises DataError that names the line."""
-        doubtful = self.delimiter != "," and _may_be_thousands(self.body)
+        signs = {",": "", ";": ",.", "\t": ",."}.get(self.delimiter or "", ",")  # that may divide thousands
+        doubtful = bool(signs) and _may_be_thousands(self.body, signs)
         sure = self.width and not doubtful
         plain = parse_plain(self.body, self.width, self.delimiter, self.limit) if sure else None
         if plain is not None:
@@ -154,14 +157,14 @@ class TextTable:
         """Returns the decimal sign of the cells. Raises DataError where points and commas contradict one another."""
         commas = [row[place] for row in rows for place in places if "," in row[place]]
         if not commas:
-            return "."
+            return self._decimal_of_points(rows, places)
         both = [cell for cell in commas if "." in cell]
         signs = {max(".,", key=cell.rfind) for cell in both}
         if not both:
             others = [row[place] for row in rows for place in places if "," not in row[place]]
             points = any("." in cell for cell in others)
             grouped = all(_THOUSANDS.fullmatch(cell) for cell in commas)
-            whole = [cell for cell in others if re.fullmatch(r"[-+]?[1-9]\d{0,2}", cell)]  # as groups leave below 1,000
+            whole = [cell for cell in others if _BELOW_THOUSAND.fullmatch(cell)]
             if grouped and whole and not points and self.delimiter != ",":
                 raise DataError(
                     f"{self.path}: {commas[0]} beside {whole[0]} may be {commas[0].replace(',', '')} or"
@@ -173,12 +176,33 @@ class TextTable:
             raise DataError(f"{self.path}: numbers such as {commas[0]} beside others with a point; expected one style")
         return signs.pop()
 
+    def _decimal_of_points(self, rows: list[list[str]], places: list[int]) -> str:
+        """Returns the decimal sign of cells without commas. Raises DataError where a column of points in groups of three digits
+        holds whole numbers, too, as where they divide thousands.
+        """
+        for place in places:
+            column = [row[place] for row in rows]
+            pointed = [cell for cell in column if "." in cell]
+            if any(cell.count(".") > 1 for cell in pointed):
+                return ","
+            whole = [cell for cell in column if _BELOW_THOUSAND.fullmatch(cell)]
+            if self.delimiter in (";", "\t") and pointed and whole and all(map(_POINTED.fullmatch, pointed)):
+                raise DataError(
+                    f"{self.path}: {pointed[0]} beside {whole[0]} may be {pointed[0].replace('.', '')} or {pointed[0]};"
+                    " expected numbers without groups of thousands"
+                )
+        return "."
 
-def _may_be_thousands(body: str) -> bool:
-    """Returns whether every comma of a text may divide thousands, such as 1,500: no other number tells decimal commas."""
-    if "," not in body or "." in body:
+
+def _may_be_thousands(body: str, signs: str) -> bool:
+    """Returns whether all of a text's commas, or all its points, may divide thousands, such as 1,500: no other number tells
+    decimals. signs: which of the two may.
+    """
+    found = [sign for sign in ",." if sign in body]
+    if len(found) != 1 or found[0] not in signs:
         return False
-    return re.search(r",(?!\d{3}(?![\d,]))|(?<!\d)0,|\d{4},|(?<!\d),", body) is None
+    sign = f"[{found[0]}]"
+    return re.search(rf"{sign}(?!\d{{3}}(?!\d))|(?<!\d)0{sign}|\d{{4}}{sign}|(?<!\d){sign}", body) is None
 
 
 def _is_comment(line: str) -> bool:
@@ -283,7 +307,7 @@ def decode_text(path: Path) -> str:
     """Returns the text of a file in UTF-8, or in UTF-16 or 32 by its mark or its zeros; else byte by byte (Latin-1)."""
     data = path.read_bytes()
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "")
-    if not encoding and b"\0" in data[:200]:
+    if not encoding and b"\0" in data[:200].rstrip(b"\0"):  # zeros at the end are what a crash leaves
         zeros = [data[:200][k::2].count(0) for k in (0, 1)]
         if min(zeros) > 5 or max(zeros) < len(data[:200]) // 4:
             raise DataError(f"{path}: not text; expected numbers in columns")

@@ -94,6 +94,9 @@ def test_texts_of_the_same_points(tmp_path, text):
         ('x,y,z\n"1,500","-2,250",500\n', [1500, -2250, 500]),
         ("x;y;z\n1,500;2,250;1,125\n", [1.5, 2.25, 1.125]),
         ("x;y;z\n1,500;0,250;7\n", [1.5, 0.25, 7]),
+        ("x;y;z\n448.262.123;-5.411.932;1.000\n", [448262123, -5411932, 1000]),
+        ("x;y;z\n1.500;-2.250;7\n", [1.5, -2.25, 7]),
+        ("x,y,z\n1.500,2,3\n" + "\0" * 600, [1.5, 2, 3]),
     ],
 )
 def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
@@ -107,6 +110,7 @@ def test_groups_of_thousands_and_missing_cells(tmp_path, text, expected):
         ("0,126,-0,132,0,640\n0,105,-0,536,0,362\n", "a.csv:1: decimal commas between commas can't be told apart"),
         ("x;y;z\n0,5;1.5;2\n", "numbers such as 0,5 beside others with a point"),
         ("x;y;z\n1,500;2,250;500\n", "1,500 beside 500 may be 1500 or 1.500"),
+        ("x;y;z\n1.500;2;3\n500;2;3\n", "1.500 beside 500 may be 1500 or 1.500"),
         ("x,y,z\n1_000,2,3\n", "column 'x' holds '1_000'"),
         ("4\n1 2 3\n4 5 6\n", "says 4 points in line 1, holds 2"),
         ("\n\n", "no rows"),
