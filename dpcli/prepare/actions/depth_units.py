@@ -63,7 +63,7 @@ def require_byte_order(name: str, frames: np.ndarray) -> None:
     frame = frames[len(frames) // 2]
     some = frame[:: max(1, len(frame) // _ROWS)]
     rough = _roughness(some)
-    if rough > _ROUGH and rough > _SMOOTHER * _roughness(some.byteswap()) and len(np.unique(some)) > _KINDS:
+    if rough > _ROUGH and rough > _SMOOTHER * _roughness(some.byteswap()) and _kinds(some) > _KINDS:
         raise DataError(
             f"{name}: its depths leap from pixel to pixel, as where the two bytes of each are the wrong way round; write"
             " them again in the byte order that the format prescribes, such as by NumPy's byteswap"
@@ -89,7 +89,7 @@ def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
     if mark := _full_bits(some):
         what = f"videos in which many pixels hold {mark}, the largest number of {mark.bit_length()} bits, and none a little less"
         return {f"{what}: a mark of nothing seen? --far leaves them out": 1}
-    if len(np.unique(some)) <= _KINDS:
+    if _kinds(some) <= _KINDS:
         return {}
     for step, scale in _STEPS.items():
         alike, coarser = (np.bincount(some % own).max() > _SAME_REST * len(some) for own in (step, 2 * step))
@@ -97,6 +97,12 @@ def doubts_of_units(frames: np.ndarray) -> dict[str, int]:
             what = f"videos whose raw depths go in steps of {step}"
             return {f"{what}; if their sensor counted millimeters, give --depth-scale {scale}": 1}
     return {}
+
+
+def _kinds(values: np.ndarray) -> int:
+    """Returns how many different numbers there are; `np.unique` loads masked arrays first, for which every process would wait."""
+    ordered = np.sort(values, axis=None)
+    return np.count_nonzero(ordered[1:] != ordered[:-1]) + min(len(ordered), 1)
 
 
 def _full_bits(values: np.ndarray) -> int:

@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,14 +16,13 @@ from dpcli.errors import DataError
 from dpcli.npy_files import map_npy, require_room
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
-from dpcli.prepare.decode.deep_video import deep_frames
-from dpcli.prepare.decode.exr import read_exr
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
-from dpcli.prepare.decode.video_streams import VideoStream, depth_stream
 from dpcli.prepare.series import Series, choose_series, is_hidden
 from dpcli.regular_files import stand_in
 from dpcli.runtime.clips.container_ends import empty_frames, ends_early, promised_frames
-from dpcli.runtime.clips.video_frames import missing_frames
+
+if TYPE_CHECKING:
+    from dpcli.prepare.decode.video_streams import VideoStream
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".m4v", ".webm", ".nut", ".y4m")
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".jp2", ".pfm", ".exr")
@@ -117,6 +117,9 @@ def read_timed_video(path: Path, stride: int = 1) -> tuple[list[np.ndarray], np.
 
     Of several streams the one of depth is taken. Raises DataError where gray of more than 8 bits would be cut.
     """
+    from dpcli.prepare.decode.deep_video import deep_frames  # for videos alone: folders of images start without it
+    from dpcli.prepare.decode.video_streams import depth_stream
+
     capture = _opened(path)
     try:
         tag, rate = int(capture.get(load_cv2().CAP_PROP_CODEC_PIXEL_FORMAT)), _declared_rate(capture)
@@ -153,6 +156,8 @@ def _declared_frames(capture) -> int:
 
 def _missing(path: Path, declared: int, count: int, times: np.ndarray | None, stride: int) -> int:
     """Returns how many frames the file lacks; it is opened again only where OpenCV's guess of its length says more."""
+    from dpcli.runtime.clips.video_frames import missing_frames
+
     seen = count * stride  # but for the last few
     missing = missing_frames(path, seen, times if stride == 1 else None) if declared > seen else 0
     return missing or max(promised_frames(path) - max(declared, seen), 0)
@@ -217,6 +222,8 @@ def _colored(frame: np.ndarray) -> bool:
 def read_image(path: Path) -> np.ndarray:
     """Reads one gray depth image (H,W) u8, u16 or f32. Raises DataError when unreadable or colored."""
     if path.suffix.lower() == ".exr":
+        from dpcli.prepare.decode.exr import read_exr
+
         return read_exr(path)
     data = path.read_bytes()
     image = decode_gray_png(data)
