@@ -7,7 +7,6 @@ import errno
 import functools
 import math
 import os
-import re
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -19,6 +18,7 @@ import typer
 
 from dpcli import __version__
 from dpcli.cli.help_groups import SectionedCommand, SectionedGroup, use_sections
+from dpcli.cli.out_of_memory import memory_sentence, naming_large, out_of_memory
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.regular_files import regular_files_only
 from dpcli.runtime.tuning import tune_environment
@@ -40,7 +40,16 @@ ROOMS = {
 _WRITTEN = ("output", "picture", "animation", "ply", "turntable", "page")  # options that name what a command writes
 CLOSED_PIPE = 141  # what a shell reports for SIGPIPE
 # What is wrong with a path that was given, rather than with the machine.
-_PLACES = (errno.EROFS, errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR)
+_PLACES = (
+    errno.EROFS,
+    errno.EACCES,
+    errno.EPERM,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.ENXIO,
+)
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
 
 
@@ -163,11 +172,8 @@ def _explain(error: BaseException) -> int:
     if full is not None:
         log.error(str(full))
         return full.exit_code
-    if _out_of_memory(error):
-        log.error(
-            f"not enough memory on {'the GPU' if 'CUDA' in str(error) else 'this machine'}{_asked_for(str(error))}; take less"
-            " at a time: --batch, or --set accumulate=2 in `classify train`, --points, --frames, --size, --jobs"
-        )
+    if out_of_memory(error):
+        log.error(memory_sentence(error))
         return 1
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
@@ -175,24 +181,11 @@ def _explain(error: BaseException) -> int:
     raise error
 
 
-def _out_of_memory(error: BaseException) -> bool:
-    """numpy raises MemoryError, torch RuntimeError: on a GPU a kind of its own, on a CPU a plain one."""
-    text = str(error)
-    said = type(error).__name__ == "OutOfMemoryError" or "can't allocate memory" in text
-    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and said)
-
-
-def _asked_for(said: str) -> str:
-    found = re.search(r"allocate ([\d.]+) ?(\w+)", said)
-    if found is None:
-        return ""
-    from rich.filesize import decimal
-
-    return f" ({decimal(int(found[1])) if found[2] == 'bytes' else ' '.join(found.groups())} more were asked for)"
-
-
 def _refusing_nan(command: Any) -> Any:
-    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default."""
+    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default.
+
+    Where memory ends, options far above their defaults are named.
+    """
     for below in getattr(command, "commands", {}).values():
         _refusing_nan(below)
     run = command.callback
@@ -207,7 +200,9 @@ def _refusing_nan(command: Any) -> Any:
                 if isinstance(number, float) and not abs(number) < _LARGEST and number != options[name].default:
                     below = f" below {_LARGEST:g}" if math.isfinite(number) else ""
                     raise UsageError(f"{options[name].opts[-1]} {number}: expected a finite number{below}")
-        return run(*args, **values)
+        given = {f"{options[name].opts[-1]} {value}": (value, options[name].default) for name, value in values.items()}
+        with naming_large(given):
+            return run(*args, **values)
 
     command.callback = checked
     return command

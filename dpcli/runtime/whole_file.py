@@ -180,11 +180,9 @@ def refuse_folder(path: Path) -> None:
 
 
 def refuse_pipe(path: Path) -> None:
-    """Raises UsageError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
-    if path.exists() and not path.is_file() and not path.is_dir():
-        raise UsageError(
-            f"{path}: a pipe or device, expected a file; to read from a pipe give `-`: COMMAND | dpc ... -"
-        )
+    """Raises DataError for an input such as `<(command)`: HDF5 is read at any place, a pipe only once from its begin."""
+    if path.exists() and (reason := why_unreadable(path)):
+        raise DataError(f"{path}: {reason}; to read from a pipe give `-`: COMMAND | dpc ... -")
 
 
 def check_replaced(folder: Path, own: Sequence[str]) -> None:

@@ -17,6 +17,7 @@ import typer
 from typer.testing import CliRunner
 
 from dpcli.cli import app as cli
+from dpcli.cli.out_of_memory import naming_large
 from dpcli.errors import UsageError
 from dpcli.store import CloudSequence, CloudsWriter, ScoresWriter
 from tests.fuzz.forks import Limits, forked
@@ -105,13 +106,23 @@ def test_too_little_memory_is_no_bug(error, expected, capsys):
     assert f"not enough memory on {expected}" in capsys.readouterr().err
 
 
+def test_numbers_that_ask_for_the_memory_are_named(capsys):
+    error = MemoryError("Unable to allocate 7.28 TiB for an array with shape (1000000000000,)")
+    given = {"--batch 4": (4, 8), "hidden = 4096": (4096, 64), "widths = 64,4096": (((64, 4096),), ((64, 64),))}
+    with pytest.raises(UsageError, match=r"hidden = 4096, widths = 64,4096: .* than this machine has \(7.28 TiB more"):
+        with naming_large(given):
+            raise error
+    with pytest.raises(MemoryError), naming_large({"--batch 4": (4, 8), "--jobs 2": (2, None), "--amp": (True, False)}):
+        raise error
+
+
 def test_another_error_of_torch_s_stays_a_bug():
     with pytest.raises(RuntimeError):
         cli._explain(RuntimeError("mat1 and mat2 shapes cannot be multiplied"))
 
 
 def test_a_network_too_large_for_this_machine_is_told_so(dpc_here):
-    done = dpc_here("classify", "profile", "--preset", "tiny", "--points", 10**12)
+    done = dpc_here("classify", "profile", "--preset", "tiny", "--points", 10**6)
     assert done.returncode == 2 and b"expected at most 4194304 points in a clip" in done.stderr
 
 

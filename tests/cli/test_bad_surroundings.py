@@ -366,8 +366,8 @@ def shell(line: str, path: Path, **env: str) -> subprocess.CompletedProcess:
         ("DPC classify fuse F F.copy -o - --force >&-", 2, "-o -: standard output is closed"),
         ("DPC info - <&-", 2, "-: standard input is closed; pipe a command"),
         ("DPC evaluate report - --markdown <&-", 2, "-: standard input is closed; pipe a command"),
-        ("DPC evaluate classification <(cat F)", 2, "a pipe or device, expected a file; to read from a pipe give `-`"),
-        ("DPC prepare split <(cat F) -o x.h5", 2, "a pipe or device, expected a file; to read from a pipe give `-`"),
+        ("DPC evaluate classification <(cat F)", 3, "a FIFO, expected a regular file; to read from a pipe give `-`"),
+        ("DPC prepare split <(cat F) -o x.h5", 3, "a FIFO, expected a regular file; to read from a pipe give `-`"),
     ],
 )
 def test_closed_streams_and_pipes_in_the_place_of_files(named, line, code, said):
