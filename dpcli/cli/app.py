@@ -51,6 +51,7 @@ _PLACES = (
     errno.ENXIO,
 )
 _LARGEST = 1e30  # of an option; torch ends with an error of its own where float32 overflows
+_MOST = 10**7  # of a whole number that says how much: lists of more take gigabytes before any work begins
 
 
 def _version(wanted: bool) -> None:
@@ -168,7 +169,8 @@ def _explain(error: BaseException) -> int:
     if isinstance(error, OSError) and error.errno in _PLACES and error.filename:
         log.error(f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}")
         return DataError.exit_code
-    full = disk_full(error.filename or "the output", error) if isinstance(error, OSError) else None
+    named = error.filename if isinstance(error, OSError) else None
+    full = disk_full(named or "the output", error, place=named) if isinstance(error, OSError) else None
     if full is not None:
         log.error(str(full))
         return full.exit_code
@@ -181,25 +183,38 @@ def _explain(error: BaseException) -> int:
     raise error
 
 
-def _refusing_nan(command: Any) -> Any:
-    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default.
+def _check_value(value: Any, option: Any) -> None:
+    """Raises UsageError for a number that is none, or too large for float32 or a count, DataError for what nobody may read."""
+    if isinstance(value, float) and not abs(value) < _LARGEST and value != option.default:
+        below = f" below {_LARGEST:g}" if math.isfinite(value) else ""
+        raise UsageError(f"{option.opts[-1]} {value}: expected a finite number{below}")
+    counts = type(value) is int and option.type_descriptor.parameter_info.parser is None  # no seed, which has a parser
+    if counts and abs(value) > _MOST:
+        raise UsageError(f"{option.opts[-1]} {value}: expected a whole number up to {_MOST}")
+    if isinstance(value, Path) and option.name not in _WRITTEN and value.exists() and not os.access(value, os.R_OK):
+        raise DataError(f"{value}: permission denied")
+
+
+def _checking_values(command: Any) -> Any:
+    """The command, or all below it, ending where an option is nan or too large for float32, and not so by default, and where
+    nobody may read a path.
 
     Where memory ends, options far above their defaults are named.
     """
     for below in getattr(command, "commands", {}).values():
-        _refusing_nan(below)
+        _checking_values(below)
     run = command.callback
     if run is None:
         return command
     options = {one.name: one for one in command.params}
+    for one in command.params:
+        one.type_descriptor.parameter_info.readable = False  # typer would call it wrong use; see below
 
     @functools.wraps(run)
     def checked(*args: Any, **values: Any) -> Any:
         for name, value in values.items():
-            for number in value if isinstance(value, (list, tuple)) else [value]:
-                if isinstance(number, float) and not abs(number) < _LARGEST and number != options[name].default:
-                    below = f" below {_LARGEST:g}" if math.isfinite(number) else ""
-                    raise UsageError(f"{options[name].opts[-1]} {number}: expected a finite number{below}")
+            for one in value if isinstance(value, (list, tuple)) else [value]:
+                _check_value(one, options[name])
         given = {f"{options[name].opts[-1]} {value}": (value, options[name].default) for name, value in values.items()}
         with naming_large(given):
             return run(*args, **values)
@@ -247,7 +262,7 @@ def _keeping_inputs(command: Any) -> Any:
 def main(argv: list[str] | None = None) -> None:
     """Run `dpc`; exits with the code that design.md section 2 lists."""
     arguments = _global_flags(list(sys.argv[1:] if argv is None else argv))
-    command = _keeping_inputs(_refusing_nan(typer.main.get_command(application(_words_to_complete() or arguments))))
+    command = _keeping_inputs(_checking_values(typer.main.get_command(application(_words_to_complete() or arguments))))
     code = _run(command, arguments)
     let_end()
     ended = signal_outcome() or (INTERRUPTED, "interrupted")

@@ -1,4 +1,4 @@
-"""What is said where memory ends: which numbers of the user's asked for so much, or what to take less of."""
+"""Tells where memory ends which numbers of the user's asked for so much, or what to take less of."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def _spool() -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix="dpc-") as folder:
             yield Path(folder)
     except (DiskFull, OSError) as error:
-        full = disk_full(f"TMPDIR ({place})", error, advice)
+        full = disk_full(f"TMPDIR ({place})", error, advice, place)
         if full is None or not (isinstance(error, DiskFull) or str(error.filename or place).startswith(place)):
             raise
         raise full from None

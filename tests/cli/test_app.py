@@ -132,7 +132,7 @@ def leaves(command):
 
 
 def test_no_option_takes_what_is_no_number():
-    checked = leaves(cli._refusing_nan(typer.main.get_command(cli.application())))
+    checked = leaves(cli._checking_values(typer.main.get_command(cli.application())))
     numbers = [(leaf, one) for leaf in checked for one in leaf.params if "float" in str(one.type_descriptor.annotation)]
     assert len(numbers) > 60
     for leaf, one in numbers:
@@ -141,6 +141,17 @@ def test_no_option_takes_what_is_no_number():
         with pytest.raises((TypeError, UsageError)) as refused:  # where it is let through, the other words are missing
             leaf.callback(**{one.name: math.inf})
         assert ("inf: expected a finite number" in str(refused.value)) == (one.default != math.inf)
+
+
+def test_no_option_takes_a_count_of_a_thousand_millions():
+    """Seeds alone are no counts; settings have bounds of their own (test_settings_options.py)."""
+    checked = leaves(cli._checking_values(typer.main.get_command(cli.application())))
+    counts = [(leaf, one) for leaf in checked for one in leaf.params if "int" in str(one.type_descriptor.annotation)]
+    counts = [(leaf, one) for leaf, one in counts if one.type_descriptor.parameter_info.parser is None]
+    assert len(counts) > 60
+    for leaf, one in counts:
+        with pytest.raises(UsageError, match=f"{one.opts[-1]} 1000000000: expected a whole number up to 10000000"):
+            leaf.callback(**{one.name: 10**9})
 
 
 def test_a_number_that_is_none_ends_with_a_sentence(dpc_here):

@@ -76,7 +76,7 @@ class KinetConfig:
     head: tuple[int, int] | None = setting(
         None, "Widths of the dynamic branch's head; none: the last group of widths.", least=1, most=WIDEST
     )
-    group_size: int = setting(4, "Features per fitted surface, d of eq. 3.5.", least=1)
+    group_size: int = setting(4, "Features per fitted surface, d of eq. 3.5.", least=1, most=WIDEST)
     reduction: float = setting(
         0.5, "Width of the fitted features as a share of the static layer's width.", above=0, most=1
     )

@@ -89,8 +89,10 @@ def test_the_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # the standard says to ignore it
     monkeypatch.setenv("HOME", str(tmp_path))
     assert weights_folder() == tmp_path / ".cache" / "dpc" / "weights"
-    with pytest.raises(UsageError, match="--weights .*nowhere: no such folder"):
-        weights_folder(tmp_path / "nowhere")
+    (tmp_path / "w.pt").touch()
+    for name, said in (("nowhere", "no such folder"), ("w.pt", "a file, expected a folder")):
+        with pytest.raises(DataError, match=f"--weights .*{name}: {said}"):
+            weights_folder(tmp_path / name)
 
 
 def test_a_missing_file_is_one_line(tmp_path):
