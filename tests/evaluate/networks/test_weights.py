@@ -19,7 +19,7 @@ from safetensors.torch import save_file
 from torch import nn
 from typer.testing import CliRunner
 
-from dpcli.cli.evaluate import weights as evaluate_weights
+from dpcli.cli.evaluate.app import WEIGHTS
 from dpcli.errors import DataError, DpcError, UsageError
 from dpcli.evaluate.commands import weights as commands
 from dpcli.evaluate.networks import weights as module
@@ -355,7 +355,7 @@ def run(monkeypatch, server):
     for one in (module, commands):
         monkeypatch.setattr(one, "known_weights", lambda: {"toy": server.entry, "lost": lost})
     app = typer.Typer()
-    app.add_typer(evaluate_weights.app, name="weights")
+    app.add_typer(WEIGHTS.application(), name="weights")
     app.command("other")(lambda: None)
     return lambda *words: CliRunner().invoke(app, ["weights", *map(str, words)], catch_exceptions=False)
 
