@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy, require_room
+from dpcli.npy_files import map_npy, read_arrays
 from dpcli.prepare.cloud_formats.cloud import (
     Cloud,
     cloud_of_columns,
@@ -34,15 +34,7 @@ def read_npy(path: Path, keep: Sequence[str] = ()) -> Cloud:
 
 def read_npz(path: Path, keep: Sequence[str] = ()) -> Cloud:
     """Reads the array called points (or xyz, pos, point_cloud), and colors where there are some."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            require_room(path, sum(info.file_size for info in archive.zip.infolist()))
-            arrays = {key: archive[key] for key in archive.files}
-            arrays = {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}  # or bare bytes
-    except DataError:
-        raise
-    except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
-        raise DataError(f"{path}: not a readable .npz archive ({error})") from None
+    arrays = read_arrays(path)
     key = next((k for k in _POINT_KEYS if k in arrays), None) or _only_points(arrays)
     if key is None and {"x", "y", "z"} <= arrays.keys():
         return cloud_of_columns(path, {k: a for k, a in arrays.items() if a.shape == arrays["x"].shape}, keep)

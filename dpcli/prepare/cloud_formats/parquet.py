@@ -36,7 +36,7 @@ class ParquetTable:
             raise
         except Exception as error:  # pyarrow.ArrowInvalid, OSError on truncated footers
             raise DataError(
-                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({error})"
+                f"{path}: not a readable {path.suffix[1:].capitalize()} table, perhaps truncated ({' '.join(str(error).split())})"
             ) from None
         self.names = tuple(self._table.column_names)
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dpcli.errors import DataError
-from dpcli.npy_files import map_npy, require_room
+from dpcli.npy_files import map_npy, read_arrays
 from dpcli.path_names import utf8_path
 from dpcli.prepare.decode.cv2_import import load_cv2
 from dpcli.prepare.decode.png import check_picture, decode_gray_png, read_header
@@ -400,14 +400,7 @@ def _require_frames_first(path: Path, shape: tuple[int, ...]) -> None:
 
 def _archived(path: Path) -> np.ndarray:
     """Returns the array of a ``.npz`` that is called depth, or the only one of two or three dimensions."""
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            require_room(path, sum(info.file_size for info in archive.zip.infolist()))
-            arrays = {key: array for key in archive.files if isinstance(array := archive[key], np.ndarray)}
-    except DataError:
-        raise
-    except Exception as error:  # zipfile.BadZipFile, ValueError for pickles, EOFError...
-        raise DataError(f"{path}: not a readable .npz archive ({error})") from None
+    arrays = read_arrays(path)
     called = [key for key in arrays if says_depth(key)]
     shaped = [key for key, array in arrays.items() if array.ndim in (2, 3) and array.dtype.kind in "uif"]
     chosen = next((choice[0] for choice in (called, shaped) if len(choice) == 1), None)

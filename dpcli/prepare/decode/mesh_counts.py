@@ -82,6 +82,10 @@ def _check_stl(path: Path) -> None:
         _compare(path, "bytes", _STL_HEAD + count * _STL_FACE, len(data))
     elif re.match(_SOLID, data) and not re.search(rb"(?i)\bendsolid\b[^\n]*\s*\Z", data):
         raise DataError(f"{path}: truncated: it doesn't end with endsolid; copy it again")
+    elif not re.match(_SOLID, data):
+        raise DataError(
+            f"{path}: truncated: its header alone has {_STL_HEAD} bytes, it holds {len(data)}; copy it again"
+        )
 
 
 def _is_binary(data: bytes) -> bool:

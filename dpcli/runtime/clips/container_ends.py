@@ -66,6 +66,24 @@ def promised_frames(path: Path) -> int:
     return int.from_bytes(head[48:52], "little") if int.from_bytes(head[56:60], "little") == 1 else 0
 
 
+def pictures_in(path: Path) -> int:
+    """Returns how many pictures lie in an APNG or animated WebP, whatever its header counts; 0 for other files."""
+    found, size = 0, os.path.getsize(path)
+    with path.open("rb") as file:
+        start = file.read(12)
+        png = start.startswith(b"\x89PNG")
+        if not png and start[8:] != b"WEBP":
+            return 0
+        at = 8 if png else 12
+        while at + 8 <= size:
+            file.seek(at)
+            one, two = file.read(4), file.read(4)
+            name, length = (two, int.from_bytes(one, "big") + 4) if png else (one, int.from_bytes(two, "little"))
+            found += name in (b"fcTL", b"ANMF")
+            at += 8 + length + (length % 2 if not png else 0)
+    return found
+
+
 def _goes_on(ends: Iterator[int], size: int) -> bool:
     """Returns whether the last of the places where parts end lies beyond the file."""
     last = 0

@@ -161,9 +161,7 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
     context.thread_type = "AUTO"
     context.flags |= av.codec.context.Flags.unaligned  # else columns that H.264 and HEVC cut off on the left are shown
     begun = False
-    # A packet without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
-    packets = (packet for packet in container.demux(stream) if packet.size)
-    for packet in chain(packets, [None]):
+    for packet in chain(_packets_with_bytes(path, container, stream), [None]):
         try:
             frames = context.decode(packet)
         except av.FFmpegError as error:
@@ -173,6 +171,19 @@ def _decoded(path: Path, container, stream) -> Iterator:  # of av.VideoFrame
         for frame in frames:
             begun = True
             yield frame
+
+
+def _packets_with_bytes(path: Path, container, stream) -> Iterator:  # of av.Packet
+    """Yields the packets of a stream. DataError where what lies between two of them is damaged.
+
+    One without bytes says that a picture stays, in Theora; a codec takes it for the end, which comes but once.
+    """
+    import av
+
+    try:
+        yield from (packet for packet in container.demux(stream) if packet.size)
+    except av.FFmpegError as error:
+        raise DataError(f"{path}: no frame begins where one should ({error.strerror}); copy the video again") from None
 
 
 def missing_frames(path: Path, count: int, times: np.ndarray | None) -> int:
