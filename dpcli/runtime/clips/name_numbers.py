@@ -26,6 +26,8 @@ _YEAR_LAST = re.compile(
 _SECONDS = re.compile(r"(?<!\d)([12]\d{9})(?:\.(\d{1,9})|_(\d{6}|\d{9}))(?!\d)")  # since 1970, and their parts
 _SHORTEST = 1e-4  # seconds between frames: what is shorter was counted, not timed
 _HALF_DAY = re.compile(r"\d[.:_-]\d\d[ _.-]?[ap]\.?m(?![a-z])", re.IGNORECASE)  # a time before or after noon
+_TIME_OF_DAY = re.compile(r"(?<!\d)([01]\d|2[0-3])([-_.:h])([0-5]\d)\2([0-5]\d)(?!\d)")
+_HALF_A_DAY = 720  # minutes
 _SAID: set[str] = set()
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _NOTHING = Decimal(0)
@@ -199,12 +201,22 @@ def tell_unclear_order(folder: Path, names: Sequence[str]) -> None:
         why = f"whether day or month stands first in {dates[0][0]} and the like"
     elif len(names) > 1 and any(map(_HALF_DAY.search, names)):
         why = "when it was by clocks of 12 hours"
+    elif _may_pass_midnight(names):
+        why = "whether these times of day go on past midnight"
     if why:
         with log.each_once(_SAID):
             log.warn(
                 f"{folder}: {why} can't be told from the names; the numbers order them as they stand. Names such as"
                 " 2024-03-05_14-30-00 tell it"
             )
+
+
+def _may_pass_midnight(names: Sequence[str]) -> bool:
+    """Returns whether names hold times of day without a date, and none from between late and early: more than half a day."""
+    clocks = [match for name in names if (match := _TIME_OF_DAY.search(name)) and not _DATE.search(name)]
+    minutes = sorted({int(match[1]) * 60 + int(match[3]) for match in clocks})
+    apart = [b - a for a, b in zip(minutes, minutes[1:])]
+    return len(clocks) == len(names) > 1 and max(apart, default=0) > _HALF_A_DAY
 
 
 def _counts_after_point(column: Sequence[str]) -> bool:
