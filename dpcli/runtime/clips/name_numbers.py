@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from decimal import Decimal
 from functools import lru_cache
 from os.path import splitext
@@ -19,6 +19,7 @@ from dpcli.runtime.progress import log
 
 _DATE = re.compile(
     r"((?:19|20)\d\d)[-_.]?([01]\d)[-_.]?([0-3]\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
+    r"(?:\+([01]\d):?([0-5]\d)(?!\d))?"  # ahead of Greenwich; behind a minus other numbers may stand
 )
 _YEAR_LAST = re.compile(
     r"([0-3]\d)[-_.]([0-3]\d)[-_.]((?:19|20)\d\d)[T _-]{1,2}([0-2]\d)[-_.:hH]?([0-5]\d)[-_.:mM]?([0-6]\d)(?:[.,_](\d{1,9})(?!\d))?"
@@ -101,9 +102,13 @@ def _since_1970_told_last(match: re.Match[str]) -> str:
     return _since_1970(year, month, day, *clock)
 
 
-def _since_1970(year: str, month: str, day: str, hour: str, minute: str, second: str, fraction: str | None) -> str:
+def _since_1970(
+    year: str, month: str, day: str, hour: str, minute: str, second: str, fraction: str | None, *ahead: str | None
+) -> str:
+    """Returns the seconds of a date, "" where it is none. ahead: hours and minutes by which its zone is."""
+    zone = timezone(timedelta(hours=int(ahead[0] or 0), minutes=int(ahead[1] or 0)) if ahead else timedelta())
     try:
-        moment = datetime(int(year), int(month), int(day), int(hour), int(minute), 0, tzinfo=timezone.utc)
+        moment = datetime(int(year), int(month), int(day), int(hour), int(minute), 0, tzinfo=zone)
     except ValueError:  # such as month 13: it is no date
         return ""
     return f"{int(moment.timestamp()) + int(second)}" + (f".{fraction}" if fraction else "")
