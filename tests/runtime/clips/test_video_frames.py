@@ -401,6 +401,36 @@ def test_every_label_but_0_is_opaque_and_what_may_mean_undecided_is_told(tmp_pat
     assert f"{said} is read as the object" in capfd.readouterr().err
 
 
+def with_palette(numbers: np.ndarray, *colors: tuple[int, int, int]) -> Image.Image:
+    image = Image.fromarray(np.asarray(numbers, np.uint8), "L").convert("P")
+    image.putpalette(bytes(value for color in colors for value in color))
+    return image
+
+
+BLACK, WHITE, RED, GREEN = (0, 0, 0), (255, 255, 255), (255, 0, 0), (0, 200, 0)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        pytest.param(with_palette(LABELS == 0, WHITE, BLACK), id="white is number 0"),
+        pytest.param(with_palette(np.choose(LABELS, [1, 0, 2]), RED, BLACK, GREEN), id="black is number 1"),
+        pytest.param(with_palette(LABELS, WHITE, RED, GREEN), id="on white paper"),
+        pytest.param(with_palette(LABELS, BLACK, BLACK, BLACK), id="without colors"),
+        pytest.param(with_palette(LABELS * 0, WHITE), id="white alone"),
+        pytest.param(colors_of(RED, GREEN).quantize(4), id="made smaller"),
+        pytest.param(Image.fromarray(np.dstack([LABELS, LABELS * 0 + 60, 70 * LABELS]), "RGB"), id="overlay"),
+    ],
+)
+def test_numbers_of_a_palette_are_labels_unless_its_colors_say_otherwise(tmp_path, image):
+    """Programs that make files smaller number the colors of a mask as they like."""
+    if image.mode == "RGB":  # as tools draw a mask over a picture: nowhere opaque
+        image.putalpha(Image.fromarray((153 * (LABELS > 0)).astype(np.uint8)))
+    image.save(tmp_path / "m.png")
+    whole = image.mode == "P" and image.getextrema() == (0, 0)
+    np.testing.assert_array_equal(read_mask(tmp_path / "m.png"), np.where((LABELS > 0) | whole, 255, 0))
+
+
 def test_labels_in_a_webp_without_loss_are_labels(tmp_path):
     for name, words in (("a.webp", {}), ("b.webp", {"exif": b"Exif\0\0MM\0*\0\0\0\x08\0\0\0\0\0\0"})):
         Image.fromarray(LABELS).convert("RGB").save(tmp_path / name, lossless=True, **words)
@@ -420,7 +450,7 @@ def test_masks_that_cannot_be_told_are_refused(tmp_path, values, name, message):
         read_mask(tmp_path / name)
 
 
-@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency"])
+@pytest.mark.parametrize("kind", ["8 bits", "16 bits", "floats", "alpha", "transparency", "palette"])
 def test_a_soft_mask_stays_soft(tmp_path, kind):
     y, x = np.mgrid[:48, :64]
     soft = np.clip(255 * (16.5 - np.hypot(x - 32, y - 24)), 0, 255).round().astype(np.uint8)
@@ -431,6 +461,7 @@ def test_a_soft_mask_stays_soft(tmp_path, kind):
         "floats": Image.fromarray(soft.astype(np.float32) / 255),
         "alpha": Image.fromarray(np.stack([soft * 0, soft], -1)),
         "transparency": Image.fromarray(soft).convert("P"),
+        "palette": Image.fromarray(soft).convert("RGB").quantize(256),
     }[kind]
     name, words = ("m.tif", {}) if kind == "floats" else ("m.png", {})
     words = {"transparency": bytes(range(256))} if kind == "transparency" else words
