@@ -94,8 +94,14 @@ def bake(file: Gltf, clip: int | None, frames: int) -> AnimatedMesh:
     )
     culled = np.array([not is_double_sided(file, index) for index in used])[mesh.material]
     faceted = np.concatenate([np.full(len(piece.triangles), piece.faceted) for piece in pieces])
+    turned = np.stack([_turns(piece, poses) for piece in pieces], axis=1)
     return replace(
-        mesh, one_sided=culled & ~_has_twin(mesh) if culled.any() else None, faceted=faceted if faceted.any() else None
+        mesh,
+        one_sided=culled & ~_has_twin(mesh) if culled.any() else None,
+        faceted=faceted if faceted.any() else None,
+        turned=turned.repeat([len(piece.triangles) for piece in pieces], axis=1)
+        if culled.any() and turned.any()
+        else None,
     )
 
 
@@ -112,12 +118,21 @@ def _hidden_apart(pieces: list[_Piece], poses: np.ndarray, shown: np.ndarray) ->
 
 
 def _turned_out(piece: _Piece, poses: np.ndarray) -> _Piece:
-    """Returns the piece with its triangles wound the other way when its node, or first bone, mirrors it."""
+    """Returns the piece with its triangles wound the other way when its node, or first bone, mirrors it where it is largest."""
+    size = _sizes(piece, poses)
+    return replace(piece, triangles=piece.triangles[:, ::-1]) if size[np.abs(size).argmax()] < 0 else piece
+
+
+def _turns(piece: _Piece, poses: np.ndarray) -> np.ndarray:
+    """Returns bool (T): when a node, or first bone, mirrors a piece though it doesn't where it is largest, or the other way."""
+    size = _sizes(piece, poses)
+    return size * size[np.abs(size).argmax()] < 0
+
+
+def _sizes(piece: _Piece, poses: np.ndarray) -> np.ndarray:
+    """Returns (T) how many times as large its node, or first bone, makes a piece, negative where it mirrors it."""
     bone = int(piece.bones[0, piece.weights[0].argmax()])
-    size = np.linalg.det((poses[:, bone] @ piece.inverse_bind[bone])[:, :3, :3])
-    if size[np.abs(size).argmax()] < 0:
-        return replace(piece, triangles=piece.triangles[:, ::-1])
-    return piece
+    return np.linalg.det((poses[:, bone] @ piece.inverse_bind[bone])[:, :3, :3])
 
 
 def _has_twin(mesh: AnimatedMesh) -> np.ndarray:
@@ -133,7 +148,7 @@ def _scene_nodes(file: Gltf) -> list[int]:
     """Returns nodes of the default scene, parents first; all nodes when the file names no scene."""
     if not file.items("scenes"):
         return list(range(len(file.items("nodes"))))
-    order = list(file.item("scenes", file.tree.get("scene", 0)).get("nodes", []))
+    order = list(dict.fromkeys(file.item("scenes", file.tree.get("scene", 0)).get("nodes", [])))
     for index in order:  # grows while it is walked; circles are refused before
         order += file.item("nodes", index).get("children", [])
     return order

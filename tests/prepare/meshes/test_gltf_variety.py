@@ -130,6 +130,19 @@ def test_a_mirrored_node_keeps_its_front(tmp_path):
     assert look(load(file, tmp_path))[32, 32, 3] == 0
 
 
+@pytest.mark.parametrize("scales", [(1, -1), (-1, 0.5), (-0.5, 1)])
+def test_a_front_is_in_front_in_every_frame_of_a_clip_that_mirrors_it(scales, tmp_path):
+    """As flat figures turn round, by a scale that jumps below 0; a scene names its root twice, too."""
+    file = quad()
+    file.tree["scenes"][0]["nodes"] = [0, 0]
+    node(file, mesh=square(file, 0.0, z=-0.5))
+    del file.tree["animations"]
+    file.animate(0, "scale", [0, 1, 2], [[scale, 1, 1] for scale in (*scales, scales[1])], "STEP")
+    mesh = load(file, tmp_path, frames=2)
+    assert [look(mesh.frames(k, k + 1))[32, 32].tolist() for k in (0, 1)] == [[255] * 4] * 2
+    assert mesh.positions.shape[1] == 8
+
+
 def test_a_leaf_of_two_triangles_back_to_back_has_no_holes(tmp_path):
     file = quad()
     primitive = file.tree["meshes"][0]["primitives"][0]
