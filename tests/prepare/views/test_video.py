@@ -633,6 +633,7 @@ def test_dialects_of_transforms_json_give_the_same_views(tmp_path, dialect):
         ((0, 0.5, 2.5), None, (0, 0.5, 2.5), "0 to 2.5 are taken for seconds"),
         ((0, 0.5, 2.5), 10, (0, 0.04, 0.2), "0 to 2.5 are taken for shares of a clip of 10 frames per second"),
         ((10, 20, 50), 10, (0, 0.1, 0.4), "10 to 50 are taken for numbers of frames, 10 per second"),
+        ((1.7e9, 1.7e9 + 0.5, 1.7e9 + 2), None, (0, 0.5, 2), "1700000000 to 1700000002 are taken for seconds"),
     ],
 )
 def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys, times, fps, seconds, said):
@@ -669,6 +670,8 @@ def test_times_of_transforms_json_are_seconds_numbers_or_shares(tmp_path, capsys
             "a focal length of 1.04 pixels for pictures of 64x48; expected pixels, not shares",
         ),
         (lambda d: d.update(fl_x=0), "fl_x 0; expected more than 0"),
+        (lambda d: d.update(cx=0.5, cy=0.52), "a principal point at 0.5, 0.52; expected pixels, not shares"),
+        (lambda d: d.update(distortion_params=[0.1, 0, 0, 0]), "distortion_params .0.1, 0, 0, 0.; expected pictures"),
         (lambda d: d.update(w=48, h=64), "is 64x48, its camera is of 48x64, which is another shape"),
         (lambda d: d["frames"][1].update(time=0), "r_0_1.png and r_0_0.png are of one camera at one time, 0"),
         (lambda d: d["frames"][1].update(fl_x=90), "the camera moves or zooms"),
@@ -694,6 +697,17 @@ def test_bad_transforms(tmp_path, change, message):
     change(data)
     (folder / "transforms_train.json").write_text(json.dumps(data))
     with pytest.raises(DataError, match=message):
+        transforms_clip(folder, SMALL)
+
+
+def test_inverted_poses_are_noticed(tmp_path):
+    """Cameras around the origin, as world to camera: all seem to stand in one place."""
+    folder, _ = blender_folder(tmp_path / "scene")
+    data = json.loads((folder / "transforms_train.json").read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = np.linalg.inv(frame["transform_matrix"]).tolist()
+    (folder / "transforms_train.json").write_text(json.dumps(data))
+    with pytest.raises(DataError, match="its 3 cameras stand in one place, turned differently; .* are they inverted"):
         transforms_clip(folder, SMALL)
 
 
