@@ -102,6 +102,19 @@ def test_without_alpha_everything_is_opaque(pictures, tmp_path, name):
     assert not look_at_video(path).has_alpha and (decoded(path)[..., 3] == 255).all()
 
 
+@pytest.mark.parametrize("name", ["raw.avi", "animation.mov"])
+def test_an_alpha_of_0_everywhere_is_none(pictures, tmp_path, capfd, name):
+    """Windows leaves the fourth byte of its pixels empty, and so do programs that record them."""
+    words = {
+        "raw.avi": ("-c:v", "rawvideo", "-pix_fmt", "bgra"),
+        "animation.mov": ("-c:v", "qtrle", "-pix_fmt", "argb"),
+    }
+    path = film(pictures, tmp_path / name, "-vf", "format=rgba,lutrgb=a=0", *words[name])
+    read = decoded(path)
+    assert (read[..., 3] == 255).all() and read[0, 20, 12].tolist() == [200, 30, 30, 255]
+    assert not look_at_video(path).has_alpha and "its alpha is 0 everywhere" in capfd.readouterr().err
+
+
 PLAIN = ("-pix_fmt", "yuv420p", "-c:v", "libx264", "-crf", 10)
 SUFFIXES = {
     "av1.mp4": ("-pix_fmt", "yuv420p", "-c:v", "libsvtav1", "-crf", 20),
@@ -185,17 +198,18 @@ def test_colors_follow_the_tagged_matrix_and_range(tmp_path, matrix, number, ful
     assert np.abs(decoded(tmp_path / "c.mp4")[0, 32, 32, :3].astype(int) - (200, 30, 30)).max() <= 4
 
 
-def with_clean_aperture(mp4: bytes, aperture: tuple[int, ...]) -> bytes:
-    """An MP4 whose index comes last, with a `clap` box at the end of the sample entry of its one video."""
+def with_box(mp4: bytes, box: bytes, depth: int = 7) -> bytes:
+    """An MP4 whose index comes last, with a box at the end of the sample entry of its one video, or `depth` boxes down."""
     data, (start, stop), above = bytearray(mp4), (0, len(mp4)), []
-    for name, skipped in zip((b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1"), (8, 8, 8, 8, 8, 16, 86)):
+    names = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd", b"avc1")
+    for name, skipped in zip(names[:depth], (8, 8, 8, 8, 8, 16, 86)):
         while data[start + 4 : start + 8] != name:
             start += int.from_bytes(data[start : start + 4], "big")
         above.append(start)
         start, stop = start + skipped, start + int.from_bytes(data[start : start + 4], "big")
-    data[stop:stop] = struct.pack(">I4s8i", 40, b"clap", *aperture)
+    data[stop:stop] = box
     for at in above:
-        data[at : at + 4] = struct.pack(">I", int.from_bytes(data[at : at + 4], "big") + 40)
+        data[at : at + 4] = struct.pack(">I", int.from_bytes(data[at : at + 4], "big") + len(box))
     return bytes(data)
 
 
@@ -203,7 +217,7 @@ def with_clean_aperture(mp4: bytes, aperture: tuple[int, ...]) -> bytes:
 def test_margins_that_a_container_cuts_off_are_not_shown(pictures, tmp_path, capfd, name):
     """40 x 30, whose middle lies 4 to the right of the frame's and 3 above: columns 16 to 56, rows 14 to 44."""
     whole = film(pictures, tmp_path / "whole.mp4", *PLAIN)
-    cut = with_clean_aperture(whole.read_bytes(), (40, 1, 30, 1, 4, 1, -6, 2))
+    cut = with_box(whole.read_bytes(), struct.pack(">I4s8i", 40, b"clap", 40, 1, 30, 1, 4, 1, -6, 2))
     (tmp_path / "c.mp4").write_bytes(cut)
     if name != "c.mp4":
         ffmpeg("-i", tmp_path / "c.mp4", "-c", "copy", tmp_path / name)
@@ -220,6 +234,31 @@ def test_margins_that_a_codec_cuts_off_are_not_shown(pictures, tmp_path, margins
         decoded(tmp_path / "cut.mp4")[..., 3, 3, :], decoded(whole)[:, top:, left : SIDE - right][..., 3, 3, :]
     )
     assert decoded(tmp_path / "cut.mp4").shape[1:3] == (SIDE - top, SIDE - left - right)
+
+
+def test_dolby_vision_of_its_own_colors_is_refused_and_of_others_colors_is_not(pictures, tmp_path):
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN).read_bytes()
+    for name, profile in ((b"dvcC", 5), (b"dvvC", 8)):
+        box = struct.pack(">I4s2B20s", 32, name, 1, 0, bytes([profile << 1, 3 << 3 | 5]))
+        (tmp_path / "c.mp4").write_bytes(with_box(whole, box + bytes(2)))
+        if profile == 5:
+            with pytest.raises(DataError, match="c.mp4: Dolby Vision of profile 5"):
+                look_at_video(tmp_path / "c.mp4")
+        else:
+            assert look_at_video(tmp_path / "c.mp4").count == COUNT
+
+
+def test_a_file_that_says_it_holds_two_views_or_a_panorama_is_told(pictures, tmp_path, capfd):
+    whole = film(pictures, tmp_path / "whole.mp4", *PLAIN)
+    ffmpeg("-i", whole, "-c", "copy", "-metadata:s:v", "stereo_mode=left_right", tmp_path / "two.mkv")
+    words = {"Spherical": "true", "Stitched": "true", "StitchingSoftware": "x", "ProjectionType": "equirectangular"}
+    text = "".join(f"<GSpherical:{key}>{value}</GSpherical:{key}>" for key, value in words.items()).encode()
+    box = b"uuid" + bytes.fromhex("ffcc8263f8554a938814587a02521fdd") + text
+    (tmp_path / "round.mp4").write_bytes(with_box(whole.read_bytes(), struct.pack(">I", len(box) + 4) + box, depth=2))
+    for name, said in (("two.mkv", "two views side by side"), ("round.mp4", "a panorama"), ("whole.mp4", "")):
+        look_at_video(tmp_path / name)
+        error = capfd.readouterr().err
+        assert f"{name}: {said}, as the file says" in error if said else not error
 
 
 def test_of_a_turn_that_is_no_quarter_is_told(pictures, tmp_path, capfd):
