@@ -1,4 +1,4 @@
-"""What a file says of how its frames are shown: turned by quarters and mirrored, or as two views or a panorama."""
+"""Frames of videos as their file says they are shown: turned by quarters, mirrored, two views in each, or a panorama."""
 
 from __future__ import annotations
 
